@@ -39,9 +39,10 @@ from .xla.trees import PyTree
 class Scene(NamedTuple):
     """All that an image depends on: what `render` is given, and what is `prepared` from that.
 
-    - `source`: where rays come from, a `Camera` or `GivenRays`; None where there is a single ray.
-    - `space`: in which rays meet the volume. `classification`: how samples are measured, classified and
-      shaded.
+    Attributes:
+        source: where rays come from, a `Camera` or `GivenRays`; None where there is a single ray.
+        space: in which rays meet the volume.
+        classification: how samples are measured, classified and shaded.
     """
 
     volume: Volume

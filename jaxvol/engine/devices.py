@@ -74,10 +74,12 @@ def split(
 ) -> tuple[PyTree, PyTree]:
     """What `program(replicated, sharded)` returns on all devices.
 
-    - `replicated`: what all devices have, not only arrays.
-    - `sharded`: arrays of which each device has a part along the first axis, and is given that.
+    Args:
+        replicated: what all devices have, not only arrays.
+        sharded: arrays of which each device has a part along the first axis, and is given that.
 
-    The program returns the same two: first what is the same on all devices, then what is sharded."""
+    The program returns the same two: first what is the same on all devices, then what is sharded.
+    """
     if mesh is None:
         return program(replicated, sharded)
     arrays, rest = eqx.partition(replicated, eqx.is_array)

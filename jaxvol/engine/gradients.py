@@ -75,10 +75,12 @@ class Sums(NamedTuple):
 class ImageVjp(NamedTuple):
     """What the tiles of an image share.
 
-    - `scene`: as given. `prepared`: without lighting, since samples are pulled back through `shader`. `lit`:
-      through which rays are marched: with lighting if that is inline, so that invisible samples have their
-      light, too.
-    - `pull_shader`: from the shader's leaves to volume, transfer function, march and lighting.
+    Attributes:
+        scene: as given.
+        prepared: without lighting, since samples are pulled back through `shader`.
+        lit: through which rays are marched: with lighting if that is inline, so that invisible samples have
+            their light, too.
+        pull_shader: from the shader's leaves to volume, transfer function, march and lighting.
     """
 
     scene: Scene

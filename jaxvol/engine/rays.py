@@ -33,7 +33,9 @@ Lanes = Int[Array, "groups rays"]
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
-    - `number`: of tiles, on each device. `beam_count`: of beams in each tile.
+    Attributes:
+        number: of tiles, on each device.
+        beam_count: of beams in each tile.
 
     Where there are several devices, all but `of` is called inside `devices.split`, and is about the tiles of
     this device.

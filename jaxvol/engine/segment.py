@@ -54,9 +54,10 @@ class Samples(NamedTuple):
 class SampleVisitor(ABC):
     """Looks at all samples of a march.
 
-    - `given`, `carry`, `sums`: for each ray, (groups, rays in a group): constants, state carried from segment
-      to segment, and sums, which begin at 0.
-    - `total`: sums over all rays.
+    Attributes:
+        given, carry, sums: for each ray, (groups, rays in a group): constants, state carried from segment to
+            segment, and sums, which begin at 0.
+        total: sums over all rays.
     """
 
     given: PyTree

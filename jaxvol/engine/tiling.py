@@ -18,19 +18,20 @@ class Tiling(NamedTuple):
     """Sizes by which rays and samples are processed. None of them shows in an image; gradients are summed in
     another order, and the number of samples between two leaps differs.
 
-    - `cells`: cells of a segment, whose samples are all fetched before any is composited.
-    - `group`: rays compacted as one unit, a square number.
-    - `batch`: groups marched at a time, as many as fit into the cache.
-    - `min_alive`: share of a batch's groups that must be alive for it to go on; below it, batches are
-      refilled.
-    - `turns`: if not 0, the segments by which a batch is marched before it is refilled, in place of
-      `min_alive`: a number that is known when the program is compiled.
-    - `tile`: beams that are marched to their ends before the next ones are made: 262 144 rays.
-    - `direct_tile`: the same where JAX differentiates the march itself, and so keeps all its states.
-    - `searched`: groups whose entries and exits are searched at a time, where a search is needed. It takes as
-      many steps as the slowest ray among them.
-    - `chunk`: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
-    - `devices`: between which beams are sharded, a mesh of one axis; None where JAX decides.
+    Attributes:
+        cells: cells of a segment, whose samples are all fetched before any is composited.
+        group: rays compacted as one unit, a square number.
+        batch: groups marched at a time, as many as fit into the cache.
+        min_alive: share of a batch's groups that must be alive for it to go on; below it, batches are
+            refilled.
+        turns: if not 0, the segments by which a batch is marched before it is refilled, in place of
+            `min_alive`: a number that is known when the program is compiled.
+        tile: beams that are marched to their ends before the next ones are made: 262 144 rays.
+        direct_tile: the same where JAX differentiates the march itself, and so keeps all its states.
+        searched: groups whose entries and exits are searched at a time, where a search is needed. It takes
+            as many steps as the slowest ray among them.
+        chunk: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
+        devices: between which beams are sharded, a mesh of one axis; None where JAX decides.
     """
 
     cells: int = 8
@@ -70,7 +71,8 @@ class Tiling(NamedTuple):
 class RenderOptions(eqx.Module):
     """What is computed, how it is differentiated, and how work is divided.
 
-    - `steps`: of each ray's scan, for `"direct"`.
+    Attributes:
+        steps: of each ray's scan, for `"direct"`.
     """
 
     outputs: Outputs = eqx.field(static=True)

@@ -73,10 +73,11 @@ class VisibleRangeRecorder(SampleVisitor):
 class Beams(eqx.Module):
     """Rays that are marched together, in groups, of which equally many in a row make up a beam.
 
-    - `rays`: of shape (groups, rays in a group).
-    - `count`: number of beams.
-    - `box`: the boxes around the beams.
-    - `range`: where known, the cells outside of which a ray sees nothing, and is not marched.
+    Attributes:
+        rays: of shape (groups, rays in a group).
+        count: number of beams.
+        box: the boxes around the beams.
+        range: where known, the cells outside of which a ray sees nothing, and is not marched.
     """
 
     rays: Ray
@@ -99,9 +100,10 @@ class Beams(eqx.Module):
 class Job(NamedTuple):
     """What does not change while the rays of a tile are marched.
 
-    - `skip_to`: of the `EmptySpaceIndex`, asked about these beams; None where no empty space is known.
-    - `resumable`: whether rays that are finished stay where they are, so that they can go on from there;
-      and `exact`: whether they take no cell behind the last one of their range.
+    Attributes:
+        skip_to: of the `EmptySpaceIndex`, asked about these beams; None where no empty space is known.
+        resumable: whether rays that are finished stay where they are, so that they can go on from there; and
+            `exact`: whether they take no cell behind the last one of their range.
     """
 
     scene: Scene

@@ -18,10 +18,11 @@ CHUNK = 2048
 class Chosen(NamedTuple):
     """Chosen entries of arrays (rows, columns), of which there may be several, stacked along the rows.
 
-    - `indices`: flat indices of the chosen entries, padded with indices past the end.
-    - `number`: how many are chosen.
-    - `columns`: of the arrays.
-    - `chunk`: entries processed at a time; all, chosen or not, if 0.
+    Attributes:
+        indices: flat indices of the chosen entries, padded with indices past the end.
+        number: how many are chosen.
+        columns: of the arrays.
+        chunk: entries processed at a time; all, chosen or not, if 0.
     """
 
     indices: Int[Array, " entries"]
