@@ -1,9 +1,10 @@
 """One ray, cell by cell: the steps that the reference and the fast engine share.
 
 `begin` a ray; cut each cell into `pieces`, `measure` each at its sample, find its `opacity`, and `add` it to
-the pixel; `stop` the ray, or `move` on; then `end` it. A cell of extinction σ and width w has the opacity
-α = 1 - exp(-σ w); `compositing` says how cells become a pixel. A fault in here shows in both engines: the
-independent check is `tests/oracle.py`.
+the pixel; `stop` the ray if it needs no more, and `move` it on; at last `end` it. A cell of extinction σ and
+width w has the opacity α = 1 - exp(-σ w); `compositing` says how cells become a pixel. "In front" and
+"behind" are as seen from the camera. A bug in here is in both engines alike, so that comparing them cannot
+show it: `tests/oracle.py` is independent.
 """
 
 from dataclasses import replace
@@ -37,12 +38,12 @@ from .xla.trees import PyTree
 
 
 class Scene(NamedTuple):
-    """All that an image depends on: what `render` is given, and what is `prepared` from that.
+    """All that an image depends on: what `render` is given, and what `prepared` computes from that.
 
     Attributes:
         source: where rays come from, a `Camera` or `GivenRays`; None where there is a single ray.
-        space: in which rays meet the volume.
-        classification: how samples are measured, classified and shaded.
+        space: the map between world and grid; None until `prepared`.
+        classification: how samples are measured, classified and shaded; None until `prepared`.
     """
 
     volume: Volume
@@ -55,8 +56,8 @@ class Scene(NamedTuple):
     classification: Classification = cast(Classification, None)
 
     def prepared(self, windows: Windows | None = None) -> "Scene":
-        """The scene with what is computed once for each image. `windows`: of the volume, where a transform
-        chooses strides."""
+        """The scene with what is computed once for each image. `windows`: those of the volume, which a
+        `StrideControl` needs."""
         space, march = self.march.locate(self.volume), self.march
         lit = lit_classification(
             self.volume, self.transfer, space, self.lighting, integrated=march.integrates
@@ -69,8 +70,10 @@ class Scene(NamedTuple):
     @property
     def has_fault(self) -> Bool[Array, ""]:
         """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
-        Comparisons with NaN are false and would make it invisible, so that a fit that diverged would look
-        converged. Rays and voxels are checked ray by ray."""
+
+        All pixels are NaN then. Otherwise comparisons with NaN, which are false, would hide the fault, and a
+        fit that diverged would look converged. Given rays are checked one by one; NaN in voxels spreads to
+        the pixels that meet it."""
         parts = without_voxels(self.volume), self.march, self.transfer, self.compositing, self.lighting
         return ~(all_finite(parts) & (self.march.step > 0))
 
@@ -81,8 +84,8 @@ class Scene(NamedTuple):
 
     @property
     def marched(self) -> "Scene":
-        """The scene as its rays are marched: if it `resolves`, without light, and by the march and the
-        transfer function of its mode."""
+        """The scene as its rays are marched: if it `resolves`, without light, and with the march and transfer
+        function that its mode puts in place of its own."""
         if not self.resolves:
             return self
         transfer, march = self.compositing.marched(self.transfer, self.march, self.volume)
@@ -124,7 +127,8 @@ FINAL: dict[type, str] = {
     TransferFunction2D: "jaxvol.scene.transfer.Transfer instead",
     LabelTransferFunction: "jaxvol.scene.transfer.Transfer instead",
 }
-"""Classes whose subclasses would not be asked by the fast engine, and what to subclass."""
+"""Classes whose subclasses may disagree with what the fast engine computes for the class itself (packed
+voxels, ranges of blocks, the VJP), and what to subclass instead."""
 
 
 def check_arguments(call: str, **arguments: Any) -> None:
@@ -135,7 +139,7 @@ def check_arguments(call: str, **arguments: Any) -> None:
             arguments are swapped.
 
     Raises:
-        ValueError: naming the first wrong argument, what came, and what to pass.
+        ValueError: naming the first argument that is not, what came, and what to pass.
     """
     for name, value in arguments.items():
         kind, expected, remedy = EXPECTED[name]
@@ -143,7 +147,7 @@ def check_arguments(call: str, **arguments: Any) -> None:
             if isinstance(value, final) and type(value) is not final:
                 raise ValueError(
                     f"{name} must be a jaxvol {final.__name__} itself; got its subclass "
-                    f"{type(value).__name__}, whose methods the fast engine would not call. Subclass {other}."
+                    f"{type(value).__name__}, with which the fast engine may disagree. Subclass {other}."
                 )
         if isinstance(value, kind) or (name == "lighting" and value is None):
             continue
@@ -159,8 +163,8 @@ class Progress(eqx.Module):
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
     the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
-    first transparent cell, and is 0 from then on. What is not asked for, or not needed, is None: `strides`
-    where all cells are one step long.
+    first transparent cell, and is 0 from then on. Three are None where they are not needed: `stats` unless
+    all outputs are asked for, `shift` unless a transform shifts, `strides` unless there is a `StrideControl`.
     """
 
     index: Int[Array, ""]
@@ -198,8 +202,9 @@ def begin(scene: Scene, ray: Ray, outputs: Outputs | None = "all") -> Progress:
 def with_stride(
     scene: Scene, ray: Ray, at: Progress, ahead: Int[Array, ""] | int = 0
 ) -> tuple[Progress, Int[Array, ""] | int]:
-    """The ray, with the stride of the run that holds the step `ahead`, up to which all is transparent; and
-    the steps to where the next cell begins."""
+    """Chooses the stride of the run that holds the step `ahead` of this one; all cells before it must be
+    transparent. Returns the progress, and the steps to that run (`ahead` itself without a
+    `StrideControl`)."""
     if at.strides is None:
         return at, ahead
     march, transmittance = scene.march, scene.compositing.transmittance(at.composite)
@@ -212,7 +217,7 @@ def with_stride(
 
 
 def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
-    """The pieces of the ray's next cell, or the one so many cells behind it in its run."""
+    """The pieces of the ray's next cell, or of the `number`-th one after it, which is as long."""
     march, steps = scene.march, steps_of(at.strides)
     width = jnp.asarray(steps, march.step.dtype) * march.step
     begin = front(march, at, number * steps)
@@ -221,7 +226,7 @@ def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 
 
 def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
     """The measured values at a piece's sample, or over the piece where it is integrated, and what the
-    transfer function's search finds for them. `recorded`: for the engine's `Recording`, which cannot record
+    transfer function's search finds for them. `recorded`: by the engine's `Recording`, which cannot record
     fetches inside branches."""
     march, classification = scene.march, scene.classification
     if not march.integrates:
@@ -244,7 +249,7 @@ def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     _, extinction = scene.classification.of_cells(measured)
     inside = ray.contains(scene.march.sample(piece))
     optical_depth = jnp.where(inside, extinction, 0) * piece.width
-    # 1 - exp(-τ), exact for thin cells, as is expm1, which takes 1.5 times as long
+    # 1 - exp(-τ) with t = tanh(τ / 2): as exact for thin cells as expm1, which takes 1.5 times as long
     t = jnp.tanh(optical_depth / 2)
     return 2 * t / (1 + t)
 
@@ -253,7 +258,7 @@ def is_sample(march: March, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Arr
     """Whether a piece counts as a sample. `divided`: transforms divide cells, so that pieces may have
     width 0."""
     before_exit = march.sample(piece) < ray.length
-    # not in general: it would take 15 % of a frame whose last cells are cut
+    # only where cells are divided: elsewhere the second test would take 15 % of a frame
     return before_exit & (piece.width > 0) if divided else before_exit
 
 
@@ -268,8 +273,8 @@ def add(
     *,
     divided: bool,
 ) -> Progress:
-    """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: of `Fragment`.
-    `divided`: of `is_sample`."""
+    """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: what a
+    `Selection` compares; a `Weighting` may be given the value alone. `divided`: as for `is_sample`."""
     march, compositing = scene.march, scene.compositing
     depth, counts = march.sample(piece), ~at.finished & is_sample(march, ray, piece, divided=divided)
     alpha = jnp.where(at.finished, 0, alpha)
@@ -298,8 +303,9 @@ def stopped(scene: Scene, composite: Any) -> Bool[Array, ""]:
 
 
 def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
-    """Moves on by this many steps. `transparent`: whether the last cell, or all of them, are, so that the ray
-    shifts; None where no shift is ahead. The ray is finished if the next cell begins past the exit."""
+    """Moves on by this many steps. `transparent`: whether the cell just composited, or all cells leapt over,
+    are transparent, so that a shift ahead is added now; None where none is ahead. The ray is finished if the
+    next cell begins past the exit."""
     at = replace(at, index=at.index + steps)
     if at.shift is not None and transparent is not None:
         shift = jnp.where(transparent, at.shift, 0)
@@ -313,11 +319,11 @@ def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
 
 
 def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
-    """The rendering of a ray, with the outputs that it was begun with. Modes that resolve leave the pixel to
-    `resolve`."""
+    """The rendering of a ray, with the outputs that it was begun with. Where the scene `resolves`, `resolve`
+    makes the pixel from it."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
     rgba, depth = scene.compositing.end(at.composite)
-    # a product, since the derivative of a `where` would be 0
+    # times NaN, so that the derivative is NaN, too; that of a `where` would be 0
     rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
     if depth is not None:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
@@ -359,7 +365,7 @@ def _selected(
     compositing: Selection[Any], scene: Scene, line: Line, rgba: Float[Array, "4"], state: PyTree
 ) -> Pixel:
     ray, march = enter(scene.space, *line), scene.march
-    # 1, with a derivative: the selected depths are numbers of steps, and so grow with the step
+    # a selected depth is a fixed number of steps: its derivative by the step is depth / step
     scale = march.step / jax.lax.stop_gradient(march.step)
     gradient = partial(world_gradient, scene.volume, scene.space)
     sampler = RaySampler(ray, scene.classification, scale, gradient)

@@ -1,4 +1,4 @@
-"""What does one ray see? The definition: a plain scan over its cells, by the steps of `ray`."""
+"""What does one ray see? The definition: a plain scan over its cells, by the functions of `ray`."""
 
 import math
 from dataclasses import replace
@@ -70,7 +70,7 @@ def render_ray_reference(
         A `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
     Raises:
-        ValueError: where the step, the spacing or a transform that bends space is traced, and
+        ValueError: where the step, the volume's place or a transform that bends space is traced, and
             `march.max_samples` is not given: the length of the scan cannot be known.
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
@@ -107,7 +107,7 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
         after = add(scene, ray, after, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     after = move(march, ray, stop(scene, after), transparent, steps_of(at.strides))
-    if at.strides is None:  # a scan has as many steps as a ray may take
+    if at.strides is None:  # each cell is one step, and the scan is no longer than `most_samples`
         return after
     return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
 
@@ -133,8 +133,8 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 
 
 def steps_across(volume: Volume, march: March) -> int:
-    """Number of steps that suffices for any ray: across the volume's diagonal, and a few more for
-    transforms."""
+    """Number of steps that suffices for any ray: across the volume's diagonal, and four
+    more."""
     with jax.ensure_compile_time_eval():
         diagonal = march.locate(volume).diagonal
         traced = is_traced(march.step, diagonal)
@@ -143,7 +143,7 @@ def steps_across(volume: Volume, march: March) -> int:
         if march.max_samples is not None:
             return march.max_samples
         raise ValueError(
-            "March(max_samples=...) must be given where march.step or volume.spacing is traced: "
+            "March(max_samples=...) must be given where march.step or the volume's place is traced: "
             "the length of a scan must be known before the program is compiled."
         )
     if not math.isfinite(steps):  # then nothing is marched, and the image is NaN

@@ -55,7 +55,7 @@ def render(
         compositing: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or
             `"average"`, the projections of VTK (`Maximum` and its siblings take a `thickness`); an
             `Isosurface(value)`; or another `Weighting` or `Selection`. Where a `Selection` chooses a depth,
-            no adjoint marches again: JAX differentiates what is computed there.
+            the march is not differentiated: JAX differentiates the pixel that is computed there.
         lighting: how samples are shaded: `lighting.Phong(lights)` or
             `lighting.ScattererTemplates(materials, lights)`; by default not at all.
         outputs: `"all"`, or `"rgba"` for the image and `exhausted` only, in some 5 % less time.
@@ -63,7 +63,7 @@ def render(
             (`jax.grad`): a second march computes the samples again, so that memory does not grow with their
             number (one array like each leaf, and the rays of one tile). `"forward"`, for forward mode
             (`jax.jvp`, `jax.jacfwd`). `"direct"`, for both and higher derivatives: JAX differentiates
-            `render_ray_reference`, and memory grows with the number of samples.
+            the reference's march, and memory grows with the number of samples.
         devices: a sequence of JAX's devices, or a `jax.sharding.Mesh` of one axis, over which
             `jax.shard_map` shards the rays. Image and gradient are the same, and lie on all of these
             devices; so does the scene (a volume is copied to each once in its lifetime). By default JAX
@@ -75,22 +75,22 @@ def render(
         A `Rendering` of shape (height, width), in JAX's default float type. If a number on which all pixels
         depend is NaN or infinite (a transfer function whose fit diverged, say), all of the image and of its
         gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays meet it, or leave the volume
-        next to it.
+        next to it (0 times NaN is NaN).
 
     Raises:
         ValueError: for an argument of another kind (an array for a `Volume`, a camera in the march's place);
-            for unknown outputs or adjoint; for `"direct"` where march or spacing is traced and
-            `march.max_samples` is not given; for `"auto"` where arrays are traced, and for a tolerance
-            without it; for wrong `devices`, and for any inside a `jax.shard_map`; and under a mode of
-            differentiation that is not the adjoint's. (`jax.jvp` of a `jax.jit` under `"replay"` is JAX's
-            own `TypeError`.)
+            for unknown outputs or adjoint; for `"direct"` where the step, the volume's place or a transform
+            that bends space is traced and `march.max_samples` is not given; for `"auto"` where arrays are
+            traced, and for a tolerance without it; for wrong `devices`, and for any inside a `jax.shard_map`;
+            and under a mode of differentiation that is not the adjoint's. (`jax.jvp` of a `jax.jit` under
+            `"replay"` is JAX's own `TypeError`.)
 
     `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so do
-    gradients. `"direct"` renders them side by side, and so does `"forward"` where the image is also
-    differentiated or compiled within the `jax.vmap`: slower, with more memory.
+    gradients. Under `"direct"` and `"forward"`, images that are also differentiated, or compiled by a
+    `jax.jit` within the `jax.vmap`, are rendered side by side: slower, with more memory.
 
-    In float32, the gradient by the extinction drowns in rounding along rays of optical depth above 14
-    (`experiments/stability.py`, "gradients of opaque rays").
+    In float32, the gradient with respect to extinction is lost in rounding along rays of optical depth above
+    14 (`experiments/stability.py`, "gradients of opaque rays").
 
     Without `AlphaCorrection` an image jumps when a sample crosses the exit. The gradient with respect to the
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.

@@ -78,7 +78,11 @@ def lacks(thing):
         for name, method in own.items():
             shown = ast.get_docstring(method)
             if shown and not name.startswith("_") and any(isinstance(n, ast.Raise) for n in ast.walk(method)):
-                found += [] if has("Raises", inspect.cleandoc(shown)) or has("Raises", doc) else [f"Raises of {name}"]
+                found += (
+                    []
+                    if has("Raises", inspect.cleandoc(shown)) or has("Raises", doc)
+                    else [f"Raises of {name}"]
+                )
     elif not (
         node.returns is None or (isinstance(node.returns, ast.Constant) and node.returns.value is None)
     ):

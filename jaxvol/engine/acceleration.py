@@ -1,4 +1,4 @@
-"""What is computed from the voxels before an image is marched: a packed copy, and where space is empty.
+"""What is computed before an image is marched: once from the voxels, a packed copy; and where space is empty.
 
 A fetch costs the same for one byte as for four. In the packed copy, each 32-bit word holds a voxel and its
 neighbour along z, and for 8-bit voxels the two next to these along y, which saves three fetches in four for
@@ -55,8 +55,8 @@ class VolumeAcceleration(eqx.Module):
     ) -> "VolumeAcceleration":
         lit_by_gradient = lighting is not None and lighting.reads_gradient
         slopes = transfer.reads_gradient or lit_by_gradient
-        # a part of a volume is rendered once: to pack it takes longer than to fetch voxels one by one, unless
-        # six cubes of them are fetched for a sample
+        # a brick of a volume is rendered once: packing it takes longer than fetching voxels one by one,
+        # unless gradients fetch six cubes of them for each sample
         packs = slopes or volume.first is None
         return cls(
             words_of(volume) if packs else None,
@@ -88,7 +88,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
     visible = compositing.occupied(transfer, blocks)
     check_answer(compositing, "occupied", visible, blocks.unordered)
     visible |= blocks.unordered
-    if march.may_shift:  # what is leapt over is taken as transparent
+    if march.may_shift:  # a leap applies the shift, so that it must not cross what `opacity` sees
         visible |= transfer.visible(blocks)
     corner = volume.first
     occupancy = space.occupancy(visible) if corner is None else space.occupancy(visible, corner)
@@ -117,8 +117,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
 
 
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
-    """The packed copy of a volume's voxels. None for other types of voxels, traced ones, and NumPy arrays;
-    where a field replaces them; and where the copy would take too much memory."""
+    """The packed copy of a volume's voxels: of integers of 8 or 16 bits in a JAX array that is not traced.
+    None for others, where a field replaces them, and where the copy would take too much memory."""
     data = cast(Array | np.ndarray, volume.data)
     small = data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
     if (
@@ -133,8 +133,8 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
 
 
 def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
-    """The slopes of a volume's nodes, exact, for the gradient. For 8-bit voxels only; otherwise None where
-    `words_of` is."""
+    """The slopes of a volume's nodes, exact, for the gradient; None where `words_of` is, and for voxels of
+    more than 8 bits."""
     small = words_of(volume) is not None and volume.data.dtype.itemsize == 1
     return memoized(volume.data, _packed_slopes) if small else None
 

@@ -96,8 +96,8 @@ def split(
 def on_devices(
     gives: Literal["replicated", "sharded", "both"], *, sharded: tuple[str, ...] = ()
 ) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Decorator: a function of `options` runs by `split` on their devices. `gives`: what it returns, or both
-    in this order. `sharded`: the arguments that are."""
+    """Decorator: a function of `options` runs by `split` on their devices. `gives`: whether its result
+    is replicated, sharded, or a pair of both. `sharded`: names of the sharded arguments."""
 
     def made(function: Callable[P, T]) -> Callable[P, T]:
         signature = inspect.signature(function)
@@ -146,8 +146,8 @@ def summed(mesh: Mesh | None, tree: PyTree) -> PyTree:
 
 
 def on_all(mesh: Mesh | None, tree: PyTree) -> PyTree:
-    """The tree, with those of its arrays on all devices that would otherwise be copied there for each image,
-    or that lie where JAX would not move them from. They are copied once in their lifetime."""
+    """The tree, with its large arrays (`LARGE` bytes or more) and committed ones copied to all devices, once
+    in the lifetime of each; JAX copies the others for each image."""
     if mesh is None:
         return tree
     there = set(mesh.devices.tolist())

@@ -1,7 +1,7 @@
 """VJP of a whole image: sums, over its tiles, the gradients of all that `render` was given.
 
-Rays are made and marched once more, tile by tile; `replay` pulls their samples back, and JAX the making of
-rays.
+Rays are made and marched once more, tile by tile; `replay` pulls their samples back, and JAX differentiates
+how rays are made. `of_x` is the cotangent of `x`, here and in `replay`.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from ..lighting.shading import Shader, Surroundings
-from ..march.march import EmptySpaceIndex
+from ..march.beams import EmptySpaceIndex
 from ..ray import Progress, Scene
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
@@ -96,7 +96,7 @@ class ImageVjp(NamedTuple):
     def of(
         cls, scene: Scene, perturbed: Any, options: RenderOptions, acceleration: VolumeAcceleration
     ) -> "ImageVjp":
-        """That of a scene."""
+        """The pull-back of a scene's image."""
         index = empty_space_of(scene, acceleration, options.tiling)
         lit = prepared = acceleration.prepared(scene._replace(lighting=None))
         shader, pull_shader = None, None
@@ -108,7 +108,7 @@ class ImageVjp(NamedTuple):
         return cls(scene, prepared, lit, index, shader, pull_shader, scene.has_fault, tiles)
 
     def zeros(self, perturbed: Any) -> Sums:
-        """Sums of no tile yet, for what is perturbed."""
+        """Zeros, for what is perturbed."""
         around = without_voxels(perturbed.volume), perturbed.source, perturbed.march
         geometric = any(jax.tree.leaves(around))
         of_transfer = any(jax.tree.leaves(perturbed.transfer))

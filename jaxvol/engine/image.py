@@ -33,7 +33,8 @@ from .wavefront import Beams, CellRange, VisibleRangeRecorder, march_rays
 
 
 RenderOutputs: TypeAlias = Literal["all", "rgba"]
-"""What a caller may ask for. Of the engine's outputs, the depth alone is for lightings that shade pixels."""
+"""What a caller may ask for. (`"depth"` is the engine's own, for pixels that are computed after the
+march.)"""
 
 WRONG_MODE = {
     "replay": 'adjoint="replay" is for reverse mode (jax.grad, jax.vjp). For forward mode (jax.jvp, '
@@ -46,7 +47,7 @@ WRONG_MODE = {
 def render_scene(
     scene: Scene, outputs: Any, adjoint: Any, tiling: Tiling | None = None, devices: Any = None
 ) -> Rendering:
-    """The image of a scene whose parts are what they should be.
+    """The image of a scene whose arguments have been checked.
 
     Raises:
         ValueError: For unknown outputs or an unknown adjoint; for `"direct"` where the march or the spacing
@@ -76,7 +77,7 @@ def render_scene(
 
 def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
     """The rays are marched without light, and pixels computed from what that found."""
-    # the march does not depend on parameters of the mode, or what it finds is a constant
+    # a mode's parameters have no gradient through the march: it ignores them, or its result is a constant
     marched = scene.marched._replace(compositing=jax.lax.stop_gradient(scene.compositing))
     if isinstance(scene.compositing, Selection):
         marched = jax.lax.stop_gradient(marched)
@@ -128,7 +129,8 @@ def _checked_for_forward_mode(scene: Scene) -> list[list[str]]:
 def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, CellRange | None]:
-    """The image, by the fast engine; and, to `record`, each ray's visible cells, where rays leap."""
+    """The image, by the fast engine; and the range of each ray's visible cells, where rays leap and `record`
+    asks for it."""
     tiles = RayTiles.of(scene.source, options.tiling)
     index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
     prepared = acceleration.prepared(scene)

@@ -1,8 +1,9 @@
 """How is an image divided into tiles, and a tile into beams and groups of rays?
 
-Besides the finished pixels, only one tile's rays are in memory, however large the image; or one on each
-device, between which beams are sharded (`devices`). They are arrays (groups, rays in a group), in which
-equally many groups in a row make up a beam.
+An image is divided into tiles (of 4096 beams by default), a tile into beams (8 x 8 pixels: four groups), and
+a beam into groups (4 x 4 pixels: 16 rays). Besides finished pixels, only the rays of one tile are in memory,
+as arrays (groups, rays in a group), however large the image; or those of one tile on each device, between
+which beams are sharded (`devices`).
 """
 
 import math
@@ -58,7 +59,7 @@ class RayTiles(eqx.Module):
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // side), -(-height // side)
-            # or a device would have the same columns in every row, and perhaps a narrow object alone
+            # if the columns were a multiple of the devices, each device would always get the same ones
             across += shares > 1 and across % shares == 0
             return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
@@ -106,7 +107,7 @@ class RayTiles(eqx.Module):
 
     @abstractmethod
     def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
-        """The boxes around the beams of a tile."""
+        """A function from an occupancy grid to the boxes around the beams of a tile."""
 
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:
@@ -170,7 +171,7 @@ class _GivenRayTiles(RayTiles):
 
     def rays(self, source: GivenRays, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         count = math.prod(self.shape)
-        if count == 0:  # one to look up where there is none
+        if count == 0:  # a row for the look-ups below
             source = GivenRays(
                 *(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions))
             )

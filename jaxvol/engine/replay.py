@@ -11,9 +11,9 @@ to the loss, and
 
 with the optical depth τ_k (extinction × width). The last is the compositing mode's to say
 (`Weighting.slope`) from q_k and Σ_{j>k} w_j q_j, which is Σ w_j q_j = c̄ · C + ā A, known from the image,
-minus the sum over j ≤ k. So nothing is kept from the first march, and nothing is divided by a transmittance,
-which may be 0. JAX pulls optical depths, colours and depths back to the transfer function, the voxels, the
-ray and the step, one segment at a time.
+minus the sum over j ≤ k. So nothing is kept for each sample, and nothing is divided by a transmittance,
+which may be 0. `Transfer.vjp` pulls colours and optical depths back to the transfer function, JAX all else to
+the voxels, the ray and the step, one segment at a time.
 
 Where rays leap over empty space, the first march records each ray's first and last visible cell, and the
 second one leaps over all others, which saves two fifths of the samples in the head.
@@ -43,8 +43,8 @@ from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
 
 
 class Cotangents(NamedTuple):
-    """Of each ray, the cotangents of colour and opacity; `worth`, what all its samples are worth to the loss;
-    and, where the loss depends on depth, what a unit of weight gains for each unit of depth past `middle`."""
+    """For each ray, the cotangents of colour and opacity, c̄ and ā; `worth`, Σ w_j q_j; and, where the loss
+    depends on depth, `depth`, d̄ / A, and `middle`, D - t_in."""
 
     color: Vec3
     opacity: Scalar
@@ -104,7 +104,7 @@ class Replay(SampleVisitor):
     """Pulls the cotangents of rays (groups, rays in a group) back to what their samples depend on.
 
     Args:
-        scene: what the gradient is taken by.
+        scene: as given; its leaves get the cotangents.
         prepared: the same, without lighting.
         shader: what shades the samples, `chunk` at a time.
         rays: those that are marched.
@@ -147,8 +147,7 @@ class Replay(SampleVisitor):
         if self.shader is not None:
             sums = ShadingTotal(total.shader, total.transfer, total.voxels)
             shaded, sums = shading_vjp(
-                *(self.shader, self.prepared, ray, samples, weights, of_color),
-                *(self.chunk, sums),
+                self.shader, self.prepared, ray, samples, weights, of_color, self.chunk, sums
             )
             total = total._replace(transfer=sums.transfer, voxels=sums.voxels, shader=sums.shader)
             of_color = [part.of_color for part in shaded]
@@ -193,9 +192,9 @@ class Replay(SampleVisitor):
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
     ) -> tuple[tuple[PyTree, PyTree, PyTree], list[Array], list[Cube]]:
-        """The cotangents of march, volume and rays, from those of each piece's measured values and width, of
-        its depth where the loss depends on that, and of its point where it is shaded; then where the cubes of
-        voxels begin that were fetched, and their cotangents. The number of samples counts as constant."""
+        """From the cotangents of each piece's measured values and width, of its depth where the loss depends
+        on that, and of its point where it is shaded: those of march, volume and rays; the index at which each
+        fetched cube of voxels begins; and the cubes' cotangents. The number of samples counts as constant."""
         parts = self.prepared.march, without_voxels(self.scene.volume), ray
         (march, volume, ray), fixed = eqx.partition(parts, eqx.is_inexact_array)
         _, _, ray_fixed = fixed
@@ -214,7 +213,7 @@ class Replay(SampleVisitor):
             whole, record = with_voxels(volume, self.scene.volume.data), Recording(perturbations or [], [])
             here = with_fetch(whole, record if voxels else self.prepared.volume.fetch)
             classification = classification_of(self.scene.transfer, here, integrated=march.integrates)
-            classification = classification._replace(search=None)  # it is constant here
+            classification = classification._replace(search=None)  # what it finds has no gradient
             scene = self.prepared._replace(march=march, volume=here, classification=classification)
             found = []
             for piece in pieces(scene, ray, at, number):

@@ -53,10 +53,10 @@ resolve_image = on_devices("replicated")(resolve_pixels)
 
 
 def of_visible(
-    some: Callable[..., Float[Array, "chunk numbers"]], tiling: Tiling, found: Found, numbers: int = NUMBERS
+    some: Callable[..., Float[Array, "chunk numbers"]], tiling: Tiling, found: Found, numbers: int
 ) -> Float[Array, "*rays numbers"]:
     """Pixels of so many numbers by `some(indices, *found)`, called for a chunk of visible pixels at a time,
-    or once, for all pixels, if chunks have no size. Transparent pixels stay 0, at infinite depth."""
+    or once, for all pixels, if `Tiling.chunk` is 0. Transparent pixels stay 0, at infinite depth."""
     shape, size, mesh = found[1].shape, tiling.chunk, tiling.devices
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0

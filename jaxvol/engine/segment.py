@@ -37,8 +37,9 @@ def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
 
 
 class Samples(NamedTuple):
-    """The next cells of many rays: lists with one entry for each piece of a cell, arrays (cells, rays). Cells
-    that a ray does not keep are placed beyond its exit. `light`: the terms of shading that is `inline`."""
+    """The next cells of many rays: lists with one entry for each piece of a cell, of arrays (cells, rays).
+    Cells that a ray does not keep (`_kept`) are transparent, and placed at its exit. `light`: the terms of
+    shading that is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
@@ -73,7 +74,8 @@ class SampleVisitor(ABC):
 
 
 def vmap_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
-    """Maps a function of one ray over arrays (rays,) and, where `of_cells`, (cells, rays)."""
+    """Maps a function over rays, and over cells for those arguments whose `of_cells` is true, which are
+    arrays (cells, rays)."""
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
 
 
@@ -91,9 +93,9 @@ def march_segment(
     regular: bool,
     until: Int[Array, " rays"] | None = None,
 ) -> tuple[Progress, Samples]:
-    """Marches rays by a segment, or to where they are finished, shifted off the cells that were sampled, or
-    at the end of a run; or to `until`, where that is given. `regular`: no ray has a shift or such an end
-    ahead of it."""
+    """Marches rays by a segment of cells; by fewer, where a ray is finished, where a shift puts its next
+    samples elsewhere than those that were fetched, at the end of a run, or at `until`. `regular`: no ray has
+    a shift, a limit of samples or `until` ahead of it, which is then not tested."""
     march, classification = scene.march, scene.classification
     number = tiling.cells if at.strides is None else min(tiling.cells, RUN)
     every = samples = _sampled(scene, number, ray, at)
@@ -118,7 +120,7 @@ def march_segment(
 
     def composited(ray: Ray, at: Progress, keeps: Bool[Array, ""] | None, cell: Any) -> Progress:
         finished = at.finished
-        if keeps is not None:
+        if keeps is not None:  # cells that are not kept are composited as if the ray were finished
             at = replace(at, finished=finished | ~keeps)
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
@@ -126,7 +128,7 @@ def march_segment(
 
     def next_(at: Progress, each: tuple[Int[Array, ""], Any]) -> tuple[Progress, None]:
         index, cell = each
-        # not from `samples`, whose arrays would have to be stored
+        # not by the opacities of `samples`, whose arrays would have to be stored
         keeps = None if kept is None else index < kept
         return jax.vmap(composited)(ray, at, keeps, cell), None
 
@@ -178,7 +180,7 @@ def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
 
 def always(at: Progress) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
-    # In a pass there are at most some `march.most_samples` / cells segments, in each of which an index grows
+    # An index cannot overflow: in a pass there are at most some `most_samples` / cells segments, and it grows
     # by at most cells times the longest stride, finished or not: with 2**24 samples and strides of 64 it
     # stays below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
     return at.index[0] >= 0

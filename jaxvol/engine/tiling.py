@@ -15,8 +15,8 @@ Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
 
 
 class Tiling(NamedTuple):
-    """Sizes by which rays and samples are processed. None of them shows in an image; gradients are summed in
-    another order, and the number of samples between two leaps differs.
+    """Sizes by which rays and samples are processed. They change no image, only the order in which gradients
+    are summed, and `Rendering.samples` where rays leap.
 
     Attributes:
         cells: cells of a segment, whose samples are all fetched before any is composited.

@@ -5,8 +5,8 @@
   refilled from the groups that are left. Idle lanes cost as much as working ones.
 - On a GPU, to find out how many are left costs more than some idle lanes: a batch, of as many rays as keep it
   busy, is marched by a known number of segments (`Tiling.turns`), and refilled after each.
-- A ray that may still shift (`Transform.shift`) must stop at its next transparent cell. As soon as a batch
-  has no such rays left, it takes whole segments without that test.
+- The segment of a ray that may still shift (`Transform.shift`) ends at its next transparent cell. As soon as
+  a batch has no such rays left, it takes whole segments without that test.
 - Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments.
 
 None of it shows in an image: cells, transforms and compositing are those of `ray`. (Measured on CPU.)
@@ -119,7 +119,7 @@ class Job(NamedTuple):
         return ~at.finished & (at.index < self.scene.march.most_samples)
 
     def shifts(self, at: Progress) -> Bool[Array, "*rays"]:
-        """Those of them that still have a shift ahead."""
+        """Rays that are alive and still have a shift ahead."""
         return self.alive(at) & ~regular_from_here(at)
 
 
@@ -151,9 +151,9 @@ def march_rays(
         at = with_fields(at, finished=~visible)
     else:
         at = resumed
-    # Rays that may shift begin behind a transparent first cell. Not for a `Selection`, to which such cells
-    # may matter; not where rays leap, since a leap shifts them, too; not for a visitor, which must see every
-    # sample.
+    # A shortcut: a ray with a shift ahead is put behind its first cell if that is transparent. Not for a
+    # `Selection`, to which such cells may matter; not where rays leap, since a leap shifts them, too; not for
+    # a visitor, which must see every sample.
     weighs = isinstance(scene.compositing, Weighting)
     if march.may_shift and weighs and index is None and visitor is None and resumed is None:
         at = vmap_rays(partial(_past_first_cell, scene))(rays, at)
@@ -276,12 +276,12 @@ def with_fields(at: Progress, **changes: PyTree) -> Progress:
 
 
 def finished_after(range_: CellRange | None, at: Progress) -> Progress:
-    """Finishes rays that have passed their last visible cell."""
+    """Finishes rays that have passed the end of their range."""
     return at if range_ is None else with_fields(at, finished=at.finished | (at.index >= range_.until))
 
 
 def _staying(here: Progress, after: Progress) -> Progress:
-    """`after`, but where rays were finished before, where they are."""
+    """`after`, but rays that were finished before keep their position."""
     names = "index", "offset", "shift", "strides"
     there, moved = ({n: getattr(at, n) for n in names if getattr(at, n) is not None} for at in (here, after))
     return with_fields(after, **jax.tree.map(partial(jnp.where, here.finished), there, moved))
@@ -303,8 +303,8 @@ def _past_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
 
 
 def _over_transparent(scene: Scene, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
-    """Moves a ray on by so many steps, over which all cells are transparent, or to where the cell begins
-    that lies there."""
+    """Moves a ray on by so many steps, whose cells are all transparent; with strides, to the beginning of the
+    run that holds that step."""
     return _moved(scene.march, ray, *with_stride(scene, ray, at, steps))
 
 
