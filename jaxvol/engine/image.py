@@ -96,11 +96,11 @@ def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAccelera
 def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
     """The image, with the derivatives of its adjoint."""
     if options.adjoint == "direct":
-        return _scan(scene, options, acceleration)
+        return _direct_image(scene, options, acceleration)
     if options.adjoint == "forward":
-        return forward_only(_march(scene, options, acceleration), WRONG_MODE["forward"])
-    if not is_traced(scene):  # going through a custom rule takes milliseconds
-        return _march_in_turn(scene, options, acceleration)
+        return forward_only(_forward_image(scene, options, acceleration), WRONG_MODE["forward"])
+    if not is_traced(scene):  # nothing is differentiated; to go through a custom rule takes milliseconds
+        return _plain_image(scene, options, acceleration)
     kinds = _checked_for_forward_mode(scene)
     # inside `jax.shard_map`, JAX has custom rules only under `jax.jit`
     sharded = any("ShardMapTracer" in kind for kind in kinds)
@@ -112,8 +112,8 @@ def _pixels(scene: Scene, options: RenderOptions, acceleration: VolumeAccelerati
     """Pixels that are computed after the march, with the derivatives of its adjoint."""
     if options.adjoint == "replay":
         _checked_for_forward_mode(scene)
-        return _resolve_again(scene, options, acceleration, found)
-    pixels = _resolve(scene, options, acceleration, found)
+        return _pixels_recomputed(scene, options, acceleration, found)
+    pixels = _pixels_kept(scene, options, acceleration, found)
     return forward_only(pixels, WRONG_MODE["forward"]) if options.adjoint == "forward" else pixels
 
 
@@ -133,7 +133,7 @@ def march_image(
     asks for it."""
     tiles = RayTiles.of(scene.source, options.tiling)
     index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
-    prepared = acceleration.prepared(scene)
+    prepared = acceleration.prepared(scene)  # voxels are fetched from their packed copy from here on
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
         beams = Beams.of(tiles, scene.source, rays, tile)
@@ -178,25 +178,25 @@ def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcc
     return march_image(scene, options, acceleration)[0]
 
 
-_march = compiled(_marched_image, has_jvp=True)
-_march_in_turn = compiled(_marched_image)
-_march_recorded = compiled(partial(march_image, record=True))
-_render_vjp = compiled(render_vjp)
-_scan = compiled(scan_image, has_jvp=True)
-_resolve = compiled(resolve_image, has_jvp=True)
-_resolve_again = recomputed(resolve_image)
+_forward_image = compiled(_marched_image, has_jvp=True)
+_plain_image = compiled(_marched_image)
+_recorded_image = compiled(partial(march_image, record=True))
+_image_vjp = compiled(render_vjp)
+_direct_image = compiled(scan_image, has_jvp=True)
+_pixels_kept = compiled(resolve_image, has_jvp=True)
+_pixels_recomputed = recomputed(resolve_image)
 
 
 @eqx.filter_custom_vjp
 def _replayed(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
-    return _march_in_turn(scene, options, acceleration)
+    return _plain_image(scene, options, acceleration)
 
 
 @_replayed.def_fwd
 def _(
     perturbed: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
 ) -> tuple[Rendering, Any]:
-    rendering, ranges = _march_recorded(scene, options, acceleration)
+    rendering, ranges = _recorded_image(scene, options, acceleration)
     return rendering, (rendering, ranges)
 
 
@@ -209,7 +209,7 @@ def _(
     options: RenderOptions,
     acceleration: VolumeAcceleration,
 ) -> Any:
-    return _render_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
+    return _image_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
 
 
 _replayed_in_shard = eqx.filter_jit(_replayed)
