@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int
 
 from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along, dot, scaled
-from ..scene.transfer import Measured
 from ..xla.memory import gather
 from .lights import Arriving, Light
 from .materials import Material, Optics, shares, smoothstep, step

@@ -250,7 +250,9 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
         each = jax.vmap(of_samples, in_axes=(None, None, 0))(samples, shared, numbers)
 
         def total(leaf: Array) -> Array:  # `jnp.sum` over the terms would not be vectorized over the samples
-            return reduce(jnp.add, (jnp.where(numbers[i] < shading.terms, leaf[i], 0) for i in range(together)))
+            return reduce(
+                jnp.add, (jnp.where(numbers[i] < shading.terms, leaf[i], 0) for i in range(together))
+            )
 
         return jax.tree.map(jnp.add, sums, jax.tree.map(total, each))
 

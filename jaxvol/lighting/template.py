@@ -219,7 +219,7 @@ class PacketTree:
             if opacity <= self.faintest * self.packets:
                 raise ValueError(
                     f"opacity {opacity:g} leaves no photon above threshold={self.threshold:g} with "
-                    f"packets={self.packets}: use a threshold of at most {opacity / self.packets:.3g}, or fewer."
+                    f"packets={self.packets}; give a threshold of at most {opacity / self.packets:.3g}."
                 )
             most = max(most, self.levels(opacity))
         return most if levels is None else integer("levels", levels, 1)

@@ -33,11 +33,8 @@ class _Lanes(NamedTuple):
 def walk_all(
     begin: Callable[[Index], Walk], step: Callable[[Walk], Walk], count: int, lanes: int
 ) -> WalkResult:
-    """The results of all walks of a queue.
-
-    - `begin`: the walks with these indices, from 0 to `count`. Those past the last must not be alive.
-    - `step`: advances all lanes' walks by one step.
-    """
+    """The results of all walks of a queue. `begin`: the walks with these indices, from 0 to `count`; those
+    past the last must not be alive. `step`: advances all lanes' walks by one step."""
     lanes = min(lanes, count)
     fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)
