@@ -123,7 +123,7 @@ class WalkScene(NamedTuple):
 
 
 Scattering: TypeAlias = tuple[Vec3, Vec3, Vec3, Bool[Array, "..."], Vec3, Scalar]
-"""New `direction`, `throughput`, `unoccluded` and `to_light` of a walk; the next flight's direction and end."""
+"""New direction, throughput, `unoccluded` and `to_light` of a walk; its next flight's direction and end."""
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
