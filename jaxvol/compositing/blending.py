@@ -1,8 +1,7 @@
 """How do the cells of a ray become a pixel?
 
-There are two kinds of modes. A `Weighting` gives each cell a weight: the pixel is the weighted sum of the
-cells' colours, and the sum of the weights is its opacity. A `Selection` (`selection.py`) picks one depth on
-the ray, such as that of the greatest value, and the pixel is what is there.
+A `Weighting` gives each cell a weight: the pixel is the weighted sum of their colours, and the sum of the
+weights is its opacity. A `Selection` picks one depth on the ray, such as that of the greatest value.
 """
 
 from abc import abstractmethod
@@ -58,12 +57,8 @@ class Compositing(eqx.Module, Generic[State]):
 
     @abstractmethod
     def begin(self, zero: Scalar, outputs: Outputs | None) -> State:
-        """The state before the first fragment.
-
-        Args:
-            zero: a 0 of the ray's type.
-            outputs: what is computed; None for the opacity alone.
-        """
+        """The state before the first fragment. `zero`: a 0 of the ray's type. `outputs`: what is computed;
+        None for the opacity alone."""
 
     @abstractmethod
     def add(self, state: State, fragment: Fragment) -> State:
@@ -121,17 +116,6 @@ class Composite(eqx.Module):
             moment = self.moment + weight * depth
         return Composite(self.opacity + weight, sums, moment)
 
-    def mean_depth(self) -> Scalar:
-        """Mean depth past the entry, weighted as colours are; infinite where nothing is visible."""
-        assert self.moment is not None
-        # not `> 0`, which is false for NaN: NaN is to be passed on
-        visible = ~(self.opacity <= 0)
-        # Both are first divided by a constant, so that the denominator is 1: its square, by which the
-        # derivative divides, would underflow where the opacity is very small.
-        whole = jax.lax.stop_gradient(jnp.where(visible, self.opacity, 1))
-        mean = (self.moment / whole) / jnp.where(visible, self.opacity / whole, 1)
-        return jnp.where(visible, mean, jnp.inf)
-
 
 class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
@@ -164,13 +148,9 @@ class Weighting(Compositing[Composite]):
         return jnp.ones_like(state.opacity)
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
-        """The pixel of a ray that is not transparent, where it is computed after the march. JAX
-        differentiates it, also of sums that are 0, which must not give NaN.
-
-        Args:
-            classification: of the transfer function that was given, not of that of `marched`.
-            sums: Σ w c and Σ w.
-        """
+        """The pixel of a ray that is not transparent, from its Σ w c and Σ w, where it is computed after the
+        march by the given transfer function. JAX differentiates it, also of sums that are 0, which must not
+        give NaN."""
         return sums
 
     @property
@@ -190,8 +170,15 @@ class Weighting(Compositing[Composite]):
     @final
     def end(self, state: Composite) -> tuple[Float[Array, "4"], Scalar | None]:
         assert state.color is not None
-        depth = None if state.moment is None else state.mean_depth()
-        return jnp.stack([*state.color, state.opacity]), depth
+        rgba = jnp.stack([*state.color, state.opacity])
+        if state.moment is None:
+            return rgba, None
+        visible = ~(state.opacity <= 0)  # also NaN
+        # Both are first divided by a constant, so that the denominator is 1: its square, by which the
+        # derivative divides, would underflow where the opacity is very small.
+        whole = jax.lax.stop_gradient(jnp.where(visible, state.opacity, 1))
+        mean = (state.moment / whole) / jnp.where(visible, state.opacity / whole, 1)
+        return rgba, jnp.where(visible, mean, jnp.inf)
 
 
 class Over(Weighting):

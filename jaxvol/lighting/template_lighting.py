@@ -43,9 +43,8 @@ class ScattererTemplates(Lighting):
        `reach` of p_j.
     3. b, the brightness, grows with the intensities of the photons that are not hidden.
     4. s, the inner colour that shines through, comes from photons in the same material,
-    5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
-       times its intensity. Here n is the refractive index, α the opacity, and primes mark the photon's
-       material.
+    5. or in another one, of refractive index n' and opacity α': a photon there lies at n / n' times its
+       offset, and adds its colour with α' / α times its intensity.
     6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
@@ -53,16 +52,14 @@ class ScattererTemplates(Lighting):
 
     **Scale.** The paper's sum E b (c + s) has no unit. Here the intensities of a template sum to 1 (except
     for `given` ones), and k R turns the sum into radiance on the scale of `path_trace`: k = 4 / (3π), and R
-    is the `Optics.reflectance` of the sample's material. So a flat face of white matter, of which only the
-    surface is visible, has a radiance of R L under a `ConstantLight` of radiance L. White half-spaces have
-    0.9 to 1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times
-    (`docs/methods.md`). For darker colours, templates are too bright: in path tracing the colour darkens each
-    of many scatterings, in templates it darkens the sum once.
+    is the `Optics.reflectance` of the sample's material. White half-spaces have 0.9 to 1.6 times the exact
+    radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For darker colours,
+    templates are too bright: in path tracing the colour darkens each of many scatterings, here it darkens the
+    sum once. It fails for long and for short mean free paths (`experiments/stability.py`).
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
-    show, since invisible points are not lit. Where it fails: `experiments/stability.py`, "long mean free
-    paths", "short mean free paths".
+    show, since invisible points are not lit.
 
     Args:
         materials: one or several. Where two overlap, the first counts.
@@ -93,9 +90,8 @@ class ScattererTemplates(Lighting):
             templates). Then nothing depends on the materials' mean free paths.
 
     Raises:
-        ValueError: for invalid arguments, if `levels` are required but missing, for a material of which no
-            photon is above the threshold (if its opacity is traced, the image is NaN), and for a grid that
-            does not fit into memory.
+        ValueError: for invalid arguments, missing `levels`, a material of which no photon is above the
+            threshold (if its opacity is traced, the image is NaN), and a grid that does not fit into memory.
     """
 
     materials: tuple[Material, ...]
@@ -139,10 +135,9 @@ class ScattererTemplates(Lighting):
         if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
             raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
         self.occlusion, self.reach, self.seed = occlusion, tuple(multiples.tolist()), integer("seed", seed, 0)
-        if cutoff is None and occlusion == "hard":
-            cutoff = 0.02
-        given_cutoff = cutoff is not None and (is_traced(cutoff) or cutoff != 0)
-        self.cutoff = number("cutoff", cutoff, above=0, below=1) if given_cutoff else None
+        cutoff = 0.02 * (occlusion == "hard") if cutoff is None else cutoff
+        skips = is_traced(cutoff) or cutoff != 0
+        self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
         # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
         tree = PacketTree(packets, threshold)
