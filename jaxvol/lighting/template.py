@@ -240,19 +240,39 @@ class PacketTree:
     ) -> ScattererTemplate:
         """The photons of a tree of so many levels, merged and sorted; NaN if a traced opacity leaves none."""
         origin, draws = jax.random.split(key)
-        share = jnp.full(self.packets, 1 / self.packets)
-        packets = jnp.zeros((self.packets, 3)), _spread(origin, self.packets), share
+        # evenly spread over the sphere and rotated at random, so that each alone is uniformly distributed
+        q, r = jnp.linalg.qr(jax.random.normal(origin, (3, 3)))
+        spread = golden_spiral(self.packets)
+        directions = jnp.asarray(spread, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
+        packets = jnp.zeros((self.packets, 3)), directions, jnp.full(self.packets, 1 / self.packets)
+        sine_of_critical_angle = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
+        cone = 1 - _root(1 - sine_of_critical_angle**2)
 
-        def next_(packets: Packets, level: Any) -> tuple[Packets, ScattererTemplate]:
-            return self._level(optics, jax.random.fold_in(draws, level), packets)
+        def advance(packets: Packets, level: Any) -> tuple[Packets, ScattererTemplate]:
+            """The packets that go on from a level, and the photons that they leave (lengths in λ)."""
+            position, direction, light = packets
+            u = jax.random.uniform(jax.random.fold_in(draws, level), (6, light.shape[0]))
+            flight = -jnp.log1p(-u[0])
+            position = position + flight[:, None] * direction
+            light, passed = self.energies(optics.opacity, light, flight, u[1])
+            cosine = 1 - u[2] * cone
+            after = (
+                jnp.concatenate([position] * 2),
+                jnp.concatenate([_turned(direction, cosine, u[3]), _turned(-direction, u[4], u[5])]),
+                jnp.concatenate([passed * cosine, passed * (1 - cosine)]),
+            )
+            if after[2].shape[0] > self.max_width:
+                _, brightest = jax.lax.top_k(jax.lax.stop_gradient(after[2]), int(self.max_width))
+                after = jax.tree.map(lambda leaf: leaf[brightest], after)
+            return after, ScattererTemplate(position, optics.opacity * light)
 
         by_level, level = [], 0
         while level < levels and packets[2].shape[0] < self.max_width:
-            packets, photons = next_(packets, level)
+            packets, photons = advance(packets, level)
             by_level.append(photons)
             level += 1
         if level < levels:  # from here on, all levels have the same width
-            _, photons = jax.lax.scan(next_, packets, jnp.arange(level, levels))
+            _, photons = jax.lax.scan(advance, packets, jnp.arange(level, levels))
             by_level.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), photons))
         photons = jax.tree.map(lambda *each: jnp.concatenate(each), *by_level).sorted()
         if merge > 0:
@@ -262,27 +282,6 @@ class PacketTree:
         return ScattererTemplate(
             photons.offset * optics.mean_free_path, jnp.where(any_left, photons.intensity, jnp.nan)
         )
-
-    def _level(
-        self, optics: Optics, key: PRNGKeyArray, packets: Packets
-    ) -> tuple[Packets, ScattererTemplate]:
-        """Advance packets by one level: the packets that go on, and the photons they leave (lengths in λ)."""
-        position, direction, light = packets
-        u = jax.random.uniform(key, (6, light.shape[0]))
-        flight = -jnp.log1p(-u[0])
-        position = position + flight[:, None] * direction
-        light, passed = self.energies(optics.opacity, light, flight, u[1])
-        sine_of_critical_angle = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
-        cosine = 1 - u[2] * (1 - _root(1 - sine_of_critical_angle**2))
-        after = (
-            jnp.concatenate([position] * 2),
-            jnp.concatenate([_turned(direction, cosine, u[3]), _turned(-direction, u[4], u[5])]),
-            jnp.concatenate([passed * cosine, passed * (1 - cosine)]),
-        )
-        if after[2].shape[0] > self.max_width:
-            _, brightest = jax.lax.top_k(jax.lax.stop_gradient(after[2]), int(self.max_width))
-            after = jax.tree.map(lambda leaf: leaf[brightest], after)
-        return after, ScattererTemplate(position, optics.opacity * light)
 
     def energies(
         self, opacity: Scalar, light: Scalar, flight: Scalar, uniform: Scalar
@@ -304,12 +303,6 @@ def _root(squared: Scalar) -> Scalar:
     """Square root; 0 with derivative 0 for arguments up to 0. NaN stays NaN."""
     clamped = squared <= 0
     return jnp.where(clamped, 0, jnp.sqrt(jnp.where(clamped, 1, squared)))
-
-
-def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
-    """Directions spread evenly over the sphere and rotated at random: each alone is uniformly distributed."""
-    q, r = jnp.linalg.qr(jax.random.normal(key, (3, 3)))
-    return jnp.asarray(golden_spiral(n), q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
 
 
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:

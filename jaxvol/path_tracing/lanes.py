@@ -41,18 +41,15 @@ def walk_all(
     idle = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(begin, none))
     state = _Lanes(idle, none, jnp.zeros((), jnp.int32), WalkResult.zeros((count,)))
 
-    def refill(state: _Lanes) -> _Lanes:
+    def refill_and_step(state: _Lanes) -> _Lanes:
         free = ~state.walks.alive
         results = _stored(state, jnp.where(free, state.queue_index, count))
         queued = state.begun + jnp.cumsum(free, dtype=jnp.int32) - 1
         queue_index = jnp.where(free, jnp.minimum(queued, count), state.queue_index)
         walks = jax.tree.map(lambda new, old: jnp.where(free, new, old), begin(queue_index), state.walks)
         begun = jnp.minimum(state.begun + jnp.sum(free, dtype=jnp.int32), count)
-        return _Lanes(walks, queue_index, begun, results)
-
-    def refill_and_step(state: _Lanes) -> _Lanes:
-        state = refill(state)
-        return _step_until(step, state, jnp.where(state.begun < count, int(BUSY * lanes), fewer))
+        keep = jnp.where(begun < count, int(BUSY * lanes), fewer)
+        return _step_until(step, _Lanes(walks, queue_index, begun, results), keep)
 
     state = jax.lax.while_loop(lambda state: state.begun < count, refill_and_step, state)
     state = _step_until(step, _compact(state, fewer, count), jnp.zeros((), jnp.int32))

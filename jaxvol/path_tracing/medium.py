@@ -36,10 +36,29 @@ class Majorants(eqx.Module):
 
     @classmethod
     def of(
-        cls, volume: Volume, blocks: Blocks, transfer: Transfer, materials: tuple[Material, ...] = ()
+        cls, volume: Volume, blocks: Blocks, transfer: Transfer, materials: tuple[Material, ...]
     ) -> "Majorants":
-        """Those of the medium that `Medium.of` makes of a volume, from the volume's blocks."""
-        bound = greatest_extinction(transfer, blocks, materials)
+        """Those of the medium that `Medium.of` makes of a volume. **Raises** `ValueError` for a transfer
+        function without a majorant."""
+        if type(transfer).majorant is Transfer.majorant:
+            name = type(transfer).__name__
+            raise ValueError(f"transfer must have a majorant; {name} does not override Transfer.majorant.")
+        blocks, transfer, materials = jax.lax.stop_gradient((blocks, transfer, materials))
+        own, none = transfer.majorant(blocks), jnp.zeros(blocks.low.shape, bool)
+        bound, open_ = jnp.zeros_like(blocks.low), ~none
+        for material in materials:  # what comes after a material that fills the block is ignored
+            if material.label is not None:
+                may, fills = blocks.may_hold(material.label), none
+            elif material.values is None:
+                may, fills = ~none, ~none
+            else:
+                low, high = material.values
+                may = (blocks.high >= low) & (blocks.low <= high)
+                fills = (blocks.low >= low) & (blocks.high <= high)
+            bound = jnp.where(open_ & may, jnp.maximum(bound, 1 / material.mean_free_path), bound)
+            open_ &= ~fills
+        bound = jnp.where(open_, jnp.maximum(bound, own), bound)
+        bound = jnp.where(own > 0, bound, 0)
         distance = Affine(volume).occupancy(bound > 0).distance().astype(bound.dtype)
         x, y, z = (jnp.asarray(n - 1, bound.dtype) for n in volume.shape)
         return cls(jnp.where(bound > 0, bound, -distance.reshape(bound.shape)), (x, y, z))
@@ -63,33 +82,6 @@ class Majorants(eqx.Module):
             for c, i, last in zip(coordinate, block, self.last, strict=True)
         )
         return x, y, z
-
-
-def greatest_extinction(
-    transfer: Transfer, blocks: Blocks, materials: tuple[Material, ...] = ()
-) -> Float[Array, "bx by bz"]:
-    """Upper bound of the extinction in each block, 1/length; 0 where nothing is visible. Whatever comes after
-    a material that fills the block is ignored. **Raises** `ValueError` for a transfer without a majorant."""
-    if type(transfer).majorant is Transfer.majorant:
-        raise ValueError(
-            f"transfer must have a majorant; {type(transfer).__name__} does not override Transfer.majorant."
-        )
-    blocks, transfer, materials = jax.lax.stop_gradient((blocks, transfer, materials))
-    own, none = transfer.majorant(blocks), jnp.zeros(blocks.low.shape, bool)
-    bound, open_ = jnp.zeros_like(blocks.low), ~none
-    for material in materials:
-        if material.label is not None:
-            may, fills = blocks.may_hold(material.label), none
-        elif material.values is None:
-            may, fills = ~none, ~none
-        else:
-            low, high = material.values
-            may = (blocks.high >= low) & (blocks.low <= high)
-            fills = (blocks.low >= low) & (blocks.high <= high)
-        bound = jnp.where(open_ & may, jnp.maximum(bound, 1 / material.mean_free_path), bound)
-        open_ &= ~fills
-    bound = jnp.where(open_, jnp.maximum(bound, own), bound)
-    return jnp.where(own > 0, bound, 0)
 
 
 class Medium(NamedTuple):

@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.checks import Arrayable, all_finite, described, flag, integer, number
 from .._util.noise import hashed_uniforms_4, is_key
-from .._util.vec3 import Scalar
 from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
@@ -26,7 +25,7 @@ from ..xla.compiling import compiled
 from ..xla.platform import is_traced
 from .lanes import walk_all
 from .medium import Medium
-from .walks import Walk, WalkScene, Words, step
+from .walks import Walk, WalkResult, WalkScene, Words, step
 
 
 LANES = 2**13
@@ -40,9 +39,6 @@ NOT_DIFFERENTIABLE = (
     "lighting.ScattererTemplates instead, or apply jax.lax.stop_gradient to the inputs."
 )
 """Error message: how often and where a path collides jumps with the extinction."""
-
-BEFORE_FIRST_STEP = np.uint32(2**32 - 1)
-"""Used in place of a walk's step number for what is drawn before its first step."""
 
 
 class PathTraced(eqx.Module):
@@ -122,10 +118,8 @@ def path_trace(
     colour, clipped to [0, 1]: an image corresponds to one by Mitsuba's `volpath` with a heterogeneous medium.
     (`render` treats the colour as light that the medium emits.)
 
-    The image is radiance, in the unit of `lights`: in a white furnace (albedo 1 under a `ConstantLight` of
-    radiance L) it is L times the opacity. Under light of radiance L from all sides, a half-space of albedo ω
-    reflects (1 - γ H(μ)) L, where γ = √(1 - ω), H is Chandrasekhar's H function, and μ is the cosine of the
-    viewing angle. `ScattererTemplates` are on the same scale.
+    The image is radiance, in the unit of `lights`, as that of `ScattererTemplates`: in a white furnace
+    (albedo 1 under a `ConstantLight` of radiance L) it is L times the opacity.
 
     NaN or infinity in any input makes the whole image NaN, since any path may reach it.
 
@@ -180,10 +174,9 @@ def path_trace(
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
     blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
-    return _trace(
-        *(volume, words_of(volume), blocks, transfer, materials, lights, anisotropy),
-        *(jnp.asarray(limit, jnp.int32), camera, seed, paths, lanes, pixels, antialias),
-    )
+    inputs = volume, blocks, transfer, materials, lights, anisotropy, camera
+    limit = jnp.asarray(limit, jnp.int32)
+    return _trace(inputs, words_of(volume), limit, seed, paths, lanes, pixels, antialias)
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -199,15 +192,9 @@ def _seed(key: Any) -> UInt32[Array, ""]:
 
 @compiled
 def _trace(
-    volume: Volume,
+    inputs: tuple[Any, ...],
     words: UInt32[Array, " voxels"] | None,
-    blocks: Blocks,
-    transfer: Transfer,
-    materials: tuple[Material, ...],
-    lights: tuple[Light, ...],
-    anisotropy: Scalar,
     max_scatterings: Int[Array, ""],
-    camera: Camera,
     seed: UInt32[Array, ""],
     paths: int,
     lanes: int,
@@ -217,8 +204,7 @@ def _trace(
     """Trace the image in batches of `pixels`. `words`: the volume's packed voxels."""
     # float64 becomes float32, whose rounding is far below the noise
     volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
-        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf,
-        (volume, blocks, transfer, materials, lights, anisotropy, camera),
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, inputs
     )
     packed, (width, height) = with_words(volume, words), camera.size
     medium = Medium.of(packed, blocks, transfer, materials)
@@ -258,11 +244,15 @@ def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, aliv
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
     if antialias:
-        x, y, *_ = hashed_uniforms_4(pixel, path, jnp.full_like(pixel, BEFORE_FIRST_STEP), seed)
+        no_step = jnp.full_like(pixel, np.uint32(2**32 - 1))  # in place of a step's number
+        x, y, *_ = hashed_uniforms_4(pixel, path, no_step, seed)
         origin, direction = camera.ray(column.astype(x.dtype) + x - 0.5, row.astype(y.dtype) + y - 0.5)
     else:
         origin, direction = camera.ray(column, row)
     ray = enter(Affine(scene.volume), origin, direction, (column, row))
     start = ray.path(jnp.zeros_like(ray.length))
     flight = scene.flight(start, direction, jnp.full_like(ray.length, jnp.inf))
-    return Walk.begin(words, flight, direction, alive & (ray.length > 0))
+    zero, result = jnp.zeros_like(flight.depth), WalkResult.zeros(())
+    black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
+    steps, to_light, alive = jnp.zeros((), jnp.int32), jnp.zeros((), bool), alive & (ray.length > 0)
+    return Walk(words, steps, flight, to_light, direction, white, black, zero, result, alive)

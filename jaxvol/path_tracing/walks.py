@@ -73,14 +73,6 @@ class Walk(NamedTuple):
     result: WalkResult
     alive: Bool[Array, ""]
 
-    @classmethod
-    def begin(cls, words: Words, flight: Flight, direction: Vec3, alive: Bool[Array, ""]) -> "Walk":
-        """A walk on its first flight, from where the camera's ray enters the volume."""
-        zero = jnp.zeros_like(flight.depth)
-        black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
-        steps, to_light, result = jnp.zeros((), jnp.int32), jnp.zeros((), bool), WalkResult.zeros(())
-        return cls(words, steps, flight, to_light, direction, white, black, zero, result, alive)
-
 
 class WalkScene(NamedTuple):
     """The scene that walks travel through."""
