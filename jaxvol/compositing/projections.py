@@ -31,9 +31,6 @@ class Extreme(Selection[Chosen]):
 
     thickness: Float[Array, ""]
 
-    def __init__(self, thickness: Any = 1.0):
-        self.thickness = number("thickness", thickness, above=0)
-
     @abstractmethod
     def score(self, value: Scalar) -> Scalar:
         """Score; the maximum wins."""
@@ -83,7 +80,7 @@ class Maximum(Extreme):
     """
 
     def __init__(self, thickness: Any = 1.0):
-        super().__init__(thickness)
+        self.thickness = number("thickness", thickness, above=0)
 
     def score(self, value: Scalar) -> Scalar:
         return value
@@ -106,7 +103,7 @@ class Minimum(Extreme):
     """
 
     def __init__(self, thickness: Any = 1.0):
-        super().__init__(thickness)
+        self.thickness = number("thickness", thickness, above=0)
 
     def score(self, value: Scalar) -> Scalar:
         return -value
