@@ -33,7 +33,7 @@ class Fragment(NamedTuple):
         alpha: opacity of its cell; 0 past the ray's end.
         depth: of the sample, past the ray's entry.
         cell: the piece of the ray that it stands for.
-        measured: what was read from the volume; for a `Weighting`, the value alone.
+        measured: what was read from the volume; for a `Weighting`, only the value.
         color: as shaded; None for a `Selection`, or where only opacities are computed.
         valid: False past the ray's end, in gaps of the volume, and for cells of width 0.
     """
@@ -58,7 +58,7 @@ class Compositing(eqx.Module, Generic[State]):
     @abstractmethod
     def begin(self, zero: Scalar, outputs: Outputs | None) -> State:
         """The state before the first fragment. `zero`: a 0 of the ray's type. `outputs`: what is computed;
-        None for the opacity alone."""
+        None for only the opacity."""
 
     @abstractmethod
     def add(self, state: State, fragment: Fragment) -> State:
@@ -119,9 +119,9 @@ class Composite(eqx.Module):
 
 class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
-    override `weight`, `slope` and `transmittance` alone, which work elementwise.
+    override only `weight`, `slope` and `transmittance`, which work elementwise.
 
-    Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. Where transforms
+    Weights depend only on the cells' opacities, are at least 0, and sum to at most 1. Where transforms
     divide cells, each piece has a weight. Parameters are static fields, or, if only `resolved` depends on
     them, arrays, which have gradients.
     """
@@ -199,7 +199,7 @@ class Over(Weighting):
 
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
         transmittance = 1 - after
-        # below this transmittance `behind` is rounding alone, which a high extinction would amplify
+        # below this transmittance `behind` is only rounding, which a high extinction would amplify
         nothing = 2 * float(jnp.finfo(behind.dtype).eps)
         return jnp.where(transmittance <= nothing, 0, transmittance * worth - behind)
 

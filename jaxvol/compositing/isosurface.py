@@ -133,7 +133,7 @@ class _Crossings(Transfer):
     value: Float[Array, ""]
 
     def classifier(self) -> Classify:
-        return self.integrator()  # cells alone are asked
+        return self.integrator()  # only cells are classified
 
     def integrator(self) -> Classify:
         def crossed(measured: Measured) -> tuple[Vec3, Scalar]:

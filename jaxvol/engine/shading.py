@@ -4,7 +4,7 @@ costs much; or, by a shader of one cheap term, all of them inline."""
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -110,6 +110,10 @@ def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
     return Weights(*(list(values) for values in zip(*each, strict=True)))
 
 
+Seen: TypeAlias = list[tuple[Scalar, Measured, Scalar]]
+"""For each piece of a cell: depth, measured values, and the opacity before; arrays (cells, rays)."""
+
+
 def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: Scalar) -> Sample:
     """The sample at this depth of a ray (entry, direction, pixel), behind this opacity."""
     entry, direction, pixel = ray
@@ -120,21 +124,11 @@ def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: 
     )
 
 
-def samples_of(
-    chosen: Chosen,
-    indices: Int[Array, " chunk"],
-    scene: Scene,
-    ray: Ray,
-    cells: list[Cell],
-    measured: list[Measured],
-    weights: Weights,
-) -> Sample:
+def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, seen: Seen) -> Sample:
     """The samples at these flat indices of a segment."""
     column, of_rays = indices % chosen.columns, (ray.entry, ray.direction, ray.pixel)
     of_rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), of_rays)
-    depths = [scene.march.sample(cell) for cell in cells]
-    each = chosen.take(list(zip(depths, measured, weights.before, strict=True)), indices)
-    return jax.vmap(partial(_sample, scene))(of_rays, *each)
+    return jax.vmap(partial(_sample, scene))(of_rays, *chosen.take(seen, indices))
 
 
 def shaded_colors(
@@ -152,25 +146,24 @@ def shaded_colors(
     (shading, around), thresholds = light, light.shading.thresholds()
     none = jnp.zeros_like(alphas[0])
     start, shown = [(none, none, none)] * len(alphas), [weight > 0 for weight in weights.weight]
+    seen: Seen = list(zip(map(scene.march.sample, cells), measured, weights.before, strict=True))
 
-    def without_terms(ray: Ray, cell: Cell, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
+    def without_terms(ray: Ray, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
         """The colour of a sample without any term of light, and whether it needs one."""
-        of_ray, depth = (ray.entry, ray.direction, ray.pixel), scene.march.sample(cell)
-        sample = _sample(scene, of_ray, depth, *seen)
+        sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
         shared = shading.begin(around, sample)
         color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
         return color, ~(sample.transmittance < thresholds[0])
 
     if shading.skips_hidden and thresholds is not None:
         each = jax.vmap(jax.vmap(without_terms), in_axes=(None, 0, 0, 0))
-        found = [each(ray, *piece) for piece in zip(cells, measured, weights.before, strict=True)]
+        found = [each(ray, *piece) for piece in seen]
         start = [color for color, _ in found]
         shown = [weight & lit for weight, (_, lit) in zip(shown, found, strict=True)]
     chosen = Chosen.of(shown, chunk)
 
     def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        samples = samples_of(chosen, indices, scene, ray, cells, measured, weights)
-        return chosen.put(colors, indices, light(samples))
+        return chosen.put(colors, indices, light(samples_of(chosen, indices, scene, ray, seen)))
 
     flat = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *start)
     return chosen.split(chosen.fold(one, flat), len(alphas))

@@ -52,13 +52,14 @@ def shading_vjp(
     """Pulls back the `cotangents` of the shaded colours of a segment's samples, and adds to the total."""
     chosen = Chosen.of([weight > 0 for weight in weights.weight], chunk)
     size = sum(weight.size for weight in weights.weight)
+    depths = map(scene.march.sample, samples.cells)
+    seen = list(zip(depths, samples.measured, weights.before, strict=True))
 
     def one(
         indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
     ) -> tuple[ShadingVjp, ShadingTotal]:
         found, total = carry
-        some = samples_of(chosen, indices, scene, ray, samples.cells, samples.measured, weights)
-        real = indices < size
+        some, real = samples_of(chosen, indices, scene, ray, seen), indices < size
         red, green, blue = (jnp.where(real, each, 0) for each in chosen.take(cotangents, indices))
         color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
         place = of_sample.point, of_sample.direction
