@@ -32,11 +32,9 @@ class Phong(Shading):
       of its length leaves the range of floats: in float32, below 1e-19 and above 1e19 value units per length.
     - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: lights of
       irradiance π E here are those of irradiance E for `ScattererTemplates` and `path_trace`.
-    - VTK's fixed-point ray caster computes its highlight from the vector half-way between l and v: as wide as
-      Phong's of a quarter of the power. VTK's ray caster on GPUs has Phong's.
-
-    Only the angle matters, not whether there is a surface: a nearly homogeneous region is shaded by its noise
-    (`experiments/stability.py`, "normals in noise").
+    - Only the angle matters, not whether there is a surface: a nearly homogeneous region is shaded by its
+      noise (`experiments/stability.py`, "normals in noise").
+    - The highlight of VTK's fixed-point ray caster is as wide as this one of a quarter of the power.
 
     Gradients are those of this formula, also by an extinction of 0, where samples are lit although they are
     invisible. They grow without bound as the volume's gradient falls to 0; where it is 0, and where a normal

@@ -34,8 +34,8 @@ light around it: half of the photons of a sample on its face are inside, so that
 
 
 class _Shared(NamedTuple):
-    """What is common to all photons of a sample. `mixture`: the materials' shares, normalized to sum to 1.
-    `template`: which one it uses, if there are several."""
+    """What all photons of a sample have in common. `mixture`: the materials' shares, scaled to sum to 1.
+    `template`: the one in use, if there are several."""
 
     shares: tuple[Scalar, ...]
     mixture: tuple[Scalar, ...]

@@ -105,8 +105,6 @@ def scatterer_template(
     The paper's tables were made in this way; its equations (1) to (3) as printed hand on αI
     (`experiments/printed_templates.py`).
 
-    Where it fails: `experiments/stability.py`, "lopsided templates", "energy of templates as printed".
-
     Args:
         material: its opacity, mean free path λ and refractive index.
         key: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.
@@ -120,13 +118,12 @@ def scatterer_template(
             threshold.
 
     Returns:
-        A `ScattererTemplate` with room for the photons of the tree, or for as many above the threshold as
-        energy 1 could fill; differentiable in the material's mean free path, opacity and refractive index (at
-        an index of 1, where the critical angle has no derivative, the derivative used is 0).
+        A `ScattererTemplate`, differentiable in the material's mean free path, opacity and refractive index
+        (at an index of 1, where the critical angle has no derivative, the derivative used is 0).
 
     Raises:
-        ValueError: for numbers out of range, if `levels` are required but missing, and if all photons are
-            below the threshold; if the opacity is traced, the intensities are NaN in the last case.
+        ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
+            a traced opacity, intensities are then NaN.
     """
     tree = PacketTree(packets, threshold)
     levels = tree.levels_of((material,), levels)

@@ -6,6 +6,7 @@ volume rendering (2016), sections 3.3 and 3.4.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, get_args
 
 import equinox as eqx
@@ -164,7 +165,7 @@ class ScattererTemplates(Lighting):
     def farthest_read(self) -> float | None:
         if self.baked:
             return None
-        offset = np.asarray(self.simulated(blend=self.blend).offset)
+        offset = np.asarray(self.simulated().offset)
         indices = [float(material.refractive_index) for material in self.materials]
         stretched = max(indices) / min(indices)  # by refraction
         return float(np.max(np.linalg.norm(offset, axis=-1))) * max(1.0, *self.reach) * stretched
@@ -172,9 +173,15 @@ class ScattererTemplates(Lighting):
     def for_image(self, around: Surroundings) -> Shading:
         if self.baked:
             return _baked(self, around).for_image(around)
-        return self._by_photons(blend=self.blend, cutoff=self.cutoff)
+        return PhotonShading(
+            *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
+            blended=self.templates if self.blend else 1,
+            occlusion=self.occlusion,
+            reach=self.reach,
+            seed=self.seed,
+        )
 
-    def simulated(self, *, blend: bool) -> ScattererTemplate:
+    def simulated(self) -> ScattererTemplate:
         """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
         each material."""
         templates = self.given
@@ -182,24 +189,16 @@ class ScattererTemplates(Lighting):
             how: Any = {"packets": self.packets, "threshold": self.threshold, "levels": self.levels}
             templates = scatterer_templates(self.materials, self.seed, count=self.templates, **how)
             templates = templates.normalized()  # restores the energy that the threshold has cut off
-        if not blend:
+        if not self.blend:
             return templates.brightest(self.photons)
         blended = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
         return blended.brightest(self.photons * self.templates)
 
-    def _by_photons(self, *, blend: bool, cutoff: Float[Array, ""] | None) -> PhotonShading:
-        return PhotonShading(
-            *(self.materials, self.lights, self.simulated(blend=blend), optics_of(self.materials), cutoff),
-            blended=self.templates if blend else 1,
-            occlusion=self.occlusion,
-            reach=self.reach,
-            seed=self.seed,
-        )
-
 
 @eqx.filter_jit
 def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
-    return bake(lighting._by_photons(blend=True, cutoff=None), around, lighting.baked)
+    unbaked = replace(lighting, blend=True, cutoff=0.0, baked=False)
+    return bake(unbaked.for_image(around), around, lighting.baked)
 
 
 def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:

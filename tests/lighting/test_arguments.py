@@ -148,10 +148,10 @@ def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():
     def shape(opacity):
         lighting = lit(Material(opacity, 1.0), levels=2)()
         assert lighting.photons >= two.photons
-        return lighting.simulated(blend=False).intensity
+        return lighting.simulated().intensity
 
     assert jax.eval_shape(shape, 0.5).shape[:2] == (1, two.templates)
-    blended = jax.eval_shape(lambda: lit()().simulated(blend=True).intensity)
+    blended = jax.eval_shape(lambda: lit(blend=True)().simulated().intensity)
     assert blended.shape[:2] == (1, 1)
 
 

@@ -241,7 +241,7 @@ def test_photons_that_coincide_add_also_by_way_of_others():
 def test_lighting_scales_templates_to_the_energy_of_all():
     sun = DirectionalLight((0, 0, 1))
     lighting = ScattererTemplates(Material(0.5, 1.0, INDEX), sun, photons=7, packets=1, templates=1)
-    found = jax.jit(lambda: lighting.simulated(blend=False))().intensity
+    found = jax.jit(lambda: lighting.simulated())().intensity
     assert found.shape == (1, 1, 7)
     np.testing.assert_allclose(found.sum(), 1, rtol=1e-5)
 
