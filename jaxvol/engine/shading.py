@@ -148,14 +148,15 @@ def shaded_colors(
     start, shown = [(none, none, none)] * len(alphas), [weight > 0 for weight in weights.weight]
     seen: Seen = list(zip(map(scene.march.sample, cells), measured, weights.before, strict=True))
 
-    def without_terms(ray: Ray, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
-        """The colour of a sample without any term of light, and whether it needs one."""
-        sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
-        shared = shading.begin(around, sample)
-        color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
-        return color, ~(sample.transmittance < thresholds[0])
-
     if shading.skips_hidden and thresholds is not None:
+
+        def without_terms(ray: Ray, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
+            """The colour of a sample without any term of light, and whether it needs one."""
+            sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
+            shared = shading.begin(around, sample)
+            color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
+            return color, ~(sample.transmittance < thresholds[0])
+
         each = jax.vmap(jax.vmap(without_terms), in_axes=(None, 0, 0, 0))
         found = [each(ray, *piece) for piece in seen]
         start = [color for color, _ in found]

@@ -83,7 +83,8 @@ def _chunk_vjp(
 
     def rebuilt(moving: PyTree) -> tuple[Shading, Surroundings, Sample]:
         (leaves, transfer), samples = eqx.combine(moving, fixed)
-        return *shader.with_leaves(leaves, transfer), samples
+        shading, around = shader.with_leaves(leaves, transfer)
+        return shading, around, samples
 
     def begin(moving: PyTree) -> tuple[PyTree, PyTree]:
         shading, around, samples = rebuilt(moving)

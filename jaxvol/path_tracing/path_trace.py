@@ -235,8 +235,8 @@ def _trace(
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
     *numbers, exhausted = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
-    numbers = [jnp.where(valid, each, jnp.nan) for each in numbers]
-    return PathTraced(*numbers, exhausted, paths)
+    radiance, opacity, deviations = (jnp.where(valid, each, jnp.nan) for each in numbers)
+    return PathTraced(radiance, opacity, deviations, exhausted, paths)
 
 
 def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
