@@ -122,7 +122,7 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], many: int, repetition
 def held() -> dict[str, Any]:
     """Number of photons that the templates hold, and that their arrays have room for."""
     lighting = ScattererTemplates(FLESH, LIGHTS)
-    intensity = np.asarray(jax.jit(lambda: lighting.simulated(blend=False))().intensity)
+    intensity = np.asarray(jax.jit(lambda: lighting.simulated())().intensity)
     each = np.sum(intensity > 0, axis=-1)
     return {"fewest": int(each.min()), "most": int(each.max()), "room": intensity.shape[-1]}
 

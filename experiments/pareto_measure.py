@@ -141,7 +141,7 @@ def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dic
     image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
     if row.noisy:
         # grown once: in float64, random numbers are others
-        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).simulated(blend=False)
+        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).simulated()
         few = lighting_of(case, given=grown)
         image = program(case, fine(case, row.finer, row.quadrature), few).image()
     coarse = program(case, fine(case, row.finer / 2, row.quadrature), few).image()

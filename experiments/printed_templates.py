@@ -12,7 +12,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import jaxvol as jv
 from jaxvol.lighting.template import PacketTree
@@ -34,7 +33,7 @@ class LevelTree(PacketTree):
         return light
 
 
-@dataclass(frozen=True)
+@dataclass
 class PrintedTree(PacketTree):
     """`flights`: whether each flight weakens a packet, by equation (1)."""
 
@@ -46,12 +45,11 @@ class PrintedTree(PacketTree):
         light = self.faded(opacity, light)
         return light, opacity * light
 
-    def capacity(self, levels: int) -> int:
-        return self.size(levels)
+    def capacity(self, levels: int, opacity: float | None = None) -> int:
+        return int(sum(min(self.packets * 2 ** min(k, 64), self.max_width) for k in range(levels)))
 
-    def levels(self, material: jv.Material) -> int:
-        alpha = float(np.asarray(material.opacity))
-        return 1 + math.floor(math.log(self.faintest * self.packets / alpha) / math.log(alpha) + 1e-9)
+    def levels(self, opacity: float) -> int:
+        return 1 + math.floor(math.log(self.faintest * self.packets / opacity) / math.log(opacity) + 1e-9)
 
 
 def printed_templates(
@@ -59,7 +57,7 @@ def printed_templates(
 ) -> jv.lighting.ScattererTemplate:
     """Several templates of a material, (1, count, photons), as by `scatterer_templates`."""
     tree, key = PrintedTree(flights=flights), jax.random.fold_in(jax.random.key(seed), 0)
-    levels = tree.levels(material)
+    levels = tree.levels(float(material.opacity))
     keys = jax.vmap(lambda number: jax.random.fold_in(key, number))(jnp.arange(count))
     each = jax.vmap(lambda key: tree.template(material.optics, key, levels, merge))(keys)
     return jax.tree.map(lambda leaf: leaf[None], each)

@@ -7,7 +7,6 @@ import pkgutil
 from pathlib import Path
 
 import jaxvol as jv
-from jaxvol.lighting import Light
 from jaxvol.march.march import Transform
 from jaxvol.scene.space import Path as RayPath
 
@@ -21,9 +20,9 @@ NAMES = """
 ORDER = [str(name) for name in NAMES.split()]
 """Order of imports, from the volume to the command line: a file imports only entries before its own."""
 
-DO_NOTHING = {Transform, RayPath, Light}
-"""Base classes without abstract methods: the default of each method changes nothing, or there are no methods
-and the class only marks its subclasses. None of them is instantiated itself."""
+DO_NOTHING = {Transform, RayPath}
+"""Base classes without abstract methods: the default of each method changes nothing. None of them is
+instantiated itself."""
 
 
 def files():

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
-from ..compositing.blending import Compositing
+from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration
@@ -355,7 +355,7 @@ def _check_distributed(scene: Scene, method: Method) -> None:
     march, mode = scene.march, scene.compositing
     refused = {
         f"method={method!r}": method != "overlap",
-        f"compositing by {type(mode).__name__}, which does not join parts of a ray": not mode.joins,
+        f"compositing by {type(mode).__name__}, which joins no parts of a ray": not isinstance(mode, Over),
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
         "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),

@@ -1,8 +1,7 @@
 """How do the cells of a ray become a pixel?
 
-There are two kinds of modes. A `Weighting` gives each cell a weight: the pixel is the weighted sum of the
-cells' colours, and the sum of the weights is its opacity. A `Selection` (`selection.py`) picks one depth on
-the ray, such as that of the greatest value, and the pixel is what is there.
+A `Weighting` gives each cell a weight: the pixel is the weighted sum of their colours, and the sum of the
+weights is its opacity. A `Selection` picks one depth on the ray, such as that of the greatest value.
 """
 
 from abc import abstractmethod
@@ -30,11 +29,13 @@ Outputs: TypeAlias = Literal["all", "depth", "rgba"]
 class Fragment(NamedTuple):
     """A sample, as compositing sees it.
 
-    - `alpha`: opacity of its cell; 0 past the ray's end.
-    - `depth`: of the sample, past the ray's entry. `cell`: the piece of the ray that it stands for.
-    - `measured`: what was read from the volume; for a `Weighting`, the value alone.
-    - `color`: as shaded; None for a `Selection`, or where only opacities are computed.
-    - `valid`: False past the ray's end, in gaps of the volume, and for cells of width 0.
+    Attributes:
+        alpha: opacity of its cell; 0 past the ray's end.
+        depth: of the sample, past the ray's entry.
+        cell: the piece of the ray that it stands for.
+        measured: what was read from the volume; for a `Weighting`, only the value.
+        color: as shaded; None for a `Selection`, or where only opacities are computed.
+        valid: False past the ray's end, in gaps of the volume, and for cells of width 0.
     """
 
     alpha: Scalar
@@ -51,15 +52,13 @@ class Fragment(NamedTuple):
 
 
 class Compositing(eqx.Module, Generic[State]):
-    """A compositing mode: a `Weighting` or a `Selection`. All methods see one ray.
-
-    `State`: a tree of arrays that the fragments are added to, front to back.
-    """
+    """A compositing mode: a `Weighting` or a `Selection`. All methods see one ray, whose fragments are added
+    to a `State`, a tree of arrays, front to back."""
 
     @abstractmethod
     def begin(self, zero: Scalar, outputs: Outputs | None) -> State:
         """The state before the first fragment. `zero`: a 0 of the ray's type. `outputs`: what is computed;
-        None for the opacity alone."""
+        None for only the opacity."""
 
     @abstractmethod
     def add(self, state: State, fragment: Fragment) -> State:
@@ -76,8 +75,8 @@ class Compositing(eqx.Module, Generic[State]):
         return False
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
-        """For a mode that `resolves`: the transfer function and the march for its cells, which need not be
-        those for its pixels. By default those that are given."""
+        """The transfer function and the march for the cells of a mode that `resolves`; by default those that
+        are given."""
         return transfer, march
 
     @abstractmethod
@@ -88,20 +87,8 @@ class Compositing(eqx.Module, Generic[State]):
         """Whether further fragments cannot change the pixel."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
-    def joined(self, front: State, back: State) -> State:
-        """Combines the states of a front and a back part of a ray that were marched independently.
-
-        **Raises:** `NotImplementedError` by default."""
-        raise NotImplementedError(f"{type(self).__name__} does not join the states of two parts of a ray.")
-
-    @property
-    @final
-    def joins(self) -> bool:
-        """Whether the states of two parts of a ray can be joined."""
-        return type(self).joined is not Compositing.joined and not self.resolves
-
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume may change a pixel, from the ranges of their values. Rays leap over the
+        """Which blocks of a volume may change a pixel, from the ranges of their values; rays leap over the
         others. `transfer`: that of `marched`."""
         return transfer.visible(blocks)
 
@@ -112,8 +99,8 @@ class Compositing(eqx.Module, Generic[State]):
 
 
 class Composite(eqx.Module):
-    """The cells of a ray so far, of weights w: Σ w, Σ w × colour and Σ w × depth past the entry. What is not
-    computed is None."""
+    """Sums over the cells of a ray so far, of weights w: Σ w, Σ w × colour and Σ w × depth past the entry.
+    What is not computed is None."""
 
     opacity: Scalar
     color: Vec3 | None = None
@@ -129,28 +116,12 @@ class Composite(eqx.Module):
             moment = self.moment + weight * depth
         return Composite(self.opacity + weight, sums, moment)
 
-    def rgba(self) -> Float[Array, "4"]:
-        """Premultiplied colour, and opacity."""
-        assert self.color is not None
-        return jnp.stack([*self.color, self.opacity])
-
-    def mean_depth(self) -> Scalar:
-        """Mean depth past the entry, weighted as colours are; infinite where nothing is visible."""
-        assert self.moment is not None
-        # not `> 0`, which is false for NaN: NaN is to be passed on
-        visible = ~(self.opacity <= 0)
-        # Both are first divided by a constant, so that the denominator is 1: its square, by which the
-        # derivative divides, would underflow where the opacity is very small.
-        whole = jax.lax.stop_gradient(jnp.where(visible, self.opacity, 1))
-        mean = (self.moment / whole) / jnp.where(visible, self.opacity / whole, 1)
-        return jnp.where(visible, mean, jnp.inf)
-
 
 class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
-    override `weight`, `slope` and `transmittance` alone, which work elementwise.
+    override only `weight`, `slope` and `transmittance`, which work elementwise.
 
-    Weights depend on the cells' opacities alone, are at least 0, and sum to at most 1. Where transforms
+    Weights depend only on the cells' opacities, are at least 0, and sum to at most 1. Where transforms
     divide cells, each piece has a weight. Parameters are static fields, or, if only `resolved` depends on
     them, arrays, which have gradients.
     """
@@ -165,12 +136,11 @@ class Weighting(Compositing[Composite]):
         """Derivative of a loss by the optical depth τ of a cell, for the second march. The arguments suffice
         for weights that do not depend on `before`, and for (constant - `before`) f(`alpha`).
 
-        **Arguments:**
-
-        - `alpha`: opacity of the cell, 1 - exp(-τ), so that its own derivative is 1 - `alpha`.
-        - `after`: sum of the weights up to and including this cell's.
-        - `worth`: derivative of the loss by the cell's weight.
-        - `behind`: sum over all cells behind this one of weight × worth.
+        Args:
+            alpha: opacity of the cell, 1 - exp(-τ), so that its own derivative is 1 - `alpha`.
+            after: sum of the weights up to and including this cell's.
+            worth: derivative of the loss by the cell's weight.
+            behind: sum over all cells behind this one of weight × worth.
         """
 
     def transmittance(self, state: Composite) -> Scalar:
@@ -179,8 +149,8 @@ class Weighting(Compositing[Composite]):
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         """The pixel of a ray that is not transparent, from its Σ w c and Σ w, where it is computed after the
-        march. JAX differentiates it, also of sums that are 0, which must not give NaN. `classification`: of
-        the transfer function that was given, not of that of `marched`."""
+        march by the given transfer function. JAX differentiates it, also of sums that are 0, which must not
+        give NaN."""
         return sums
 
     @property
@@ -199,7 +169,16 @@ class Weighting(Compositing[Composite]):
 
     @final
     def end(self, state: Composite) -> tuple[Float[Array, "4"], Scalar | None]:
-        return state.rgba(), None if state.moment is None else state.mean_depth()
+        assert state.color is not None
+        rgba = jnp.stack([*state.color, state.opacity])
+        if state.moment is None:
+            return rgba, None
+        visible = ~(state.opacity <= 0)  # also NaN
+        # Both are first divided by a constant, so that the denominator is 1: its square, by which the
+        # derivative divides, would underflow where the opacity is very small.
+        whole = jax.lax.stop_gradient(jnp.where(visible, state.opacity, 1))
+        mean = (state.moment / whole) / jnp.where(visible, state.opacity / whole, 1)
+        return rgba, jnp.where(visible, mean, jnp.inf)
 
 
 class Over(Weighting):
@@ -219,18 +198,19 @@ class Over(Weighting):
         return (1 - before) * alpha
 
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        """More of the cell, and less of all that lies behind it."""
         transmittance = 1 - after
-        # below this transmittance `behind` is rounding alone, which a high extinction would amplify
+        # below this transmittance `behind` is only rounding, which a high extinction would amplify
         nothing = 2 * float(jnp.finfo(behind.dtype).eps)
         return jnp.where(transmittance <= nothing, 0, transmittance * worth - behind)
 
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
 
-    def joined(self, front: Composite, back: Composite) -> Composite:
-        """The operator is associative: what is behind is weighted by the transmittance in front."""
-        return jax.tree.map(lambda a, b: a + (1 - front.opacity) * b, front, back)
-
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:
         return transfer.variation(windows)
+
+
+def joined(front: Composite, back: Composite) -> Composite:
+    """A front and a back part of a ray, each marched independently under "over", which is associative: what
+    is behind is weighted by the transmittance in front."""
+    return jax.tree.map(lambda a, b: a + (1 - front.opacity) * b, front, back)

@@ -42,21 +42,18 @@ class Isosurface(Selection[Crossing]):
     blocks whose range does not hold the value.
 
     **What is missed:** a ray that crosses the value twice within a cell, as in a sheet thinner than a step,
-    sees neither; of three crossings within a cell, any may be found. `Jitter` misses what lies before its
-    first cell (not with `front_residual`).
+    sees neither (`experiments/stability.py`, "isosurfaces of thin sheets"); of three crossings within a cell,
+    any may be found. `Jitter` misses what lies before its first cell (not with `front_residual`).
 
-    **Arguments:**
+    Gradients of depth and normal follow from the implicit function theorem. They miss the jumps at
+    silhouettes, where a ray loses the surface, and where a ray only touches it, that of depth grows without
+    bound. In a plane of voxels, where the interpolated field has an edge, they are those of one side.
 
-    - `value`: of the volume, on the surface. It has a gradient.
+    Args:
+        value: of the volume, on the surface. It has a gradient.
 
-    Gradients of depth and normal, by the value, the voxels, spacing and camera, follow from the implicit
-    function theorem. They miss the jumps at silhouettes, where a ray loses the surface, and where a ray only
-    touches it, that of depth grows without bound. In a plane of voxels, where the interpolated field has an
-    edge, they are those of one side.
-
-    Where it fails: `experiments/stability.py`, "isosurfaces of thin sheets".
-
-    **Raises:** `ValueError` for a value that is not a finite number.
+    Raises:
+        ValueError: for a value that is not a finite number.
     """
 
     value: Float[Array, ""]
@@ -93,8 +90,8 @@ class Isosurface(Selection[Crossing]):
         depth = self._implicit(sampler, jax.lax.stop_gradient(self._root(sampler, state)))
         classification = sampler.classification
         # the value itself rather than that at the root, which is rounded
-        measured = self.value, *classification.attributes(sampler.coordinate(depth))
-        measured = classification.searched(measured)
+        attributes = classification.attributes(sampler.coordinate(depth))
+        measured = classification.searched((self.value, *attributes))
         color = sampler.color(depth, measured, classification.classify(measured), jnp.ones_like(depth))
         known = jnp.where(jnp.isnan(depth), jnp.nan, jnp.ones_like(depth))
         return jnp.stack([*color, known]) * known, depth
@@ -131,19 +128,12 @@ class Isosurface(Selection[Crossing]):
 
 
 class _Crossings(Transfer):
-    """Of positive extinction where the value is crossed between the two ends of a cell, and transparent
-    elsewhere."""
+    """Of positive extinction where the value is crossed between the two ends of a cell, else transparent."""
 
     value: Float[Array, ""]
 
     def classifier(self) -> Classify:
-        """A point crosses nothing."""
-
-        def nothing(measured: Measured) -> tuple[Vec3, Scalar]:
-            none = jnp.zeros_like(measured[0])
-            return (none, none, none), none
-
-        return nothing
+        return self.integrator()  # only cells are classified
 
     def integrator(self) -> Classify:
         def crossed(measured: Measured) -> tuple[Vec3, Scalar]:

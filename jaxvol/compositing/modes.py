@@ -22,10 +22,8 @@ MODES: dict[str, type[Compositing[Any]]] = {
 
 
 def compositing_of(given: Mode | Any) -> Compositing[Any]:
-    """The mode of this name, or the mode itself.
-
-    **Raises:** `ValueError`, naming the argument, for anything else, and for a `Weighting` whose fields are
-    not all static although its weights may depend on them."""
+    """The mode of this name, or the mode itself. **Raises** `ValueError` for anything else, and for a
+    `Weighting` whose fields are not all static although its weights may depend on them."""
     if isinstance(given, Weighting | Selection):
         if isinstance(given, Weighting) and not given.resolves and jax.tree.leaves(given):
             raise ValueError(

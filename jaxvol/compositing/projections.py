@@ -31,9 +31,6 @@ class Extreme(Selection[Chosen]):
 
     thickness: Float[Array, ""]
 
-    def __init__(self, thickness: Any = 1.0):
-        self.thickness = number("thickness", thickness, above=0)
-
     @abstractmethod
     def score(self, value: Scalar) -> Scalar:
         """Score; the maximum wins."""
@@ -62,30 +59,28 @@ class Maximum(Extreme):
     of the ray by O(step²), and a peak thinner than a step may be missed. Of equal values, the nearest is
     chosen. NaN is above all numbers, so that a fault of the volume shows. Under
     `quadrature="preintegrated"`, means of the values at the two ends of cells are compared, and what lies in
-    the middle of the cell is shown.
-
-    `Rendering.depth` is that of the sample, infinite where it is transparent.
+    the middle of the cell is shown. `Rendering.depth` is that of the sample, infinite where it is
+    transparent.
 
     `SpaceLeaping` leaps over blocks in which neither the values nor any that are less are visible: air, under
     most transfer functions. `"min_distance"` is refused.
 
-    **Arguments:**
-
-    - `thickness`: of a layer of the value, world length, > 0. Its opacity, `1 - exp(-extinction thickness)`,
-      is that of the pixel: if it is equal to the `unit_distance` of the transfer function, the opacity that
-      was given for the value.
-
-    Gradients, also that of the thickness, are those of the sample that is chosen: of the voxels around it,
-    the transfer function, the camera (`Selection`). Where the choice changes, the value is the same on both
-    sides, and the image has a kink; depth and light jump there.
-
-    **Raises:** `ValueError` for a thickness that is not a positive finite number.
+    Gradients, also that of the thickness, are those of the sample that is chosen (`Selection`). Where the
+    choice changes, the value is the same on both sides, and the image has a kink; depth and light jump there.
 
     Source: VTK's MAXIMUM_INTENSITY_BLEND; Wallis et al. 1989.
+
+    Args:
+        thickness: of a layer of the value, world length, > 0. Its opacity, `1 - exp(-extinction thickness)`,
+            is that of the pixel: if it is equal to the `unit_distance` of the transfer function, the opacity
+            that was given for the value.
+
+    Raises:
+        ValueError: for a thickness that is not a positive finite number.
     """
 
     def __init__(self, thickness: Any = 1.0):
-        super().__init__(thickness)
+        self.thickness = number("thickness", thickness, above=0)
 
     def score(self, value: Scalar) -> Scalar:
         return value
@@ -98,18 +93,17 @@ class Maximum(Extreme):
 class Minimum(Extreme):
     """The least value along a ray (minimum intensity projection), looked up in the transfer function.
 
-    All else is as in `Maximum`, with less for greater: rays leap over blocks in which neither the values nor
-    any that are greater are visible.
+    All else is as in `Maximum`, with less for greater. Source: VTK's MINIMUM_INTENSITY_BLEND.
 
-    **Arguments:** `thickness`: as for `Maximum`.
+    Args:
+        thickness: as for `Maximum`.
 
-    **Raises:** `ValueError` for a thickness that is not a positive finite number.
-
-    Source: VTK's MINIMUM_INTENSITY_BLEND.
+    Raises:
+        ValueError: for a thickness that is not a positive finite number.
     """
 
     def __init__(self, thickness: Any = 1.0):
-        super().__init__(thickness)
+        self.thickness = number("thickness", thickness, above=0)
 
     def score(self, value: Scalar) -> Scalar:
         return -value
@@ -127,20 +121,16 @@ class Average(Weighting):
     does not shift. `Rendering.depth` is the middle of the ray's part in the volume.
 
     With `AlphaCorrection`, the mean of values that are linear along the ray is exact but for rounding under
-    `"midpoint"` and `"preintegrated"`; under `"left"` it errs by half their change over one step. Without
-    `AlphaCorrection`, the last cell counts as a whole.
+    `"midpoint"` and `"preintegrated"`; under `"left"` it errs by half their change over one step; and
+    gradients are complete. Without, the last cell counts as a whole, and gradients miss the jumps of the exit
+    (`render`). Source: VTK's AVERAGE_INTENSITY_BLEND.
 
-    **Arguments:**
+    Args:
+        thickness: of a layer of the mean value, world length, > 0, as in `Maximum`.
 
-    - `thickness`: of a layer of the mean value, world length, > 0, as in `Maximum`. It has a gradient.
-
-    Gradients are complete with `AlphaCorrection`: of the voxels, transfer function, camera, spacing and step,
-    in every adjoint. Without, they miss the jumps of the exit (`render`).
-
-    **Raises:** `ValueError` for a thickness that is not a positive finite number. In a render, for a lighting
-    and for a transfer function that reads more than the value: a mean lies nowhere.
-
-    Source: VTK's AVERAGE_INTENSITY_BLEND.
+    Raises:
+        ValueError: for a thickness that is not a positive finite number; in a render, for a lighting and for
+            a transfer function that reads more than the value: a mean lies nowhere.
     """
 
     thickness: Float[Array, ""]
@@ -149,8 +139,7 @@ class Average(Weighting):
         self.thickness = number("thickness", thickness, above=0)
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
-        """Through a fog of constant extinction that shows the values as colours. The optical depths of its
-        cells are their widths."""
+        """Through a fog of constant extinction whose colours are the values: optical depths are widths."""
         if type(transfer).attributes is not Transfer.attributes:
             raise ValueError(
                 "compositing by an average needs a transfer function that depends on the value alone; "

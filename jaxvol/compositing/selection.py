@@ -18,8 +18,11 @@ from .blending import Compositing, Fragment, Outputs, State
 class RaySampler(NamedTuple):
     """Measures, classifies and shades what is on a ray. Depths are past the entry.
 
-    - `depth_scale`: 1, with the derivative that depths of a fixed number of steps have by the step.
-    - `gradient`: of the volume's value at a world point, by that point; None during the march.
+    Attributes:
+        ray: on which it samples.
+        classification: how samples are measured, classified and shaded.
+        depth_scale: 1, with the derivative that depths of a fixed number of steps have by the step.
+        gradient: of the volume's value at a world point, by that point; None during the march.
     """
 
     ray: Ray
@@ -30,10 +33,6 @@ class RaySampler(NamedTuple):
     def value(self, depth: Scalar) -> Scalar:
         """The volume's value at this depth."""
         return self.classification.measure(self.coordinate(depth))[0]
-
-    def measured(self, depth: Scalar) -> Measured:
-        """The measured values at this depth, the volume's value first."""
-        return self.classification.at(self.coordinate(depth))
 
     def coordinate(self, depth: Scalar) -> Vec3:
         """The grid coordinate at this depth."""
@@ -50,19 +49,18 @@ class RaySampler(NamedTuple):
     def color(
         self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
     ) -> Vec3:
-        """The colour of what was measured and classified at this depth, shaded if there is a lighting.
-        `transmittance`: between there and the camera."""
+        """The colour of what was measured and classified at this depth, behind this transmittance; shaded if
+        there is a lighting."""
         color, extinction = classified
         if self.classification.light is None:
             return color
-        ray = self.ray
-        return self.classification.light(
-            Sample(self.point(depth), ray.direction, measured, color, extinction, transmittance, ray.pixel)
-        )
+        point, (direction, pixel) = self.point(depth), (self.ray.direction, self.ray.pixel)
+        sample = Sample(point, direction, measured, color, extinction, transmittance, pixel)
+        return self.classification.light(sample)
 
     def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
         """Colour, shaded if there is a lighting, and extinction at this depth; nothing in front hides it."""
-        measured = self.measured(depth)
+        measured = self.classification.at(self.coordinate(depth))
         classified = self.classification.classify(measured)
         return self.color(depth, measured, classified, jnp.ones_like(depth)), classified[1]
 
@@ -84,7 +82,7 @@ class Selection(Compositing[State]):
     @abstractmethod
     def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
         """Premultiplied colour and opacity, and the depth that is reported (infinite where nothing is
-        visible), of a ray for which a depth was chosen. JAX differentiates it. To compute with a depth, take
+        visible), of a ray for which a depth was chosen. JAX differentiates it. To compute with a depth, use
         `sampler.differentiable_depth(depth)`."""
 
     def normal(self, sampler: RaySampler, depth: Scalar) -> Float[Array, "3"] | None:

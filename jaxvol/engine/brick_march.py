@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
+from ..compositing.blending import joined
 from ..march.march import March
 from ..ray import Progress, Scene, begin, end, front, stopped
 from ..scene.rendering import Rendering
@@ -134,7 +135,7 @@ def join_segments(scene: Scene, parts: RayStates) -> RayStates:
         both = replace(
             front,
             index=jnp.maximum(front.index, back.index),
-            composite=scene.compositing.joined(front.composite, back.composite),
+            composite=joined(front.composite, back.composite),
             finished=front.finished & back.finished,
             stats=stats,
         )

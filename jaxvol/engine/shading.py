@@ -4,7 +4,7 @@ costs much; or, by a shader of one cheap term, all of them inline."""
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -110,24 +110,25 @@ def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
     return Weights(*(list(values) for values in zip(*each, strict=True)))
 
 
-def samples_of(
-    chosen: Chosen,
-    indices: Int[Array, " chunk"],
-    scene: Scene,
-    ray: Ray,
-    cells: list[Cell],
-    measured: list[Measured],
-    weights: Weights,
-) -> Sample:
-    """The samples at these flat indices of a segment."""
-    entry, direction, pixel = jax.tree.map(
-        lambda leaf: leaf.at[indices % chosen.columns].get(mode="clip"), (ray.entry, ray.direction, ray.pixel)
+Seen: TypeAlias = list[tuple[Scalar, Measured, Scalar]]
+"""For each piece of a cell: depth, measured values, and the opacity before; arrays (cells, rays)."""
+
+
+def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: Scalar) -> Sample:
+    """The sample at this depth of a ray (entry, direction, pixel), behind this opacity."""
+    entry, direction, pixel = ray
+    color, extinction = scene.classification.of_cells(measured)
+    transmittance = scene.compositing.transmittance(Composite(opacity))
+    return Sample(
+        along(entry, direction, depth), direction, measured, color, extinction, transmittance, pixel
     )
-    depths = [scene.march.sample(cell) for cell in cells]
-    depth, read, before = chosen.take(list(zip(depths, measured, weights.before, strict=True)), indices)
-    color, extinction = jax.vmap(scene.classification.of_cells)(read)
-    transmittance = scene.compositing.transmittance(Composite(before))
-    return Sample(along(entry, direction, depth), direction, read, color, extinction, transmittance, pixel)
+
+
+def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, seen: Seen) -> Sample:
+    """The samples at these flat indices of a segment."""
+    column, of_rays = indices % chosen.columns, (ray.entry, ray.direction, ray.pixel)
+    of_rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), of_rays)
+    return jax.vmap(partial(_sample, scene))(of_rays, *chosen.take(seen, indices))
 
 
 def shaded_colors(
@@ -142,44 +143,28 @@ def shaded_colors(
     """Shaded colours of a segment's samples; any finite ones for invisible samples."""
     weights, light = weights_of(scene, at, alphas), scene.classification.light
     assert isinstance(light, Shader)
+    (shading, around), thresholds = light, light.shading.thresholds()
     none = jnp.zeros_like(alphas[0])
     start, shown = [(none, none, none)] * len(alphas), [weight > 0 for weight in weights.weight]
-    if light.shading.skips_hidden:
-        start, dark = _without_terms(scene, light, ray, cells, measured, weights)
-        shown = [each & ~unlit for each, unlit in zip(shown, dark, strict=True)]
+    seen: Seen = list(zip(map(scene.march.sample, cells), measured, weights.before, strict=True))
+
+    if shading.skips_hidden and thresholds is not None:
+
+        def without_terms(ray: Ray, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
+            """The colour of a sample without any term of light, and whether it needs one."""
+            sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
+            shared = shading.begin(around, sample)
+            color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
+            return color, ~(sample.transmittance < thresholds[0])
+
+        each = jax.vmap(jax.vmap(without_terms), in_axes=(None, 0, 0, 0))
+        found = [each(ray, *piece) for piece in seen]
+        start = [color for color, _ in found]
+        shown = [weight & lit for weight, (_, lit) in zip(shown, found, strict=True)]
     chosen = Chosen.of(shown, chunk)
 
     def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        samples = samples_of(chosen, indices, scene, ray, cells, measured, weights)
-        return chosen.put(colors, indices, light(samples))
+        return chosen.put(colors, indices, light(samples_of(chosen, indices, scene, ray, seen)))
 
     flat = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *start)
     return chosen.split(chosen.fold(one, flat), len(alphas))
-
-
-def _without_terms(
-    scene: Scene,
-    light: Shader,
-    ray: Ray,
-    cells: list[Cell],
-    measured: list[Measured],
-    weights: Weights,
-) -> tuple[list[Vec3], list[Bool[Array, "cells rays"]]]:
-    """The colours of a segment's samples without any term of light, and which of them need none."""
-    shading, around = light
-    thresholds = shading.thresholds()
-    assert thresholds is not None
-
-    def one(ray: Ray, cell: Cell, measured: Measured, before: Scalar) -> tuple[Vec3, Bool[Array, ""]]:
-        point = along(ray.entry, ray.direction, scene.march.sample(cell))
-        color, extinction = scene.classification.of_cells(measured)
-        transmittance = scene.compositing.transmittance(Composite(before))
-        sample = Sample(point, ray.direction, measured, color, extinction, transmittance, ray.pixel)
-        shared = shading.begin(around, sample)
-        color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
-        return color, transmittance < thresholds[0]
-
-    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
-    found = [each(ray, *piece) for piece in zip(cells, measured, weights.before, strict=True)]
-    colors, dark = zip(*found, strict=True)
-    return list(colors), list(dark)

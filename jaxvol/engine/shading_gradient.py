@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from ..lighting.shading import Sample, Shader, Surroundings, needed_terms, terms_needed
+from ..lighting.shading import Sample, Shader, Shading, Surroundings, needed_terms, terms_needed
 from ..ray import Scene
 from ..scene.space import Ray
 from ..scene.volume import read_as
@@ -52,13 +52,14 @@ def shading_vjp(
     """Pulls back the `cotangents` of the shaded colours of a segment's samples, and adds to the total."""
     chosen = Chosen.of([weight > 0 for weight in weights.weight], chunk)
     size = sum(weight.size for weight in weights.weight)
+    depths = map(scene.march.sample, samples.cells)
+    seen = list(zip(depths, samples.measured, weights.before, strict=True))
 
     def one(
         indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
     ) -> tuple[ShadingVjp, ShadingTotal]:
         found, total = carry
-        some = samples_of(chosen, indices, scene, ray, samples.cells, samples.measured, weights)
-        real = indices < size
+        some, real = samples_of(chosen, indices, scene, ray, seen), indices < size
         red, green, blue = (jnp.where(real, each, 0) for each in chosen.take(cotangents, indices))
         color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
         place = of_sample.point, of_sample.direction
@@ -67,18 +68,8 @@ def shading_vjp(
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     zeros = zero, zero, zero
-    start = ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros))
-    found, total = chosen.fold(one, (start, total))
+    found, total = chosen.fold(one, (ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros)), total))
     return chosen.split(found, len(weights.weight)), total
-
-
-class _ShadingInputs(NamedTuple):
-    """What shaded colours are differentiated by (shader and transfer function; samples; what all terms of a
-    sample share), or its cotangents."""
-
-    leaves: PyTree
-    samples: PyTree
-    shared: PyTree = None
 
 
 def _chunk_vjp(
@@ -86,35 +77,34 @@ def _chunk_vjp(
 ) -> tuple[Vec3, PyTree, ShadingTotal]:
     """The shaded colours of many samples, the cotangents of the samples, and the new total. Each term has the
     cotangent of the terms' sum: they are pulled back one by one, and nothing is kept of them."""
-    (leaves, fixed_leaves), (moving, fixed) = (
-        eqx.partition(tree, eqx.is_inexact_array)
-        for tree in ((shader.leaves, shader.around.transfer), samples)
-    )
+    # Differentiated are the shader's leaves and the transfer function, samples, and what terms share.
+    given = (shader.leaves, shader.around.transfer), samples
+    moving, fixed = eqx.partition(given, eqx.is_inexact_array)
 
-    def rebuilt(inputs: _ShadingInputs) -> tuple[Shader, Sample]:
-        leaves, transfer = eqx.combine(inputs.leaves, fixed_leaves)
-        return shader.with_leaves(leaves, transfer), eqx.combine(inputs.samples, fixed)
+    def rebuilt(moving: PyTree) -> tuple[Shading, Surroundings, Sample]:
+        (leaves, transfer), samples = eqx.combine(moving, fixed)
+        shading, around = shader.with_leaves(leaves, transfer)
+        return shading, around, samples
 
-    def begin(leaves: PyTree, samples: PyTree) -> tuple[PyTree, PyTree]:
-        (shading, around), each = rebuilt(_ShadingInputs(leaves, samples))
-        return eqx.partition(jax.vmap(partial(shading.begin, around))(each), eqx.is_inexact_array)
+    def begin(moving: PyTree) -> tuple[PyTree, PyTree]:
+        shading, around, samples = rebuilt(moving)
+        return eqx.partition(jax.vmap(partial(shading.begin, around))(samples), eqx.is_inexact_array)
 
-    shared, pull_begin, fixed_shared = jax.vjp(begin, leaves, moving, has_aux=True)
-    inputs = _ShadingInputs(leaves, moving, shared)
+    shared, pull_begin, fixed_shared = jax.vjp(begin, moving, has_aux=True)
 
-    def color(inputs: _ShadingInputs, sums: PyTree) -> Vec3:
-        (shading, _), each = rebuilt(inputs)
-        return jax.vmap(shading.color)(each, eqx.combine(inputs.shared, fixed_shared), sums)
+    def color(moving: PyTree, shared: PyTree, sums: PyTree) -> Vec3:
+        shading, _, samples = rebuilt(moving)
+        return jax.vmap(shading.color)(samples, eqx.combine(shared, fixed_shared), sums)
 
     shading, around = shader
     sums = needed_terms(shading, around, samples, eqx.combine(shared, fixed_shared))
-    colors, pull_color = jax.vjp(color, inputs, sums)
-    of_inputs, of_sums = pull_color(cotangent)
+    colors, pull_color = jax.vjp(color, moving, shared, sums)
+    *of_inputs, of_sums = pull_color(cotangent)
 
     def term(
-        inputs: _ShadingInputs, perturbations: list[Cube] | None, number: Int[Array, ""]
+        moving: PyTree, shared: PyTree, perturbations: list[Cube] | None, number: Int[Array, ""]
     ) -> tuple[PyTree, list[Array]]:
-        (shading, around), each = rebuilt(inputs)
+        shading, around, samples = rebuilt(moving)
 
         def one(sample: Sample, shared: PyTree, perturbations: list[Cube] | None) -> tuple[PyTree, Any]:
             if perturbations is None:
@@ -123,25 +113,25 @@ def _chunk_vjp(
             here = Surroundings(read_as(around.volume, record), around.transfer, around.space)
             return shading.term(here, sample, shared, number), record.bases
 
-        return jax.vmap(one)(each, eqx.combine(inputs.shared, fixed_shared), perturbations)
+        return jax.vmap(one)(samples, eqx.combine(shared, fixed_shared), perturbations)
 
-    def add(number: Int[Array, ""], carry: tuple[_ShadingInputs, PyTree]) -> tuple[_ShadingInputs, PyTree]:
+    def add(number: Int[Array, ""], carry: tuple[list[PyTree], PyTree]) -> tuple[list[PyTree], PyTree]:
         of_inputs, voxels = carry
-        _, pull, bases = jax.vjp(partial(term, number=number), inputs, perturbations, has_aux=True)
-        more, of_cubes = pull(of_sums)
+        _, pull, bases = jax.vjp(partial(term, number=number), moving, shared, perturbations, has_aux=True)
+        *more, of_cubes = pull(of_sums)
         if voxels is not None:
-            voxels = scatter_add(voxels, shader.around.volume.shape, bases, of_cubes)
+            voxels = scatter_add(voxels, around.volume.shape, bases, of_cubes)
         return added(of_inputs, more), voxels
 
     perturbations, voxels = None, total.voxels
     if shading.terms > 0:
         if voxels is not None:
-            _, bases = jax.eval_shape(term, inputs, [], jnp.zeros((), jnp.int32))
+            _, bases = jax.eval_shape(term, moving, shared, [], jnp.zeros((), jnp.int32))
             perturbations = cubes_of_zeros(bases, cotangent[0].dtype)
-        needed = terms_needed(shading, samples.transmittance)
         start = varying((of_inputs, voxels), samples)
+        needed = terms_needed(shading, samples.transmittance)
         of_inputs, voxels = jax.lax.fori_loop(0, needed, add, start)
-    more_of_leaves, more_of_samples = pull_begin(of_inputs.shared)
-    of_shader, of_transfer = added(of_inputs.leaves, more_of_leaves)
+    of_moving, of_shared = of_inputs
+    (of_shader, of_transfer), of_samples = added(of_moving, *pull_begin(of_shared))
     total = ShadingTotal(added(total.shader, of_shader), added(total.transfer, of_transfer), voxels)
-    return colors, added(of_inputs.samples, more_of_samples), total
+    return colors, of_samples, total

@@ -19,18 +19,17 @@ class Deferred(Lighting):
 
     This is right where a ray sees one surface. Where it sees several, one through the other, the mean depth
     lies between them, perhaps where there is no material, and then the pixel stays unlit. Baked light shows
-    its grid as faint rings. `experiments/lighting.py` measures the error:
-    `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))` is the cheapest that is as near as
-    all photons of a template on all samples.
+    its grid as faint rings. `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))` is the
+    cheapest that is as near as all photons of a template on all samples (`experiments/lighting.py`).
 
     The gradient of voxels takes an array of their size for each place where light is looked up, for each
     chunk of 2048 pixels: slow for large volumes.
 
-    **Arguments:**
+    Args:
+        lighting: how the one sample is shaded.
 
-    - `lighting`: how the one sample is shaded.
-
-    **Raises:** `ValueError` for something that is no lighting.
+    Raises:
+        ValueError: for something that is no lighting.
     """
 
     lighting: Lighting
@@ -48,12 +47,7 @@ class Deferred(Lighting):
         return self.lighting.for_image(around)
 
     def shade_pixel(
-        self,
-        classification: Classification,
-        space: Space,
-        line: Line,
-        rgba: Float[Array, "4"],
-        depth: Scalar,
+        self, classification: Classification, space: Space, line: Line, rgba: Float[Array, "4"], depth: Scalar
     ) -> Float[Array, "4"]:
         """The shaded colour and opacity of a ray (premultiplied), from those without light and its depth."""
         light = classification.light

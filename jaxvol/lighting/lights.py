@@ -14,10 +14,15 @@ from .._util.vec3 import Scalar, Vec3, apart
 
 
 class Arriving(NamedTuple):
-    """Light at a point from one direction: toward the light, its distance (infinite for parallel light), and
-    the irradiance on a plane that faces it, without occlusion."""
+    """Light at a point, without occlusion.
 
-    toward: Vec3
+    Attributes:
+        toward: direction to the light; None for light from all sides.
+        distance: of the light; infinite for parallel light.
+        irradiance: on a plane that faces the light.
+    """
+
+    toward: Vec3 | None
     distance: Scalar
     irradiance: Vec3
 
@@ -25,24 +30,20 @@ class Arriving(NamedTuple):
 class Light(eqx.Module):
     """A light source outside the volume or anywhere inside it."""
 
-
-class LocatedLight(Light):
-    """Light that reaches each point from a single direction."""
-
     @abstractmethod
-    def at(self, point: Vec3) -> Arriving:
-        """Light that arrives at a world point."""
+    def at(self, point: Vec3, direction: Vec3) -> Arriving:
+        """Light that arrives at a world point on a ray of this direction."""
 
 
-class DirectionalLight(LocatedLight):
+class DirectionalLight(Light):
     """Parallel light, such as sunlight.
 
-    **Arguments:**
+    Args:
+        direction: (3,), in which the light travels; any length except 0.
+        irradiance: (3,) linear RGB, power per area on a plane that faces the light, ≥ 0.
 
-    - `direction`: (3,), in which the light travels; any length except 0.
-    - `irradiance`: (3,) linear RGB, power per area on a plane that faces the light, ≥ 0.
-
-    **Raises:** `ValueError` for other shapes, NaN or infinity, a direction of length 0, negative irradiance.
+    Raises:
+        ValueError: for other shapes, NaN or infinity, a direction of length 0, negative irradiance.
     """
 
     direction: Float[Array, "3"]
@@ -54,27 +55,27 @@ class DirectionalLight(LocatedLight):
             lambda d: (d != 0).any(),
             "direction must not have length 0; got {got}.",
         )
-        self.irradiance = _power("irradiance", irradiance)
+        self.irradiance = not_negative("irradiance", irradiance, (3,))
 
-    def at(self, point: Vec3) -> Arriving:
+    def at(self, point: Vec3, direction: Vec3) -> Arriving:
         # scaled first, so that no square overflows or underflows
-        direction = self.direction / jax.lax.stop_gradient(jnp.max(jnp.abs(self.direction)))
-        x, y, z = apart(-direction / jnp.linalg.norm(direction))
+        travels = self.direction / jax.lax.stop_gradient(jnp.max(jnp.abs(self.direction)))
+        x, y, z = apart(-travels / jnp.linalg.norm(travels))
         zero = jnp.zeros_like(point[0])
         r, g, b = apart(self.irradiance)
         return Arriving((x + zero, y + zero, z + zero), zero + jnp.inf, (r + zero, g + zero, b + zero))
 
 
-class PointLight(LocatedLight):
+class PointLight(Light):
     """Isotropic point light. Its irradiance falls with the square of the distance.
 
-    **Arguments:**
+    Args:
+        position: (3,) world point.
+        intensity: (3,) linear RGB, power per solid angle, ≥ 0. The irradiance at distance r is
+            intensity / r².
 
-    - `position`: (3,) world point.
-    - `intensity`: (3,) linear RGB, power per solid angle, ≥ 0. The irradiance at distance r is
-      intensity / r².
-
-    **Raises:** `ValueError` for other shapes, NaN or infinity, and negative intensity.
+    Raises:
+        ValueError: for other shapes, NaN or infinity, and negative intensity.
     """
 
     position: Float[Array, "3"]
@@ -82,9 +83,9 @@ class PointLight(LocatedLight):
 
     def __init__(self, position: Arrayable, intensity: Arrayable = (1.0, 1.0, 1.0)):
         self.position = finite_array("position", position, (3,))
-        self.intensity = _power("intensity", intensity)
+        self.intensity = not_negative("intensity", intensity, (3,))
 
-    def at(self, point: Vec3) -> Arriving:
+    def at(self, point: Vec3, direction: Vec3) -> Arriving:
         dx, dy, dz = (p - x for p, x in zip(apart(self.position), point, strict=True))
         # bounded away from 0 at the light itself, where the derivative would be infinite
         squared = jnp.maximum(dx * dx + dy * dy + dz * dz, jnp.finfo(dx.dtype).tiny ** 0.5)
@@ -96,52 +97,57 @@ class PointLight(LocatedLight):
 class HeadLight(Light):
     """A light at the camera: each ray brings its own parallel light, which travels along it. For `Phong`.
 
-    **Arguments:**
+    Args:
+        irradiance: (3,) linear RGB, power per area on a plane that faces the ray, ≥ 0.
 
-    - `irradiance`: (3,) linear RGB, power per area on a plane that faces the ray, ≥ 0.
-
-    **Raises:** `ValueError` for another shape, NaN or infinity, and negative irradiance.
+    Raises:
+        ValueError: for another shape, NaN or infinity, and negative irradiance.
     """
 
     irradiance: Float[Array, "3"]
 
     def __init__(self, irradiance: Arrayable = (1.0, 1.0, 1.0)):
-        self.irradiance = _power("irradiance", irradiance)
+        self.irradiance = not_negative("irradiance", irradiance, (3,))
+
+    def at(self, point: Vec3, direction: Vec3) -> Arriving:
+        x, y, z = direction
+        return Arriving((-x, -y, -z), jnp.full_like(x, jnp.inf), apart(self.irradiance))
 
 
 class ConstantLight(Light):
     """The same radiance from all directions, as in a white room or under an overcast sky.
 
-    **Arguments:**
+    Args:
+        radiance: (3,) linear RGB, ≥ 0.
 
-    - `radiance`: (3,) linear RGB, ≥ 0.
-
-    **Raises:** `ValueError` for another shape, NaN or infinity, and negative radiance.
+    Raises:
+        ValueError: for another shape, NaN or infinity, and negative radiance.
     """
 
     radiance: Float[Array, "3"]
 
     def __init__(self, radiance: Arrayable = (1.0, 1.0, 1.0)):
-        self.radiance = _power("radiance", radiance)
+        self.radiance = not_negative("radiance", radiance, (3,))
+
+    def at(self, point: Vec3, direction: Vec3) -> Arriving:
+        r, g, b = (jnp.pi * radiance for radiance in self.radiance)
+        return Arriving(None, jnp.full_like(point[0], jnp.inf), (r, g, b))
 
 
-def lights_of(
-    lights: Light | tuple[Light, ...] | Any,
-    kinds: tuple[type[Light], ...] = (LocatedLight, ConstantLight),
-) -> tuple[Light, ...]:
-    """One or several lights of some kinds, as a tuple; `ValueError` for anything else."""
+def lights_of(lights: Any, excluded: type[Light] = HeadLight) -> tuple[Light, ...]:
+    """One or several lights of any but the `excluded` kind, as a tuple; `ValueError` for anything else."""
     several = (lights,) if isinstance(lights, Light) else lights
     if not isinstance(several, tuple | list) or not several:
         raise ValueError(f"lights must be a light or a tuple of lights; got {lights!r}.")
     for light in several:
-        if not isinstance(light, kinds):
-            classes = (DirectionalLight, PointLight, HeadLight, ConstantLight)
-            known = ", ".join(each.__name__ for each in classes if issubclass(each, kinds))
-            raise ValueError(f"lights must hold jaxvol lights, here {known}; got {light!r}.")
+        if not isinstance(light, Light) or isinstance(light, excluded):
+            raise ValueError(
+                f"lights must hold jaxvol lights, of any kind but {excluded.__name__}; got {light!r}."
+            )
     return tuple(several)
 
 
-def _power(name: str, value: Arrayable) -> Float[Array, "3"]:
-    return require(
-        finite_array(name, value, (3,)), lambda v: v >= 0, f"{name} must not be negative; got {{got}}."
-    )
+def not_negative(name: str, value: Arrayable, shape: tuple[int, ...]) -> Array:
+    """`value` as an array of numbers ≥ 0."""
+    array = finite_array(name, value, shape)
+    return require(array, lambda v: v >= 0, f"{name} must not be negative; got {{got}}.")

@@ -22,12 +22,9 @@ class Optics(NamedTuple):
 
     @property
     def reflectance(self) -> Float[Array, "..."]:
-        """Reflectance R of a half-space of the material under light from all sides, if its colour is white:
-        isotropic scattering with single-scattering albedo ω = 1 - opacity.
-
-        `R = r (1 - γ / (3 (1 + γ)))`, `r = (1 - γ) / (1 + γ)`, `γ = √(1 - ω)`; within 0.0014 of the integral
-        over Chandrasekhar's H function. Source: Hapke, Theory of Reflectance and Emittance Spectroscopy,
-        1993.
+        """Reflectance R of a half-space of the white material under light from all sides, within 0.0014 of
+        the integral over Chandrasekhar's H function: `R = r (1 - γ / (3 (1 + γ)))`, `r = (1 - γ) / (1 + γ)`,
+        `γ = √opacity`. Source: Hapke, Theory of Reflectance and Emittance Spectroscopy, 1993.
         """
         # bounded away from 0, where the derivative of the square root is infinite
         gamma = jnp.sqrt(jnp.maximum(self.opacity, jnp.finfo(self.opacity.dtype).tiny ** 0.5))
@@ -37,21 +34,20 @@ class Optics(NamedTuple):
 class Material(eqx.Module):
     """A material that scatters light, such as skin, muscle or bone.
 
-    **Arguments:**
-
-    - `opacity`: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
-      Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
-      tracing. Scatterer templates need an opacity above 0, see their `threshold`.
-    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0.
-    - `refractive_index`: > 0; 1 in air.
-    - `values`: (low, high), the range of volume values that are this material, low < high; or
-    - `label`: the volume's label for this material. Give one of the two to say where the material is;
-      without either, it is everywhere.
-
     All but `values` and `label` are differentiable. For instance, in mm and chosen for appearance: skin
     `Material(0.5, 0.7, 1.39)`, muscle `Material(0.6, 1.4, 1.37)`, bone `Material(0.8, 0.6, 1.55)`.
 
-    **Raises:** `ValueError` for numbers out of these ranges, and if both `values` and `label` are given.
+    Args:
+        opacity: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
+            Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
+            tracing. Scatterer templates need an opacity above 0, see their `threshold`.
+        mean_free_path: λ, the mean distance between scatterings, world length, > 0.
+        refractive_index: > 0; 1 in air.
+        values: (low, high), the range of volume values that are this material, low < high.
+        label: the volume's label for this material. Without `values` or `label`, it is everywhere.
+
+    Raises:
+        ValueError: for numbers out of these ranges, and if both `values` and `label` are given.
     """
 
     opacity: Float[Array, ""]
@@ -74,18 +70,13 @@ class Material(eqx.Module):
         self.refractive_index = number("refractive_index", refractive_index, above=0)
         if values is not None and label is not None:
             raise ValueError(f"values and label must not both be given; got {values!r} and {label!r}.")
-        self.values = None
         if values is not None:
-            self.values = require(
-                finite_array("values", values, (2,)),
-                lambda v: v[1:] > v[:1],
-                "values must be (low, high) with low < high; got {got}.",
-            )
-        self.label = None if label is None else integer("label", label, 0)
+            message = "values must be (low, high) with low < high; got {got}."
+            values = require(finite_array("values", values, (2,)), lambda v: v[1:] > v[:1], message)
+        self.values, self.label = values, None if label is None else integer("label", label, 0)
 
     @property
     def optics(self) -> Optics:
-        """Opacity, mean free path and refractive index."""
         return Optics(self.opacity, self.mean_free_path, self.refractive_index)
 
 
@@ -109,13 +100,14 @@ def shares(
     materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
 ) -> tuple[Scalar, ...]:
     """Share of each material at a grid coordinate with this value: 1 for the first that is present, 0 for all
-    others. With an `edge` above 0, the fraction of its value range over which a material fades, shares are
-    continuous and sum to at most 1; labels are then looked up trilinearly."""
+    others. `edge`: the fraction of its value range over which a material fades; above 0, shares are
+    continuous and sum to at most 1, and labels are looked up trilinearly."""
     remaining, each = jnp.ones_like(value), []
     for one in materials:
-        if one.label is not None:
-            sharp = volume.label(coordinate) == one.label if edge == 0 else None
-            share = volume.label_share(coordinate, one.label) if sharp is None else sharp.astype(value.dtype)
+        if one.label is not None and edge == 0:
+            share = (volume.label(coordinate) == one.label).astype(value.dtype)
+        elif one.label is not None:
+            share = volume.label_share(coordinate, one.label)
         elif one.values is None:
             share = jnp.ones_like(value)
         else:

@@ -5,16 +5,13 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
-from .._util.checks import Arrayable, finite_array, number, require
-from .._util.vec3 import Vec3, apart, dot, plus, scaled, times
+from .._util.checks import Arrayable, number
+from .._util.vec3 import Vec3, dot, plus, scaled, times
 from ..scene.space import world_gradient
 from ..xla.memory import packed_pair, unpacked_pair
-from .lights import HeadLight, Light, LocatedLight, lights_of
+from .lights import ConstantLight, HeadLight, Light, lights_of, not_negative
 from .shading import Sample, Shading, Surroundings
 
-
-_Lit: TypeAlias = tuple[Vec3, Vec3]
-"""The direction to a light, and the irradiance that arrives."""
 
 Angles: TypeAlias = Float[Array, "..."] | Complex[Array, "..."]
 """How a light falls on a sample: of a head light n·v; of others the pair n·l and n·v, packed in one array."""
@@ -35,23 +32,23 @@ class Phong(Shading):
       of its length leaves the range of floats: in float32, below 1e-19 and above 1e19 value units per length.
     - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: lights of
       irradiance π E here are those of irradiance E for `ScattererTemplates` and `path_trace`.
-    - VTK's fixed-point ray caster computes its highlight from the vector half-way between l and v. It is as
-      wide as Phong's of a quarter of the power. VTK's ray caster on GPUs has Phong's.
+    - Only the angle matters, not whether there is a surface: a nearly homogeneous region is shaded by its
+      noise (`experiments/stability.py`, "normals in noise").
+    - The highlight of VTK's fixed-point ray caster is as wide as this one of a quarter of the power.
 
-    Only the angle matters, not whether there is a surface: a nearly homogeneous region is shaded by its noise
-    (`experiments/stability.py`, "normals in noise").
+    Gradients are those of this formula, also by an extinction of 0, where samples are lit although they are
+    invisible. They grow without bound as the volume's gradient falls to 0; where it is 0, and where a normal
+    turns from one side to the other, they miss a jump.
 
-    Gradients of light, material, transfer function, camera and volume are those of this formula, also by an
-    extinction of 0, where samples are lit although they are invisible. They grow without bound as the
-    volume's gradient falls to 0; where it is 0, and where a normal turns from one side to the other, they
-    miss a jump.
+    Args:
+        lights: one or several, of any kind but `ConstantLight`; by default a `HeadLight`.
+        ambient: ≥ 0. Names and defaults are those of `vtkVolumeProperty`.
+        diffuse: ≥ 0.
+        specular: ≥ 0.
+        specular_power: > 0.
 
-    **Arguments:**
-
-    - `lights`: one or several of `HeadLight`, `DirectionalLight` and `PointLight`; by default a `HeadLight`.
-    - `ambient`, `diffuse`, `specular`: ≥ 0. `specular_power`: > 0. Names and defaults of `vtkVolumeProperty`.
-
-    **Raises:** `ValueError` for other lights, and for numbers that are negative, NaN or infinite.
+    Raises:
+        ValueError: for other lights, and for numbers that are negative, NaN or infinite.
 
     Source: Phong, "Illumination for Computer Generated Pictures", 1975; Levoy, "Display of Surfaces from
     Volume Data", 1988.
@@ -71,10 +68,10 @@ class Phong(Shading):
         specular: Arrayable = 0.2,
         specular_power: Arrayable = 10.0,
     ):
-        self.lights = lights_of(HeadLight() if lights is None else lights, (LocatedLight, HeadLight))
-        self.ambient = _coefficient("ambient", ambient)
-        self.diffuse = _coefficient("diffuse", diffuse)
-        self.specular = _coefficient("specular", specular)
+        self.lights = lights_of(HeadLight() if lights is None else lights, excluded=ConstantLight)
+        self.ambient = not_negative("ambient", ambient, ())
+        self.diffuse = not_negative("diffuse", diffuse, ())
+        self.specular = not_negative("specular", specular, ())
         self.specular_power = number("specular_power", specular_power, above=0)
 
     @property
@@ -82,18 +79,20 @@ class Phong(Shading):
         return True
 
     @property
-    def farthest_read(self) -> float | None:
+    def farthest_read(self) -> float:
         return 0.0
 
     @property
     def terms(self) -> int:
         return 1
 
-    def begin(self, around: Surroundings, sample: Sample) -> tuple[_Lit, ...]:
-        return tuple(_arriving(light, sample) for light in self.lights)
+    def begin(self, around: Surroundings, sample: Sample) -> list[tuple[Vec3, Vec3]]:
+        """For each light, the direction to it and its irradiance."""
+        arriving = [light.at(sample.point, sample.direction) for light in self.lights]
+        return [(light.toward, light.irradiance) for light in arriving if light.toward is not None]
 
     def term(
-        self, around: Surroundings, sample: Sample, shared: tuple[_Lit, ...], number: Int[Array, ""]
+        self, around: Surroundings, sample: Sample, shared: list[tuple[Vec3, Vec3]], number: Int[Array, ""]
     ) -> tuple[Angles, ...]:
         gradient = world_gradient(around.volume, around.space, sample.point)
         squared, toward_viewer = dot(gradient, gradient), -dot(gradient, sample.direction)
@@ -111,7 +110,7 @@ class Phong(Shading):
             for light, (toward, _) in zip(self.lights, shared, strict=True)
         )
 
-    def color(self, sample: Sample, shared: tuple[_Lit, ...], sums: tuple[Angles, ...]) -> Vec3:
+    def color(self, sample: Sample, shared: list[tuple[Vec3, Vec3]], sums: tuple[Angles, ...]) -> Vec3:
         zero = jnp.zeros_like(sample.extinction)
         diffuse, specular = (zero, zero, zero), (zero, zero, zero)
         for (toward, irradiance), angles in zip(shared, sums, strict=True):
@@ -127,18 +126,3 @@ class Phong(Shading):
         ambient = self.ambient
         factor = plus(scaled(diffuse, self.diffuse), (ambient, ambient, ambient))
         return plus(times(sample.color, factor), scaled(specular, self.specular))
-
-
-def _coefficient(name: str, value: Arrayable) -> Float[Array, ""]:
-    return require(
-        finite_array(name, value, ()), lambda v: v >= 0, f"{name} must not be negative; got {{got}}."
-    )
-
-
-def _arriving(light: Light, sample: Sample) -> _Lit:
-    if isinstance(light, HeadLight):
-        x, y, z = sample.direction
-        return (-x, -y, -z), apart(light.irradiance)
-    assert isinstance(light, LocatedLight)
-    arriving = light.at(sample.point)
-    return arriving.toward, arriving.irradiance

@@ -13,9 +13,8 @@ from jaxtyping import Array, Float, Int
 
 from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along, dot, scaled
-from ..scene.transfer import Measured
 from ..xla.memory import gather
-from .lights import ConstantLight, Light, LocatedLight
+from .lights import Arriving, Light
 from .materials import Material, Optics, shares, smoothstep, step
 from .shading import ClassifiedPoint, Sample, Shading, Surroundings
 from .template import ScattererTemplate
@@ -35,34 +34,19 @@ light around it: half of the photons of a sample on its face are inside, so that
 
 
 class _Shared(NamedTuple):
-    """What is common to all photons of a sample: the materials' shares, and the same normalized to sum to 1;
-    its optics; which template it uses, if there are several; and of each light the direction to it (None:
-    from all sides), its distance and irradiance."""
+    """What all photons of a sample have in common. `mixture`: the materials' shares, scaled to sum to 1.
+    `template`: the one in use, if there are several."""
 
     shares: tuple[Scalar, ...]
     mixture: tuple[Scalar, ...]
     optics: Optics
     template: Int[Array, ""] | None
-    lights: tuple[tuple[Vec3 | None, Scalar, Vec3], ...]
-
-
-class _Photon(NamedTuple):
-    """A photon of a sample; where there are several materials, also the factor by which the colour at its
-    place counts, and the mean free path there."""
-
-    offset: Vec3
-    intensity: Scalar
-    inner: Scalar | None = None
-    mean_free_path: Scalar | None = None
+    lights: tuple[Arriving, ...]
 
 
 class PhotonShading(Shading):
-    """Templates prepared for one image.
-
-    - `templates`: (materials, templates, photons). `blended`: how many were blended into each; their photons
-      are skipped as they would be in their own templates.
-    - `cutoff`: None: no photon is skipped.
-    """
+    """Templates prepared for one image: (materials, templates, photons). `blended`: how many were blended
+    into each, whose photons are skipped as they would be in their own templates."""
 
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
@@ -101,35 +85,38 @@ class PhotonShading(Shading):
         if (count := self.templates.intensity.shape[1]) > 1:
             u, _, _ = hashed_uniforms(*sample.pixel, jnp.uint32(self.seed), jnp.float32)
             template = (u * count).astype(jnp.int32)
-        lights = []
-        for light in self.lights:
-            if isinstance(light, ConstantLight):
-                r, g, b = (jnp.pi * radiance for radiance in light.radiance)
-                lights.append((None, jnp.full_like(sample.extinction, jnp.inf), (r, g, b)))
-            elif isinstance(light, LocatedLight):
-                lights.append(tuple(light.at(sample.point)))
         total = sum(material_shares)
         mixture = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
         optics = _blend(self.optics, mixture, Optics(*(jnp.ones_like(total),) * 3))
-        return _Shared(material_shares, mixture, optics, template, tuple(lights))
+        lights = tuple(light.at(sample.point, sample.direction) for light in self.lights)
+        return _Shared(material_shares, mixture, optics, template, lights)
 
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
         # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
         # photon of a single template costs nothing, as it is the same for all samples.
-        several = len(self.materials) > 1
+        several, medium = len(self.materials) > 1, None
         if several or shared.template is not None:
-            photon = around.stored(lambda: self._photon(sample, shared, number))
+            offset, intensity = around.stored(lambda: self._photon(sample, shared, number))
         else:
-            photon = self._photon(sample, shared, number)
+            offset, intensity = self._photon(sample, shared, number)
         if several:
-            photon = self._refracted(around, sample, shared, photon)
+            offset, medium = self._refracted(around, sample, shared, offset)
 
         def places() -> list[Vec3]:
-            return [_displaced(sample, photon.offset, times) for times in (1.0, *self.reach)]
+            return [_displaced(sample, offset, times) for times in (1.0, *self.reach)]
+
+        def weights() -> tuple[Scalar, Scalar]:
+            """How much of the photon is seen, and how much the colour at its place counts."""
+            points = [around.classified(*each) for each in zip(places(), read, strict=True)]
+            inner, path = self._medium(around, shared, points[0])[:2] if medium is None else medium
+            extinctions = [point.extinction for point in points]
+            # soft: the opacity of one mean free path there
+            matter = -jnp.expm1(-extinctions[0] * path) if self._soft else step(extinctions[0], 0.0)
+            return intensity * self._visible(offset, extinctions), intensity * inner * matter
 
         read = around.stored(lambda: [around.measured(place) for place in places()])
-        seen, shows = around.stored(lambda: self._weights(around, shared, photon, places(), read))
-        brightness = tuple(seen * self._lit_side(photon.offset, *light[:2]) for light in shared.lights)
+        seen, shows = around.stored(weights)
+        brightness = tuple(seen * self._lit_side(offset, light) for light in shared.lights)
         color, _ = around.classification.classify(read[0])
         return brightness, scaled(color, shows)
 
@@ -142,13 +129,13 @@ class PhotonShading(Shading):
             c * (1 - matter)
             + scale
             * (c + s)
-            * sum(b * irradiance[i] for b, (_, _, irradiance) in zip(brightness, shared.lights, strict=True))
+            * sum(b * light.irradiance[i] for b, light in zip(brightness, shared.lights, strict=True))
             for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
         )
         return red, green, blue
 
-    def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
-        """A photon of the sample's materials, blended by their shares; of intensity 0 if it is skipped."""
+    def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
+        """Offset and intensity of a photon, blended by the materials' shares; of intensity 0 if skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
@@ -167,51 +154,37 @@ class PhotonShading(Shading):
         if self.cutoff is not None:
             skipped = sample.transmittance * intensity * self.blended < self.cutoff
             intensity = jnp.where(skipped, 0, intensity)
-        return _Photon((x, y, z), intensity)
+        return (x, y, z), intensity
 
-    def _refracted(self, around: Surroundings, sample: Sample, shared: _Shared, photon: _Photon) -> _Photon:
-        """The photon, moved by refraction into the material at its place."""
+    def _refracted(
+        self, around: Surroundings, sample: Sample, shared: _Shared, offset: Vec3
+    ) -> tuple[Vec3, tuple[Scalar, Scalar]]:
+        """The offset of a photon that is moved by refraction into the material at its place; the factor by
+        which the colour there counts, and the mean free path there."""
         own = shared.optics
-        read = around.stored(lambda: around.measured(_displaced(sample, photon.offset)))
+        read = around.stored(lambda: around.measured(_displaced(sample, offset)))
 
-        def moved() -> _Photon:
-            there = around.classified(_displaced(sample, photon.offset), read)
-            shares = self._shares_at(around, there)
-            optics = _blend(self.optics, shares, own)
-            # the template is stretched by the ratio of the speeds of light
-            offset = scaled(photon.offset, own.refractive_index / optics.refractive_index)
+        def moved() -> tuple[Vec3, tuple[Scalar, Scalar]]:
+            there = around.classified(_displaced(sample, offset), read)
+            matter, path, optics = self._medium(around, shared, there)
             ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
-            inner = jnp.where(own.opacity == 0, 0, ratio) * _sum(shares)
-            return _Photon(offset, photon.intensity, inner, optics.mean_free_path)
+            inner = jnp.where(own.opacity == 0, 0, ratio) * matter
+            # the template is stretched by the ratio of the speeds of light
+            return scaled(offset, own.refractive_index / optics.refractive_index), (inner, path)
 
         return around.stored(moved)
 
-    def _weights(
-        self,
-        around: Surroundings,
-        shared: _Shared,
-        photon: _Photon,
-        places: list[Vec3],
-        read: list[Measured],
-    ) -> tuple[Scalar, Scalar]:
-        """How much of a photon is seen, and how much the colour at its place counts. `read`: at `places`."""
-        points = [around.classified(*each) for each in zip(places, read, strict=True)]
-        inner, path = photon.inner, photon.mean_free_path
-        if inner is None or path is None:
-            shares = self._shares_at(around, points[0])
-            inner, path = _sum(shares), _blend(self.optics, shares, shared.optics).mean_free_path
-        extinctions = [point.extinction for point in points]
-        # soft: the opacity of one mean free path there
-        matter = -jnp.expm1(-extinctions[0] * path) if self._soft else step(extinctions[0], 0.0)
-        return photon.intensity * self._visible(photon.offset, extinctions), photon.intensity * inner * matter
+    def _medium(
+        self, around: Surroundings, shared: _Shared, there: ClassifiedPoint
+    ) -> tuple[Scalar, Scalar, Optics]:
+        """Total share of the materials at a place, which falls to 0 outside of the volume; mean free path and
+        all optics there."""
+        each = tuple(there.inside * share for share in self._shares(around, there.coordinate, there.value))
+        optics = _blend(self.optics, each, shared.optics)
+        return _sum(each), optics.mean_free_path, optics
 
     def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        edge = EDGE if self._soft else 0.0
-        return shares(self.materials, around.volume, coordinate, value, edge=edge)
-
-    def _shares_at(self, around: Surroundings, there: ClassifiedPoint) -> tuple[Scalar, ...]:
-        """Shares of the materials at a place, which fall to 0 outside of the volume."""
-        return tuple(there.inside * share for share in self._shares(around, there.coordinate, there.value))
+        return shares(self.materials, around.volume, coordinate, value, edge=EDGE if self._soft else 0.0)
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
         """Visibility of a photon from the sample, from the extinctions at its place and at `reach`."""
@@ -221,13 +194,13 @@ class PhotonShading(Shading):
         depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
         return jnp.exp(-depth * _norm(offset))
 
-    def _lit_side(self, offset: Vec3, toward: Vec3 | None, distance: Scalar) -> Scalar:
+    def _lit_side(self, offset: Vec3, light: Arriving) -> Scalar:
         """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
-        if toward is None:
+        if light.toward is None:
             return jnp.ones_like(offset[0])
         length = _norm(offset)
         # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
-        near = dot(offset, toward) - length**2 / (2 * distance)
+        near = dot(offset, light.toward) - length**2 / (2 * light.distance)
         if not self._soft:
             return step(near, 0.0)
         return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))

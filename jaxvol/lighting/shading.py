@@ -35,11 +35,14 @@ TOGETHER = 8
 class Sample(NamedTuple):
     """A sample to be shaded.
 
-    - `point`: in the world. `direction`: of the ray, a unit vector.
-    - `measured`, `color`, `extinction`: from the volume and the transfer function. Of what was measured, only
-      the value, `measured[0]`, has a gradient.
-    - `transmittance`: between the sample and the camera.
-    - `pixel`: (column, row), which keys random numbers.
+    Attributes:
+        point: in the world.
+        direction: of the ray, a unit vector.
+        measured: what was read from the volume; only the value, `measured[0]`, has a gradient.
+        color: from the transfer function.
+        extinction: from the transfer function.
+        transmittance: between the sample and the camera.
+        pixel: (column, row), which keys random numbers.
     """
 
     point: Vec3
@@ -62,8 +65,12 @@ class ClassifiedPoint(NamedTuple):
 
 
 class Surroundings(eqx.Module):
-    """The scene around a sample. `live`: see `in_memory`; None: nothing is stored, since fetches cannot be
-    recorded inside a branch. `tables`: the classification, if it was computed before."""
+    """The scene around a sample.
+
+    Attributes:
+        live: of `in_memory`; None: nothing is stored, since fetches cannot be recorded inside a branch.
+        tables: the classification, if it was computed before.
+    """
 
     volume: Volume
     transfer: Transfer
@@ -206,15 +213,10 @@ class Shader(NamedTuple):
         if self.inline:
             sample = sample._replace(transmittance=jnp.ones_like(sample.transmittance))
         if sample.extinction.ndim == 0:
-            return shade_sample(shading, around, sample)
+            shared = shading.begin(around, sample)
+            return shading.color(sample, shared, _all_terms(shading, around, sample, shared))
         shared = jax.vmap(partial(shading.begin, around))(sample)
         return jax.vmap(shading.color)(sample, shared, needed_terms(shading, around, sample, shared))
-
-
-def shade_sample(shading: Shading, around: Surroundings, sample: Sample) -> Vec3:
-    """The shaded colour of a sample."""
-    shared = shading.begin(around, sample)
-    return shading.color(sample, shared, _all_terms(shading, around, sample, shared))
 
 
 def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: PyTree) -> PyTree:
@@ -241,10 +243,10 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
     looped = replace(around, tables=around.classification)
     together = math.ceil(shading.terms / math.ceil(shading.terms / TOGETHER))
 
-    def terms(first: Int[Array, ""]) -> PyTree:
-        here = looped.in_memory_by(first >= 0, samples)
+    def add(group: Int[Array, ""], sums: PyTree) -> PyTree:
+        here = looped.in_memory_by(group >= 0, samples)
         of_samples = jax.vmap(partial(shading.term, here), in_axes=(0, 0, None))
-        numbers = first + jnp.arange(together, dtype=jnp.int32)
+        numbers = group * together + jnp.arange(together, dtype=jnp.int32)
         each = jax.vmap(of_samples, in_axes=(None, None, 0))(samples, shared, numbers)
 
         def total(leaf: Array) -> Array:  # `jnp.sum` over the terms would not be vectorized over the samples
@@ -252,10 +254,7 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
                 jnp.add, (jnp.where(numbers[i] < shading.terms, leaf[i], 0) for i in range(together))
             )
 
-        return jax.tree.map(total, each)
-
-    def add(group: Int[Array, ""], sums: PyTree) -> PyTree:
-        return jax.tree.map(jnp.add, sums, terms(group * together))
+        return jax.tree.map(jnp.add, sums, jax.tree.map(total, each))
 
     none = jax.vmap(partial(no_terms, shading, around))(samples, shared)
     groups = -(-terms_needed(shading, samples.transmittance) // together)
@@ -264,10 +263,10 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
 
 @needed_terms.def_jvp
 def _(primals: Any, tangents: Any) -> Any:
-    def all_(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
+    def all_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
         return jax.vmap(partial(_all_terms, shading, around))(samples, shared)
 
-    return eqx.filter_jvp(all_, primals, tangents)
+    return eqx.filter_jvp(all_terms, primals, tangents)
 
 
 def terms_needed(shading: Shading, transmittance: Float[Array, " samples"]) -> Int[Array, ""]:

@@ -11,7 +11,7 @@ volume rendering (2016), section 3.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -35,8 +35,9 @@ MERGE = 0.01
 class ScattererTemplate(eqx.Module):
     """Photons around a sample, brightest first; or several such sets, along leading axes.
 
-    - `offset`: from the sample, world length.
-    - `intensity`: the fraction of the light that each photon holds; 0 for padding.
+    Attributes:
+        offset: from the sample, world length.
+        intensity: the fraction of the light that each photon holds; 0 for padding.
     """
 
     offset: Float[Array, "*templates n 3"]
@@ -104,29 +105,27 @@ def scatterer_template(
     The paper's tables were made in this way; its equations (1) to (3) as printed hand on αI
     (`experiments/printed_templates.py`).
 
-    **Arguments:**
+    Args:
+        material: its opacity, mean free path λ and refractive index.
+        key: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.
+        packets: how many packets share the light, of energy 1, at the origin. Their directions are spread
+            evenly and rotated at random. One packet makes a lopsided template.
+        threshold: in (0, 1), of a photon's intensity. A photon fades out between this and 0.8 times this,
+            instead of vanishing at once. The first photons are the brightest, of α / `packets` each: with a
+            threshold above 1.25 times that, a template is empty.
+        merge: photons closer than this fraction of λ are merged, as in the paper's tables.
+        levels: of the tree; required if the opacity is traced. By default as many as leave photons above the
+            threshold.
 
-    - `material`: its opacity, mean free path λ and refractive index.
-    - `key`: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.
-    - `packets`: how many packets share the light, of energy 1, at the origin. Their directions are spread
-      evenly and rotated at random. One packet makes a lopsided template.
-    - `threshold`: in (0, 1), of a photon's intensity. A photon fades out between this and 0.8 times this,
-      instead of vanishing at once. The first photons are the brightest, of α / `packets` each: with a
-      threshold above 1.25 times that, a template is empty.
-    - `merge`: photons closer than this fraction of λ are merged, as in the paper's tables.
-    - `levels`: of the tree; required if the opacity is traced. By default as many as leave photons above the
-      threshold.
+    Returns:
+        A `ScattererTemplate`, differentiable in the material's mean free path, opacity and refractive index
+        (at an index of 1, where the critical angle has no derivative, the derivative used is 0).
 
-    **Returns:** a `ScattererTemplate` with room for the photons of the tree, or for as many above the
-    threshold as energy 1 could fill; differentiable in the material's mean free path, opacity and refractive
-    index (at an index of 1, where the critical angle has no derivative, the derivative used is 0).
-
-    Where it fails: `experiments/stability.py`, "lopsided templates", "energy of templates as printed".
-
-    **Raises:** `ValueError` for numbers out of range, if `levels` are required but missing, and if all
-    photons are below the threshold; if the opacity is traced, the intensities are NaN in the last case.
+    Raises:
+        ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
+            a traced opacity, intensities are then NaN.
     """
-    tree = PacketTree.checked(packets, threshold)
+    tree = PacketTree(packets, threshold)
     levels = tree.levels_of((material,), levels)
     return tree.template(material.optics, _key(key), levels, merge)
 
@@ -143,16 +142,23 @@ def scatterer_templates(
 ) -> ScattererTemplate:
     """Several templates for each of several materials, simulated at once.
 
-    **Arguments:** `materials`: one or several. `count`: templates per material. The others, `key` among them,
-    as for `scatterer_template`.
+    Args:
+        materials: one or several.
+        key: as for `scatterer_template`. The draws are also keyed by the indices of material and template.
+        count: templates per material.
+        packets: as for `scatterer_template`.
+        threshold: as for `scatterer_template`.
+        merge: as for `scatterer_template`.
+        levels: as for `scatterer_template`.
 
-    **Returns:** a `ScattererTemplate` with leading axes (materials, count). The draws are keyed by the index
-    of the material and that of the template.
+    Returns:
+        A `ScattererTemplate` with leading axes (materials, count).
 
-    **Raises:** as `scatterer_template` does.
+    Raises:
+        ValueError: as `scatterer_template` does.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
-    tree = PacketTree.checked(packets, threshold)
+    tree = PacketTree(packets, threshold)
     levels = tree.levels_of(materials, levels)
 
     def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
@@ -163,25 +169,20 @@ def scatterer_templates(
     return several(optics_of(materials), jnp.arange(len(materials)), jnp.arange(count))
 
 
-class _Packets(NamedTuple):
-    """Packets of light: start, direction and energy of each."""
-
-    position: Float[Array, "n 3"]
-    direction: Float[Array, "n 3"]
-    light: Float[Array, " n"]
+Packets: TypeAlias = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]
+"""Start, direction and energy of each packet of light."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class PacketTree:
-    """The tree of packets of a template. Fields are as for `scatterer_template`."""
+    """The tree of packets of a template, with the arguments of `scatterer_template`."""
 
     packets: int = 4
     threshold: float = 0.01
 
-    @classmethod
-    def checked(cls, packets: Any, threshold: Any) -> "PacketTree":
-        """**Raises** `ValueError` for invalid arguments."""
-        return cls(integer("packets", packets, 1), float(number("threshold", threshold, above=0, below=1)))
+    def __post_init__(self):
+        self.packets = integer("packets", self.packets, 1)
+        self.threshold = float(number("threshold", self.threshold, above=0, below=1))
 
     @property
     def faintest(self) -> float:
@@ -190,82 +191,85 @@ class PacketTree:
 
     @property
     def max_width(self) -> float:
-        """Most packets of one level that go on: as many as can be above the threshold, as their energies sum
-        to 1."""
+        """Most packets of a level: as many as can be above the threshold, as their energies sum to 1."""
         return math.floor(1 / self.faintest + 1e-9)
 
-    def size(self, levels: int) -> int:
-        """Photons of all levels, each twice as wide as the one before, up to `max_width`."""
-        return int(sum(min(self.packets * 2 ** min(k, 64), self.max_width) for k in range(levels)))
-
-    def capacity(self, levels: int) -> int:
-        """Number of photons that a template has room for."""
-        return int(min(self.size(levels), self.max_width))
+    def levels(self, opacity: float) -> int:
+        """Number of levels that may hold a photon above the threshold. The brightest possible photon of level
+        k has `α (1 - α)^k / packets`."""
+        if opacity == 1:
+            return 1
+        return 1 + math.floor(math.log(self.faintest * self.packets / opacity) / math.log(1 - opacity) + 1e-9)
 
     def levels_of(self, materials: Sequence[Material], levels: int | None) -> int:
         """The given number of levels, by default the most of any material. **Raises** `ValueError` for an
         opacity that leaves no photon, and for one that is traced, if no number is given."""
+        most = 1
         for material in materials:
-            self._require_photons(material)
-        return max(map(self.levels, materials)) if levels is None else integer("levels", levels, 1)
+            if is_traced(material.opacity):
+                if levels is None:
+                    raise ValueError(
+                        "levels must be given where opacity is traced: the number of photons depends on it."
+                    )
+                continue
+            opacity = float(material.opacity)
+            if opacity <= self.faintest * self.packets:
+                raise ValueError(
+                    f"opacity {opacity:g} leaves no photon above threshold={self.threshold:g} with "
+                    f"packets={self.packets}; give a threshold of at most {opacity / self.packets:.3g}."
+                )
+            most = max(most, self.levels(opacity))
+        return most if levels is None else integer("levels", levels, 1)
 
-    def levels(self, material: Material) -> int:
-        """Number of levels that may hold a photon above the threshold. The brightest possible photon of level
-        k has `α (1 - α)^k / packets`."""
-        if is_traced(material.opacity):
-            raise ValueError(
-                "levels must be given where opacity is traced: the number of photons depends on it."
-            )
-        alpha = float(np.asarray(material.opacity))
-        if alpha == 1:
-            return 1
-        return 1 + math.floor(math.log(self.faintest * self.packets / alpha) / math.log(1 - alpha) + 1e-9)
-
-    def most_photons(self, material: Material) -> int:
-        """Upper bound of a template's photons above 0: in each level, no more than its energy allows."""
-        alpha = float(np.asarray(material.opacity))
-        by_energy = (
-            int((1 - alpha) ** k * alpha / self.faintest + 1e-9) for k in range(self.levels(material))
-        )
-        return max(1, sum(min(self.packets * 2 ** min(k, 32), most) for k, most in enumerate(by_energy)))
-
-    def _require_photons(self, material: Material) -> None:
-        """**Raises** `ValueError` if the first photons are below the threshold; traced opacities are not
-        checked."""
-        if is_traced(material.opacity):
-            return
-        alpha = float(np.asarray(material.opacity))
-        if alpha == 0:
-            raise ValueError(
-                "opacity must be above 0 for scatterer templates: without absorption there are no photons."
-            )
-        if alpha <= self.faintest * self.packets:
-            raise ValueError(
-                f"opacity {alpha:g} leaves no photon above threshold={self.threshold:g} with "
-                f"packets={self.packets}: use a threshold of at most {alpha / self.packets:.3g}, or fewer."
-            )
+    def capacity(self, levels: int, opacity: float | None = None) -> int:
+        """Upper bound of a template's photons: in each level at most twice as many as in the one before, and,
+        for a given opacity, no more than its energy allows."""
+        total = 0
+        for k in range(levels):
+            most = self.max_width
+            if opacity is not None:
+                most = math.floor((1 - opacity) ** k * opacity / self.faintest + 1e-9)
+            total += min(self.packets * 2 ** min(k, 64), most)
+        return int(min(total, self.max_width))
 
     def template(
         self, optics: Optics, key: PRNGKeyArray, levels: int, merge: float = MERGE
     ) -> ScattererTemplate:
         """The photons of a tree of so many levels, merged and sorted; NaN if a traced opacity leaves none."""
         origin, draws = jax.random.split(key)
-        packets = _Packets(
-            jnp.zeros((self.packets, 3)),
-            _spread(origin, self.packets),
-            jnp.full(self.packets, 1 / self.packets),
-        )
+        # evenly spread over the sphere and rotated at random, so that each alone is uniformly distributed
+        q, r = jnp.linalg.qr(jax.random.normal(origin, (3, 3)))
+        spread = golden_spiral(self.packets)
+        directions = jnp.asarray(spread, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
+        packets = jnp.zeros((self.packets, 3)), directions, jnp.full(self.packets, 1 / self.packets)
+        sine_of_critical_angle = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
+        cone = 1 - _root(1 - sine_of_critical_angle**2)
 
-        def next_(packets: _Packets, level: Any) -> tuple[_Packets, ScattererTemplate]:
-            return self._level(optics, jax.random.fold_in(draws, level), packets)
+        def advance(packets: Packets, level: Any) -> tuple[Packets, ScattererTemplate]:
+            """The packets that go on from a level, and the photons that they leave (lengths in λ)."""
+            position, direction, light = packets
+            u = jax.random.uniform(jax.random.fold_in(draws, level), (6, light.shape[0]))
+            flight = -jnp.log1p(-u[0])
+            position = position + flight[:, None] * direction
+            light, passed = self.energies(optics.opacity, light, flight, u[1])
+            cosine = 1 - u[2] * cone
+            after = (
+                jnp.concatenate([position] * 2),
+                jnp.concatenate([_turned(direction, cosine, u[3]), _turned(-direction, u[4], u[5])]),
+                jnp.concatenate([passed * cosine, passed * (1 - cosine)]),
+            )
+            if after[2].shape[0] > self.max_width:
+                _, brightest = jax.lax.top_k(jax.lax.stop_gradient(after[2]), int(self.max_width))
+                after = jax.tree.map(lambda leaf: leaf[brightest], after)
+            return after, ScattererTemplate(position, optics.opacity * light)
 
         by_level, level = [], 0
-        while level < levels and packets.light.shape[0] < self.max_width:
-            packets, photons = next_(packets, level)
+        while level < levels and packets[2].shape[0] < self.max_width:
+            packets, photons = advance(packets, level)
             by_level.append(photons)
             level += 1
         if level < levels:  # from here on, all levels have the same width
-            _, photons = jax.lax.scan(next_, packets, jnp.arange(level, levels))
+            _, photons = jax.lax.scan(advance, packets, jnp.arange(level, levels))
             by_level.append(jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), photons))
         photons = jax.tree.map(lambda *each: jnp.concatenate(each), *by_level).sorted()
         if merge > 0:
@@ -276,31 +280,10 @@ class PacketTree:
             photons.offset * optics.mean_free_path, jnp.where(any_left, photons.intensity, jnp.nan)
         )
 
-    def _level(
-        self, optics: Optics, key: PRNGKeyArray, packets: _Packets
-    ) -> tuple[_Packets, ScattererTemplate]:
-        """Advance packets by one level: the packets that go on, and the photons they leave (lengths in λ)."""
-        position, direction, light = packets
-        u = jax.random.uniform(key, (6, light.shape[0]))
-        flight = -jnp.log1p(-u[0])
-        position = position + flight[:, None] * direction
-        light, passed = self.energies(optics.opacity, light, flight, u[1])
-        sine_of_critical_angle = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
-        cosine = 1 - u[2] * (1 - _root(1 - sine_of_critical_angle**2))
-        after = _Packets(
-            jnp.concatenate([position] * 2),
-            jnp.concatenate([_turned(direction, cosine, u[3]), _turned(-direction, u[4], u[5])]),
-            jnp.concatenate([passed * cosine, passed * (1 - cosine)]),
-        )
-        if after.light.shape[0] > self.max_width:
-            _, brightest = jax.lax.top_k(jax.lax.stop_gradient(after.light), int(self.max_width))
-            after = jax.tree.map(lambda leaf: leaf[brightest], after)
-        return after, ScattererTemplate(position, optics.opacity * light)
-
     def energies(
         self, opacity: Scalar, light: Scalar, flight: Scalar, uniform: Scalar
     ) -> tuple[Scalar, Scalar]:
-        """The energy of packets at the end of their flights (lengths in λ), and what of it they hand on."""
+        """The energy of packets after their flights (lengths in λ), and what of it they hand on."""
         light = self.faded(opacity, light)
         return light, (1 - opacity) * light
 
@@ -317,12 +300,6 @@ def _root(squared: Scalar) -> Scalar:
     """Square root; 0 with derivative 0 for arguments up to 0. NaN stays NaN."""
     clamped = squared <= 0
     return jnp.where(clamped, 0, jnp.sqrt(jnp.where(clamped, 1, squared)))
-
-
-def _spread(key: PRNGKeyArray, n: int) -> Float[Array, "n 3"]:
-    """Directions spread evenly over the sphere and rotated at random: each alone is uniformly distributed."""
-    q, r = jnp.linalg.qr(jax.random.normal(key, (3, 3)))
-    return jnp.asarray(golden_spiral(n), q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
 
 
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:

@@ -6,6 +6,7 @@ volume rendering (2016), sections 3.3 and 3.4.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, get_args
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import computed_now
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
-from .baked import BakedLighting, bake, nodes_for
+from .baked import BakedLighting, bake
 from .deferred import Deferred
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
@@ -43,9 +44,8 @@ class ScattererTemplates(Lighting):
        `reach` of p_j.
     3. b, the brightness, grows with the intensities of the photons that are not hidden.
     4. s, the inner colour that shines through, comes from photons in the same material,
-    5. or in another one: a photon there lies at n / n' times its offset, and adds its colour with α' / α
-       times its intensity. Here n is the refractive index, α the opacity, and primes mark the photon's
-       material.
+    5. or in another one, of refractive index n' and opacity α': a photon there lies at n / n' times its
+       offset, and adds its colour with α' / α times its intensity.
     6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
@@ -53,47 +53,46 @@ class ScattererTemplates(Lighting):
 
     **Scale.** The paper's sum E b (c + s) has no unit. Here the intensities of a template sum to 1 (except
     for `given` ones), and k R turns the sum into radiance on the scale of `path_trace`: k = 4 / (3π), and R
-    is the `Optics.reflectance` of the sample's material. So a flat face of white matter, of which only the
-    surface is visible, has a radiance of R L under a `ConstantLight` of radiance L. White half-spaces have
-    0.9 to 1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times
-    (`docs/methods.md`). For darker colours, templates are too bright: in path tracing the colour darkens each
-    of many scatterings, in templates it darkens the sum once.
-
-    **Arguments:**
-
-    - `materials`: one or several. Where two overlap, the first counts.
-    - `lights`: one or several.
-    - `templates`: number per material, of which each pixel uses one, chosen at random (the paper does not say
-      which). A single one has no noise, takes less time, and is lopsided in the same way everywhere.
-      `blend`: use all of them for every sample, instead. This has less noise, and takes as much longer as
-      there are templates.
-    - `photons`: keep this many of each template's brightest photons, scaled to the energy of all. By default
-      all.
-    - `occlusion`: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
-      each segment taken at its far end; materials and the lit side have soft edges, and the image is
-      differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
-      points. The gradient with respect to λ, the light and the camera is then wrong, since it misses photons
-      that become hidden or change their material.
-    - `reach`: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
-      for thin parts in front of others.
-    - `cutoff`: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
-      misses the photons that are skipped.
-    - `seed`: of the templates, and of their choice for each pixel.
-    - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light of
-      all templates is computed once and then fetched, as long as volume, transfer function and lighting stay
-      the same; if any of them is traced, it is computed for each image. It carries no gradient.
-    - `packets`, `threshold`, `levels`: of the templates, see `scatterer_template`.
-    - `given`: templates to use as they are instead of simulated ones, with leading axes (materials,
-      templates). Then nothing depends on the materials' mean free paths.
+    is the `Optics.reflectance` of the sample's material. White half-spaces have 0.9 to 1.6 times the exact
+    radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For darker colours,
+    templates are too bright: in path tracing the colour darkens each of many scatterings, here it darkens the
+    sum once. It fails for long and for short mean free paths (`experiments/stability.py`).
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
-    show, since invisible points are not lit. Where it fails: `experiments/stability.py`, "long mean free
-    paths", "short mean free paths".
+    show, since invisible points are not lit.
 
-    **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
-    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for a grid that
-    does not fit into memory.
+    Args:
+        materials: one or several. Where two overlap, the first counts.
+        lights: one or several, of any kind but `HeadLight`.
+        templates: number per material, of which each pixel uses one, chosen at random (the paper does not say
+            which). A single one has no noise, takes less time, and is lopsided in the same way everywhere.
+        blend: use all templates for every sample, instead. This has less noise, and takes as much longer as
+            there are templates.
+        photons: keep this many of each template's brightest photons, scaled to the energy of all. By default
+            all.
+        occlusion: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
+            each segment taken at its far end; materials and the lit side have soft edges, and the image is
+            differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
+            points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
+            photons that become hidden or change their material.
+        reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
+            for thin parts in front of others.
+        cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
+            misses the photons that are skipped.
+        seed: of the templates, and of their choice for each pixel.
+        baked: False, or the number of nodes, along the volume's longest side, of a grid on which the light of
+            all templates is computed once and then fetched, as long as volume, transfer function and lighting
+            stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
+        packets: of the templates, see `scatterer_template`.
+        threshold: of the templates.
+        levels: of the templates.
+        given: templates to use as they are instead of simulated ones, with leading axes (materials,
+            templates). Then nothing depends on the materials' mean free paths.
+
+    Raises:
+        ValueError: for invalid arguments, missing `levels`, a material of which no photon is above the
+            threshold (if its opacity is traced, the image is NaN), and a grid that does not fit into memory.
     """
 
     materials: tuple[Material, ...]
@@ -133,18 +132,24 @@ class ScattererTemplates(Lighting):
         self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         if occlusion not in get_args(Occlusion):
             raise ValueError(f"occlusion must be one of {', '.join(get_args(Occlusion))}; got {occlusion!r}.")
-        self.occlusion, self.reach, self.seed = occlusion, _checked_reach(reach), integer("seed", seed, 0)
-        if cutoff is None:
-            cutoff = 0.02 if occlusion == "hard" else 0.0
-        self.cutoff = None
-        if is_traced(cutoff) or cutoff != 0:
-            self.cutoff = number("cutoff", cutoff, above=0, below=1)
+        multiples = np.asarray(reach, float)
+        if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
+            raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
+        self.occlusion, self.reach, self.seed = occlusion, tuple(multiples.tolist()), integer("seed", seed, 0)
+        cutoff = 0.02 * (occlusion == "hard") if cutoff is None else cutoff
+        skips = is_traced(cutoff) or cutoff != 0
+        self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
         # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
-        tree = PacketTree.checked(packets, threshold)
-        self.packets, self.threshold = tree.packets, tree.threshold
-        self.given = given
-        if given is not None:
+        tree = PacketTree(packets, threshold)
+        self.packets, self.threshold, self.given = tree.packets, tree.threshold, given
+        if given is None:
+            self.levels = tree.levels_of(self.materials, levels)
+            available = tree.capacity(self.levels)
+            if not is_traced([each.opacity for each in self.materials]):
+                opacities = [float(each.opacity) for each in self.materials]
+                available = min(available, max(tree.capacity(tree.levels(a), a) for a in opacities))
+        else:
             if not isinstance(given, ScattererTemplate):
                 raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")
             shape = given.intensity.shape
@@ -154,18 +159,13 @@ class ScattererTemplates(Lighting):
                     f"(materials, templates, n); got {shape}."
                 )
             self.templates, self.levels, available = shape[1], 0, shape[-1]
-        else:
-            self.levels = tree.levels_of(self.materials, levels)
-            available = tree.capacity(self.levels)
-            if not is_traced([each.opacity for each in self.materials]):
-                available = min(available, max(map(tree.most_photons, self.materials)))
         self.photons = available if photons is None else min(available, integer("photons", photons, 1))
 
     @property
     def farthest_read(self) -> float | None:
         if self.baked:
             return None
-        offset = np.asarray(self.simulated(blend=self.blend).offset)
+        offset = np.asarray(self.simulated().offset)
         indices = [float(material.refractive_index) for material in self.materials]
         stretched = max(indices) / min(indices)  # by refraction
         return float(np.max(np.linalg.norm(offset, axis=-1))) * max(1.0, *self.reach) * stretched
@@ -173,52 +173,32 @@ class ScattererTemplates(Lighting):
     def for_image(self, around: Surroundings) -> Shading:
         if self.baked:
             return _baked(self, around).for_image(around)
-        return self._by_photons(blend=self.blend, cutoff=self.cutoff)
-
-    def simulated(self, *, blend: bool) -> ScattererTemplate:
-        """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
-        each material."""
-        if self.given is not None:
-            templates = self.given
-        else:
-            templates = scatterer_templates(
-                self.materials,
-                self.seed,
-                count=self.templates,
-                packets=self.packets,
-                threshold=self.threshold,
-                levels=self.levels,
-            ).normalized()  # restores the energy that the threshold has cut off
-        if not blend:
-            return templates.brightest(self.photons)
-        blended = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
-        return blended.brightest(self.photons * self.templates)
-
-    def _by_photons(self, *, blend: bool, cutoff: Float[Array, ""] | None) -> PhotonShading:
         return PhotonShading(
-            self.materials,
-            self.lights,
-            self.simulated(blend=blend),
-            optics_of(self.materials),
-            cutoff,
-            blended=self.templates if blend else 1,
+            *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
+            blended=self.templates if self.blend else 1,
             occlusion=self.occlusion,
             reach=self.reach,
             seed=self.seed,
         )
 
-
-def _checked_reach(reach: Any) -> tuple[float, ...]:
-    multiples = np.asarray(reach, float)
-    if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
-        raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
-    return tuple(multiples.tolist())
+    def simulated(self) -> ScattererTemplate:
+        """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
+        each material."""
+        templates = self.given
+        if templates is None:
+            how: Any = {"packets": self.packets, "threshold": self.threshold, "levels": self.levels}
+            templates = scatterer_templates(self.materials, self.seed, count=self.templates, **how)
+            templates = templates.normalized()  # restores the energy that the threshold has cut off
+        if not self.blend:
+            return templates.brightest(self.photons)
+        blended = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
+        return blended.brightest(self.photons * self.templates)
 
 
 @eqx.filter_jit
 def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
-    nodes = nodes_for(around.volume, lighting.baked)  # checks the memory before templates are simulated
-    return bake(lighting._by_photons(blend=True, cutoff=None), around, nodes)
+    unbaked = replace(lighting, blend=True, cutoff=0.0, baked=False)
+    return bake(unbaked.for_image(around), around, lighting.baked)
 
 
 def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:
@@ -230,23 +210,25 @@ def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, mar
         return lighting
     # of the march, only the transforms that locate points affect the light
     spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
-    leaves, tree = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
-    if is_traced(leaves, volume.data):
+    inputs = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
+    if is_traced(inputs, volume.data):
         return lighting
     cache = memoized(volume.data, _bake_cache)
-    entry = cache.get(tree)
-    # large leaves, such as labels, are the same only if they are the same array
-    if entry is None or not all(
-        a is b or (np.size(a) <= 2**16 and np.array_equal(np.asarray(a), np.asarray(b)))
-        for a, b in zip(entry[0], leaves, strict=True)
-    ):
-        cache.clear()
+    if not cache or not _same(cache["inputs"], inputs):
         with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
             around = Surroundings(volume, transfer, march.locate(volume))
-        cache[tree] = entry = leaves, computed_now(_baked, lighting, around)
-    return entry[1]
+        cache.update(inputs=inputs, light=computed_now(_baked, lighting, around))
+    return cache["light"]
 
 
-def _bake_cache(_: Array) -> dict[Any, Any]:
-    """Cache of a volume's baked light: the last one only, keyed by its other inputs."""
+def _bake_cache(_: Array) -> dict[str, Any]:
+    """A volume's last baked light, and what it was computed from."""
     return {}
+
+
+def _same(a: tuple[list[Any], Any], b: tuple[list[Any], Any]) -> bool:
+    """Whether two flattened trees are equal. Large leaves, such as labels, must be the same array."""
+    return a[1] == b[1] and all(
+        one is other or (np.size(one) <= 2**16 and np.array_equal(np.asarray(one), np.asarray(other)))
+        for one, other in zip(a[0], b[0], strict=True)
+    )

@@ -33,29 +33,23 @@ class _Lanes(NamedTuple):
 def walk_all(
     begin: Callable[[Index], Walk], step: Callable[[Walk], Walk], count: int, lanes: int
 ) -> WalkResult:
-    """The results of all walks of a queue.
-
-    - `begin`: the walks with these indices, from 0 to `count`. Those past the last must not be alive.
-    - `step`: advances all lanes' walks by one step.
-    """
+    """The results of all walks of a queue. `begin`: the walks with these indices, from 0 to `count`; those
+    past the last must not be alive. `step`: advances all lanes' walks by one step."""
     lanes = min(lanes, count)
     fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)
     idle = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(begin, none))
     state = _Lanes(idle, none, jnp.zeros((), jnp.int32), WalkResult.zeros((count,)))
 
-    def refill(state: _Lanes) -> _Lanes:
+    def refill_and_step(state: _Lanes) -> _Lanes:
         free = ~state.walks.alive
         results = _stored(state, jnp.where(free, state.queue_index, count))
         queued = state.begun + jnp.cumsum(free, dtype=jnp.int32) - 1
         queue_index = jnp.where(free, jnp.minimum(queued, count), state.queue_index)
         walks = jax.tree.map(lambda new, old: jnp.where(free, new, old), begin(queue_index), state.walks)
         begun = jnp.minimum(state.begun + jnp.sum(free, dtype=jnp.int32), count)
-        return _Lanes(walks, queue_index, begun, results)
-
-    def refill_and_step(state: _Lanes) -> _Lanes:
-        state = refill(state)
-        return _step_until(step, state, jnp.where(state.begun < count, int(BUSY * lanes), fewer))
+        keep = jnp.where(begun < count, int(BUSY * lanes), fewer)
+        return _step_until(step, _Lanes(walks, queue_index, begun, results), keep)
 
     state = jax.lax.while_loop(lambda state: state.begun < count, refill_and_step, state)
     state = _step_until(step, _compact(state, fewer, count), jnp.zeros((), jnp.int32))

@@ -12,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.checks import Arrayable, all_finite, described, flag, integer, number
 from .._util.noise import hashed_uniforms_4, is_key
-from .._util.vec3 import Scalar
 from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
@@ -35,36 +34,30 @@ LANES = 2**13
 WALKS_PER_LANE = 128
 """Walks that each lane of a batch runs, one after the other."""
 
-MAX_SCATTERINGS = 2**20
-"""Scatterings that a walk may have by default: enough for media a thousand mean free paths thick."""
-
 NOT_DIFFERENTIABLE = (
     "path_trace has no derivative, but an input carries a tangent here (jax.grad, jax.jvp). Differentiate "
     "lighting.ScattererTemplates instead, or apply jax.lax.stop_gradient to the inputs."
 )
 """Error message: how often and where a path collides jumps with the extinction."""
 
-BEFORE_FIRST_STEP = np.uint32(2**32 - 1)
-"""Used in place of a walk's step number for what is drawn before its first step."""
-
 
 class PathTraced(eqx.Module):
     """A path-traced image, from the paths traced so far.
 
-    - `radiance`: linear RGB of the light that the volume scatters into the camera, mean over all paths,
-      without the background.
-    - `opacity`: the fraction of camera rays that met anything.
-    - `deviations`: sums of the squared deviations of each path's radiance from the mean.
-    - `exhausted`: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
-      contributed.
-    - `paths`: per pixel. `seed`: of all random numbers.
+    Attributes:
+        radiance: linear RGB of the light that the volume scatters into the camera, mean over all paths,
+            without the background.
+        opacity: the fraction of camera rays that met anything.
+        deviations: sums of the squared deviations of each path's radiance from the mean.
+        exhausted: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
+            contributed.
+        paths: per pixel.
     """
 
     radiance: Float[Array, "height width 3"]
     opacity: Float[Array, "height width"]
     deviations: Float[Array, "height width 3"]
     exhausted: Bool[Array, "height width"]
-    seed: UInt32[Array, ""]
     paths: int = eqx.field(static=True)
 
     @property
@@ -78,32 +71,31 @@ class PathTraced(eqx.Module):
         return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
-        """Linear RGB over a background: one colour (3,), or an image of the same shape. **Raises:**
-        `ValueError` for another shape."""
+        """Linear RGB over a background.
+
+        Args:
+            background: one colour (3,), or an image of the same shape.
+
+        Raises:
+            ValueError: for another shape.
+        """
         background = jnp.asarray(background, self.radiance.dtype)
         if background.shape not in ((3,), self.radiance.shape):
             shapes = f"(3,) or {self.radiance.shape}"
             raise ValueError(f"background must have shape {shapes}; got {background.shape}.")
-        return self.radiance + (1 - self.opacity[..., None]) * jnp.broadcast_to(
-            background, self.radiance.shape
-        )
+        background = jnp.broadcast_to(background, self.radiance.shape)
+        return self.radiance + (1 - self.opacity[..., None]) * background
 
     def joined(self, other: "PathTraced") -> "PathTraced":
-        """The result of this one's and another one's paths, of the same scene.
-
-        Source: Chan, Golub and LeVeque 1983.
-        """
+        """The image by the paths of both, of the same scene and different keys. Source: Chan, Golub and
+        LeVeque 1983."""
         paths = self.paths + other.paths
         share = other.paths / paths
         between = jnp.square(other.radiance - self.radiance) * (self.paths * share)
-        return PathTraced(
-            radiance=self.radiance + (other.radiance - self.radiance) * share,
-            opacity=self.opacity + (other.opacity - self.opacity) * share,
-            deviations=self.deviations + other.deviations + between,
-            exhausted=self.exhausted | other.exhausted,
-            seed=self.seed,
-            paths=paths,
-        )
+        radiance = self.radiance + (other.radiance - self.radiance) * share
+        opacity = self.opacity + (other.opacity - self.opacity) * share
+        deviations = self.deviations + other.deviations + between
+        return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths)
 
 
 def path_trace(
@@ -116,9 +108,8 @@ def path_trace(
     key: Any = 0,
     materials: Material | tuple[Material, ...] | None = None,
     anisotropy: Arrayable = 0.0,
-    max_scatterings: int | Any = None,
+    max_scatterings: int | Any = 2**20,
     antialias: bool | Any = False,
-    onto: PathTraced | Any = None,
     lanes: int | Any = None,
 ) -> PathTraced:
     """Image of a volume that scatters light any number of times.
@@ -127,38 +118,8 @@ def path_trace(
     colour, clipped to [0, 1]: an image corresponds to one by Mitsuba's `volpath` with a heterogeneous medium.
     (`render` treats the colour as light that the medium emits.)
 
-    The image is radiance, in the unit of `lights`: in a white furnace (albedo 1 under a `ConstantLight` of
-    radiance L) it is L times the opacity. Under light of radiance L from all sides, a half-space of albedo ω
-    reflects (1 - γ H(μ)) L, where γ = √(1 - ω), H is Chandrasekhar's H function, and μ is the cosine of the
-    viewing angle. `ScattererTemplates` are on the same scale.
-
-    **Arguments:**
-
-    - `volume`: on its own grid; curved grids (`ToroidalMap`) are not supported.
-    - `transfer`: a `TransferFunction`, a `LabelTransferFunction`, or another one with a `majorant`.
-    - `camera`: its rays pass through the centres of pixels, as in `render`; with `antialias`, through random
-      points in them.
-    - `lights`: those with a position or a direction are sampled at every scattering, one of them at random;
-      a `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
-      unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-    - `paths`: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once: for very many, use `onto`.
-    - `key`: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
-      and on the path's number.
-    - `materials`: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
-      is colour · (1 - opacity). Where materials overlap, the first counts.
-    - `anisotropy`: g in (-1, 1), the mean cosine of a scattering (Henyey and Greenstein).
-    - `max_scatterings`: after which a path ends, ≥ 1. By default 2²⁰, so that only Russian roulette ends a
-      path, with a probability that depends on its throughput. A smaller number gives an image of light
-      scattered at most that many times, and `exhausted` marks the pixels that lack some.
-    - `onto`: an earlier result of the same scene, camera and key, to which these paths are added.
-    - `lanes`: paths that are traced side by side. Memory grows with it; the result does not change.
-
-    **Returns:** a `PathTraced`, with the standard error of each pixel.
-
-    **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function without
-    a majorant, labels where the volume has none, and `onto` of another size or key; `RuntimeError` if it is
-    differentiated with respect to any of its inputs. It may be called in a function that is differentiated
-    with respect to something else.
+    The image is radiance, in the unit of `lights`, as that of `ScattererTemplates`: in a white furnace
+    (albedo 1 under a `ConstantLight` of radiance L) it is L times the opacity.
 
     NaN or infinity in any input makes the whole image NaN, since any path may reach it.
 
@@ -166,6 +127,35 @@ def path_trace(
     probability 6e-8, are never drawn.
 
     Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`.
+
+    Args:
+        volume: on its own grid; curved grids (`ToroidalMap`) are not supported.
+        transfer: a `TransferFunction`, a `LabelTransferFunction`, or another one with a `majorant`.
+        camera: its rays pass through the centres of pixels, as in `render`.
+        lights: those with a position or a direction are sampled at every scattering, one of them at random; a
+            `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
+            unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
+        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once. More paths of another key are added
+            by `PathTraced.joined`.
+        key: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
+            and on the path's number.
+        materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
+            is colour · (1 - opacity). Where materials overlap, the first counts.
+        anisotropy: g in (-1, 1), the mean cosine of a scattering (Henyey and Greenstein).
+        max_scatterings: after which a path ends, ≥ 1. By default 2²⁰, so that only Russian roulette ends a
+            path, with a probability that depends on its throughput. A smaller number gives an image of light
+            scattered at most that many times, and `exhausted` marks the pixels that lack some.
+        antialias: let rays pass through random points of their pixels.
+        lanes: paths that are traced side by side. Memory grows with it; the result does not change.
+
+    Returns:
+        A `PathTraced`, with the standard error of each pixel.
+
+    Raises:
+        ValueError: for arguments out of these ranges, no lights, a transfer function without a majorant, and
+            labels where the volume has none.
+        RuntimeError: if it is differentiated with respect to any of its inputs. It may be called in a
+            function that is differentiated with respect to something else.
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
@@ -178,23 +168,15 @@ def path_trace(
         raise ValueError("materials use labels, but this volume has none; give Volume(..., labels=...).")
     paths = integer("paths", paths, 1)
     anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
-    if max_scatterings is None:
-        max_scatterings = MAX_SCATTERINGS
     limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
-    if onto is not None:
-        _check_earlier(onto, camera, seed)
-    first = 0 if onto is None else onto.paths
     blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
-    traced = _trace(
-        *(volume, words_of(volume), blocks, transfer, materials, lights, anisotropy),
-        *(jnp.asarray(limit, jnp.int32), camera, seed, jnp.asarray(first, jnp.uint32)),
-        *(paths, lanes, pixels, antialias),
-    )
-    return traced if onto is None else onto.joined(traced)
+    inputs = volume, blocks, transfer, materials, lights, anisotropy, camera
+    limit = jnp.asarray(limit, jnp.int32)
+    return _trace(inputs, words_of(volume), limit, seed, paths, lanes, pixels, antialias)
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -208,38 +190,21 @@ def _seed(key: Any) -> UInt32[Array, ""]:
     return jax.random.bits(key, (), jnp.uint32)
 
 
-def _check_earlier(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> None:
-    if not isinstance(onto, PathTraced):
-        raise ValueError(f"onto must be an earlier result of path_trace; got {onto!r}.")
-    size = camera.size[::-1]
-    if onto.opacity.shape != size:
-        raise ValueError(f"onto must have the camera's size {size}; got size {onto.opacity.shape}.")
-    if not is_traced(onto.seed, seed) and onto.seed != seed:
-        raise ValueError("onto must be of the same key, since otherwise other paths would be drawn again.")
-
-
 @compiled
 def _trace(
-    volume: Volume,
+    inputs: tuple[Any, ...],
     words: UInt32[Array, " voxels"] | None,
-    blocks: Blocks,
-    transfer: Transfer,
-    materials: tuple[Material, ...],
-    lights: tuple[Light, ...],
-    anisotropy: Scalar,
     max_scatterings: Int[Array, ""],
-    camera: Camera,
     seed: UInt32[Array, ""],
-    first: UInt32[Array, ""],
     paths: int,
     lanes: int,
     pixels: int,
     antialias: bool,
 ) -> PathTraced:
-    """Trace the image in batches of `pixels`. `words`: the volume's packed voxels. `first`: number
-    of each pixel's first path."""
+    """Trace the image in batches of `pixels`. `words`: the volume's packed voxels."""
+    # float64 becomes float32, whose rounding is far below the noise
     volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
-        _single, (volume, blocks, transfer, materials, lights, anisotropy, camera)
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, inputs
     )
     packed, (width, height) = with_words(volume, words), camera.size
     medium = Medium.of(packed, blocks, transfer, materials)
@@ -255,29 +220,23 @@ def _trace(
         def begin(index: Int[Array, " lanes"]) -> Walk:
             pixel, path = number * pixels + index // paths, index % paths
             alive = valid & (index < count) & (pixel < width * height)
-            words = (
-                pixel.astype(jnp.uint32),
-                first + path.astype(jnp.uint32),
-                jnp.broadcast_to(seed, index.shape),
-            )
+            words = pixel.astype(jnp.uint32), path.astype(jnp.uint32), jnp.broadcast_to(seed, index.shape)
             return jax.vmap(partial(_begin, scene, camera, antialias))(words, alive)
 
         results = walk_all(begin, partial(step, scene), count, lanes)
-        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results))
+        results = jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results)
+        radiance = jnp.stack(results.radiance, axis=-1)
+        mean = radiance.mean(axis=1)
+        opacity = results.met.astype(mean.dtype).mean(axis=1)
+        deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
+        return mean, opacity, deviations, results.exhausted.any(axis=1)
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
-    images = jax.tree.map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
-    images = jax.tree.map(
-        lambda leaf: jnp.where(valid, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, images
-    )
-    return PathTraced(*images, seed=seed, paths=paths)
-
-
-def _single(leaf: Array) -> Array:
-    """Convert float64 to float32, whose rounding is far below the noise."""
-    return leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf
+    *numbers, exhausted = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
+    radiance, opacity, deviations = (jnp.where(valid, each, jnp.nan) for each in numbers)
+    return PathTraced(radiance, opacity, deviations, exhausted, paths)
 
 
 def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
@@ -285,19 +244,15 @@ def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, aliv
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
     if antialias:
-        x, y, *_ = hashed_uniforms_4(pixel, path, jnp.full_like(pixel, BEFORE_FIRST_STEP), seed)
+        no_step = jnp.full_like(pixel, np.uint32(2**32 - 1))  # in place of a step's number
+        x, y, *_ = hashed_uniforms_4(pixel, path, no_step, seed)
         origin, direction = camera.ray(column.astype(x.dtype) + x - 0.5, row.astype(y.dtype) + y - 0.5)
     else:
         origin, direction = camera.ray(column, row)
     ray = enter(Affine(scene.volume), origin, direction, (column, row))
     start = ray.path(jnp.zeros_like(ray.length))
     flight = scene.flight(start, direction, jnp.full_like(ray.length, jnp.inf))
-    return Walk.begin(words, flight, direction, alive & (ray.length > 0))
-
-
-def _statistics(results: WalkResult) -> tuple[Array, ...]:
-    """Fields of `PathTraced`, from radiance to exhausted, for each pixel of results (pixels, paths)."""
-    radiance = jnp.stack(results.radiance, axis=-1)
-    mean = radiance.mean(axis=1)
-    deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
-    return mean, results.met.astype(mean.dtype).mean(axis=1), deviations, results.exhausted.any(axis=1)
+    zero, result = jnp.zeros_like(flight.depth), WalkResult.zeros(())
+    black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
+    steps, to_light, alive = jnp.zeros((), jnp.int32), jnp.zeros((), bool), alive & (ray.length > 0)
+    return Walk(words, steps, flight, to_light, direction, white, black, zero, result, alive)

@@ -16,19 +16,12 @@ def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
     return (1 - g * g) / (4 * math.pi * squared * jnp.sqrt(squared))
 
 
-def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
-    """Draw a cosine from `phase` by inversion, from a uniform number in [0, 1).
-
-    The usual inverse, `(1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g`, multiplied out, for g near 0.
-    """
-    g, x = anisotropy, 2 * uniform - 1
-    numerator = x + g * ((3 + x * x) / 2 + g * (x - g * (1 - x * x) / 2))
-    return jnp.clip(numerator / jnp.square(1 + g * x), -1, 1)
-
-
 def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
     """Draw a unit direction from `phase` around the z axis, from two uniform numbers in [0, 1)."""
-    cosine = scattered_cosine(anisotropy, first)
+    # the usual inverse, (1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g, multiplied out, for g near 0
+    g, x = anisotropy, 2 * first - 1
+    numerator = x + g * ((3 + x * x) / 2 + g * (x - g * (1 - x * x) / 2))
+    cosine = jnp.clip(numerator / jnp.square(1 + g * x), -1, 1)
     sine = jnp.sqrt(jnp.maximum(1 - cosine * cosine, 0))
     angle = 2 * math.pi * second
     return sine * jnp.cos(angle), sine * jnp.sin(angle), cosine

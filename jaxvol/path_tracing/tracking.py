@@ -28,11 +28,15 @@ TINY = 1e-20
 
 
 class Flight(NamedTuple):
-    """A straight segment through the grid, travelled up to `depth`.
+    """A straight segment through the grid.
 
-    - `start`: grid coordinate. `rate`: its change per world length; no component is 0.
-    - `depth`: world length from the start, so far. `end`: the depth at which the flight ends.
-    - `block`: the current block. `entry`: its entry in the table of majorants.
+    Attributes:
+        start: grid coordinate.
+        rate: change of the grid coordinate per world length; no component is 0.
+        depth: world length from the start, so far.
+        end: depth at which the flight ends.
+        block: the current one.
+        entry: of the block, in the table of majorants.
     """
 
     start: Vec3
@@ -48,7 +52,8 @@ class Flight(NamedTuple):
     ) -> "Flight":
         """Flight from a grid coordinate over `distance`, or to the grid's border. `direction`: its components
         along the grid's axes, of a unit vector."""
-        x, y, z = (_nonzero(d / step) for d, step in zip(direction, spacing, strict=True))
+        x, y, z = (d / step for d, step in zip(direction, spacing, strict=True))
+        x, y, z = (jnp.where(jnp.abs(rate) < TINY, TINY, rate) for rate in (x, y, z))
         end = distance
         for rate, at, last in zip((x, y, z), start, majorants.last, strict=True):
             end = jnp.minimum(end, (jnp.where(rate > 0, last, 0) - at) / rate)
@@ -57,11 +62,8 @@ class Flight(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Where a flight has stopped.
-
-    - `found`: at a collision candidate, at the grid coordinate `coordinate`, under this `majorant`.
-    - `over`: at its end. If neither holds, the flight is still on its way.
-    """
+    """Where a flight has stopped: at a collision candidate if `found`, at its end if `over`; if neither
+    holds, it is still on its way. `coordinate`: in the grid."""
 
     found: Bool[Array, "..."]
     over: Bool[Array, "..."]
@@ -90,7 +92,7 @@ def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Fligh
     """Advance a flight by an optical depth, or to the border of the box in which its majorant holds. Also
     returns the remaining optical depth, whether it is used up (a candidate), and whether the flight ends."""
     majorant, reach = jnp.maximum(flight.entry, 0), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
-    axes = list(zip(flight.start, flight.rate, majorants.indices(flight.block), majorants.shape, strict=True))
+    axes = list(zip(flight.start, flight.rate, flight.block, majorants.table.shape, strict=True))
     walls = [_wall(start, rate, index, reach, count) for start, rate, index, count in axes]
     border = jnp.minimum(jnp.minimum(walls[0], walls[1]), walls[2])
     stop = jnp.minimum(border, flight.end)
@@ -98,14 +100,13 @@ def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Fligh
     collides, ends = optical < thickness, flight.end <= border
     collision = flight.depth + optical / jnp.where(collides, majorant, 1)
     depth = jnp.where(collides, jnp.minimum(collision, stop), jnp.maximum(stop, flight.depth))
-    behind = majorants.block(
-        *(
-            _next(start + depth * rate, rate, index, reach, count, wall <= border)
-            for (start, rate, index, count), wall in zip(axes, walls, strict=True)
+    x, y, z = (
+        jnp.where(
+            collides | ends, index, _next(start + depth * rate, rate, index, reach, count, wall <= border)
         )
+        for (start, rate, index, count), wall in zip(axes, walls, strict=True)
     )
-    block = jnp.where(collides | ends, flight.block, behind)
-    there = Flight(flight.start, flight.rate, depth, flight.end, block, majorants.at(block))
+    there = flight._replace(depth=depth, block=(x, y, z), entry=majorants.at((x, y, z)))
     return there, optical - thickness, collides, ~collides & ends
 
 
@@ -124,7 +125,3 @@ def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: i
     arrived = jnp.floor(coordinate / BLOCK).astype(jnp.int32)
     inside = jnp.clip(arrived, jnp.maximum(first, 0), jnp.minimum(last, count - 1))
     return jnp.where(leaves, jnp.where(ahead, last + 1, first - 1), inside)
-
-
-def _nonzero(rate: Scalar) -> Scalar:
-    return jnp.where(jnp.abs(rate) < TINY, TINY, rate)

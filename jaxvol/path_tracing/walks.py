@@ -4,8 +4,9 @@ A walk is always on one flight: its own, or one from its last scattering towards
 volume in the same way, so that walks at different stages run side by side, a step at a time.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.noise import hashed_uniforms_4
 from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, select, times
-from ..lighting.lights import Arriving, ConstantLight, Light, LocatedLight
+from ..lighting.lights import Arriving, ConstantLight, Light
 from ..scene.space import Affine
 from ..scene.volume import Volume
 from ..xla.memory import in_memory
@@ -48,12 +49,17 @@ class WalkResult(NamedTuple):
 class Walk(NamedTuple):
     """The state of one path.
 
-    - `words`: key of all its random numbers. `steps`: number of steps so far.
-    - `flight`: the current flight: towards a light if `to_light`, else its own.
-    - `direction`: of its own flight, world, unit; on the way to a light, that of its next own flight.
-    - `throughput`: fraction of the light at its end that arrives at the camera; (r, g, b).
-    - `unoccluded`: what the light adds without occlusion; `transmittance`: towards the light, so far.
-    - `alive`: whether it continues.
+    Attributes:
+        words: key of all its random numbers.
+        steps: number of steps so far.
+        flight: the current one: towards a light if `to_light`, else its own.
+        to_light: whether it is on the way to a light.
+        direction: of its own flight, world, unit; on the way to a light, that of its next own flight.
+        throughput: fraction of the light at its end that arrives at the camera; (r, g, b).
+        unoccluded: what the light adds without occlusion.
+        transmittance: towards the light, so far.
+        result: of the path, so far.
+        alive: whether it continues.
     """
 
     words: Words
@@ -67,14 +73,6 @@ class Walk(NamedTuple):
     result: WalkResult
     alive: Bool[Array, ""]
 
-    @classmethod
-    def begin(cls, words: Words, flight: Flight, direction: Vec3, alive: Bool[Array, ""]) -> "Walk":
-        """A walk on its first flight, from where the camera's ray enters the volume."""
-        zero = jnp.zeros_like(flight.depth)
-        black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
-        steps, to_light, result = jnp.zeros((), jnp.int32), jnp.zeros((), bool), WalkResult.zeros(())
-        return cls(words, steps, flight, to_light, direction, white, black, zero, result, alive)
-
 
 class WalkScene(NamedTuple):
     """The scene that walks travel through."""
@@ -86,8 +84,9 @@ class WalkScene(NamedTuple):
     max_scatterings: Int[Array, ""]
 
     @property
-    def located(self) -> tuple[LocatedLight, ...]:
-        return tuple(light for light in self.lights if isinstance(light, LocatedLight))
+    def located(self) -> tuple[Light, ...]:
+        """The lights that reach each point from a single direction."""
+        return tuple(light for light in self.lights if not isinstance(light, ConstantLight))
 
     @property
     def surroundings(self) -> Vec3:
@@ -103,60 +102,52 @@ class WalkScene(NamedTuple):
         """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
         return Flight.to(self.medium.majorants, start, self.space.own(direction), self.space.spacing, end)
 
-    def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
-        """Light at a grid coordinate from one located light, chosen at random, weighted by their number."""
+    def light(self, coordinate: Vec3, direction: Vec3, uniform: Scalar) -> Arriving:
+        """Light at a grid coordinate of a walk in this direction, from one located light, chosen at random,
+        weighted by their number."""
         x, y, z = self.space.point(coordinate)
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
-        each = [light.at((x, y, z)) for light in self.located]
+        each = [light.at((x, y, z), direction) for light in self.located]
         one = jax.tree.map(lambda *parts: jnp.select([chosen == i for i in range(count)], parts), *each)
         r, g, b = one.irradiance
         return one._replace(irradiance=(r * count, g * count, b * count))
 
 
-class Scattering(NamedTuple):
-    """The outcome of a scattering: new values for fields of `Walk`, and the next flight `toward` (world) a
-    direction up to its `end`."""
-
-    direction: Vec3
-    throughput: Vec3
-    unoccluded: Vec3
-    to_light: Bool[Array, ""]
-    toward: Vec3
-    end: Scalar
+Scattering: TypeAlias = tuple[Vec3, Vec3, Vec3, Bool[Array, "..."], Vec3, Scalar]
+"""New direction, throughput, `unoccluded` and `to_light` of a walk; its next flight's direction and end."""
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
     """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome. Whatever is
     expensive is put in memory, since XLA would recompute it for each of its uses."""
     live = jnp.any(walks.alive)
-    first, second = (in_memory(live, jax.vmap(partial(_uniforms, stage=i)), walks) for i in (0, 1))
+
+    def uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        pixel, path, seed = walk.words
+        return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
+
+    def each(f: Callable[..., Any], *arguments: Any) -> Any:
+        return in_memory(live, jax.vmap(f), *arguments)
+
+    first, second = (each(partial(uniforms, stage=stage), walks) for stage in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
-    turn = in_memory(
-        live, jax.vmap(sample_phase, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
-    )
-    flight, candidate = in_memory(live, jax.vmap(partial(fly, scene.medium.majorants)), walks.flight, draw)
-    measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.coordinate)
-    extinction, albedo = in_memory(live, jax.vmap(scene.medium.classify), measured)
+    turn = each(partial(sample_phase, scene.anisotropy), first_turn, second_turn)
+    flight, candidate = each(partial(fly, scene.medium.majorants), walks.flight, draw)
+    extinction, albedo = each(scene.medium.classify, each(scene.medium.measure, candidate.coordinate))
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
-    scattering = in_memory(
-        live,
-        jax.vmap(partial(_scatter, scene)),
-        *(walks, candidate.coordinate, albedo, turn, choose, survive),
-    )
+    at = candidate.coordinate
+    scattering = each(partial(_scatter, scene), walks, at, albedo, turn, choose, survive)
     candidate = candidate._replace(found=candidate.found & walks.alive, over=candidate.over & walks.alive)
     walks = walks._replace(flight=flight, steps=walks.steps + 1)
-    return jax.vmap(partial(_advance, scene))(walks, candidate, share, scattering, decide)
 
+    def advance(walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, u: Scalar) -> Walk:
+        advanced = _delta_tracking(scene, walk, candidate, share, scattering, u)
+        if not scene.located:
+            return advanced
+        return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, share, u), advanced)
 
-def _advance(
-    scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
-) -> Walk:
-    """The walk after a candidate, where `share` is extinction / majorant; or after the end of its flight."""
-    advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
-    if not scene.located:
-        return advanced
-    return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, share, decide), advanced)
+    return jax.vmap(advance)(walks, candidate, share, scattering, decide)
 
 
 def _scatter(
@@ -169,33 +160,33 @@ def _scatter(
     endless = jnp.full_like(survive, jnp.inf)
     if not scene.located:
         no = jnp.zeros(survive.shape, bool)
-        return Scattering(direction, throughput, walk.unoccluded, no, direction, endless)
-    light = scene.light(coordinate, choose)
+        return direction, throughput, walk.unoccluded, no, direction, endless
+    light = scene.light(coordinate, walk.direction, choose)
+    assert light.toward is not None
     density = phase(dot(walk.direction, light.toward), scene.anisotropy)
     unoccluded = scaled(times(before_roulette, light.irradiance), density)
     to_light = greatest(unoccluded) > 0
     toward, end = select(to_light, light.toward, direction), jnp.where(to_light, light.distance, endless)
-    return Scattering(direction, throughput, unoccluded, to_light, toward, end)
+    return direction, throughput, unoccluded, to_light, toward, end
 
 
 def _delta_tracking(
     scene: WalkScene, walk: Walk, candidate: Candidate, share: Scalar, scattering: Scattering, decide: Scalar
 ) -> Walk:
     """Advance a walk on its own flight. A collision scatters it; at the end it gathers the constant light."""
-    before = walk.result
+    before, (direction, throughput, unoccluded, to_light, toward, end) = walk.result, scattering
     collides = candidate.found & (decide < share)
     capped = collides & (before.scatterings >= scene.max_scatterings)
     scatters = collides & ~capped
     gathered = times(walk.throughput, scene.surroundings)
     gathered = scaled(gathered, (candidate.over & before.met).astype(share.dtype))
-    next_flight = scene.flight(candidate.coordinate, scattering.toward, scattering.end)
-    goes_on = scattering.to_light | (greatest(scattering.throughput) > 0)
+    goes_on = to_light | (greatest(throughput) > 0)
     return walk._replace(
-        flight=_where(scatters, next_flight, walk.flight),
-        to_light=scatters & scattering.to_light,
-        direction=select(scatters, scattering.direction, walk.direction),
-        throughput=select(scatters, scattering.throughput, walk.throughput),
-        unoccluded=select(scatters, scattering.unoccluded, walk.unoccluded),
+        flight=_where(scatters, scene.flight(candidate.coordinate, toward, end), walk.flight),
+        to_light=scatters & to_light,
+        direction=select(scatters, direction, walk.direction),
+        throughput=select(scatters, throughput, walk.throughput),
+        unoccluded=select(scatters, unoccluded, walk.unoccluded),
         transmittance=jnp.ones_like(walk.transmittance),
         result=WalkResult(
             plus(before.radiance, gathered),
@@ -237,9 +228,3 @@ def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:
     survives = uniform * ROULETTE < most
     weight = ROULETTE / jnp.where(most > 0, most, 1)
     return scaled(throughput, jnp.where(small, jnp.where(survives, weight, 0), 1))
-
-
-def _uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Four uniform random numbers for stage 0 or 1 of a walk's next step."""
-    pixel, path, seed = walk.words
-    return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.compositing import blending
 from jaxvol.compositing.blending import Fragment
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import ConstantLight, Deferred, Material, ScattererTemplates
@@ -58,7 +59,7 @@ def composited(fragments):
 
         over = MODES["over"]
         found = {name: mode.end(state(mode, 0, CELLS)[0]) for name, mode in MODES.items()}
-        joined = over.end(over.joined(state(over, 0, 5)[0], state(over, 5, CELLS)[0]))
+        joined = over.end(blending.joined(state(over, 0, 5)[0], state(over, 5, CELLS)[0]))
         return {**found, "joined": joined}, {name: state(mode, 0, CELLS)[1] for name, mode in MODES.items()}
 
     return of_ray(*(jnp.asarray(part, jnp.float32 if part.dtype == float else bool) for part in fragments))

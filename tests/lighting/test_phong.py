@@ -14,7 +14,7 @@ import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.engine.acceleration import VolumeAcceleration, slopes_of, with_words, words_of
 from jaxvol.lighting import Deferred, DirectionalLight, HeadLight, Phong, PointLight
-from jaxvol.lighting.shading import shade_sample
+from jaxvol.lighting.shading import Shader
 from jaxvol.scene.space import Affine, world_gradient
 
 from ..scenes import BOX, PLANE, RESOLUTION, SIZE, around, in_float64, slow
@@ -122,7 +122,7 @@ def all_slopes(scene, viewer):
     around = surroundings(volume, jv.TransferFunction((0.0, 1.0), np.ones((2, 3)), (1.0, 1.0)))
     sample = sample_at(around, jnp.asarray(POINT, viewer.dtype), jnp.ones((), viewer.dtype), zero, -viewer)
     sample = sample._replace(color=apart(jnp.asarray(COLOR, viewer.dtype)))
-    color = jnp.stack(shade_sample(lighting.for_image(around), around, sample))
+    color = jnp.stack(Shader.of(lighting, around)(sample))
     return jnp.sum(color), color
 
 

@@ -222,7 +222,7 @@ def test_a_pixel_uses_one_of_a_materials_templates_and_a_blend_all():
     assert 0.25 < is_first.mean() < 0.75
     blend = ScattererTemplates(MATERIALS[0], ConstantLight(), given=templates, blend=True)
     half = np.sort(np.asarray(templates.intensity).reshape(-1))[::-1] / 2
-    np.testing.assert_allclose(blend.simulated(blend=True).intensity[0, 0], half, rtol=1e-6)
+    np.testing.assert_allclose(blend.simulated().intensity[0, 0], half, rtol=1e-6)
 
 
 def test_nan_in_light_or_material_reaches_the_sample():

@@ -180,7 +180,8 @@ def test_light_arrives_at_the_world_point():
 
     @jax.jit
     def light(node):
-        arriving = scene.light(node, jnp.float32(0.5))
+        arriving = scene.light(node, vector((0, 0, 1)), jnp.float32(0.5))
+        assert arriving.toward is not None
         return arriving.distance, jnp.stack(arriving.toward)
 
     distance, toward = light(vector(node))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol.path_tracing.phase import phase, sample_phase, scattered, scattered_cosine
+from jaxvol.path_tracing.phase import phase, sample_phase, scattered
 
 
 ANISOTROPIES = np.array([-0.95, -0.5, -1e-4, 0.0, 1e-6, 0.3, 0.9, 0.99], np.float32)
@@ -27,7 +27,7 @@ def test_the_phase_function_is_a_density_of_mean_cosine_g():
 def test_cosines_are_sampled_from_the_phase_function():
     """The cumulative distribution at the sampled cosine is the uniform number that it was sampled with."""
     uniform = np.linspace(0.005, 0.995, 199)
-    drawn = for_each(lambda u, g: scattered_cosine(g, u), uniform)
+    drawn = for_each(lambda u, g: sample_phase(g, u, 0 * u)[2], uniform)
     for g, cosine in zip(ANISOTROPIES.astype(float), drawn, strict=True):
         # cumulative distribution of the Henyey–Greenstein phase function, in closed form, float64
         if abs(g) > 1e-3:
