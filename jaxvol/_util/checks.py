@@ -129,6 +129,12 @@ def number(
     )
 
 
+def not_negative(name: str, value: Arrayable) -> Array:
+    """`value` as a finite scalar of at least 0."""
+    message = f"{name} must not be negative; got {{got}}."
+    return require(finite_array(name, value, ()), lambda scalar: scalar >= 0, message)
+
+
 def increasing(name: str, value: Arrayable) -> Array:
     """`value` as an array of at least two numbers that increase, but for two equal ones that make a step."""
     array = finite_array(name, value, (None,))

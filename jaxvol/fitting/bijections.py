@@ -19,8 +19,8 @@ from ..scene.camera import Camera, axes_of
 
 
 MARGIN = 1e-3
-"""A start closer than this to an open end of the range (relative to the scale) is moved to this distance from
-it: at the end itself the map is flat, and a fit could never leave it."""
+"""Least distance of a start from an open end of the range, relative to the scale: at the end itself the map
+is flat, and a fit could never leave it."""
 
 
 class Bijection(eqx.Module):
@@ -35,13 +35,10 @@ class Bijection(eqx.Module):
 
     @abstractmethod
     def inverse(self, value: Any, name: str = "value") -> Any:
-        """Free variables for a value.
-
-        **Raises:** `ValueError`, naming `name`, for a value that is not allowed.
-        """
+        """Free variables for a value. A value that is not allowed raises a `ValueError` that names `name`."""
 
     def moved(self, value: Any) -> Any:
-        """Parts of a value that the free variables change."""
+        """What of a value the free variables change."""
         return value
 
 
@@ -62,20 +59,18 @@ class Unconstrained(Bijection):
         return free
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
-        return _finite(value, name)
+        return finite_array(name, value, (...,))
 
 
 class Positive(Bijection):
-    """Positive numbers: `scale` · log(1 + exp(free)).
+    """Positive numbers: `scale` · log(1 + exp(free)). A start below `scale` / 1000 is raised to that.
 
-    **Arguments:**
+    Args:
+        scale: A typical value, in the value's unit, > 0. The map is linear far above it and exponential far
+            below.
 
-    - `scale`: a typical value, in the value's unit, > 0. The map is linear far above it and exponential far
-      below.
-
-    A start at 0, or below `scale` / 1000, is raised to `scale` / 1000.
-
-    **Raises:** `ValueError` for a scale that is not positive, and for negative starts.
+    Raises:
+        ValueError: For a scale that is not positive, and for negative starts.
     """
 
     scale: Float[Array, ""]
@@ -87,30 +82,25 @@ class Positive(Bijection):
         return self.scale.astype(free.dtype) * jax.nn.softplus(free)
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
-        value = require(
-            _finite(value, name), lambda v: v >= 0, f"{name} must not be negative to be fitted; got {{got}}."
-        )
-        part = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
-        return part + jnp.log(-jnp.expm1(-part))  # inverse of softplus, which JAX lacks
+        message = f"{name} must not be negative to be fitted; got {{got}}."
+        value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
+        ratio = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
+        return ratio + jnp.log(-jnp.expm1(-ratio))  # inverse of softplus, which JAX lacks
 
 
 class UnitInterval(Bijection):
-    """Numbers between 0 and 1: 1 / (1 + exp(-free)).
+    """Numbers between 0 and 1: 1 / (1 + exp(-free)). Starts keep a distance of 1/1000 from both ends.
 
-    A start within 1/1000 of an end is moved to that distance from it.
-
-    **Raises:** `ValueError` for starts outside [0, 1].
+    Raises:
+        ValueError: For starts outside [0, 1].
     """
 
     def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         return jax.nn.sigmoid(free)
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
-        value = require(
-            _finite(value, name),
-            lambda v: (v >= 0) & (v <= 1),
-            f"{name} must be in [0, 1] to be fitted; got {{got}}.",
-        )
+        message = f"{name} must be in [0, 1] to be fitted; got {{got}}."
+        value = require(finite_array(name, value, (...,)), lambda v: (v >= 0) & (v <= 1), message)
         return logit(jnp.clip(value, MARGIN, 1 - MARGIN))
 
 
@@ -122,7 +112,11 @@ class Pose(Bijection):
     between the two. Everything else (field of view, size) stays fixed. Rotating about the focal point, rather
     than about the camera itself, keeps rotation and translation from imitating each other.
 
-    **Raises:** `ValueError` for a camera that is not a rigid motion of `start`.
+    Args:
+        start: The camera at which both are 0.
+
+    Raises:
+        ValueError: For a camera that is not a rigid motion of `start`.
     """
 
     whole: bool = eqx.field(static=True, default=True, init=False)
@@ -132,14 +126,9 @@ class Pose(Bijection):
         start = jax.lax.stop_gradient(self.start)
         arm = start.position - start.focal_point
         focal_point = start.focal_point + jnp.linalg.norm(arm) * free["translation"]
+        position = focal_point + rotate(free["rotation"], arm)
         return eqx.tree_at(
-            _moved,
-            self.start,
-            (
-                focal_point + rotate(free["rotation"], arm),
-                focal_point,
-                rotate(free["rotation"], start.view_up),
-            ),
+            _moved, self.start, (position, focal_point, rotate(free["rotation"], start.view_up))
         )
 
     def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
@@ -184,7 +173,3 @@ def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "
     second = jnp.where(small, 0.5 - square / 24, 2 * (jnp.sin(angle / 2) / angle) ** 2)
     across = jnp.cross(turn, vector)
     return vector + first * across + second * jnp.cross(turn, across)
-
-
-def _finite(value: Arrayable, name: str) -> Array:
-    return finite_array(name, value, (None,) * np.ndim(value))

@@ -1,6 +1,5 @@
 """Which parameters are free, and within which bounds? Assigns a bijection to each."""
 
-import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -40,8 +39,10 @@ class Free(eqx.Module):
     def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", FreeVariables]:
         """The mapping from free variables to parameters, and the free variables for `parameters`.
 
-        **Raises:** `ValueError` for constraints or a `where` that do not match the parameters, parameters
-        outside their bounds or not finite, and if nothing is free."""
+        Raises:
+            ValueError: For constraints or a `where` that do not match the parameters, parameters outside
+                their bounds or not finite, and if nothing is free.
+        """
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
         tree = _select(_resolve(parameters, constraints), where)
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
@@ -59,7 +60,7 @@ class Free(eqx.Module):
         return jax.tree.unflatten(self.structure, self._nodes(free))
 
     def moved(self, free: FreeVariables) -> list[Any]:
-        """Parts of the parameters that are fitted."""
+        """What of the parameters is fitted."""
         nodes = zip(self.bijections, self._nodes(free), strict=True)
         return [None if isinstance(b, Fixed) else b.moved(node) for b, node in nodes]
 
@@ -77,9 +78,9 @@ class Free(eqx.Module):
         return [held if isinstance(b, Fixed) else b.forward(u) for b, held, u in each]
 
 
-def size(free: FreeVariables) -> int:
-    """Number of free variables."""
-    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(free))
+def size(tree: PyTree) -> int:
+    """Number of numbers in a tree of arrays."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 def _is_bijection(node: Any) -> bool:
@@ -91,18 +92,15 @@ def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
 
     def expand(constraint: Any, node: Any) -> PyTree:
         if constraint is None:
-            return jax.tree.map(_default, node, is_leaf=lambda n: isinstance(n, tuple(_DEFAULTS)))
+            return jax.tree.map(_default, node, is_leaf=lambda n: isinstance(n, KNOWN))
         if not _is_bijection(constraint):
             raise ValueError(f"constraints must hold bijections, such as Positive(); got {constraint!r}.")
         if constraint.whole:
             return constraint
         return jax.tree.map(lambda leaf: constraint if eqx.is_inexact_array(leaf) else Fixed(), node)
 
-    def is_leaf(node: Any) -> bool:
-        return node is None or _is_bijection(node)
-
     try:
-        return jax.tree.map(expand, constraints, parameters, is_leaf=is_leaf)
+        return jax.tree.map(expand, constraints, parameters, is_leaf=lambda n: n is None or _is_bijection(n))
     except (ValueError, TypeError, KeyError) as fault:
         if "constraints" in str(fault):
             raise
@@ -112,48 +110,37 @@ def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
         ) from fault
 
 
+KNOWN = (
+    TransferFunction,
+    TransferFunction2D,
+    LabelTransferFunction,
+    Camera,
+    ToroidalMap,
+    Volume,
+    March,
+    Material,
+)
+"""Types with constraints of their own."""
+
+
 def _default(node: Any) -> PyTree:
-    for kind, constraint in _DEFAULTS.items():
-        if isinstance(node, kind):
-            return constraint(node)
-    return Unconstrained() if eqx.is_inexact_array(node) else Fixed()
-
-
-def _of_transfer(transfer: TransferFunction | TransferFunction2D) -> PyTree:
-    top = float(jnp.max(transfer.extinction))
-    bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
-    return eqx.tree_at(lambda t: (t.colors, t.extinction), _fixed(transfer), bounds)
-
-
-def _of_labels(transfer: LabelTransferFunction) -> PyTree:
-    # factors of the extinctions, which are free themselves
-    return eqx.tree_at(lambda t: t.stacked, _fixed(transfer), _of_transfer(transfer.stacked))
-
-
-def _of_volume(volume: Volume) -> PyTree:
-    data = Unconstrained() if eqx.is_inexact_array(volume.data) else Fixed()
-    return eqx.tree_at(lambda v: v.data, _fixed(volume), data)
-
-
-def _of_material(material: Material) -> PyTree:
-    return eqx.tree_at(lambda m: m.mean_free_path, _fixed(material), Positive(material.mean_free_path))
-
-
-def _fixed(node: Any) -> PyTree:
-    return jax.tree.map(lambda _: Fixed(), node)
-
-
-_DEFAULTS: dict[type, Callable[[Any], PyTree]] = {
-    TransferFunction: _of_transfer,
-    TransferFunction2D: _of_transfer,
-    LabelTransferFunction: _of_labels,
-    Camera: Pose,
-    ToroidalMap: ProbeGeometry,
-    Volume: _of_volume,
-    March: _fixed,
-    Material: _of_material,
-}
-"""Default constraints of each type."""
+    """The constraints of an object, or of a leaf, unless others are given."""
+    if isinstance(node, Camera):
+        return Pose(node)
+    if isinstance(node, ToroidalMap):
+        return ProbeGeometry(node)
+    fixed = jax.tree.map(lambda _: Fixed(), node)
+    if isinstance(node, TransferFunction | TransferFunction2D):
+        top = float(jnp.max(node.extinction))
+        bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
+        return eqx.tree_at(lambda t: (t.colors, t.extinction), fixed, bounds)
+    if isinstance(node, LabelTransferFunction):  # factors of its extinctions are free in `stacked`
+        return eqx.tree_at(lambda t: t.stacked, fixed, _default(node.stacked))
+    if isinstance(node, Volume):
+        return eqx.tree_at(lambda v: v.data, fixed, _default(node.data))
+    if isinstance(node, Material):
+        return eqx.tree_at(lambda m: m.mean_free_path, fixed, Positive(node.mean_free_path))
+    return Unconstrained() if eqx.is_inexact_array(node) else fixed
 
 
 def _select(tree: PyTree, where: Where | None) -> PyTree:

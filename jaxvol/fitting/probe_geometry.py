@@ -14,7 +14,7 @@ from .bijections import MARGIN, Bijection, Positive
 
 
 class Fitted(NamedTuple):
-    """What of a probe is fitted, and named in its uncertainty: all but where depth begins."""
+    """What of a probe is fitted, and named in its uncertainty."""
 
     a: Float[Array, ""]
     b: Float[Array, ""]
@@ -26,29 +26,24 @@ class Fitted(NamedTuple):
 class ProbeGeometry(Bijection):
     """The geometry of a swept probe: `a`, `b`, both ranges of angles, and the last depth of a `ToroidalMap`.
 
-    Of the map's eight numbers, seven place the samples: depth is measured from `b`, and adding a length to
-    `b` while subtracting it from both ends of `gamma_range` moves nothing. So `gamma_range[0]` stays that of
-    `start`, by convention 0.
-
-    What images determine depends on what they are compared with. Reference images whose cameras are known in
-    world units determine all seven, if the scene has edges in all directions and its ends are in view. If the
-    cameras are only known up to scale, so are `a`, `b` and `last_gamma`; if the position of the camera is
-    free, so is where the probe lies. What is seen of a scene that does not change with an angle does not
-    determine that range. `Fit.uncertainty` says which.
+    The first depth, `gamma_range[0]`, stays that of `start`: adding a length to `b` while subtracting it from
+    both ends of `gamma_range` moves nothing. Images determine the seven others if their cameras are known in
+    world units, the scene has edges in all directions, and its ends are in view. From cameras known up to
+    scale, `a`, `b` and `last_gamma` are, too; where the camera's position is free, so is the probe's.
+    `Fit.uncertainty` says what is not determined.
 
     The free variables, of order 1, are the distances of the first sample from the apex and from the motor
     axis (of the outermost beam, the nearest one), the length of a beam, and the logarithms of the ratios in
     which a range of angles divides [0, π]. So every step is a valid probe: no sample lies behind the apex or
-    the motor axis, ranges increase, and angles stay within [0, π].
+    the motor axis, ranges increase, and angles stay within [0, π]. A start within 1/1000 of a limit (π, the
+    size of the probe) is moved to that distance from it.
 
-    A start within 1/1000 of a limit (π, the size of the probe) is moved to that distance from it.
+    Args:
+        start: Sets the typical lengths, and the first depth.
 
-    **Arguments:**
-
-    - `start`: sets the typical lengths, and the first depth.
-
-    **Raises:** `ValueError` for what is not a `ToroidalMap`, for one that begins at another depth, and for
-    one with samples behind the motor axis.
+    Raises:
+        ValueError: For what is not a `ToroidalMap`, for one that begins at another depth, and for one with
+            samples behind the motor axis.
     """
 
     whole: bool = eqx.field(static=True, default=True, init=False)
@@ -65,21 +60,20 @@ class ProbeGeometry(Bijection):
         beta, sigma = (_range_of(free[name]) for name in ("beta", "sigma"))
         first = start.gamma_range[0]
         gamma = jnp.stack([first, first + span])
-        about_axis = eqx.tree_at(
-            lambda probe: (probe.a, probe.b, probe.beta_range, probe.sigma_range, probe.gamma_range),
-            self.start,
-            (jnp.zeros_like(near), near - first, beta, sigma, gamma),
+        fields = jnp.zeros_like(near), near - first, beta, sigma, gamma
+        probe = eqx.tree_at(
+            lambda p: (p.a, p.b, p.beta_range, p.sigma_range, p.gamma_range), self.start, fields
         )
-        return eqx.tree_at(lambda probe: probe.a, about_axis, axis - about_axis.nearest_to_axis)
+        return eqx.tree_at(lambda p: p.a, probe, axis - probe.nearest_to_axis)
 
     def inverse(self, value: ToroidalMap | Any, name: str = "value") -> dict[str, Any]:
         if not isinstance(value, ToroidalMap):
             raise ValueError(f"{name} must be a ToroidalMap; got {described(value)}.")
-        if not np.isclose(value.gamma_range[0], self.start.gamma_range[0], atol=1e-5 * float(self._size)):
+        first, found = float(self.start.gamma_range[0]), float(value.gamma_range[0])
+        if not np.isclose(found, first, atol=1e-5 * float(self._size)):
             raise ValueError(
-                f"{name} must begin at the same depth as the start, gamma_range[0] = "
-                f"{float(self.start.gamma_range[0])}; got {float(value.gamma_range[0])}. Add the difference "
-                "to b."
+                f"{name} must begin at the same depth as the start, gamma_range[0] = {first}; got {found}. "
+                "Add the difference to b."
             )
         nearest = require(
             value.nearest_to_axis,
@@ -90,7 +84,7 @@ class ProbeGeometry(Bijection):
         )
         near, axis = value.b + value.gamma_range[0], jnp.maximum(nearest, 0)
         lengths = {"near": near, "axis": axis, "span": value.gamma_range[1] - value.gamma_range[0]}
-        free = {part: self._length.inverse(length, f"{name}, {part}") for part, length in lengths.items()}
+        free = {key: self._length.inverse(length, f"{name}, {key}") for key, length in lengths.items()}
         return free | {"beta": _ratios(value.beta_range), "sigma": _ratios(value.sigma_range)}
 
     def moved(self, value: ToroidalMap) -> Fitted:
