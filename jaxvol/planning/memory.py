@@ -9,8 +9,6 @@ from ..bricks.opening import Openable, source_of
 from ..bricks.render import bricks_of, budget
 from ..bricks.sources import VoxelSource
 from ..bricks.split import TooLittleMemory
-from ..compositing.blending import Compositing
-from ..lighting.shading import Lighting
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import BrickReport
@@ -43,18 +41,10 @@ def read_within(volume: Openable, memory: Any) -> tuple[Volume, VoxelSource, int
 
 
 def with_bricks(
-    source: VoxelSource,
-    transfer: Transfer,
-    camera: Camera,
-    march: March,
-    memory: int,
-    stride: int,
-    compositing: Compositing[Any],
-    lighting: Lighting | None,
+    source: VoxelSource, transfer: Transfer, camera: Camera, march: March, stride: int, **how: Any
 ) -> tuple[March, BrickReport]:
     """The march that was planned for a copy of every n-th voxel, with steps of 1/n, and shorter ones if
-    bricks fit only then; and the bricks."""
-    how: dict[str, Any] = {"memory": memory, "compositing": compositing, "lighting": lighting}
+    bricks fit only then; and the bricks. `how`: `memory`, `compositing` and `lighting`."""
     finer = stride
     while True:
         shorter = March(jnp.asarray(march.step) / finer, march.transforms, march.quadrature)
