@@ -5,6 +5,7 @@ squares per pixel, summed over channels: scaling an error by k scales them by k�
 in cycles per pixel. This is NumPy, not JAX, since it analyses finished images.
 """
 
+import math
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -58,13 +59,9 @@ def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     Raises:
         ValueError: As `rmse`, and for a `data_range` that is not positive.
     """
-    from skimage.metrics import peak_signal_noise_ratio  # here, since it imports more slowly than jaxvol
-
     number("data_range", data_range, above=0)
-    image, reference = _pair(image, reference)
-    if np.array_equal(image, reference):
-        return float("inf")
-    return float(peak_signal_noise_ratio(reference, image, data_range=data_range))
+    error = rmse(image, reference)
+    return 20 * math.log10(data_range / error) if error > 0 else math.inf
 
 
 def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
@@ -119,23 +116,20 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
     """Energy of the wood grain in an error: mean square per pixel, summed over channels.
 
     With `frequency` (the fundamental of the rings, see `comb_frequency`): the energy of the waves at it and
-    its harmonics, each measured by its Fourier coefficient under a Hann window over the image,
+    its harmonics, each measured by its Fourier coefficient under a Hann window w over the image,
 
         a_h = Σ w (e - mean_w(e)) exp(-2πi h f·x) / Σ w,    energy = Σ_h 2 |a_h|²,  h = 1 … harmonics.
 
-    A wave `A cos(2π h f·x + φ)` has energy A²/2 at any frequency, not only at FFT bins. Harmonics above
-    Nyquist are measured at their aliases; those within two bins (2/width, 2/height) of 0, of their own mirror
-    image, or of an earlier harmonic are left out. White noise of variance v adds 2.25 v · 2 harmonics /
-    pixels. A `frequency` that is wrong by half a bin loses 28 %.
+    Harmonics above Nyquist are measured at their aliases; those within two bins (2/width, 2/height) of 0, of
+    their own mirror image, or of an earlier harmonic are left out. White noise of variance v adds
+    2.25 v · 2 harmonics / pixels. A `frequency` that is wrong by half a bin loses 28 %.
 
-    Without `frequency`, for any scene: the energy in a few peaks of local spectra, beyond what noise has
-    there by chance. Blocks of `BLOCK` pixels overlap by half; each is taken minus its windowed mean and under
-    a Hann window w. Its periodogram |F|² / (BLOCK² Σ w²), over frequencies of at least `SLOWEST` cycles per
-    block (slower errors are shading), has the total E, and its `PEAKS` largest values have the sum T. In
-    white noise the m largest of N values hold on average the share q = Σ_{i ≤ m} Σ_{i ≤ j ≤ N} 1 / (j N). The
-    energy is the mean over blocks of (T - q E) / (1 - q): E for waves, and 0 on average for white noise.
-    Noise added to waves lowers it by up to 0.13 of its own energy. An edge counts as structure, a single
-    pixel does not.
+    Without `frequency`, for any scene: the energy in the peaks of local spectra, beyond what noise has there
+    by chance. Of each block of `BLOCK` pixels under a Hann window, E is the energy over frequencies of at
+    least `SLOWEST` cycles per block (slower errors are shading), T that of its `PEAKS` largest values, and q
+    their share on average in white noise. The result is the mean over blocks of (T - q E) / (1 - q): E for
+    waves, 0 on average for white noise. Noise added to waves lowers it by up to 0.13 of its own energy. An
+    edge counts as structure, a single pixel does not.
 
     Args:
         error: An image minus its reference, (height, width) or (height, width, channels).
@@ -194,31 +188,27 @@ def boundary_noise(image: Any, region: Any) -> float:
 
 def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float:
     height, width, _ = error.shape
-    window = _hann(height, width)
-    windowed = _windowed(error, window) / window.sum()
-    earlier: list[Float64[np.ndarray, 2]] = [np.zeros(2)]
-    energy = 0.0
+    windowed, window = _windowed(error)
+    x, y = np.arange(width), np.arange(height)
+    earlier, energy = [np.zeros(2)], 0.0
     for harmonic in range(1, harmonics + 1):
         wave = harmonic * np.array(frequency)
         others = [*earlier, -wave]
         apart = [np.abs(wave - other - np.round(wave - other)) for other in others]  # of their aliases
         if any(np.all(each < 2 / np.array([width, height])) for each in apart):
-            if harmonic == 1:
-                raise ValueError(
-                    f"frequency must be two bins (2/width, 2/height) away from 0 and from its mirror image; "
-                    f"got {frequency} in an image of {width} x {height}."
-                )
-            continue
+            if harmonic > 1:
+                continue
+            raise ValueError(
+                f"frequency must be two bins (2/width, 2/height) away from 0 and from its mirror image; "
+                f"got {frequency} in an image of {width} x {height}."
+            )
         earlier += [wave, -wave]
-        down, across = (
-            np.exp(-2j * np.pi * f * np.arange(n)) for f, n in ((wave[1], height), (wave[0], width))
-        )
-        energy += 2 * np.sum(np.abs(np.einsum("y,yxc,x->c", down, windowed, across)) ** 2)
+        across, down = np.exp(-2j * np.pi * wave[0] * x), np.exp(-2j * np.pi * wave[1] * y)
+        energy += 2 * np.sum(np.abs(np.einsum("y,yxc,x->c", down, windowed / window.sum(), across)) ** 2)
     return float(energy)
 
 
 def _peaks(error: Plane) -> float:
-    window = _hann(BLOCK, BLOCK)
     cycles = np.fft.fftfreq(BLOCK, 1 / BLOCK)
     y, x = np.meshgrid(cycles, cycles, indexing="ij")
     # one of each mirrored pair, without the two lines at Nyquist, which are their own mirror images
@@ -228,8 +218,9 @@ def _peaks(error: Plane) -> float:
     blocks = np.lib.stride_tricks.sliding_window_view(error, (BLOCK, BLOCK))
     starts = [np.append(np.arange(0, n - 1, BLOCK // 2), n - 1) for n in blocks.shape[:2]]
     blocks = blocks[np.ix_(*starts)].reshape(-1, BLOCK, BLOCK, 1)
-    spectra = [np.fft.fft2(_windowed(block, window)[..., 0])[selected] for block in blocks]
-    energy = np.sort(2 * np.abs(np.array(spectra)) ** 2, axis=1) / (BLOCK**2 * np.sum(window**2))
+    windowed, windows = zip(*map(_windowed, blocks), strict=True)
+    spectra = np.fft.fft2(np.array(windowed)[..., 0])[:, selected]
+    energy = np.sort(2 * np.abs(spectra) ** 2, axis=1) / (BLOCK**2 * np.sum(windows[0] ** 2))
 
     chance = _share_of_largest(PEAKS, int(selected.sum()))
     total, top = energy.sum(axis=1).mean(), energy[:, -PEAKS:].sum(axis=1).mean()
@@ -242,15 +233,12 @@ def _share_of_largest(m: int, n: int) -> float:
     return float(tails[:m].sum() / n)
 
 
-def _hann(height: int, width: int) -> Plane:
-    y, x = (np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (height, width))
-    return np.outer(y, x)
-
-
-def _windowed(error: Image, window: Plane) -> Image:
-    """The error minus its windowed mean, times the window."""
+def _windowed(error: Image) -> tuple[Image, Plane]:
+    """The error minus its windowed mean, times a Hann window; and the window."""
+    y, x = (np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in error.shape[:2])
+    window = np.outer(y, x)
     mean = np.tensordot(window, error, axes=2) / window.sum()
-    return (error - mean) * window[..., None]
+    return (error - mean) * window[..., None], window
 
 
 def _pair(image: Any, reference: Any) -> tuple[Image, Image]:

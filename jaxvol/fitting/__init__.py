@@ -5,6 +5,7 @@ from .bijections import (
     Fixed as Fixed,
     Pose as Pose,
     Positive as Positive,
+    ProbeGeometry as ProbeGeometry,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
 )
@@ -18,5 +19,4 @@ from .candidates import (
 from .choice import Choice as Choice, Evidence as Evidence, choose as choose
 from .driver import Fit as Fit, Outcome as Outcome, fit as fit, fit_coarse_to_fine as fit_coarse_to_fine
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
-from .probe_geometry import ProbeGeometry as ProbeGeometry
 from .residuals import ImageResidual as ImageResidual

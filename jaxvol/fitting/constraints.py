@@ -17,8 +17,7 @@ from ..scene.transfer import TransferFunction
 from ..scene.transfer2d import TransferFunction2D
 from ..scene.volume import Volume
 from ..xla.trees import PyTree
-from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInterval
-from .probe_geometry import ProbeGeometry
+from .bijections import Bijection, Fixed, Pose, Positive, ProbeGeometry, Unconstrained, UnitInterval
 
 
 Where = Callable[[Any], Any]
