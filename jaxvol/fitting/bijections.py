@@ -5,7 +5,7 @@ allowed range. Free variables are of order 1 whatever the parameter's units, whi
 """
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -46,10 +46,15 @@ class Bijection(eqx.Module):
 class Fixed(Bijection):
     """No free variables: the value stays as it was at the start."""
 
-    def forward(self, free: Any) -> Any:
-        raise ValueError("Fixed has no free variables: the caller keeps the value.")
+    start: Any = None
+
+    def forward(self, free: None) -> Any:
+        return self.start
 
     def inverse(self, value: Any, name: str = "value") -> None:
+        return None
+
+    def moved(self, value: Any) -> None:
         return None
 
 
@@ -163,7 +168,8 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0.
+    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula).
+
     Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts."""
     square = jnp.sum(turn**2)
     small = square < 1e-6
@@ -174,30 +180,20 @@ def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "
     return vector + first * across + second * jnp.cross(turn, across)
 
 
-class _Fitted(NamedTuple):
-    """What of a probe is fitted, and named in its uncertainty."""
-
-    a: Float[Array, ""]
-    b: Float[Array, ""]
-    beta_range: Float[Array, "2"]
-    sigma_range: Float[Array, "2"]
-    last_gamma: Float[Array, ""]
-
-
 class ProbeGeometry(Bijection):
     """The geometry of a swept probe: `a`, `b`, both ranges of angles, and the last depth of a `ToroidalMap`.
 
     The first depth, `gamma_range[0]`, stays that of `start`: adding a length to `b` while subtracting it from
     both ends of `gamma_range` moves nothing. Images determine the seven others if their cameras are known in
     world units, the scene has edges in all directions, and its ends are in view. From cameras known up to
-    scale, `a`, `b` and `last_gamma` are, too; where the camera's position is free, so is the probe's.
-    `Fit.uncertainty` says what is not determined.
+    scale, so are the lengths; where the camera's position is free, so is the probe's. `Fit.uncertainty` says
+    what is not determined.
 
     The free variables, of order 1, are the distances of the first sample from the apex and from the motor
     axis (of the outermost beam, the nearest one), the length of a beam, and the logarithms of the ratios in
     which a range of angles divides [0, π]. So every step is a valid probe: no sample lies behind the apex or
-    the motor axis, ranges increase, and angles stay within [0, π]. A start within 1/1000 of a limit (π, the
-    size of the probe) is moved to that distance from it.
+    the motor axis, ranges increase, and angles stay within [0, π]. Starts keep a distance of 1/1000 from
+    these limits, relative to π or the size of the probe.
 
     Args:
         start: Sets the typical lengths, and the first depth.
@@ -209,15 +205,17 @@ class ProbeGeometry(Bijection):
 
     whole: bool = eqx.field(static=True, default=True, init=False)
     start: ToroidalMap
+    length: Positive
 
     def __init__(self, start: ToroidalMap | Any):
         if not isinstance(start, ToroidalMap):
             raise ValueError(f"start must be a ToroidalMap; got {described(start)}.")
         self.start = start
+        self.length = Positive(start.b + start.gamma_range[1])
 
     def forward(self, free: dict[str, Any]) -> ToroidalMap:
         start = jax.lax.stop_gradient(self.start)
-        near, axis, span = (self._length.forward(free[name]) for name in ("near", "axis", "span"))
+        near, axis, span = (self.length.forward(free[name]) for name in ("near", "axis", "span"))
         beta, sigma = (_range_of(free[name]) for name in ("beta", "sigma"))
         first = start.gamma_range[0]
         gamma = jnp.stack([first, first + span])
@@ -231,7 +229,7 @@ class ProbeGeometry(Bijection):
         if not isinstance(value, ToroidalMap):
             raise ValueError(f"{name} must be a ToroidalMap; got {described(value)}.")
         first, found = float(self.start.gamma_range[0]), float(value.gamma_range[0])
-        if not np.isclose(found, first, atol=1e-5 * float(self._size)):
+        if not np.isclose(found, first, atol=1e-5 * float(self.length.scale)):
             raise ValueError(
                 f"{name} must begin at the same depth as the start, gamma_range[0] = {first}; got {found}. "
                 "Add the difference to b."
@@ -241,27 +239,20 @@ class ProbeGeometry(Bijection):
             lambda axis, size: axis >= -1e-6 * size,
             f"{name} must not have samples behind the motor axis to be fitted: its outermost beams begin at "
             "{got} from it. Raise a, or narrow sigma_range.",
-            self._size,
+            self.length.scale,
         )
         near, axis = value.b + value.gamma_range[0], jnp.maximum(nearest, 0)
         lengths = {"near": near, "axis": axis, "span": value.gamma_range[1] - value.gamma_range[0]}
-        free = {key: self._length.inverse(length, f"{name}, {key}") for key, length in lengths.items()}
+        free = {key: self.length.inverse(length, f"{name}, {key}") for key, length in lengths.items()}
         return free | {"beta": _ratios(value.beta_range), "sigma": _ratios(value.sigma_range)}
 
-    def moved(self, value: ToroidalMap) -> _Fitted:
-        return _Fitted(value.a, value.b, value.beta_range, value.sigma_range, value.gamma_range[1])
-
-    @property
-    def _size(self) -> Float[Array, ""]:
-        return jax.lax.stop_gradient(self.start.b + self.start.gamma_range[1])
-
-    @property
-    def _length(self) -> Positive:
-        return Positive(self._size)
+    def moved(self, value: ToroidalMap) -> ToroidalMap:
+        """The map, with the last depth, which is fitted, in place of both."""
+        return eqx.tree_at(lambda probe: probe.gamma_range, value, value.gamma_range[1])
 
 
 def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Logarithms of what lies below and above a range of angles, in parts of the range."""
+    """Logarithms of what lies below and above a range of angles, relative to the range."""
     gaps = jnp.stack([angles[0], angles[1] - angles[0], jnp.pi - angles[1]])
     gaps = jnp.maximum(gaps, MARGIN * jnp.pi)
     return jnp.log(gaps[::2] / gaps[1])

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._util.checks import described, integer, not_negative
@@ -26,7 +27,7 @@ from ..xla.trees import PyTree
 from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, fit
-from .residuals import FunctionResidual, ImageResidual, Residual, check_residual
+from .residuals import ImageResidual, check_residual
 
 
 class Evidence(NamedTuple):
@@ -162,9 +163,10 @@ def choose(
             how["checkpoint"] = file.with_name(f"{file.stem}-{at + 1}{file.suffix}")
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=UNDETERMINED)
-            fits.append(fit(_of_model(training, candidate, start), start, **how))
+            fits.append(fit(_of_model(training, candidate), start, **how))
         parameters = fits[-1].parameters
-        found.append([_entries(_of_model(view, candidate, parameters), parameters) for view in validation])
+        entries = (_entries(_of_model(view, candidate), parameters) for view in validation)
+        found.append([np.asarray(each, np.float64) for each in entries])
 
     losses = [sum(float(np.sum(each**2)) for each in of_views) / 2 / len(of_views) for of_views in found]
     if not any(map(math.isfinite, losses)):
@@ -208,23 +210,21 @@ class _Expanded(eqx.Module):
         return self.function(self.expand(parameters), *more)
 
 
-def _of_model(residual: Any, candidate: Candidate, parameters: PyTree) -> Residual:
+def _of_model(residual: Any, candidate: Candidate) -> Any:
     """The residual as one of a candidate's own parameters."""
-    if isinstance(residual, ImageResidual):
-        return eqx.tree_at(lambda r: r.scene, residual, replace_fn=lambda f: _Expanded(f, candidate.expand))
-    return FunctionResidual.of(_Expanded(residual, candidate.expand), parameters)
-
-
-def _entries(residual: Residual, parameters: PyTree) -> np.ndarray:
-    """Of one view; (height, width, channels) of an image."""
-    shape = residual.groups[0].images.shape[1:] if isinstance(residual, ImageResidual) else -1
-    return np.asarray(_evaluated(residual, parameters), np.float64).reshape(shape)
+    if not isinstance(residual, ImageResidual):
+        return _Expanded(residual, candidate.expand)
+    return eqx.tree_at(lambda r: r.scene, residual, replace_fn=lambda f: _Expanded(f, candidate.expand))
 
 
 @eqx.filter_jit
-def _evaluated(residual: Residual, parameters: PyTree) -> Array:
+def _entries(residual: Any, parameters: PyTree) -> Array:
+    """Of one view; (height, width, channels) of an image."""
+    if not isinstance(residual, ImageResidual):
+        return ravel_pytree(residual(parameters))[0]
     ((function, items),) = residual.tiles(residual.count())
-    return jax.lax.map(lambda item: function(parameters, item, "replay"), items)
+    entries = jax.lax.map(lambda item: function(parameters, item, "replay"), items)
+    return entries.reshape(residual.groups[0].images.shape[1:])
 
 
 def _list(name: str, given: Any) -> list[Any]:

@@ -30,7 +30,6 @@ class Free(eqx.Module):
     """Parameters as the free variables that a solver moves."""
 
     bijections: list[Bijection]
-    held: list[Any]
     paths: list[str] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
 
@@ -45,23 +44,24 @@ class Free(eqx.Module):
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
         tree = _select(_resolve(parameters, constraints), where)
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
-        bijections = [bijection for _, bijection in found]
         nodes = structure.flatten_up_to(parameters)
+        pairs = zip([bijection for _, bijection in found], nodes, strict=True)
+        bijections = [Fixed(node) if isinstance(b, Fixed) else b for b, node in pairs]
         paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
         start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, paths, strict=True))
         if not jax.tree.leaves(start):
             raise ValueError("parameters must hold a float array that is free; everything given is fixed.")
-        held = [n if isinstance(b, Fixed) else None for b, n in zip(bijections, nodes, strict=True)]
-        return cls(bijections, held, paths, structure), start
+        return cls(bijections, paths, structure), start
 
     def forward(self, free: FreeVariables) -> PyTree:
         """Parameters for these free variables."""
-        return jax.tree.unflatten(self.structure, self._nodes(free))
+        nodes = [b.forward(variables) for b, variables in zip(self.bijections, free, strict=True)]
+        return jax.tree.unflatten(self.structure, nodes)
 
     def moved(self, free: FreeVariables) -> list[Any]:
         """What of the parameters is fitted."""
-        nodes = zip(self.bijections, self._nodes(free), strict=True)
-        return [None if isinstance(b, Fixed) else b.moved(node) for b, node in nodes]
+        each = zip(self.bijections, free, strict=True)
+        return [b.moved(b.forward(variables)) for b, variables in each]
 
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
@@ -71,10 +71,6 @@ class Free(eqx.Module):
                 name = path.removeprefix("parameters") + jax.tree_util.keystr(inner)
                 names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
-
-    def _nodes(self, free: FreeVariables) -> list[Any]:
-        each = zip(self.bijections, self.held, free, strict=True)
-        return [held if isinstance(b, Fixed) else b.forward(u) for b, held, u in each]
 
 
 def size(tree: PyTree) -> int:

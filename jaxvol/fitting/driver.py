@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,11 +25,9 @@ from ..xla.trees import PyTree
 from . import checkpoints
 from .constraints import Free, FreeVariables, Where
 from .damping import LevenbergMarquardt
-from .residuals import FunctionResidual, ImageResidual, Problem, Residual, check_residual
+from .residuals import ImageResidual, Problem, check_residual
 from .uncertainty import Uncertainty, uncertainty
 
-
-Solver: TypeAlias = Literal["levenberg_marquardt", "gauss_newton", "bfgs", "adam"]
 
 UNDETERMINED = ".*directions are not determined"
 """Pattern of the warning that names such directions, for those who tell it otherwise."""
@@ -87,10 +85,10 @@ class Fit(eqx.Module):
 
 
 def fit(
-    residual: Residual | Callable[[Any], PyTree] | Any,
+    residual: ImageResidual | Callable[[Any], PyTree] | Any,
     parameters: PyTree,
     *,
-    solver: Solver | Any = "levenberg_marquardt",
+    solver: str | Any = "levenberg_marquardt",
     constraints: PyTree = None,
     where: Where | None = None,
     rtol: float = 1e-4,
@@ -157,24 +155,19 @@ def fit(
     solver, default_patience = _solver(solver, rtol, atol)
     patience = default_patience if patience is None else integer("patience", patience, 1)
     free, y = Free.of(parameters, constraints, where)
-    if not isinstance(residual, Residual):
-        residual = FunctionResidual.of(residual, free.forward(y))
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     problem = Problem.of(residual, free, y, max_jacobian, least_squares)
 
     state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
     run = _Run(y, state, y, y, None, done, optx.RESULTS.successful, []).step(solver, problem)
-    if not math.isfinite(run.losses[0]):
-        raise ValueError(
-            "residual must be finite at the parameters that the fit starts from; half the sum of its squares "
-            f"is {run.losses[0]}."
-        )
+    if not math.isfinite(loss := run.losses[0]):
+        raise ValueError(f"residual must be finite at the parameters that the fit starts from; loss {loss}.")
     bounds = zip(free.paths, free.bijections, strict=True)
     about = {
         "solver": type(solver).__name__,
         "parameters": [f"{path}: {type(bijection).__name__}" for path, bijection in bounds],
-        "number of residuals": residual.count(),
-        "loss at the start": f"{run.losses[0]:.3g}",  # other machines round differently
+        "number of residuals": problem.count,
+        "loss at the start": f"{loss:.3g}",  # other machines round differently
     }
     if file is not None and (found := checkpoints.load(file, run, about)) is not None:
         run = replace(found[0], losses=found[1]["losses"])
@@ -204,8 +197,7 @@ def fit_coarse_to_fine(
 
     A derivative describes only features that move by less than their own size. In blurred images features are
     large, so that a pose or a geometry is found from farther away; sharp images at last make it exact. Steps
-    must be of a voxel or shorter: under longer ones, fine texture is sampled too sparsely, and fits stall
-    (`experiments/results/README.md`, "The geometry of a probe").
+    must be of a voxel or shorter: under longer ones, fine texture is sampled too sparsely, and fits stall.
 
     Args:
         residual: An `ImageResidual`. Its own `blur` is not used.
@@ -247,10 +239,8 @@ def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
             raise ImportError('solver="adam" needs Optax: pip install "jaxvol[fit]".') from fault
         optim = optax.adam(LEARNING_RATE) if solver == "adam" else solver
         return optx.OptaxMinimiser(optim, rtol, atol), 100
-    raise ValueError(
-        f"solver must be one of {', '.join(get_args(Solver))}, or a solver of Optimistix or Optax; "
-        f"got {solver!r}."
-    )
+    names = ", ".join((*known, "adam"))
+    raise ValueError(f"solver must be one of {names}, or a solver of Optimistix or Optax; got {solver!r}.")
 
 
 class _Run(eqx.Module):
@@ -306,7 +296,7 @@ def _advance(solver: Any, problem: Problem, y: FreeVariables, state: Any) -> Any
 
 @contextmanager
 def _allow_promotion() -> Iterator[None]:
-    """Allow JAX's promotion of types and ranks, which solvers need, even if the user has forbidden it."""
+    """Allow promotion of types and ranks, which solvers need, even if the user has forbidden it."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
@@ -314,8 +304,8 @@ def _allow_promotion() -> Iterator[None]:
 def _report(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     estimate = None
     if run.triangle is not None:
-        residual, triangle = problem.residual, np.asarray(run.triangle)
-        estimate = uncertainty(triangle, residual.count(), problem.free, run.best, residual.scale())
+        scale = problem.residual.scale() if isinstance(problem.residual, ImageResidual) else 0.0
+        estimate = uncertainty(np.asarray(run.triangle), problem.count, problem.free, run.best, scale)
         if estimate.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in estimate.undetermined[:6])
             warnings.warn(

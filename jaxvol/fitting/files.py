@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +21,6 @@ CAMERA = "position", "focal_point", "view_up", "view_angle", "parallel_scale", "
 TRANSFER = "values", "colors", "extinction"
 
 File = str | PathLike[str]
-T = TypeVar("T")
 
 
 def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Float[Array, "h w 3"]]]:
@@ -107,7 +106,7 @@ def _json(path: File) -> Any:
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 
-def _made(kind: Callable[..., T], what: str, allowed: Sequence[str], content: Any, **more: Any) -> T:
+def _made(kind: Callable[..., Any], what: str, allowed: Sequence[str], content: Any, **more: Any) -> Any:
     """What `kind` makes of the fields of a JSON object."""
     if not isinstance(content, dict) or not set(content) <= set(allowed):
         got = ", ".join(content) if isinstance(content, dict) else f"a {type(content).__name__}"
@@ -129,8 +128,6 @@ def _picture(path: File) -> Float[Array, "h w 3"]:
     except Exception as fault:  # each of the many readers raises errors of its own
         raise ValueError(f"{path} cannot be read as a picture: {fault}") from fault
     if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype not in (np.uint8, np.uint16):
-        raise ValueError(
-            f"{path} must be an RGB picture of 8 or 16 bits, without transparency; got shape {picture.shape} "
-            f"of {picture.dtype}."
-        )
+        got = f"shape {picture.shape} of {picture.dtype}"
+        raise ValueError(f"{path} must be an RGB picture of 8 or 16 bits, without transparency; got {got}.")
     return from_srgb(jnp.asarray(img_as_float32(picture)))

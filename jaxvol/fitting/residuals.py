@@ -11,9 +11,8 @@ exactly, for any solver; unlike JᵀJ, it does not square the condition number.
 """
 
 import math
-from abc import abstractmethod
 from collections.abc import Callable, Iterable
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,13 +24,10 @@ from jaxtyping import Array, Float
 from .._util.checks import Arrayable, described, finite_array, not_negative
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
-from ..lighting.shading import Lighting
-from ..march.march import March
 from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera, rows_of
 from ..scene.transfer import Transfer
-from ..scene.volume import Volume
 from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
 
@@ -44,54 +40,13 @@ Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]], PyTree
 """Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items."""
 
 
-class Residual(eqx.Module):
-    """What a fit minimises: the loss is half the sum of its squares."""
-
-    @abstractmethod
-    def tiles(self, most: int) -> list[Tiles]:
-        """The residual in pieces of at most `most` entries."""
-
-    @abstractmethod
-    def count(self) -> int:
-        """Total number of entries."""
-
-    def scale(self) -> float:
-        """Norm of the compared data: changes within its rounding carry no information. 0 if unknown."""
-        return 0.0
-
-
 def check_residual(residual: Any) -> None:
     """Reject what is not a residual, including a transfer function, which is callable, too."""
-    if isinstance(residual, Transfer) or not (callable(residual) or isinstance(residual, Residual)):
+    if isinstance(residual, Transfer) or not (callable(residual) or isinstance(residual, ImageResidual)):
         raise ValueError(
             "residual must be an ImageResidual, or a function from parameters to arrays; "
             f"got {described(residual)}. The order is fit(residual, parameters)."
         )
-
-
-class FunctionResidual(Residual):
-    """A residual given as a function from parameters to arrays, in one piece."""
-
-    function: Callable[[PyTree], PyTree]
-    length: int
-
-    @classmethod
-    def of(cls, function: Any, parameters: PyTree) -> "FunctionResidual":
-        count = size(eqx.filter_eval_shape(function, parameters))
-        if count == 0:
-            raise ValueError("residual must return at least one number; got none.")
-        return cls(function, count)
-
-    def count(self) -> int:
-        return self.length
-
-    def tiles(self, most: int) -> list[Tiles]:
-        if self.length > most:
-            raise ValueError(
-                f"max_jacobian leaves room for {most} of the residual's {self.length} entries, and a "
-                "custom function is not split into tiles. Raise max_jacobian, or use an ImageResidual."
-            )
-        return [(lambda parameters, *_: ravel_pytree(self.function(parameters))[0], jnp.zeros(1))]
 
 
 class _Group(eqx.Module):
@@ -101,11 +56,11 @@ class _Group(eqx.Module):
     images: Float[Array, "views height width channels"]
 
 
-SceneParts = tuple[Volume, Transfer, Camera, March] | tuple[Volume, Transfer, Camera, March, Lighting | None]
-SceneFunction = Callable[[Any, Camera], SceneParts]
+SceneFunction = Callable[[Any, Camera], tuple[Any, ...]]
+"""From parameters and a view's camera to volume, transfer function, camera, march, and maybe lighting."""
 
 
-class ImageResidual(Residual):
+class ImageResidual(eqx.Module):
     """Rendered images minus reference images, as the residual of a fit.
 
     The residual is divided by the square root of the number of its entries, so that the loss, half the
@@ -148,7 +103,7 @@ class ImageResidual(Residual):
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
-        self.scene = cast(SceneFunction, scene)
+        self.scene = scene
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
         self.blur = None if blur is None else not_negative("blur", blur)
@@ -174,35 +129,34 @@ class ImageResidual(Residual):
         return [jax.tree.map(lambda leaf, view=view: leaf[view], cameras) for cameras, view in each]
 
     def count(self) -> int:
+        """Total number of entries."""
         return sum(group.images.size for group in self.groups)
 
     def scale(self) -> float:
+        """Norm of the compared data: changes within its rounding carry no information."""
         squares = sum(float(jnp.sum(group.images**2)) for group in self.groups)
         return math.sqrt(squares / self.count())
 
     def tiles(self, most: int) -> list[Tiles]:
+        """The residual in pieces of at most `most` entries."""
         return [self._tiles(group, most) for group in self.groups]
 
     def _tiles(self, group: _Group, most: int) -> Tiles:
         views, height, width, channels = group.images.shape
-        if most < width * channels:
+        what, least = ("one row of an image", 1) if self.blur is None else ("one blurred image", height)
+        if most < least * width * channels:
             raise ValueError(
-                f"max_jacobian leaves room for {most} entries of the residual, and one row of an image has "
-                f"{width * channels}. Raise max_jacobian, or fit fewer parameters."
+                f"max_jacobian leaves room for {most} entries of the residual; {what} has "
+                f"{least * width * channels}. Raise max_jacobian, or fit fewer parameters."
             )
         pieces = math.ceil(height / min(height, most // (width * channels)))
-        if pieces > 1 and self.blur is not None:
-            raise ValueError(
-                f"max_jacobian leaves room for {most} entries of the residual, and blurred images are not "
-                f"split: one has {height * width * channels}. Raise max_jacobian, or leave out blur."
-            )
         rows = math.ceil(height / pieces)
         weight = 1 / math.sqrt(self.count())
 
         def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
             of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
-            result = cast(Any, self.scene(parameters, of_view))
+            result = self.scene(parameters, of_view)
             order = "(volume, transfer, camera, march, lighting)"
             if not isinstance(result, tuple) or len(result) not in (4, 5):
                 raise ValueError(
@@ -217,13 +171,8 @@ class ImageResidual(Residual):
                 )
             if pieces > 1:
                 camera = rows_of(camera, first, rows)
-            rendering = render(
-                *(volume, transfer, camera, march),
-                compositing=self.compositing,
-                lighting=lighting,
-                outputs="rgba",
-                adjoint=adjoint,
-            )
+            how = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
+            rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
             rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
             reference = group.images[view, jnp.minimum(row, height - 1)]
@@ -266,26 +215,34 @@ def _view(number: int, view: Any) -> tuple[Camera, Array]:
 class Problem(eqx.Module):
     """A residual as a function of the free variables, in the forms that solvers need."""
 
-    residual: Residual
+    residual: ImageResidual | Callable[[PyTree], PyTree]
     free: Free
+    count: int = eqx.field(static=True)
+    """Number of entries of the residual."""
     tile: int = eqx.field(static=True)
-    """Entries of the residual differentiated at once."""
+    """Number of these that are differentiated at once."""
     least_squares: bool = eqx.field(static=True)
 
     @classmethod
-    def of(
-        cls, residual: Residual, free: Free, y: FreeVariables, max_jacobian: int, least_squares: bool
-    ) -> "Problem":
-        """With as large tiles as fit into `max_jacobian` bytes; without Jacobian, all of the residual."""
-        bytes_of_row = (size(y) + 1) * 4
-        triangle = bytes_of_row * (size(y) + 1)
-        if least_squares and triangle > max_jacobian:
+    def of(cls, residual: Any, free: Free, y: FreeVariables, most: int, least_squares: bool) -> "Problem":
+        """With as large tiles as fit into `most` bytes; without Jacobian, all of the residual."""
+        images = isinstance(residual, ImageResidual)
+        count = residual.count() if images else size(eqx.filter_eval_shape(residual, free.forward(y)))
+        row = (size(y) + 1) * 4
+        if count == 0:
+            raise ValueError("residual must return at least one number; got none.")
+        if least_squares and row * (size(y) + 1) > most:
             raise ValueError(
-                f"max_jacobian must hold the triangle of {size(y)} parameters, {triangle} bytes; got "
-                f'{max_jacobian}. For so many parameters, use solver="adam" or "bfgs".'
+                f"max_jacobian must hold the triangle of {size(y)} parameters, {row * (size(y) + 1)} bytes; "
+                f'got {most}. For so many parameters, use solver="adam" or "bfgs".'
             )
-        tile = max_jacobian // bytes_of_row if least_squares else residual.count()
-        return cls(residual, free, tile, least_squares)
+        tile = most // row if least_squares else count
+        if not images and tile < count:
+            raise ValueError(
+                f"max_jacobian leaves room for {tile} of the residual's {count} entries, and only an "
+                "ImageResidual is split into tiles. Raise max_jacobian, or use one."
+            )
+        return cls(residual, free, count, tile, least_squares)
 
     def __call__(self, y: FreeVariables, _: Any = None) -> tuple[Array, tuple[Array, FreeVariables, Any]]:
         """What a solver minimises; and the loss, its point, and the triangle there."""
@@ -346,7 +303,11 @@ class Problem(eqx.Module):
 
     def _accumulate(self, add: Callable[[Any, Any, Any], Any], total: Any) -> Any:
         """Accumulate `add(function, total, item)` over all tiles, starting from `total`."""
-        for function, items in self.residual.tiles(self.tile):
+        if isinstance(self.residual, ImageResidual):
+            tiles = self.residual.tiles(self.tile)
+        else:
+            tiles = [(lambda parameters, *_: ravel_pytree(self.residual(parameters))[0], jnp.zeros(1))]
+        for function, items in tiles:
             total, _ = jax.lax.scan(lambda sum, item, f=function: (add(f, sum, item), None), total, items)
         return total
 

@@ -197,11 +197,11 @@ def test_tiles_make_no_difference_and_the_gradient_is_that_of_the_triangle():
     free, y = Free.of(GREY, None, None)
     triangle = eqx.filter_jit(lambda problem, y: problem.condensed(y))
     whole, tiled = (
-        np.asarray(triangle(Problem(residual, free, tile, True), y), np.float64)
+        np.asarray(triangle(Problem(residual, free, residual.count(), tile, True), y), np.float64)
         for tile in (residual.count(), 3 * WIDTH * 3)
     )
     np.testing.assert_allclose(tiled, whole, rtol=0, atol=2e-6 * abs(whole).max())
-    problem = Problem(residual, free, residual.count(), False)
+    problem = Problem(residual, free, residual.count(), residual.count(), False)
     gradient = eqx.filter_jit(lambda p, y: jax.grad(p.loss)(y))(problem, y)
     flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient)])
     np.testing.assert_allclose(whole[:, :-1].T @ whole[:, -1], flat, rtol=0, atol=1e-5 * abs(flat).max())
@@ -313,7 +313,7 @@ BAD = [
         "transfer must be .* That is the camera",
     ),
     (of_images(lambda t, c: seen(t, c.crop(0, 0, 2, 2))), r"view's size \(20, 16\); got \(2, 2\)"),
-    (of_images(max_jacobian=THREE_ROWS, blur=0.1), "blurred images are not split: one has 960"),
+    (of_images(max_jacobian=THREE_ROWS, blur=0.1), "one blurred image has 960"),
     (of_images(max_jacobian=100), "max_jacobian must hold the triangle"),
     (of_images(max_jacobian=5000), "one row of an image has 60"),
     (of_curve(unreachable, checkpoint="/dev/null/a"), "checkpoint: /dev/null/a .*null is not a folder"),
