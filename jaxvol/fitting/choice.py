@@ -11,7 +11,6 @@ is confined to few blocks, the second is wrong where variances differ: the large
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,6 +27,10 @@ from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, fit
 from .residuals import ImageResidual, check_residual
+
+
+RESOLUTION = 1e-4
+"""Residuals below this fraction of the data's norm count as equal."""
 
 
 class Evidence(NamedTuple):
@@ -94,9 +97,7 @@ def choose(
     *,
     views: Sequence[Any] | Any | None = None,
     errors: float | Any = 2.0,
-    resolution: float | Any = 1e-4,
     block: int | Any = 4,
-    callback: Callable[[str, int, PyTree, float], Any] | None = None,
     checkpoint: str | PathLike[str] | None = None,
     **options: Any,
 ) -> Choice:
@@ -109,10 +110,11 @@ def choose(
     Each candidate is fitted to the training views, and evaluated on the held-out views. The best one has the
     least held-out loss L. The first one is chosen with
 
-        L - L_best ≤ `errors` · SE(L - L_best)      or      √(2 L) ≤ `resolution` · norm of the data.
+        L - L_best ≤ `errors` · SE(L - L_best)      or      √(2 L) ≤ 1e-4 · norm of the data.
 
     The standard error is that of noise, which all candidates share. The second condition is for data without
-    noise: fits in float32 end between 1e-5 and 1e-7 of the norm, wherever they happen to stop.
+    noise: fits in float32 end between 1e-5 and 1e-7 of the norm, wherever they happen to stop. The data are
+    the training images; for a function, the norm is that of its residual at the first start.
 
     How views differ from others is not in the standard error: held-out views must show what later views will.
     Where no candidate holds the truth (images of another renderer, a wrong camera), the residual is not
@@ -127,11 +129,8 @@ def choose(
         views: The training views, for a function.
         errors: Standard errors of the difference up to which a candidate is not significantly worse, ≥ 0. If
             both models hold the truth, the larger one seems better by more than 2 in at most 2.3 % of trials.
-        resolution: See above, ≥ 0. The data are the training images; for a function, the norm is that of its
-            residual at the first start.
         block: Pixels along a side of blocks within which noise may be correlated: 1 for noise of single
             pixels, more for pictures that were smoothed or compressed.
-        callback: `callback(name, step, parameters, loss)`, of each fit.
         checkpoint: A file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
         **options: Others of `fit`, such as `max_steps`, for all candidates.
 
@@ -143,8 +142,7 @@ def choose(
         ValueError: For no candidates, candidates that do not grow or have no start, no held-out views, a view
             that is in both sets, and as `fit` does.
     """
-    errors, resolution = float(not_negative("errors", errors)), float(not_negative("resolution", resolution))
-    block = integer("block", block, 1)
+    errors, block = float(not_negative("errors", errors)), integer("block", block, 1)
     if wrong := {"constraints", "where"} & set(options):
         raise ValueError(f"{' and '.join(sorted(wrong))} must be given with each Candidate, not to choose.")
     candidates, held_out = _list("candidates", candidates), _list("held_out", held_out)
@@ -156,8 +154,6 @@ def choose(
     for at, candidate in enumerate(candidates):
         start = candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters)
         how = {**options, "constraints": candidate.constraints, "where": candidate.where}
-        if callback is not None:
-            how["callback"] = partial(callback, candidate.name)
         if checkpoint is not None:
             file = Path(checkpoint)
             how["checkpoint"] = file.with_name(f"{file.stem}-{at + 1}{file.suffix}")
@@ -176,7 +172,7 @@ def choose(
     rows, chosen = [], best
     for at, (candidate, own, loss) in enumerate(zip(candidates, fits, losses, strict=True)):
         error = standard_error(found[at], found[best], block)
-        if loss - losses[best] <= errors * error or 2 * loss <= (resolution * norm) ** 2:
+        if loss - losses[best] <= errors * error or 2 * loss <= (RESOLUTION * norm) ** 2:
             chosen = min(chosen, at)
         numbers = size(own.solution.value)
         undetermined = own.uncertainty.undetermined if own.uncertainty else []

@@ -66,10 +66,9 @@ class Free(eqx.Module):
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []
-        for path, node in zip(self.paths, self.moved(free), strict=True):
-            for inner, leaf in jax.tree_util.tree_flatten_with_path(node)[0]:
-                name = path.removeprefix("parameters") + jax.tree_util.keystr(inner)
-                names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
+        for (number, *inner), leaf in jax.tree_util.tree_flatten_with_path(self.moved(free))[0]:
+            name = self.paths[number.idx].removeprefix("parameters") + jax.tree_util.keystr(tuple(inner))
+            names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
 
 
@@ -142,14 +141,12 @@ def _select(tree: PyTree, where: Where | None) -> PyTree:
     """Fix everything except what `where` selects."""
     if where is None:
         return tree
-    leaves, structure = jax.tree.flatten(tree, is_leaf=_is_bijection)
+    chosen = jax.tree.map(lambda _: False, tree, is_leaf=_is_bijection)
     try:
-        chosen = set(jax.tree.leaves(where(jax.tree.unflatten(structure, range(len(leaves))))))
-    except (AttributeError, KeyError, IndexError, TypeError) as fault:
+        chosen = eqx.tree_at(where, chosen, replace_fn=lambda node: jax.tree.map(lambda _: True, node))
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError) as fault:
         raise ValueError(
-            "where must choose parts of the parameters, such as lambda p: p.extinction (a camera that is "
+            "where must return parts of the parameters, such as lambda p: p.extinction (a camera that is "
             f"fitted as a pose is a single part); it failed with {fault!r}."
         ) from fault
-    if not chosen <= set(range(len(leaves))):
-        raise ValueError(f"where must return parts of the parameters, unchanged; got {sorted(chosen)}.")
-    return jax.tree.unflatten(structure, [b if i in chosen else Fixed() for i, b in enumerate(leaves)])
+    return jax.tree.map(lambda free, bijection: bijection if free else Fixed(), chosen, tree)

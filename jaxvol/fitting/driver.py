@@ -112,9 +112,8 @@ def fit(
             float arrays are fitted.
         solver: `"levenberg_marquardt"` or `"gauss_newton"`: least squares, up to a few hundred parameters;
             start with the first. `"bfgs"` needs only the gradient, and a matrix of parameters × parameters.
-            `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays. Or any
-            least-squares solver or minimiser of Optimistix, with its own tolerances; or a transformation of
-            Optax.
+            `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays. Or a solver
+            of Optimistix, with its own tolerances; or a transformation of Optax.
         constraints: A tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
             `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`, `ProbeGeometry(probe)`, or None
             for the default: of a transfer function, positive extinction, colours in [0, 1] and fixed values;
@@ -143,8 +142,7 @@ def fit(
 
     Raises:
         ValueError: For incompatible arguments, parameters that are not finite or out of bounds, a residual
-            that is not finite at the start, and a checkpoint that is damaged, of another fit, or cannot be
-            written.
+            that is not finite at the start, and a checkpoint that is damaged or of another fit.
         ImportError: If Optax is requested but not installed.
     """
     not_negative("rtol", rtol)

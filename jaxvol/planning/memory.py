@@ -17,8 +17,8 @@ from ..scene.volume import Volume
 
 
 IN_MEMORY = 9
-"""Bytes for each byte of voxels, or less, that `render` takes: the voxels as read and in the device, a packed
-copy of 8-bit ones, what finding the extremes of blocks takes, and slopes."""
+"""Most bytes that `render` takes for each byte of voxels: these as read and in the device, a packed copy of
+8-bit ones, the extremes of blocks, and slopes."""
 
 HALVED = 4
 """How often a step may be halved so that bricks fit."""
@@ -34,9 +34,7 @@ def read_within(volume: Openable, memory: Any) -> tuple[Volume, VoxelSource, int
     while IN_MEMORY * source.dtype.itemsize * math.prod(-(-n // stride) for n in source.shape) > room:
         stride += 1
         if min(source.shape) // stride < 2:
-            raise ValueError(
-                f"memory must hold a copy of 2 voxels along each axis to plan with; got {room} bytes."
-            )
+            raise ValueError(f"memory must hold a copy of 2 voxels along each axis; got {room} bytes.")
     return source.subsampled(stride), source, room, stride
 
 

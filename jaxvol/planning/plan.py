@@ -56,18 +56,15 @@ class Plan(NamedTuple):
         volume: Where `bricks` is given, only the copy that was planned with.
         lighting: As given.
         tolerance: As given.
-        error: Predicted, on the safe side, from some of the pixels; where nothing could be proven to be
-            within the tolerance, just above it.
+        error: Predicted, on the safe side; just above the tolerance where nothing could be proven.
         samples: Predicted for each pixel.
         parts: What was kept or left out, and why.
         probed: Seconds that planning took, compilation included.
         compositing: As given.
         source: The volume, if there was a budget of memory.
-        memory: The budget, bytes, if there was one.
-        stride: Of the copy of every n-th voxel that was planned with, to which `error` and `samples` belong;
-            1 where the volume fits.
-        bricks: What to expect of `render_bricks`: at most `needed` bricks will be read, for this camera and
-            others of as many pixels. None where the volume fits.
+        memory: The budget, bytes.
+        stride: Of the copy that was planned with, to which `error` and `samples` belong; 1 if all fits.
+        bricks: What to expect of `render_bricks`; None if all fits.
     """
 
     march: March
@@ -159,9 +156,8 @@ def plan(
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
     - **bricks**: for a volume that does not fit into `memory`, with what `render` makes of it, the march is
-      planned on a copy of every n-th voxel along each axis, and its step divided by n; or by more, where the
-      smallest bricks do not fit. The error is that of the copy, which does not prove what is empty:
-      `AlphaCorrection` and `SpaceLeaping` are kept.
+      planned on a copy of every n-th voxel along each axis, and its step divided by n, or by more until
+      bricks fit. The error is that of the copy; `AlphaCorrection` and `SpaceLeaping` are kept.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater: an estimate from
     some of the pixels, and from how images change with the last halvings of the step. The noise of a lighting
@@ -186,8 +182,8 @@ def plan(
         seed: Of the choice of patches. With it, the plan depends on nothing but the scene.
 
     Returns:
-        A `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which takes images
-        of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
+        A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
+        False and `Plan.parts` says so.
 
     Raises:
         ValueError: For arguments of another kind, a tolerance out of range, arrays that are traced (plan
@@ -266,10 +262,8 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     for each in given:
         decided = isinstance(each, AdaptiveSampling | EarlyTermination | SpaceLeaping)
         if decided or (isinstance(each, AlphaCorrection) and not each.labels):
-            raise ValueError(
-                "transforms must be those that belong to the scene, such as a ToroidalMap; got "
-                f"{type(each).__name__}, on which the plan decides."
-            )
+            name = type(each).__name__
+            raise ValueError(f"transforms must be those of the scene; got {name}, on which the plan decides.")
     return float(tolerance), given
 
 

@@ -102,8 +102,8 @@ class Probe(NamedTuple):
         return render_scene(scene._replace(source=self.source, march=march), "all", "replay")
 
     def distance(self, image: Rendering, other: Rendering) -> float:
-        """Root mean square difference of both images' colours, over the whole image: over black or over
-        white, whichever is greater; plus CONFIDENT standard errors, since only some pixels are known."""
+        """Root mean square difference of colours over the whole image, over black or over white, whichever is
+        greater; plus CONFIDENT standard errors, since only some pixels are known."""
         a, b = (np.asarray(each.rgba, np.float64) for each in (image, other))
         color, opacity = a[:, :3] - b[:, :3], a[:, 3:] - b[:, 3:]
         squares = [np.mean(each**2, axis=-1) for each in (color, color - opacity)]
