@@ -14,7 +14,7 @@ from .vec3 import Scalar
 
 
 def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, "..."], Scalar]:
-    """The interval in which a value lies, and the fraction of it below the value, in [0, 1]. NaN stays NaN."""
+    """The interval in which a value lies, and how far along, from 0 to 1. NaN stays NaN."""
     lines = jax.lax.stop_gradient(lines)
     index = jnp.clip(points_below(lines, value) - 1, 0, lines.shape[0] - 2)
     start, end = gather(lines, index), gather(lines, index + 1)

@@ -220,7 +220,7 @@ def _entries(residual: Any, parameters: PyTree) -> Array:
         return ravel_pytree(residual(parameters))[0]
     ((function, items),) = residual.tiles(residual.count())
     entries = jax.lax.map(lambda item: function(parameters, item, "replay"), items)
-    return entries.reshape(residual.groups[0].images.shape[1:])
+    return entries.reshape(residual.groups[0][1].shape[1:])
 
 
 def _list(name: str, given: Any) -> list[Any]:

@@ -49,13 +49,6 @@ def check_residual(residual: Any) -> None:
         )
 
 
-class _Group(eqx.Module):
-    """Stacked views of the same size and kind."""
-
-    cameras: Camera
-    images: Float[Array, "views height width channels"]
-
-
 SceneFunction = Callable[[Any, Camera], tuple[Any, ...]]
 """From parameters and a view's camera to volume, transfer function, camera, march, and maybe lighting."""
 
@@ -87,7 +80,8 @@ class ImageResidual(eqx.Module):
     """
 
     scene: SceneFunction
-    groups: list[_Group]
+    groups: list[tuple[Camera, Float[Array, "views height width channels"]]]
+    """Stacked views of the same size and kind."""
     background: Float[Array, "3"]
     compositing: Compositing[Any]
     blur: Float[Array, ""] | None
@@ -114,9 +108,7 @@ class ImageResidual(eqx.Module):
         for number, view in enumerate(views):
             camera, image = _view(number, view)
             by_kind.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
-        self.groups = [
-            _Group(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *group)) for group in by_kind.values()
-        ]
+        self.groups = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *views) for views in by_kind.values()]
 
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
@@ -125,24 +117,24 @@ class ImageResidual(eqx.Module):
 
     def cameras(self) -> list[Camera]:
         """Cameras of all views."""
-        each = ((group.cameras, view) for group in self.groups for view in range(len(group.images)))
+        each = ((cameras, view) for cameras, images in self.groups for view in range(len(images)))
         return [jax.tree.map(lambda leaf, view=view: leaf[view], cameras) for cameras, view in each]
 
     def count(self) -> int:
         """Total number of entries."""
-        return sum(group.images.size for group in self.groups)
+        return sum(images.size for _, images in self.groups)
 
     def scale(self) -> float:
         """Norm of the compared data: changes within its rounding carry no information."""
-        squares = sum(float(jnp.sum(group.images**2)) for group in self.groups)
+        squares = sum(float(jnp.sum(images**2)) for _, images in self.groups)
         return math.sqrt(squares / self.count())
 
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most `most` entries."""
-        return [self._tiles(group, most) for group in self.groups]
+        return [self._tiles(*group, most) for group in self.groups]
 
-    def _tiles(self, group: _Group, most: int) -> Tiles:
-        views, height, width, channels = group.images.shape
+    def _tiles(self, cameras: Camera, images: Array, most: int) -> Tiles:
+        views, height, width, channels = images.shape
         what, least = ("one row of an image", 1) if self.blur is None else ("one blurred image", height)
         if most < least * width * channels:
             raise ValueError(
@@ -155,7 +147,7 @@ class ImageResidual(eqx.Module):
 
         def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
-            of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
+            of_view = jax.tree.map(lambda leaf: leaf[view], cameras)
             result = self.scene(parameters, of_view)
             order = "(volume, transfer, camera, march, lighting)"
             if not isinstance(result, tuple) or len(result) not in (4, 5):
@@ -175,7 +167,7 @@ class ImageResidual(eqx.Module):
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
             rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
-            reference = group.images[view, jnp.minimum(row, height - 1)]
+            reference = images[view, jnp.minimum(row, height - 1)]
             # the last piece may reach past the image
             inside = (row < height)[:, None, None]
             difference = jnp.where(inside, (rendered - reference) * weight, 0)
