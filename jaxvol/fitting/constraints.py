@@ -20,6 +20,11 @@ from ..xla.trees import PyTree
 from .bijections import Bijection, Fixed, Pose, Positive, ProbeGeometry, Unconstrained, UnitInterval
 
 
+TRANSFERS = TransferFunction, TransferFunction2D
+
+KNOWN = *TRANSFERS, LabelTransferFunction, Camera, ToroidalMap, Volume, March, Material
+"""Types with constraints of their own."""
+
 Where = Callable[[Any], Any]
 
 FreeVariables: TypeAlias = tuple[PyTree, ...]
@@ -45,8 +50,8 @@ class Free(eqx.Module):
         tree = _select(_resolve(parameters, constraints), where)
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
         nodes = structure.flatten_up_to(parameters)
-        pairs = zip([bijection for _, bijection in found], nodes, strict=True)
-        bijections = [Fixed(node) if isinstance(b, Fixed) else b for b, node in pairs]
+        pairs = zip(found, nodes, strict=True)
+        bijections = [Fixed(node) if isinstance(b, Fixed) else b for (_, b), node in pairs]
         paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
         start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, paths, strict=True))
         if not jax.tree.leaves(start):
@@ -104,19 +109,6 @@ def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
         ) from fault
 
 
-KNOWN = (
-    TransferFunction,
-    TransferFunction2D,
-    LabelTransferFunction,
-    Camera,
-    ToroidalMap,
-    Volume,
-    March,
-    Material,
-)
-"""Types with constraints of their own."""
-
-
 def _default(node: Any) -> PyTree:
     """The constraints of an object, or of a leaf, unless others are given."""
     if isinstance(node, Camera):
@@ -124,7 +116,7 @@ def _default(node: Any) -> PyTree:
     if isinstance(node, ToroidalMap):
         return ProbeGeometry(node)
     fixed = jax.tree.map(lambda _: Fixed(), node)
-    if isinstance(node, TransferFunction | TransferFunction2D):
+    if isinstance(node, TRANSFERS):
         top = float(jnp.max(node.extinction))
         bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
         return eqx.tree_at(lambda t: (t.colors, t.extinction), fixed, bounds)
