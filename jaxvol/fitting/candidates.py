@@ -65,10 +65,8 @@ def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
 
     def divided(rows: Any) -> np.ndarray:
         rows = np.asarray(rows)
-        parts = [
-            np.linspace(a, b, n, endpoint=False) for a, b, n in zip(rows, rows[1:], pieces, strict=False)
-        ]
-        return np.concatenate([*parts, rows[-1:]])
+        each = zip(pairwise(rows), pieces, strict=True)
+        return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for (a, b), n in each), rows[-1:]])
 
     return TransferFunction(divided(values), divided(transfer.colors), divided(transfer.extinction))
 
