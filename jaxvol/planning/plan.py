@@ -114,17 +114,13 @@ class Plan(NamedTuple):
             f"planned in {self.probed:.1f} s",
             *(f"  {'+' if part.kept else '-'} {part.name:16}  {part.why}" for part in self.parts),
         ]
-        if self.source is None or self.memory is None:
-            return "\n".join(lines)
-        size, room = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
-        head = f"in memory: {size} of voxels, and what is made of them, fit into {room}"
         if self.bricks is not None:
             counts = " x ".join(map(str, self.bricks.counts))
-            head = (
-                f"{counts} bricks: {size} of voxels do not fit into {room}; at most {self.bricks.needed} are "
-                f"read. Planned on a copy of one voxel in {self.stride} along each axis, with this error:"
-            )
-        return "\n".join([head, *lines])
+            copy = f"planned on a copy of one voxel in {self.stride} along each axis, with this error:"
+            lines.insert(0, f"{counts} bricks: at most {self.bricks.needed} are read; {copy}")
+        elif self.source is not None:
+            lines.insert(0, f"in memory: {self.source.nbytes / 2**20:.1f} MiB of voxels fit")
+        return "\n".join(lines)
 
 
 def plan(
