@@ -101,7 +101,7 @@ def nested_points(
         start: Where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
             of points.
         points: Increasing numbers of control points. Each candidate keeps those of the one before.
-        **of_each: Other fields of each `Candidate`, such as `constraints`.
+        of_each: Other fields of each `Candidate`, such as `constraints`.
 
     Returns:
         The candidates, for `choose`, from the fewest points to the most.

@@ -99,7 +99,7 @@ def choose(
     errors: float | Any = 2.0,
     block: int | Any = 4,
     checkpoint: str | PathLike[str] | None = None,
-    **options: Any,
+    options: Any,
 ) -> Choice:
     """Fit nested models and choose the smallest that agrees with held-out views as well as the best does.
 
@@ -132,7 +132,7 @@ def choose(
         block: Pixels along a side of blocks within which noise may be correlated: 1 for noise of single
             pixels, more for pictures that were smoothed or compressed.
         checkpoint: A file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
-        **options: Others of `fit`, such as `max_steps`, for all candidates.
+        options: Others of `fit`, such as `max_steps`, for all candidates.
 
     Returns:
         A `Choice`, with the evidence for each candidate. If the largest is chosen, a larger one may be better

@@ -189,7 +189,7 @@ def fit_coarse_to_fine(
     parameters: PyTree,
     *,
     blurs: Sequence[Arrayable | None] | Any = (1 / 8, 1 / 32, None),
-    **options: Any,
+    options: Any,
 ) -> list[Fit]:
     """Fit parameters to images blurred less and less, each time from where the last fit ended.
 
@@ -202,7 +202,7 @@ def fit_coarse_to_fine(
         parameters: The starting point.
         blurs: Of each fit, in order, as `ImageResidual`'s. End with None: only the standard errors of an
             unblurred fit are right.
-        **options: Those of `fit`, for all of them, but for `checkpoint`. A `patience` of 4 saves steps.
+        options: Those of `fit`, for all of them, but for `checkpoint`. A `patience` of 4 saves steps.
 
     Returns:
         The fits, in order. The last one's `parameters` and `uncertainty` are the result.

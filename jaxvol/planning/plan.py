@@ -92,7 +92,7 @@ class Plan(NamedTuple):
         Args:
             transfer: As for the plan.
             camera: As for the plan.
-            **options: `outputs` and `devices`, as for `render`.
+            options: `outputs` and `devices`, as for `render`.
 
         Returns:
             As `render`.
