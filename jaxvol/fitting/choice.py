@@ -99,7 +99,7 @@ def choose(
     errors: float | Any = 2.0,
     block: int | Any = 4,
     checkpoint: str | PathLike[str] | None = None,
-    options: Any,
+    **options: Any,
 ) -> Choice:
     """Fit nested models and choose the smallest that agrees with held-out views as well as the best does.
 

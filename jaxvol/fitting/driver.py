@@ -189,7 +189,7 @@ def fit_coarse_to_fine(
     parameters: PyTree,
     *,
     blurs: Sequence[Arrayable | None] | Any = (1 / 8, 1 / 32, None),
-    options: Any,
+    **options: Any,
 ) -> list[Fit]:
     """Fit parameters to images blurred less and less, each time from where the last fit ended.
 
