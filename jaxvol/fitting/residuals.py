@@ -12,7 +12,7 @@ exactly, for any solver; unlike JᵀJ, it does not square the condition number.
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -154,7 +154,7 @@ class ImageResidual(eqx.Module):
                 raise ValueError(
                     f"scene must return {order}, the last if it is lit; got {described(result)}."
                 )
-            volume, transfer, camera, march, lighting = (*result, None)[:5]
+            volume, transfer, camera, march, lighting = cast(Any, (*result, None)[:5])
             scene = {"volume": volume, "transfer": transfer, "camera": camera, "march": march}
             check_arguments(order, **scene, lighting=lighting)
             if camera.size != of_view.size:
@@ -163,7 +163,7 @@ class ImageResidual(eqx.Module):
                 )
             if pieces > 1:
                 camera = rows_of(camera, first, rows)
-            how = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
+            how: Any = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
             rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
             row = first + jnp.arange(rows)
