@@ -134,18 +134,23 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
     residual = jv.ImageResidual(problem.scene, views[:SEEN])
     choice = jv.choose(residual, problem.candidates, views[SEEN:], block=1, max_steps=STEPS)
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
-    names = [row.name for row in choice.candidates]
     held_out = [row.held_out_loss for row in choice.candidates]
-    keys = "name", "numbers", "determined", "held_out_loss", "standard_error", "bic"
+    # of independent Gaussian residuals of one unknown variance; losses below -80 dB count as equal
+    count, least = residual.count(), (1e-4 * residual.scale()) ** 2
+    bic = [
+        count * np.log(max(2 * row.fit.loss, least)) + row.numbers * np.log(count)
+        for row in choice.candidates
+    ]
+    keys = "name", "numbers", "determined", "held_out_loss", "standard_error"
     return {
         "seed": seed,
         "truth": truth,
         "chosen": choice.chosen,
-        "bic": names.index(choice.by_bic),
+        "bic": int(np.argmin(bic)),
         "least": int(np.argmin(held_out)),
         "candidates": [
-            {key: getattr(row, key) for key in keys} | {"training_loss": row.fit.loss}
-            for row in choice.candidates
+            {key: getattr(row, key) for key in keys} | {"training_loss": row.fit.loss, "bic": float(of_row)}
+            for row, of_row in zip(choice.candidates, bic, strict=True)
         ],
     }
 

@@ -150,7 +150,7 @@ def determined(residual: Any, at: Any, truth: jv.ToroidalMap, **options: Any) ->
         "last β": ".beta_range[1]",
         "first σ": ".sigma_range[0]",
         "last σ": ".sigma_range[1]",
-        "last γ": (".last_gamma", ".gamma_range[1]"),
+        "last γ": (".gamma_range", ".gamma_range[1]"),
     }
     errors = {
         number: next(error for name, error in found.standard_errors.items() if name.endswith(ending))

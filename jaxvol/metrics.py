@@ -5,18 +5,21 @@ squares per pixel, summed over channels: scaling an error by k scales them by k�
 in cycles per pixel. This is NumPy, not JAX, since it analyses finished images.
 """
 
+import math
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from jaxtyping import Float64
+
+from ._util.checks import finite_array, integer, number
 
 
 Image: TypeAlias = Float64[np.ndarray, "height width channels"]
 Plane: TypeAlias = Float64[np.ndarray, "height width"]
 
 BLOCK = 32
-"""Side, in pixels, of the blocks that are searched for wood grain of unknown frequency: small enough that
-rings on a curved surface are straight and evenly spaced within one, large enough to separate frequencies."""
+"""Side, in pixels, of the blocks that are searched for wood grain of unknown frequency: rings on a curved
+surface are straight within one, and frequencies are still apart."""
 
 SLOWEST = 3
 """Cycles per block below which an error counts as shading, not wood grain: a period of 10.7 pixels."""
@@ -28,11 +31,15 @@ PEAKS = 16
 def rmse(image: Any, reference: Any) -> float:
     """Root-mean-square difference over pixels and channels.
 
-    **Arguments:** `image`, `reference`: (height, width) or (height, width, channels), of one shape.
+    Args:
+        image: (height, width) or (height, width, channels).
+        reference: An image of the same shape.
 
-    **Returns:** the difference, in the unit of the images.
+    Returns:
+        The difference, in the unit of the images.
 
-    **Raises:** `ValueError` for NaN or infinity, shapes that differ, and input that is not an image.
+    Raises:
+        ValueError: For NaN or infinity, shapes that differ, and input that is not an image.
     """
     image, reference = _pair(image, reference)
     return float(np.sqrt(np.mean((image - reference) ** 2)))
@@ -41,36 +48,43 @@ def rmse(image: Any, reference: Any) -> float:
 def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Peak signal-to-noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
 
-    **Arguments:** `image`, `reference`: as for `rmse`. `data_range`: the greatest value of an image, > 0.
+    Args:
+        image: As for `rmse`.
+        reference: As for `rmse`.
+        data_range: The greatest value of an image, > 0.
 
-    **Returns:** the ratio, dB.
+    Returns:
+        The ratio, dB.
 
-    **Raises:** as `rmse`, and `ValueError` for a `data_range` that is not positive.
+    Raises:
+        ValueError: As `rmse`, and for a `data_range` that is not positive.
     """
-    from skimage.metrics import peak_signal_noise_ratio  # here, since it imports more slowly than jaxvol
-
-    image, reference = _pair(image, reference)
-    if not np.any(image != reference):
-        return float("inf")
-    return float(peak_signal_noise_ratio(reference, image, data_range=_positive("data_range", data_range)))
+    number("data_range", data_range, above=0)
+    error = rmse(image, reference)
+    return 20 * math.log10(data_range / error) if error > 0 else math.inf
 
 
 def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Mean structural similarity over windows of 7 x 7 pixels, then over channels; 1 for equal images.
 
-    **Arguments:** `image`, `reference`, `data_range`: as for `psnr`.
+    Args:
+        image: As for `psnr`.
+        reference: As for `psnr`.
+        data_range: As for `psnr`.
 
-    **Returns:** the similarity, at most 1.
+    Returns:
+        The similarity, at most 1.
 
-    **Raises:** as `psnr`, and `ValueError` for an image with fewer than 7 pixels along a side.
+    Raises:
+        ValueError: As `psnr`, and for an image with fewer than 7 pixels along a side.
 
     Source: Wang et al. 2004, as implemented in scikit-image.
     """
     from skimage.metrics import structural_similarity  # here, since it imports more slowly than jaxvol
 
+    number("data_range", data_range, above=0)
     image, reference = _pair(image, reference)
     _at_least("image", image, 7)
-    data_range = _positive("data_range", data_range)
     mean = structural_similarity(reference, image, data_range=data_range, channel_axis=-1)
     return float(cast(float, mean))  # a tuple only if more outputs are requested
 
@@ -80,61 +94,61 @@ def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: fl
 
     The plane's depth grows by one step, and the rings repeat, every `step / (pixel_size depth_slope)` pixels.
 
-    **Arguments:**
+    Args:
+        step: Distance between samples, world length, > 0.
+        depth_slope: World depth gained per world length to the right and downwards in the image.
+        pixel_size: World length of a pixel, > 0.
 
-    - `step`: distance between samples, world length, > 0.
-    - `depth_slope`: world depth gained per world length to the right and downwards in the image.
-    - `pixel_size`: world length of a pixel, > 0.
+    Returns:
+        The frequency to the right and downwards, cycles per pixel, as `wood_grain_energy` takes it.
 
-    **Returns:** the frequency to the right and downwards, cycles per pixel, as `wood_grain_energy` takes it.
-
-    **Raises:** `ValueError` for a step or pixel size that is not positive, and slopes that are not finite.
+    Raises:
+        ValueError: For a step or pixel size that is not positive, and slopes that are not finite.
     """
-    step, pixel_size = _positive("step", step), _positive("pixel_size", pixel_size)
-    along_x, along_y = _two("depth_slope", depth_slope)
+    number("step", step, above=0)
+    number("pixel_size", pixel_size, above=0)
+    finite_array("depth_slope", depth_slope, (2,))
+    along_x, along_y = map(float, depth_slope)
     return pixel_size * along_x / step, pixel_size * along_y / step
 
 
 def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, harmonics: int = 3) -> float:
     """Energy of the wood grain in an error: mean square per pixel, summed over channels.
 
-    **With `frequency`** (the fundamental of the rings, see `comb_frequency`): the energy of the waves at this
-    frequency and its harmonics, each measured by its Fourier coefficient under a Hann window over the image,
+    With `frequency` (the fundamental of the rings, see `comb_frequency`): the energy of the waves at it and
+    its harmonics, each measured by its Fourier coefficient under a Hann window w over the image,
 
         a_h = Σ w (e - mean_w(e)) exp(-2πi h f·x) / Σ w,    energy = Σ_h 2 |a_h|²,  h = 1 … harmonics.
 
-    Frequencies are exact, not FFT bins: a wave `A cos(2π h f·x + φ)` has energy A²/2 at any frequency.
     Harmonics above Nyquist are measured at their aliases; those within two bins (2/width, 2/height) of 0, of
     their own mirror image, or of an earlier harmonic are left out. White noise of variance v adds
     2.25 v · 2 harmonics / pixels. A `frequency` that is wrong by half a bin loses 28 %.
 
-    **Without `frequency`**, for any scene: the energy in a few peaks of local spectra, beyond what noise
-    has there by chance. Blocks of `BLOCK` pixels overlap by half; each is taken minus its windowed mean and
-    under a Hann window w. Its periodogram |F|² / (BLOCK² Σ w²), over frequencies of at least `SLOWEST` cycles
-    per block (slower errors are shading), has the total E, and its `PEAKS` largest values have the sum T.
-    In white noise the m largest of N values hold on average the share q = Σ_{i ≤ m} Σ_{i ≤ j ≤ N} 1 / (j N).
-    The energy is the mean over blocks of (T - q E) / (1 - q), which is E for waves and averages 0 for white
-    noise. Noise added to waves lowers the result by up to 0.13 of its own energy. An edge counts as
-    structure, a single pixel does not.
+    Without `frequency`, for any scene: the energy in the peaks of local spectra, beyond what noise has there
+    by chance. Of each block of `BLOCK` pixels under a Hann window, E is the energy over frequencies of at
+    least `SLOWEST` cycles per block (slower errors are shading), T that of its `PEAKS` largest values, and q
+    their share on average in white noise. The result is the mean over blocks of (T - q E) / (1 - q): E for
+    waves, 0 on average for white noise. Noise added to waves lowers it by up to 0.13 of its own energy. An
+    edge counts as structure, a single pixel does not.
 
-    **Arguments:**
+    Args:
+        error: An image minus its reference, (height, width) or (height, width, channels).
+        frequency: To the right and downwards, cycles per pixel; None where it is not known.
+        harmonics: How many are summed, with `frequency`.
 
-    - `error`: an image minus its reference, (height, width) or (height, width, channels).
-    - `frequency`: to the right and downwards, cycles per pixel; None where it is not known.
-    - `harmonics`: how many are summed, with `frequency`.
+    Returns:
+        The energy, in squared units of the error.
 
-    **Returns:** the energy, in squared units of the error.
-
-    **Raises:** `ValueError` for NaN or infinity, input that is not an image, an image smaller than a block,
-    harmonics < 1, and a fundamental that cannot be separated from 0 or from its mirror image.
+    Raises:
+        ValueError: For NaN or infinity, input that is not an image, an image smaller than a block,
+            harmonics < 1, and a fundamental that cannot be separated from 0 or from its mirror image.
     """
     error = _image("error", error)
     if frequency is None:
         _at_least("error", error, BLOCK)
         return sum(_peaks(error[..., channel]) for channel in range(error.shape[-1]))
-    if harmonics < 1:
-        raise ValueError(f"harmonics must be at least 1; got {harmonics}.")
-    return _comb(error, _two("frequency", frequency), harmonics)
+    finite_array("frequency", frequency, (2,))
+    return _comb(error, frequency, integer("harmonics", harmonics, 1))
 
 
 def boundary_noise(image: Any, region: Any) -> float:
@@ -145,15 +159,16 @@ def boundary_noise(image: Any, region: Any) -> float:
     the row and a function of the column gives 0, as does any quadratic; other smooth shading leaves its
     ∂⁴/∂x²∂y².
 
-    **Arguments:**
+    Args:
+        image: An image, or an error, (height, width) or (height, width, channels).
+        region: (height, width) booleans, for example where the bounds cut through material.
 
-    - `image`: an image, or an error, (height, width) or (height, width, channels).
-    - `region`: (height, width) booleans, for example where the bounds cut through material.
+    Returns:
+        The variance, in squared units of the image.
 
-    **Returns:** the variance, in squared units of the image.
-
-    **Raises:** `ValueError` for NaN or infinity, input that is not an image, a region of another shape, and
-    one that holds no 3 x 3 pixels.
+    Raises:
+        ValueError: For NaN or infinity, input that is not an image, a region of another shape, and one that
+            holds no 3 x 3 pixels.
 
     Source: Immerkær, "Fast noise variance estimation", CVIU 64(2), 1996, with squares for absolute values.
     """
@@ -173,31 +188,27 @@ def boundary_noise(image: Any, region: Any) -> float:
 
 def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float:
     height, width, _ = error.shape
-    window = _hann(height, width)
-    windowed = _windowed(error, window) / window.sum()
-    earlier: list[Float64[np.ndarray, 2]] = [np.zeros(2)]
-    energy = 0.0
+    windowed, window = _windowed(error)
+    x, y = np.arange(width), np.arange(height)
+    earlier, energy = [np.zeros(2)], 0.0
     for harmonic in range(1, harmonics + 1):
         wave = harmonic * np.array(frequency)
         others = [*earlier, -wave]
         apart = [np.abs(wave - other - np.round(wave - other)) for other in others]  # of their aliases
         if any(np.all(each < 2 / np.array([width, height])) for each in apart):
-            if harmonic == 1:
-                raise ValueError(
-                    f"frequency must be two bins (2/width, 2/height) away from 0 and from its mirror image; "
-                    f"got {frequency} in an image of {width} x {height}."
-                )
-            continue
+            if harmonic > 1:
+                continue
+            raise ValueError(
+                f"frequency must be two bins (2/width, 2/height) away from 0 and from its mirror image; "
+                f"got {frequency} in an image of {width} x {height}."
+            )
         earlier += [wave, -wave]
-        down, across = (
-            np.exp(-2j * np.pi * f * np.arange(n)) for f, n in ((wave[1], height), (wave[0], width))
-        )
-        energy += 2 * np.sum(np.abs(np.einsum("y,yxc,x->c", down, windowed, across)) ** 2)
+        across, down = np.exp(-2j * np.pi * wave[0] * x), np.exp(-2j * np.pi * wave[1] * y)
+        energy += 2 * np.sum(np.abs(np.einsum("y,yxc,x->c", down, windowed / window.sum(), across)) ** 2)
     return float(energy)
 
 
 def _peaks(error: Plane) -> float:
-    window = _hann(BLOCK, BLOCK)
     cycles = np.fft.fftfreq(BLOCK, 1 / BLOCK)
     y, x = np.meshgrid(cycles, cycles, indexing="ij")
     # one of each mirrored pair, without the two lines at Nyquist, which are their own mirror images
@@ -207,8 +218,9 @@ def _peaks(error: Plane) -> float:
     blocks = np.lib.stride_tricks.sliding_window_view(error, (BLOCK, BLOCK))
     starts = [np.append(np.arange(0, n - 1, BLOCK // 2), n - 1) for n in blocks.shape[:2]]
     blocks = blocks[np.ix_(*starts)].reshape(-1, BLOCK, BLOCK, 1)
-    spectra = [np.fft.fft2(_windowed(block, window)[..., 0])[selected] for block in blocks]
-    energy = np.sort(2 * np.abs(np.array(spectra)) ** 2, axis=1) / (BLOCK**2 * np.sum(window**2))
+    windowed, windows = zip(*map(_windowed, blocks), strict=True)
+    spectra = np.fft.fft2(np.array(windowed)[..., 0])[:, selected]
+    energy = np.sort(2 * np.abs(spectra) ** 2, axis=1) / (BLOCK**2 * np.sum(windows[0] ** 2))
 
     chance = _share_of_largest(PEAKS, int(selected.sum()))
     total, top = energy.sum(axis=1).mean(), energy[:, -PEAKS:].sum(axis=1).mean()
@@ -221,15 +233,12 @@ def _share_of_largest(m: int, n: int) -> float:
     return float(tails[:m].sum() / n)
 
 
-def _hann(height: int, width: int) -> Plane:
-    y, x = (np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (height, width))
-    return np.outer(y, x)
-
-
-def _windowed(error: Image, window: Plane) -> Image:
-    """The error minus its windowed mean, times the window."""
+def _windowed(error: Image) -> tuple[Image, Plane]:
+    """The error minus its windowed mean, times a Hann window; and the window."""
+    y, x = (np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in error.shape[:2])
+    window = np.outer(y, x)
     mean = np.tensordot(window, error, axes=2) / window.sum()
-    return (error - mean) * window[..., None]
+    return (error - mean) * window[..., None], window
 
 
 def _pair(image: Any, reference: Any) -> tuple[Image, Image]:
@@ -246,30 +255,12 @@ def _image(name: str, value: Any) -> Image:
     except (TypeError, ValueError) as fault:
         raise ValueError(f"{name} must be numbers; got {value!r}.") from fault
     if array.ndim not in (2, 3) or 0 in array.shape:
-        raise ValueError(
-            f"{name} must have shape (height, width) or (height, width, channels); got {array.shape}."
-        )
-    if not np.isfinite(array).all():
-        raise ValueError(
-            f"{name} must be finite; got {np.sum(~np.isfinite(array))} of {array.size} numbers "
-            "that are NaN or infinite."
-        )
+        raise ValueError(f"{name} must have shape (height, width) or (height, width, c); got {array.shape}.")
+    if bad := np.sum(~np.isfinite(array)):
+        raise ValueError(f"{name} must be finite; got {bad} of {array.size} numbers that are not.")
     return array[..., None] if array.ndim == 2 else array
 
 
 def _at_least(name: str, image: Image, side: int) -> None:
     if min(image.shape[:2]) < side:
         raise ValueError(f"{name} must have at least {side} pixels along each side; got {image.shape[:2]}.")
-
-
-def _two(name: str, value: Any) -> tuple[float, float]:
-    array = np.asarray(value, np.float64)
-    if array.shape != (2,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be two finite numbers (x, y); got {value!r}.")
-    return float(array[0]), float(array[1])
-
-
-def _positive(name: str, value: Any) -> float:
-    if not 0 < float(value) < np.inf:
-        raise ValueError(f"{name} must be a positive finite number; got {value!r}.")
-    return float(value)

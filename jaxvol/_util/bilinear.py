@@ -14,18 +14,18 @@ from .vec3 import Scalar
 
 
 def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, "..."], Scalar]:
-    """The interval in which a value lies, and the part of it below the value, in [0, 1]. NaN stays NaN."""
+    """The interval in which a value lies, and how far along, from 0 to 1. NaN stays NaN."""
     lines = jax.lax.stop_gradient(lines)
     index = jnp.clip(points_below(lines, value) - 1, 0, lines.shape[0] - 2)
     start, end = gather(lines, index), gather(lines, index + 1)
     gap = end - start
     # a quotient of a smaller and a larger number never exceeds 1, unlike a product with 1 / gap
-    part = (value - start) / jnp.where(gap > 0, gap, 1)
-    return index, jnp.where(value < lines[0], 0, jnp.where(value >= lines[-1], 1, part))
+    fraction = (value - start) / jnp.where(gap > 0, gap, 1)
+    return index, jnp.where(value < lines[0], 0, jnp.where(value >= lines[-1], 1, fraction))
 
 
 def slope_between_lines(lines: Float[Array, " n"], value: Scalar, index: Int[Array, "..."]) -> Scalar:
-    """The derivative of the part that `between_lines` finds, by the value."""
+    """The derivative of the fraction that `between_lines` finds, by the value."""
     gap = gather(lines, index + 1) - gather(lines, index)
     inside = (value >= lines[0]) & (value < lines[-1]) & (gap > 0)
     return jnp.where(inside, 1 / jnp.where(gap > 0, gap, 1), 0)
@@ -38,10 +38,10 @@ def corner_rows(table: Float[Array, "n m columns"]) -> Float[Array, "cells corne
 
 
 def interpolate_corners(row: tuple[Scalar, ...], along: Scalar, across: Scalar) -> tuple[Scalar, ...]:
-    """The entries at these parts of a cell: 0 between zeros, and positive between positive numbers."""
+    """The entries at these fractions of a cell: 0 between zeros, and positive between positive numbers."""
 
-    def mix(part: Scalar, a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-        return tuple(p * (1 - part) + q * part for p, q in zip(a, b, strict=True))
+    def mix(t: Scalar, a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+        return tuple(p * (1 - t) + q * t for p, q in zip(a, b, strict=True))
 
     n = len(row) // 4
     first, second = (mix(across, row[at : at + n], row[at + n : at + 2 * n]) for at in (0, 2 * n))

@@ -1,7 +1,7 @@
 """Checks arguments. An error names the argument, what came, and what was expected.
 
-A fault visible in shapes or Python values raises `ValueError` at once. A fault visible only in traced values
-is raised by `equinox.error_if` when the compiled program runs.
+A fault in shapes or Python values raises `ValueError` at once, one in traced values an error of
+`equinox.error_if` when the compiled program runs.
 """
 
 import contextlib
@@ -55,15 +55,14 @@ def shortened(value: Any) -> str:
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """Return `value` after checking that `holds(value, *others)` is true everywhere. Use what is returned:
-    without it, the check on a traced value vanishes.
+    """Check that `holds(value, *others)` is true everywhere, and return `value`.
 
     `holds` gets NumPy arrays if the values are concrete, else traced ones. `{got}` in `message` becomes the
-    value.
+    value. Use what is returned: without it, the check on a traced value vanishes. Inside `jax.shard_map`,
+    where Equinox's errors do not work, a traced value becomes NaN instead.
 
     Raises:
-        ValueError: at once for a concrete value, an Equinox runtime error for a traced one. Inside
-            `jax.shard_map`, where Equinox's errors do not work, a traced value becomes NaN instead.
+        ValueError: at once for a concrete value; for a traced one, an Equinox runtime error.
     """
     if is_traced(value, *others):
         if any(map(varies_over, jax.tree.leaves((value, others)))):
@@ -130,6 +129,12 @@ def number(
     )
 
 
+def not_negative(name: str, value: Arrayable) -> Array:
+    """`value` as a finite scalar of at least 0."""
+    message = f"{name} must not be negative; got {{got}}."
+    return require(finite_array(name, value, ()), lambda scalar: scalar >= 0, message)
+
+
 def increasing(name: str, value: Arrayable) -> Array:
     """`value` as an array of at least two numbers that increase, but for two equal ones that make a step."""
     array = finite_array(name, value, (None,))
@@ -182,7 +187,7 @@ def power_of_two(name: str, value: Any, most: int) -> int:
 
 
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
-    """**Raises** `ValueError` if the file `path` cannot be written. `whole_file` makes its folder."""
+    """The path of a file that can be written, else a `ValueError`. `whole_file` makes its folder."""
     path = Path(path)
     try:
         if path.is_dir():
@@ -200,7 +205,7 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
 
 
 def check_answer(owner: Any, method: str, answer: PyTree, expected: PyTree) -> None:
-    """**Raises** `ValueError` if a method of a user's class returned other shapes or types than expected."""
+    """Raise a `ValueError` if a method of a user's class returned other shapes or types than expected."""
 
     def kinds(tree: PyTree) -> PyTree:
         return jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), tree)

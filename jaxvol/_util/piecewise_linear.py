@@ -16,7 +16,7 @@ from .vec3 import Scalar, Vec3
 
 
 FEW = 16
-"""With up to so many control points, comparing a value with each of them costs less than a look-up."""
+"""Up to so many control points, comparing a value with each costs less than a search."""
 
 ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
 """By how much an interpolated extinction may exceed its bound, relative to the greatest of its table."""
@@ -155,9 +155,9 @@ def variation_between(
     ends = [_interval(values, end, below) for end, below in ((low, passed), (high, reached))]
 
     def between(changes: Array) -> Array:
-        """Sum of what changes along the intervals, in proportion where only a part of one lies within."""
+        """Sum of what changes along the intervals, in proportion where only a fraction of one lies within."""
         whole = jnp.cumsum(changes) - changes
-        first, last = (gather(whole, i) + part * gather(changes, i) for i, part in ends)
+        first, last = (gather(whole, i) + t * gather(changes, i) for i, t in ends)
         return jnp.maximum(last - first, 0)
 
     def inside(at_points: Array, end: Array) -> Array:
@@ -175,12 +175,12 @@ def variation_between(
 def _interval(
     values: Float[Array, " n"], value: Float[Array, "*batch"], below: Int[Array, "*batch"]
 ) -> tuple[Int[Array, "*batch"], Float[Array, "*batch"]]:
-    """In which interval a value lies that has so many points at or below it, and the part of it below."""
+    """In which interval a value lies that has so many points at or below it, and the fraction of it below."""
     i = jnp.clip(below - 1, 0, values.shape[0] - 2)
     start, end = gather(values, i), gather(values, i + 1)
     gap = end - start
-    part = jnp.clip((value - start) / jnp.where(gap > 0, gap, 1), 0, 1)
-    return i, jnp.where(gap > 0, part, (value >= start).astype(part.dtype))
+    fraction = jnp.clip((value - start) / jnp.where(gap > 0, gap, 1), 0, 1)
+    return i, jnp.where(gap > 0, fraction, (value >= start).astype(fraction.dtype))
 
 
 def _maximum_of_range(

@@ -14,13 +14,14 @@ import numpy as np
 from jax.scipy.special import logit
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, finite_array, number, require
+from .._util.checks import Arrayable, described, finite_array, number, require
+from ..march.transforms import ToroidalMap
 from ..scene.camera import Camera, axes_of
 
 
 MARGIN = 1e-3
-"""A start closer than this to an open end of the range (relative to the scale) is moved to this distance from
-it: at the end itself the map is flat, and a fit could never leave it."""
+"""Least distance of a start from an open end of the range, relative to the scale: at the end itself the map
+is flat, and a fit could never leave it."""
 
 
 class Bijection(eqx.Module):
@@ -35,23 +36,25 @@ class Bijection(eqx.Module):
 
     @abstractmethod
     def inverse(self, value: Any, name: str = "value") -> Any:
-        """Free variables for a value.
-
-        **Raises:** `ValueError`, naming `name`, for a value that is not allowed.
-        """
+        """Free variables for a value. A value that is not allowed raises a `ValueError` that names `name`."""
 
     def moved(self, value: Any) -> Any:
-        """Parts of a value that the free variables change."""
+        """What of a value the free variables change."""
         return value
 
 
 class Fixed(Bijection):
     """No free variables: the value stays as it was at the start."""
 
-    def forward(self, free: Any) -> Any:
-        raise ValueError("Fixed has no free variables: the caller keeps the value.")
+    start: Any = None
+
+    def forward(self, free: None) -> Any:
+        return self.start
 
     def inverse(self, value: Any, name: str = "value") -> None:
+        return None
+
+    def moved(self, value: Any) -> None:
         return None
 
 
@@ -62,20 +65,18 @@ class Unconstrained(Bijection):
         return free
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
-        return _finite(value, name)
+        return finite_array(name, value, (...,))
 
 
 class Positive(Bijection):
-    """Positive numbers: `scale` · log(1 + exp(free)).
+    """Positive numbers: `scale` · log(1 + exp(free)). A start below `scale` / 1000 is raised to that.
 
-    **Arguments:**
+    Args:
+        scale: A typical value, in the value's unit, > 0. The map is linear far above it and exponential far
+            below.
 
-    - `scale`: a typical value, in the value's unit, > 0. The map is linear far above it and exponential far
-      below.
-
-    A start at 0, or below `scale` / 1000, is raised to `scale` / 1000.
-
-    **Raises:** `ValueError` for a scale that is not positive, and for negative starts.
+    Raises:
+        ValueError: For a scale that is not positive, and for negative starts.
     """
 
     scale: Float[Array, ""]
@@ -87,30 +88,25 @@ class Positive(Bijection):
         return self.scale.astype(free.dtype) * jax.nn.softplus(free)
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
-        value = require(
-            _finite(value, name), lambda v: v >= 0, f"{name} must not be negative to be fitted; got {{got}}."
-        )
-        part = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
-        return part + jnp.log(-jnp.expm1(-part))  # inverse of softplus, which JAX lacks
+        message = f"{name} must not be negative to be fitted; got {{got}}."
+        value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
+        ratio = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
+        return ratio + jnp.log(-jnp.expm1(-ratio))  # inverse of softplus, which JAX lacks
 
 
 class UnitInterval(Bijection):
-    """Numbers between 0 and 1: 1 / (1 + exp(-free)).
+    """Numbers between 0 and 1: 1 / (1 + exp(-free)). Starts keep a distance of 1/1000 from both ends.
 
-    A start within 1/1000 of an end is moved to that distance from it.
-
-    **Raises:** `ValueError` for starts outside [0, 1].
+    Raises:
+        ValueError: For starts outside [0, 1].
     """
 
     def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         return jax.nn.sigmoid(free)
 
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
-        value = require(
-            _finite(value, name),
-            lambda v: (v >= 0) & (v <= 1),
-            f"{name} must be in [0, 1] to be fitted; got {{got}}.",
-        )
+        message = f"{name} must be in [0, 1] to be fitted; got {{got}}."
+        value = require(finite_array(name, value, (...,)), lambda v: (v >= 0) & (v <= 1), message)
         return logit(jnp.clip(value, MARGIN, 1 - MARGIN))
 
 
@@ -122,7 +118,11 @@ class Pose(Bijection):
     between the two. Everything else (field of view, size) stays fixed. Rotating about the focal point, rather
     than about the camera itself, keeps rotation and translation from imitating each other.
 
-    **Raises:** `ValueError` for a camera that is not a rigid motion of `start`.
+    Args:
+        start: The camera at which both are 0.
+
+    Raises:
+        ValueError: For a camera that is not a rigid motion of `start`.
     """
 
     whole: bool = eqx.field(static=True, default=True, init=False)
@@ -132,14 +132,9 @@ class Pose(Bijection):
         start = jax.lax.stop_gradient(self.start)
         arm = start.position - start.focal_point
         focal_point = start.focal_point + jnp.linalg.norm(arm) * free["translation"]
+        position = focal_point + rotate(free["rotation"], arm)
         return eqx.tree_at(
-            _moved,
-            self.start,
-            (
-                focal_point + rotate(free["rotation"], arm),
-                focal_point,
-                rotate(free["rotation"], start.view_up),
-            ),
+            _moved, self.start, (position, focal_point, rotate(free["rotation"], start.view_up))
         )
 
     def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
@@ -173,10 +168,9 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0.
+    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula).
 
-    Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts.
-    """
+    Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts."""
     square = jnp.sum(turn**2)
     small = square < 1e-6
     angle = jnp.sqrt(jnp.where(small, 1, square))  # never at 0, where the slope of sqrt is infinite
@@ -186,5 +180,84 @@ def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "
     return vector + first * across + second * jnp.cross(turn, across)
 
 
-def _finite(value: Arrayable, name: str) -> Array:
-    return finite_array(name, value, (None,) * np.ndim(value))
+class ProbeGeometry(Bijection):
+    """The geometry of a swept probe: `a`, `b`, both ranges of angles, and the last depth of a `ToroidalMap`.
+
+    The first depth, `gamma_range[0]`, stays that of `start`: adding a length to `b` while subtracting it from
+    both ends of `gamma_range` moves nothing. Images determine the seven others if their cameras are known in
+    world units, the scene has edges in all directions, and its ends are in view. From cameras known up to
+    scale, so are the lengths; where the camera's position is free, so is the probe's. `Fit.uncertainty` says
+    what is not determined.
+
+    The free variables, of order 1, are the distances of the first sample from the apex and from the motor
+    axis (of the outermost beam, the nearest one), the length of a beam, and the logarithms of the ratios in
+    which a range of angles divides [0, π]. So every step is a valid probe: no sample lies behind the apex or
+    the motor axis, ranges increase, and angles stay within [0, π]. Starts keep a distance of 1/1000 from
+    these limits, relative to π or the size of the probe.
+
+    Args:
+        start: Sets the typical lengths, and the first depth.
+
+    Raises:
+        ValueError: For what is not a `ToroidalMap`, for one that begins at another depth, and for one with
+            samples behind the motor axis.
+    """
+
+    whole: bool = eqx.field(static=True, default=True, init=False)
+    start: ToroidalMap
+    length: Positive
+
+    def __init__(self, start: ToroidalMap | Any):
+        if not isinstance(start, ToroidalMap):
+            raise ValueError(f"start must be a ToroidalMap; got {described(start)}.")
+        self.start = start
+        self.length = Positive(start.b + start.gamma_range[1])
+
+    def forward(self, free: dict[str, Any]) -> ToroidalMap:
+        start = jax.lax.stop_gradient(self.start)
+        near, axis, span = (self.length.forward(free[name]) for name in ("near", "axis", "span"))
+        beta, sigma = (_range_of(free[name]) for name in ("beta", "sigma"))
+        first = start.gamma_range[0]
+        gamma = jnp.stack([first, first + span])
+        fields = jnp.zeros_like(near), near - first, beta, sigma, gamma
+        probe = eqx.tree_at(
+            lambda p: (p.a, p.b, p.beta_range, p.sigma_range, p.gamma_range), self.start, fields
+        )
+        return eqx.tree_at(lambda p: p.a, probe, axis - probe.nearest_to_axis)
+
+    def inverse(self, value: ToroidalMap | Any, name: str = "value") -> dict[str, Any]:
+        if not isinstance(value, ToroidalMap):
+            raise ValueError(f"{name} must be a ToroidalMap; got {described(value)}.")
+        first, found = float(self.start.gamma_range[0]), float(value.gamma_range[0])
+        if not np.isclose(found, first, atol=1e-5 * float(self.length.scale)):
+            raise ValueError(
+                f"{name} must begin at the same depth as the start, gamma_range[0] = {first}; got {found}. "
+                "Add the difference to b."
+            )
+        nearest = require(
+            value.nearest_to_axis,
+            lambda axis, size: axis >= -1e-6 * size,
+            f"{name} must not have samples behind the motor axis to be fitted: its outermost beams begin at "
+            "{got} from it. Raise a, or narrow sigma_range.",
+            self.length.scale,
+        )
+        near, axis = value.b + value.gamma_range[0], jnp.maximum(nearest, 0)
+        lengths = {"near": near, "axis": axis, "span": value.gamma_range[1] - value.gamma_range[0]}
+        free = {key: self.length.inverse(length, f"{name}, {key}") for key, length in lengths.items()}
+        return free | {"beta": _ratios(value.beta_range), "sigma": _ratios(value.sigma_range)}
+
+    def moved(self, value: ToroidalMap) -> ToroidalMap:
+        """The map, with the last depth, which is fitted, in place of both."""
+        return eqx.tree_at(lambda probe: probe.gamma_range, value, value.gamma_range[1])
+
+
+def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Logarithms of what lies below and above a range of angles, relative to the range."""
+    gaps = jnp.stack([angles[0], angles[1] - angles[0], jnp.pi - angles[1]])
+    gaps = jnp.maximum(gaps, MARGIN * jnp.pi)
+    return jnp.log(gaps[::2] / gaps[1])
+
+
+def _range_of(ratios: Float[Array, "2"]) -> Float[Array, "2"]:
+    gaps = jnp.pi * jax.nn.softmax(jnp.stack([ratios[0], jnp.zeros_like(ratios[0]), ratios[1]]))
+    return jnp.stack([gaps[0], gaps[0] + gaps[1]])

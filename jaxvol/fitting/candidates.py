@@ -1,4 +1,4 @@
-"""Which models are nested in one another? Candidates for `choose`, each of which contains the one before."""
+"""Where fits start: from flat grey, or, for nested models, where the fit of a smaller one has ended."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -6,34 +6,88 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 
-from .._util.checks import described, integer
+from .._util.checks import Arrayable, described, finite_array, integer, require
 from ..lighting import Material
 from ..scene.transfer import TransferFunction
+from ..scene.volume import Volume
 from ..xla.trees import PyTree
 from .constraints import Where
-from .starts import refined
 
 
-def _unchanged(parameters: PyTree) -> PyTree:
-    return parameters
+def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = None) -> TransferFunction:
+    """A transfer function to start a fit from: middle grey, with the same extinction everywhere.
+
+    Args:
+        volume: Its optical depth becomes about 1, so that the back is visible as well as the front.
+        points: Number of control points, at least 2, evenly spaced.
+        clim: Their range (low, high), in value units; by default that of the volume's values.
+
+    Returns:
+        The `TransferFunction`, of colours 0.5.
+
+    Raises:
+        ValueError: For fewer than two points, and for a range that does not increase.
+    """
+    points = integer("points", points, 2)
+    clim = (float(volume.data.min()), float(volume.data.max())) if clim is None else clim
+    message = "clim must be (low, high), low first; got {got}."
+    low, high = require(finite_array("clim", clim, (2,)), lambda c: c[0] < c[1], message)
+    extent = float(jnp.mean(volume.bounds[1::2] - volume.bounds[::2]))
+    values = np.linspace(float(low), float(high), points)
+    return TransferFunction(values, np.full((points, 3), 0.5), np.full(points, 1 / extent))
+
+
+def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
+    """The same transfer function with more control points.
+
+    All points are kept. Each new one goes where the gap is widest, and those of one gap divide it evenly:
+    even points become even ones again from n to 2n - 1, as 2, 3, 5, 9, and nearly even ones otherwise.
+
+    Args:
+        transfer: The transfer function.
+        points: Their number, at least that of `transfer`.
+
+    Returns:
+        A `TransferFunction` that shows the same.
+
+    Raises:
+        ValueError: For fewer points than `transfer` has.
+    """
+    values = np.asarray(transfer.values)
+    points = integer("points", points, len(values))
+    gaps = np.diff(values.astype(float))
+    pieces = np.ones(len(gaps), int)
+    for _ in range(points - len(values)):
+        pieces[np.argmax(gaps / pieces)] += 1
+
+    def divided(rows: Any) -> np.ndarray:
+        rows = np.asarray(rows)
+        each = zip(pairwise(rows), pieces, strict=True)
+        return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for (a, b), n in each), rows[-1:]])
+
+    return TransferFunction(divided(values), divided(transfer.colors), divided(transfer.extinction))
 
 
 class Candidate(NamedTuple):
     """A model that `choose` may choose.
 
-    - `name`: in the table of results.
-    - `start`: the parameters that its fit starts from, as for `fit`; or
-    - `grow`: `grow(found)` makes them from the fitted parameters of the candidate before, so that the fit
-      starts where that of the smaller model ended. Give one of the two.
-    - `expand`: `expand(parameters)` is what the residual takes; by default the parameters themselves.
-    - `constraints`, `where`: as for `fit`, of the model's own parameters.
+    Attributes:
+        name: In the table of results.
+        start: The parameters that its fit starts from, as for `fit`; or
+        grow: `grow(found)` makes them from the fitted parameters of the candidate before. Give one of the
+            two.
+        expand: `expand(parameters)` is what the residual takes; by default the parameters themselves.
+        constraints: As for `fit`, of the model's own parameters.
+        where: As for `fit`, of the model's own parameters.
     """
 
     name: str
     start: PyTree = None
     grow: Callable[[PyTree], PyTree] | None = None
-    expand: Callable[[PyTree], PyTree] = _unchanged
+    expand: Callable[[PyTree], PyTree] = lambda parameters: parameters
     constraints: PyTree = None
     where: Where | None = None
 
@@ -43,17 +97,17 @@ def nested_points(
 ) -> list[Candidate]:
     """Candidates that are transfer functions of more and more control points.
 
-    **Arguments:**
+    Args:
+        start: Where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
+            of points.
+        points: Increasing numbers of control points. Each candidate keeps those of the one before.
+        of_each: Other fields of each `Candidate`, such as `constraints`.
 
-    - `start`: where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
-      of points.
-    - `points`: increasing numbers of control points. Each candidate has those of the one before, and others
-      between.
-    - `of_each`: other fields of each `Candidate`, such as `constraints`.
+    Returns:
+        The candidates, for `choose`, from the fewest points to the most.
 
-    **Returns:** the candidates, for `choose`, from the fewest points to the most.
-
-    **Raises:** `ValueError` for numbers that do not increase, or fewer than `start` has.
+    Raises:
+        ValueError: For numbers that do not increase, or fewer than `start` has.
     """
     if not isinstance(start, TransferFunction):
         raise ValueError(f"start must be a TransferFunction; got {described(start)}.")
@@ -69,68 +123,61 @@ def nested_materials(
     parts: Sequence[Any] | Any, partitions: Sequence[Sequence[int]] | Any
 ) -> list[Candidate]:
     """Candidates in which more and more materials have parameters of their own. The residual takes a tuple
-    like `parts`, whichever of them are merged.
+    like `parts`, whichever of them share parameters.
 
-    **Arguments:**
+    Args:
+        parts: The starting point: materials, which share their mean free path and nothing else; or other
+            trees of one kind, such as the transfer functions of labels, which are shared as a whole.
+        partitions: For each candidate the class of each part, numbered from 0 on: `[(0, 0, 0), (0, 1, 2)]`
+            for one mean free path for all and then one for each; `[(0, 0, 1), (0, 1, 2)]` to ask whether the
+            first two differ. Each divides classes of the one before.
 
-    - `parts`: the starting point: materials, which share their mean free path and nothing else; or other
-      trees of one kind, such as the transfer functions of labels, which are shared as a whole.
-    - `partitions`: for each candidate the class of each part, numbered from 0 on: `[(0, 0, 0), (0, 1, 2)]`
-      for one mean free path for all and then one for each; `[(0, 0, 1), (0, 1, 2)]` to ask whether the first
-      two differ. Each divides classes of the one before.
+    Returns:
+        The candidates, for `choose`, in the order of `partitions`. The parameters of each are a tuple with
+        the first part of each class; `candidate._replace(where=...)` fixes some of them.
 
-    **Returns:** the candidates, for `choose`, in the order of `partitions`. The parameters of each are a
-    tuple with the first part of each class; `candidate._replace(where=...)` fixes some of them.
-
-    **Raises:** `ValueError` for no parts, and for partitions that do not match these or are not nested.
+    Raises:
+        ValueError: For no parts, and for partitions that do not match these or are not nested.
     """
     if not isinstance(parts, list | tuple) or not parts or len({type(part) for part in parts}) > 1:
         raise ValueError(f"parts must be a list of materials or parameters of one kind; got {parts!r}.")
-    chain = _partitions(partitions, len(parts))
+    chain = [tuple(integer("partitions", number, 0) for number in classes) for classes in partitions]
+    for coarse, fine in pairwise([(), *chain]):
+        valid = len(fine) == len(parts) and set(fine) == set(range(max(fine) + 1))
+        divided = len(set(zip(coarse or fine, fine, strict=False))) == len(set(fine)) > len(set(coarse))
+        if not (valid and divided):
+            raise ValueError(
+                f"partitions must hold a class for each of {len(parts)} parts, numbered from 0 without gaps, "
+                f"and each divide classes of the one before; got {fine} after {coarse}."
+            )
+
     candidates: list[Candidate] = []
     for classes in chain:
-        count = max(classes) + 1
-        members = [[str(i) for i, own in enumerate(classes) if own == number] for number in range(count)]
-        name = f"{count} class{'es' if count > 1 else ''}: " + ", ".join(map("+".join, members))
-        expand = partial(_expanded, parts, classes)
+        numbers = range(max(classes) + 1)
+        members = ("+".join(str(i) for i, own in enumerate(classes) if own == number) for number in numbers)
+        name = f"{len(numbers)} class{'es' if len(numbers) > 1 else ''}: {', '.join(members)}"
+        expand = partial(_expand, parts, classes)
         if candidates:
-            grow = partial(_split, candidates[-1].expand, classes)
+            grow = partial(_grow, candidates[-1].expand, classes)
             candidates.append(Candidate(name, grow=grow, expand=expand))
         else:
             candidates.append(Candidate(name, _first_of_each(parts, classes), expand=expand))
     return candidates
 
 
-def _expanded(parts: Sequence[Any], classes: tuple[int, ...], found: Sequence[Any]) -> tuple[Any, ...]:
-    """The parts, each with what it shares with its class as `found` for that."""
+def _expand(parts: Sequence[Any], classes: tuple[int, ...], found: Sequence[Any]) -> tuple[Any, ...]:
+    """The parts, with what each shares with its class as `found` for that."""
     of_class = tuple(found[number] for number in classes)
     if not isinstance(parts[0], Material):
         return of_class
     pairs = zip(parts, of_class, strict=True)
-    return tuple(eqx.tree_at(lambda m: m.mean_free_path, part, own.mean_free_path) for part, own in pairs)
+    return tuple(eqx.tree_at(lambda m: m.mean_free_path, each, own.mean_free_path) for each, own in pairs)
 
 
-def _split(
-    expand: Callable[[Sequence[Any]], tuple[Any, ...]], classes: tuple[int, ...], found: Sequence[Any]
-) -> tuple[Any, ...]:
+def _grow(expand: Callable[..., Any], classes: tuple[int, ...], found: Sequence[Any]) -> tuple[Any, ...]:
     """Parameters of each class, from those `found` for the classes that they divide."""
     return _first_of_each(expand(found), classes)
 
 
 def _first_of_each(parts: Sequence[Any], classes: tuple[int, ...]) -> tuple[Any, ...]:
     return tuple(parts[classes.index(number)] for number in range(max(classes) + 1))
-
-
-def _partitions(partitions: Any, parts: int) -> list[tuple[int, ...]]:
-    chain = [tuple(integer("partitions", number, 0) for number in classes) for classes in partitions]
-    for classes in chain:
-        if len(classes) != parts or set(classes) != set(range(max(classes) + 1)):
-            raise ValueError(
-                f"partitions must hold a class for each of {parts} parts, numbered from 0 without gaps; "
-                f"got {classes}."
-            )
-    for coarse, fine in pairwise(chain):
-        pairs = set(zip(coarse, fine, strict=True))
-        if len(pairs) != len(set(fine)) or len(set(fine)) <= len(set(coarse)):
-            raise ValueError(f"partitions must each divide classes of the one before; got {coarse}, {fine}.")
-    return chain

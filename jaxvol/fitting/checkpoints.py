@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
-import numpy as np
 
 from .._util.whole_files import whole_file
 
@@ -23,8 +22,9 @@ def save(path: Path, state: Any, about: dict[str, Any]) -> None:
 def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]] | None:
     """The saved state, a tree like `like`, with its description; or None if none was saved.
 
-    **Raises:** `ValueError` for a damaged file, and for a checkpoint of another fit than `about` describes
-    (the saved description may have more entries).
+    Raises:
+        ValueError: For a damaged file, and for a checkpoint of another fit than `about` describes (the saved
+            description may have more entries).
     """
     if not path.exists():
         return None
@@ -32,7 +32,7 @@ def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]]
     try:
         with path.open("rb") as file:
             saved = json.loads(file.readline())
-            differs = next((key for key, value in about.items() if not _agree(saved[key], value)), None)
+            differs = next((key for key, value in about.items() if saved[key] != value), None)
             if differs is None:
                 return eqx.tree_deserialise_leaves(file, like), saved
     except Exception as fault:  # readers of JSON and of arrays raise errors of many kinds
@@ -41,10 +41,3 @@ def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]]
         f"checkpoint {path} belongs to another fit: its {differs} is {saved[differs]}, that of this fit is "
         f"{about[differs]}. {remedy}"
     )
-
-
-def _agree(saved: Any, expected: Any) -> bool:
-    """Whether two entries agree; floats may differ, since another machine may round differently."""
-    if isinstance(expected, float) and isinstance(saved, float):
-        return bool(np.isclose(saved, expected, rtol=1e-4))
-    return saved == expected

@@ -1,6 +1,5 @@
 """Which parameters are free, and within which bounds? Assigns a bijection to each."""
 
-import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
@@ -18,9 +17,13 @@ from ..scene.transfer import TransferFunction
 from ..scene.transfer2d import TransferFunction2D
 from ..scene.volume import Volume
 from ..xla.trees import PyTree
-from .bijections import Bijection, Fixed, Pose, Positive, Unconstrained, UnitInterval
-from .probe_geometry import ProbeGeometry
+from .bijections import Bijection, Fixed, Pose, Positive, ProbeGeometry, Unconstrained, UnitInterval
 
+
+TRANSFERS = TransferFunction, TransferFunction2D
+
+KNOWN = *TRANSFERS, LabelTransferFunction, Camera, ToroidalMap, Volume, March, Material
+"""Types with constraints of their own."""
 
 Where = Callable[[Any], Any]
 
@@ -32,7 +35,6 @@ class Free(eqx.Module):
     """Parameters as the free variables that a solver moves."""
 
     bijections: list[Bijection]
-    held: list[Any]
     paths: list[str] = eqx.field(static=True)
     structure: Any = eqx.field(static=True)
 
@@ -40,46 +42,44 @@ class Free(eqx.Module):
     def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", FreeVariables]:
         """The mapping from free variables to parameters, and the free variables for `parameters`.
 
-        **Raises:** `ValueError` for constraints or a `where` that do not match the parameters, parameters
-        outside their bounds or not finite, and if nothing is free."""
+        Raises:
+            ValueError: For constraints or a `where` that do not match the parameters, parameters outside
+                their bounds or not finite, and if nothing is free.
+        """
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
         tree = _select(_resolve(parameters, constraints), where)
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
-        bijections = [bijection for _, bijection in found]
         nodes = structure.flatten_up_to(parameters)
+        pairs = zip(found, nodes, strict=True)
+        bijections = [Fixed(node) if isinstance(b, Fixed) else b for (_, b), node in pairs]
         paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
         start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, paths, strict=True))
         if not jax.tree.leaves(start):
             raise ValueError("parameters must hold a float array that is free; everything given is fixed.")
-        held = [n if isinstance(b, Fixed) else None for b, n in zip(bijections, nodes, strict=True)]
-        return cls(bijections, held, paths, structure), start
+        return cls(bijections, paths, structure), start
 
     def forward(self, free: FreeVariables) -> PyTree:
         """Parameters for these free variables."""
-        return jax.tree.unflatten(self.structure, self._nodes(free))
+        nodes = [b.forward(variables) for b, variables in zip(self.bijections, free, strict=True)]
+        return jax.tree.unflatten(self.structure, nodes)
 
     def moved(self, free: FreeVariables) -> list[Any]:
-        """Parts of the parameters that are fitted."""
-        nodes = zip(self.bijections, self._nodes(free), strict=True)
-        return [None if isinstance(b, Fixed) else b.moved(node) for b, node in nodes]
+        """What of the parameters is fitted."""
+        each = zip(self.bijections, free, strict=True)
+        return [b.moved(b.forward(variables)) for b, variables in each]
 
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
         names = []
-        for path, node in zip(self.paths, self.moved(free), strict=True):
-            for inner, leaf in jax.tree_util.tree_flatten_with_path(node)[0]:
-                name = path.removeprefix("parameters") + jax.tree_util.keystr(inner)
-                names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
+        for (number, *inner), leaf in jax.tree_util.tree_flatten_with_path(self.moved(free))[0]:
+            name = self.paths[number.idx].removeprefix("parameters") + jax.tree_util.keystr(tuple(inner))
+            names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
 
-    def _nodes(self, free: FreeVariables) -> list[Any]:
-        each = zip(self.bijections, self.held, free, strict=True)
-        return [held if isinstance(b, Fixed) else b.forward(u) for b, held, u in each]
 
-
-def size(free: FreeVariables) -> int:
-    """Number of free variables."""
-    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(free))
+def size(tree: PyTree) -> int:
+    """Number of numbers in a tree of arrays."""
+    return sum(leaf.size for leaf in jax.tree.leaves(tree))
 
 
 def _is_bijection(node: Any) -> bool:
@@ -91,18 +91,15 @@ def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
 
     def expand(constraint: Any, node: Any) -> PyTree:
         if constraint is None:
-            return jax.tree.map(_default, node, is_leaf=lambda n: isinstance(n, tuple(_DEFAULTS)))
+            return jax.tree.map(_default, node, is_leaf=lambda n: isinstance(n, KNOWN))
         if not _is_bijection(constraint):
             raise ValueError(f"constraints must hold bijections, such as Positive(); got {constraint!r}.")
         if constraint.whole:
             return constraint
         return jax.tree.map(lambda leaf: constraint if eqx.is_inexact_array(leaf) else Fixed(), node)
 
-    def is_leaf(node: Any) -> bool:
-        return node is None or _is_bijection(node)
-
     try:
-        return jax.tree.map(expand, constraints, parameters, is_leaf=is_leaf)
+        return jax.tree.map(expand, constraints, parameters, is_leaf=lambda n: n is None or _is_bijection(n))
     except (ValueError, TypeError, KeyError) as fault:
         if "constraints" in str(fault):
             raise
@@ -113,61 +110,35 @@ def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
 
 
 def _default(node: Any) -> PyTree:
-    for kind, constraint in _DEFAULTS.items():
-        if isinstance(node, kind):
-            return constraint(node)
-    return Unconstrained() if eqx.is_inexact_array(node) else Fixed()
-
-
-def _of_transfer(transfer: TransferFunction | TransferFunction2D) -> PyTree:
-    top = float(jnp.max(transfer.extinction))
-    bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
-    return eqx.tree_at(lambda t: (t.colors, t.extinction), _fixed(transfer), bounds)
-
-
-def _of_labels(transfer: LabelTransferFunction) -> PyTree:
-    # factors of the extinctions, which are free themselves
-    return eqx.tree_at(lambda t: t.stacked, _fixed(transfer), _of_transfer(transfer.stacked))
-
-
-def _of_volume(volume: Volume) -> PyTree:
-    data = Unconstrained() if eqx.is_inexact_array(volume.data) else Fixed()
-    return eqx.tree_at(lambda v: v.data, _fixed(volume), data)
-
-
-def _of_material(material: Material) -> PyTree:
-    return eqx.tree_at(lambda m: m.mean_free_path, _fixed(material), Positive(material.mean_free_path))
-
-
-def _fixed(node: Any) -> PyTree:
-    return jax.tree.map(lambda _: Fixed(), node)
-
-
-_DEFAULTS: dict[type, Callable[[Any], PyTree]] = {
-    TransferFunction: _of_transfer,
-    TransferFunction2D: _of_transfer,
-    LabelTransferFunction: _of_labels,
-    Camera: Pose,
-    ToroidalMap: ProbeGeometry,
-    Volume: _of_volume,
-    March: _fixed,
-    Material: _of_material,
-}
-"""Default constraints of each type."""
+    """The constraints of an object, or of a leaf, unless others are given."""
+    if isinstance(node, Camera):
+        return Pose(node)
+    if isinstance(node, ToroidalMap):
+        return ProbeGeometry(node)
+    fixed = jax.tree.map(lambda _: Fixed(), node)
+    if isinstance(node, TRANSFERS):
+        top = float(jnp.max(node.extinction))
+        bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
+        return eqx.tree_at(lambda t: (t.colors, t.extinction), fixed, bounds)
+    if isinstance(node, LabelTransferFunction):  # factors of its extinctions are free in `stacked`
+        return eqx.tree_at(lambda t: t.stacked, fixed, _default(node.stacked))
+    if isinstance(node, Volume):
+        return eqx.tree_at(lambda v: v.data, fixed, _default(node.data))
+    if isinstance(node, Material):
+        return eqx.tree_at(lambda m: m.mean_free_path, fixed, Positive(node.mean_free_path))
+    return Unconstrained() if eqx.is_inexact_array(node) else fixed
 
 
 def _select(tree: PyTree, where: Where | None) -> PyTree:
     """Fix everything except what `where` selects."""
     if where is None:
         return tree
-    leaves, structure = jax.tree.flatten(tree, is_leaf=_is_bijection)
+    chosen = jax.tree.map(lambda _: False, tree, is_leaf=_is_bijection)
     try:
-        chosen = set(jax.tree.leaves(where(jax.tree.unflatten(structure, range(len(leaves))))))
-    except (AttributeError, KeyError, IndexError, TypeError) as fault:
+        chosen = eqx.tree_at(where, chosen, replace_fn=lambda node: jax.tree.map(lambda _: True, node))
+    except (AttributeError, KeyError, IndexError, TypeError, ValueError) as fault:
         raise ValueError(
-            "where must choose parts of the parameters, such as lambda p: p.extinction (a camera that is "
+            "where must return parts of the parameters, such as lambda p: p.extinction (a camera that is "
             f"fitted as a pose is a single part); it failed with {fault!r}."
         ) from fault
-    if not chosen <= set(range(len(leaves))):
-        raise ValueError(f"where must return parts of the parameters, unchanged; got {sorted(chosen)}.")
-    return jax.tree.unflatten(structure, [b if i in chosen else Fixed() for i, b in enumerate(leaves)])
+    return jax.tree.map(lambda free, bijection: bijection if free else Fixed(), chosen, tree)

@@ -24,16 +24,8 @@ away. (From two images of a head, a transfer function is recovered to rounding a
 in a wrong minimum.)"""
 
 
-class ScaledDescent(optx.AbstractDescent[Any, Any, Any]):
+class ScaledDescent(optx.DampedNewtonDescent[Any]):
     """The step d that minimises |J d + r|² + λ |D d|², with λ = 1 / step size."""
-
-    damped: optx.DampedNewtonDescent[Any] = optx.DampedNewtonDescent(lx.QR())
-
-    def init(self, y: PyTree, f_info_struct: Any) -> Any:
-        return self.damped.init(y, f_info_struct)
-
-    def query(self, y: PyTree, f_info: Any, state: Any) -> Any:
-        return self.damped.query(y, f_info, state)
 
     def step(self, step_size: Float[Array, ""], state: Any) -> tuple[PyTree, optx.RESULTS]:
         info = state.f_info
@@ -42,8 +34,8 @@ class ScaledDescent(optx.AbstractDescent[Any, Any, Any]):
         scale = jnp.maximum(scale, FLOOR * jnp.max(scale))
         unit = ravel_pytree(zeros)[1](1 / jnp.where(scale > 0, scale, 1))
         jac = info.jac @ lx.DiagonalLinearOperator(unit)
-        scaled = self.damped.query(zeros, optx.FunctionInfo.ResidualJac(info.residual, jac), state)
-        step, result = self.damped.step(step_size, scaled)
+        scaled = self.query(zeros, optx.FunctionInfo.ResidualJac(info.residual, jac), state)
+        step, result = super().step(step_size, scaled)
         return jax.tree.map(jnp.multiply, unit, step), result
 
 
@@ -53,6 +45,6 @@ class LevenbergMarquardt(optx.AbstractGaussNewton[Any, Any, Any]):
     rtol: float
     atol: float
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
-    descent: optx.AbstractDescent[Any, Any, Any] = ScaledDescent()
+    descent: optx.AbstractDescent[Any, Any, Any] = ScaledDescent(lx.QR())
     search: optx.AbstractSearch[Any, Any, Any, Any] = optx.ClassicalTrustRegion(high_cutoff=0.75)
     verbose: Callable[..., None] = lambda **_: None

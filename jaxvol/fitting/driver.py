@@ -1,14 +1,17 @@
-"""Fits parameters by minimising a residual, step by step, with a solver of Optimistix."""
+"""Fits parameters by minimising a residual, step by step, with a solver of Optimistix.
+
+Steps are taken one by one from here, not by `optimistix.least_squares`, whose loop is a single program: so a
+fit calls back, writes checkpoints, can be interrupted, and gives back the best point that it has seen.
+"""
 
 import math
-import numbers
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,20 +20,14 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._util.checks import integer, output_file
+from .._util.checks import Arrayable, described, integer, not_negative, output_file
 from ..xla.trees import PyTree
 from . import checkpoints
 from .constraints import Free, FreeVariables, Where
 from .damping import LevenbergMarquardt
-from .residuals import OwnResidual, Problem, Residual, check_residual, tile_entries
+from .residuals import ImageResidual, Problem, check_residual
 from .uncertainty import Uncertainty, uncertainty
 
-
-Solver: TypeAlias = Literal["levenberg_marquardt", "gauss_newton", "bfgs", "adam"]
-
-OptimistixSolver: TypeAlias = (
-    optx.AbstractLeastSquaresSolver[Any, Any, Any, Any] | optx.AbstractMinimiser[Any, Any, Any]
-)
 
 UNDETERMINED = ".*directions are not determined"
 """Pattern of the warning that names such directions, for those who tell it otherwise."""
@@ -38,8 +35,8 @@ UNDETERMINED = ".*directions are not determined"
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
 
-SELDOM = 9
-"""Times as long as a checkpoint took, until the next one."""
+CHECKPOINTS = 1 / 10
+"""Fraction of the time that a fit spends on writing checkpoints."""
 
 
 class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -54,11 +51,12 @@ class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 class Fit(eqx.Module):
     """Result of a fit.
 
-    - `parameters`: the best ones found, as a tree like the starting parameters.
-    - `solution`: Optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
-    - `losses`: half the sum of squared residuals at the solver's point after each step.
-    - `uncertainty`: `covariance`, `names`, `standard_errors` and `undetermined` directions, for a
-      least-squares solver; else None.
+    Attributes:
+        parameters: The best ones found, as a tree like the starting parameters.
+        solution: Optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
+        losses: Half the sum of squared residuals at the solver's point after each step.
+        uncertainty: `covariance`, `names`, `standard_errors` and `undetermined` directions, for a
+            least-squares solver; else None.
     """
 
     parameters: PyTree
@@ -81,17 +79,16 @@ class Fit(eqx.Module):
         """How the fit ended, in words."""
         if self.success:
             return "The solver converged."
-        # Optimistix's text for this names causes that do not apply to fits
         if self.solution.result == Outcome.nonlinear_max_steps_reached:
             return "The fit reached the maximum number of steps, max_steps, before it converged."
         return Outcome[self.solution.result]
 
 
 def fit(
-    residual: Residual | Callable[[Any], PyTree] | Any,
+    residual: ImageResidual | Callable[[Any], PyTree] | Any,
     parameters: PyTree,
     *,
-    solver: Solver | OptimistixSolver | Any = "levenberg_marquardt",
+    solver: str | Any = "levenberg_marquardt",
     constraints: PyTree = None,
     where: Where | None = None,
     rtol: float = 1e-4,
@@ -104,79 +101,71 @@ def fit(
 ) -> Fit:
     """Fit parameters to make a residual small: the loss is half the sum of its squares.
 
-    **Arguments:**
-
-    - `residual`: an `ImageResidual`, or a function from parameters to arrays. A function that renders
-      must use `adjoint="forward"` for the first two solvers and `"replay"` for the others.
-    - `parameters`: the starting point: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
-      float arrays are fitted.
-    - `solver`:
-        - `"levenberg_marquardt"`, `"gauss_newton"`: least squares, with forward-mode Jacobians. Start
-          with the first, up to a few hundred parameters.
-        - `"bfgs"`: needs only the gradient, and a matrix of parameters × parameters.
-        - `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays.
-        - any least-squares solver or minimiser of Optimistix, or a transformation of Optax; `rtol` and
-          `atol` are then the solver's own where it has them.
-    - `constraints`: a tree like the parameters, or a prefix of one, with a bijection at each leaf: None for
-      the default, `Fixed()`, `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`,
-      `ProbeGeometry(probe)`. The defaults are, for a transfer function, positive extinction, colours in
-      [0, 1] and fixed values; for a camera, its pose; for a `ToroidalMap`, its geometry; for a volume,
-      unconstrained data if they are float; for a material, a positive mean free path, and all else fixed;
-      for a march, all fixed; any other float array is unconstrained.
-    - `where`: the free parts, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
-      example `lambda transfer: transfer.extinction`, or a tuple of parts.
-    - `rtol`, `atol`: a fit has converged when neither the free variables nor the residual change by more
-      than this in a step.
-    - `max_steps`: maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
-    - `patience`: number of steps after which a fit has stalled if the loss has not fallen by more than
-      `rtol`, relatively; by default 10, or 100 for Optax.
-    - `max_jacobian`: bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
-      (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image.
-    - `callback`: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.
-    - `checkpoint`: a file to which the state is written after steps, as often as takes a tenth of the time,
-      and when the fit ends or is interrupted. If it exists, the fit continues from it and ends with the same
-      parameters, bit for bit, as an uninterrupted fit (on the same machine).
-
-    **Returns:** a `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success`, `Fit.message` and
-    `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
-    the residual does not determine.
-
     A fit whose rays are opaque from their first cell on may end in a wrong minimum. Where fits fail, and
     where not: `experiments/stability.py`, "fits of what images do not show", "fits from opaque starts",
     "fits under noise".
 
-    **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
-    residual that is not finite at the start, a checkpoint that is damaged or of another fit, and one that
-    cannot be written; `ImportError` if Optax is requested but not installed.
+    Args:
+        residual: An `ImageResidual`, or a function from parameters to arrays. A function that renders must
+            use `adjoint="forward"` for the first two solvers and `"replay"` for the others.
+        parameters: The starting point: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
+            float arrays are fitted.
+        solver: `"levenberg_marquardt"` or `"gauss_newton"`: least squares, up to a few hundred parameters;
+            start with the first. `"bfgs"` needs only the gradient, and a matrix of parameters × parameters.
+            `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays. Or a solver
+            of Optimistix, with its own tolerances; or a transformation of Optax.
+        constraints: A tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
+            `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`, `ProbeGeometry(probe)`, or None
+            for the default: of a transfer function, positive extinction, colours in [0, 1] and fixed values;
+            of a camera, its pose; of a `ToroidalMap`, its geometry; of a volume, its data if they are float;
+            of a material, a positive mean free path; of a march, nothing is free; any other float array is
+            unconstrained.
+        where: What is free, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
+            example `lambda transfer: transfer.extinction`, or a tuple of such.
+        rtol: A fit has converged when neither the free variables nor the residual change in a step by more
+            than `atol` plus this, relatively.
+        atol: See `rtol`.
+        max_steps: Maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
+        patience: Number of steps after which a fit has stalled if the loss has not fallen by more than
+            `rtol`, relatively; by default 10, or 100 for Optax.
+        max_jacobian: Bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
+            (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image.
+        callback: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.
+        checkpoint: A file to which the state is written after steps, as often as takes a tenth of the time,
+            and when the fit ends or is interrupted. If it exists, the fit continues from it and ends with the
+            same bits as an uninterrupted one (on the same machine).
+
+    Returns:
+        A `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success` and `Fit.message` say so, and
+        the parameters are the best ones found. A warning names directions that the residual does not
+        determine.
+
+    Raises:
+        ValueError: For incompatible arguments, parameters that are not finite or out of bounds, a residual
+            that is not finite at the start, and a checkpoint that is damaged or of another fit.
+        ImportError: If Optax is requested but not installed.
     """
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
+    not_negative("rtol", rtol)
+    not_negative("atol", atol)
     check_residual(residual)
     file = None if checkpoint is None else output_file("checkpoint", checkpoint)
     max_steps, max_jacobian = integer("max_steps", max_steps, 1), integer("max_jacobian", max_jacobian, 1)
     solver, default_patience = _solver(solver, rtol, atol)
     patience = default_patience if patience is None else integer("patience", patience, 1)
     free, y = Free.of(parameters, constraints, where)
-    if not isinstance(residual, Residual):
-        residual = OwnResidual.of(residual, free.forward(y))
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
-    problem = Problem(residual, free, tile_entries(residual, y, max_jacobian, least_squares))
+    problem = Problem.of(residual, free, y, max_jacobian, least_squares)
 
     state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
-    run = _Run(y, state, y, y, None, done, optx.RESULTS.successful, [])
-    run = run.step(solver, problem)
-    if not math.isfinite(run.losses[0]):
-        raise ValueError(
-            "residual must be finite at the parameters that the fit starts from; half the sum of its squares "
-            f"is {run.losses[0]}."
-        )
-    kinds = [type(bijection).__name__ for bijection in free.bijections]
+    run = _Run(y, state, y, y, None, done, optx.RESULTS.successful, []).step(solver, problem)
+    if not math.isfinite(loss := run.losses[0]):
+        raise ValueError(f"residual must be finite at the parameters that the fit starts from; loss {loss}.")
+    bounds = zip(free.paths, free.bijections, strict=True)
     about = {
         "solver": type(solver).__name__,
-        "parameters": [f"{path}: {kind}" for path, kind in zip(free.paths, kinds, strict=True)],
-        "number of residuals": residual.count(),
-        "loss at the start": run.losses[0],
+        "parameters": [f"{path}: {type(bijection).__name__}" for path, bijection in bounds],
+        "number of residuals": problem.count,
+        "loss at the start": f"{loss:.3g}",  # other machines round differently
     }
     if file is not None and (found := checkpoints.load(file, run, about)) is not None:
         run = replace(found[0], losses=found[1]["losses"])
@@ -188,23 +177,59 @@ def fit(
                 callback(len(run.losses), free.forward(run.evaluated), run.losses[-1])
             if file is not None and (begun := time.monotonic()) >= due:
                 checkpoints.save(file, run, {**about, "losses": run.losses})
-                due = time.monotonic() + SELDOM * (time.monotonic() - begun)
+                due = time.monotonic() + (time.monotonic() - begun) / CHECKPOINTS
     finally:
         if file is not None:
             checkpoints.save(file, run, {**about, "losses": run.losses})
     return _report(run, problem, result, max_steps)
 
 
+def fit_coarse_to_fine(
+    residual: ImageResidual | Any,
+    parameters: PyTree,
+    *,
+    blurs: Sequence[Arrayable | None] | Any = (1 / 8, 1 / 32, None),
+    **options: Any,
+) -> list[Fit]:
+    """Fit parameters to images blurred less and less, each time from where the last fit ended.
+
+    A derivative describes only features that move by less than their own size. In blurred images features are
+    large, so that a pose or a geometry is found from farther away; sharp images at last make it exact. Steps
+    must be of a voxel or shorter: under longer ones, fine texture is sampled too sparsely, and fits stall.
+
+    Args:
+        residual: An `ImageResidual`. Its own `blur` is not used.
+        parameters: The starting point.
+        blurs: Of each fit, in order, as `ImageResidual`'s. End with None: only the standard errors of an
+            unblurred fit are right.
+        options: Those of `fit`, for all of them, but for `checkpoint`. A `patience` of 4 saves steps.
+
+    Returns:
+        The fits, in order. The last one's `parameters` and `uncertainty` are the result.
+
+    Raises:
+        ValueError: For no blurs, for what is not an `ImageResidual`, for `checkpoint`, and as `fit`.
+    """
+    if not isinstance(residual, ImageResidual):
+        raise ValueError(f"residual must be an ImageResidual, to be blurred; got {described(residual)}.")
+    if len(blurs) == 0:
+        raise ValueError("blurs must hold at least one, such as None; got none.")
+    if "checkpoint" in options:
+        raise ValueError("checkpoint is of one fit: call fit with ImageResidual(..., blur=) for each stage.")
+    fits: list[Fit] = []
+    for blur in blurs:
+        fits.append(fit(residual.blurred(blur), parameters, **options))
+        parameters = fits[-1].parameters
+    return fits
+
+
 def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
     """The solver, and its default patience."""
     if isinstance(solver, optx.AbstractLeastSquaresSolver | optx.AbstractMinimiser):
         return solver, 100 if isinstance(solver, optx.OptaxMinimiser) else 10
-    if solver == "levenberg_marquardt":
-        return LevenbergMarquardt(rtol, atol), 10
-    if solver == "gauss_newton":
-        return optx.GaussNewton(rtol, atol), 10
-    if solver == "bfgs":
-        return optx.BFGS(rtol, atol), 10
+    known = {"levenberg_marquardt": LevenbergMarquardt, "gauss_newton": optx.GaussNewton, "bfgs": optx.BFGS}
+    if isinstance(solver, str) and solver in known:
+        return known[solver](rtol, atol), 10
     if solver == "adam" or (hasattr(solver, "init") and hasattr(solver, "update")):
         try:
             import optax  # pyright: ignore[reportMissingImports]
@@ -212,10 +237,8 @@ def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
             raise ImportError('solver="adam" needs Optax: pip install "jaxvol[fit]".') from fault
         optim = optax.adam(LEARNING_RATE) if solver == "adam" else solver
         return optx.OptaxMinimiser(optim, rtol, atol), 100
-    raise ValueError(
-        f"solver must be one of {', '.join(get_args(Solver))}, or a solver of Optimistix or Optax; "
-        f"got {solver!r}."
-    )
+    names = ", ".join((*known, "adam"))
+    raise ValueError(f"solver must be one of {names}, or a solver of Optimistix or Optax; got {solver!r}.")
 
 
 class _Run(eqx.Module):
@@ -254,43 +277,24 @@ class _Run(eqx.Module):
         return None
 
 
-def _squares(y: FreeVariables, problem: Problem) -> tuple[Array, tuple[Array, FreeVariables, Array]]:
-    """Residual for a least-squares solver, with auxiliary output: the loss, its point, and the triangle."""
-    triangle = problem.condensed(y)
-    return triangle[:, -1], (jnp.sum(triangle[:, -1] ** 2) / 2, y, triangle)
-
-
-def _loss(y: FreeVariables, problem: Problem) -> tuple[Array, tuple[Array, FreeVariables, None]]:
-    """Objective of a minimiser, with the same auxiliary output but no triangle."""
-    loss = problem.loss(y)
-    return loss, (loss, y, None)
-
-
-def _function(solver: Any) -> Callable[..., Any]:
-    return _squares if isinstance(solver, optx.AbstractLeastSquaresSolver) else _loss
-
-
 @eqx.filter_jit
 def _init_state(solver: Any, problem: Problem, y: FreeVariables) -> Any:
-    function = _function(solver)
     with _allow_promotion():
-        out, aux = eqx.filter_eval_shape(function, y, problem)
-        return solver.init(function, y, problem, {}, out, aux, frozenset())
+        return solver.init(problem, y, None, {}, *eqx.filter_eval_shape(problem, y), frozenset())
 
 
 @eqx.filter_jit
 def _advance(solver: Any, problem: Problem, y: FreeVariables, state: Any) -> Any:
-    function = _function(solver)
     with _allow_promotion():
-        y, state, previous_aux = solver.step(function, y, problem, {}, state, frozenset())
-        done, result = solver.terminate(function, y, problem, {}, state, frozenset())
+        y, state, previous_aux = solver.step(problem, y, None, {}, state, frozenset())
+        done, result = solver.terminate(problem, y, None, {}, state, frozenset())
     # `previous_aux` is that of the previous point in solvers with trial points; their state has the new one's
     return y, state, getattr(state, "aux", previous_aux), done, result
 
 
 @contextmanager
 def _allow_promotion() -> Iterator[None]:
-    """Allow JAX's promotion of types and ranks, which solvers need, even if the user has forbidden it."""
+    """Allow promotion of types and ranks, which solvers need, even if the user has forbidden it."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
@@ -298,8 +302,8 @@ def _allow_promotion() -> Iterator[None]:
 def _report(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     estimate = None
     if run.triangle is not None:
-        residual, triangle = problem.residual, np.asarray(run.triangle)
-        estimate = uncertainty(triangle, residual.count(), problem.free, run.best, residual.scale())
+        scale = problem.residual.scale() if isinstance(problem.residual, ImageResidual) else 0.0
+        estimate = uncertainty(np.asarray(run.triangle), problem.count, problem.free, run.best, scale)
         if estimate.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in estimate.undetermined[:6])
             warnings.warn(

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,57 +17,58 @@ from ..scene.camera import Camera
 from ..scene.transfer import TransferFunction
 
 
-CAMERA = ("position", "focal_point", "view_up", "view_angle", "parallel_scale", "window")
-"""Fields of a camera in a file, the first two of which are needed; its size is that of the image."""
-
-TRANSFER = ("values", "colors", "extinction")
+CAMERA = "position", "focal_point", "view_up", "view_angle", "parallel_scale", "window"
+TRANSFER = "values", "colors", "extinction"
 
 File = str | PathLike[str]
-T = TypeVar("T")
 
 
 def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Float[Array, "h w 3"]]]:
     """Read pictures and their cameras, as `ImageResidual` takes them.
 
-    **Arguments:**
+    Args:
+        images: Pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They are converted to linear RGB.
+        cameras: A JSON file with a list of one object per image, in the same order, with the fields
+            `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`,
+            as `Camera` takes them.
 
-    - `images`: pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They are converted to linear RGB.
-    - `cameras`: a JSON file with a list of one object per image, in the same order, with the fields
-      `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`, as
-      `Camera` takes them.
+    Returns:
+        A pair for each image: its `Camera`, and the picture, linear RGB.
 
-    **Returns:** a pair for each image: its `Camera`, and the picture, linear RGB.
-
-    **Raises:** `ValueError`, naming the file, if it is missing or holds anything else.
+    Raises:
+        ValueError: Naming the file, if it is missing or holds anything else.
     """
     entries = _json(cameras)
-    if not isinstance(entries, list):
-        raise ValueError(f"{cameras} must hold a list of cameras; got {type(entries).__name__}.")
-    if len(entries) != len(images):
+    if not isinstance(entries, list) or len(entries) != len(images):
+        got = len(entries) if isinstance(entries, list) else f"a {type(entries).__name__}"
         raise ValueError(
-            f"{cameras} must hold one camera for each of the {len(images)} images; got {len(entries)}."
+            f"{cameras} must hold a list with a camera for each of {len(images)} images; got {got}."
         )
-    pictures = [_picture(path) for path in images]
-    return [
-        (_made(Camera, f"{cameras}: camera {number}", fields, CAMERA, 2, size=picture.shape[1::-1]), picture)
-        for number, (fields, picture) in enumerate(zip(entries, pictures, strict=True))
-    ]
+    views = []
+    for number, (fields, path) in enumerate(zip(entries, images, strict=True)):
+        picture, what = _picture(path), f"{cameras}: camera {number}"
+        views.append((_made(Camera, what, CAMERA, fields, size=picture.shape[1::-1]), picture))
+    return views
 
 
 def read_transfer(path: File) -> TransferFunction:
     """Read a transfer function from a JSON file with the fields `values`, `colors` and `extinction`.
 
-    **Arguments:** `path`: of the file.
+    Args:
+        path: The file.
 
-    **Returns:** the `TransferFunction`.
+    Returns:
+        The `TransferFunction`.
 
-    **Raises:** `ValueError`, naming the file, if it is missing or holds anything else."""
+    Raises:
+        ValueError: Naming the file, if it is missing or holds anything else.
+    """
     return transfer_of_fields(str(path), _json(path))
 
 
 def transfer_of_fields(what: str, content: Any) -> TransferFunction:
     """The transfer function that `transfer_fields` wrote; `what` names its place in errors."""
-    return _made(TransferFunction, what, content, TRANSFER, len(TRANSFER))
+    return _made(TransferFunction, what, TRANSFER, content)
 
 
 def transfer_fields(transfer: TransferFunction) -> dict[str, Any]:
@@ -78,11 +79,16 @@ def transfer_fields(transfer: TransferFunction) -> dict[str, Any]:
 def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
     """Write a transfer function in the format that `read_transfer` reads.
 
-    **Arguments:** `path`: of the file. `transfer`: a `TransferFunction`.
+    Args:
+        path: The file.
+        transfer: A `TransferFunction`.
 
-    **Returns:** the path.
+    Returns:
+        The path.
 
-    **Raises:** `ValueError` for other kinds of them, which that format does not hold."""
+    Raises:
+        ValueError: For other kinds of them, which that format does not hold.
+    """
     if not isinstance(transfer, TransferFunction):
         raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
     path = Path(path)
@@ -100,17 +106,14 @@ def _json(path: File) -> Any:
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 
-def _made(
-    kind: Callable[..., T], what: str, content: Any, allowed: Sequence[str], needed: int, **more: Any
-) -> T:
-    """What `kind` makes of the fields of a JSON object, of which the first `needed` must be given."""
-    if not isinstance(content, dict) or not set(allowed[:needed]) <= set(content) <= set(allowed):
+def _made(kind: Callable[..., Any], what: str, allowed: Sequence[str], content: Any, **more: Any) -> Any:
+    """What `kind` makes of the fields of a JSON object."""
+    if not isinstance(content, dict) or not set(content) <= set(allowed):
         got = ", ".join(content) if isinstance(content, dict) else f"a {type(content).__name__}"
-        optional = f", and perhaps {', '.join(allowed[needed:])}" if allowed[needed:] else ""
-        raise ValueError(f"{what} must be an object with {', '.join(allowed[:needed])}{optional}; got {got}.")
+        raise ValueError(f"{what} must be an object with fields of {', '.join(allowed)}; got {got}.")
     try:
         return kind(**content, **more)
-    except ValueError as fault:
+    except (TypeError, ValueError) as fault:  # TypeError: a field that is needed is missing
         raise ValueError(f"{what}: {fault}") from fault
 
 
@@ -125,8 +128,6 @@ def _picture(path: File) -> Float[Array, "h w 3"]:
     except Exception as fault:  # each of the many readers raises errors of its own
         raise ValueError(f"{path} cannot be read as a picture: {fault}") from fault
     if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype not in (np.uint8, np.uint16):
-        raise ValueError(
-            f"{path} must be an RGB picture of 8 or 16 bits, without transparency; got shape {picture.shape} "
-            f"of {picture.dtype}."
-        )
+        got = f"shape {picture.shape} of {picture.dtype}"
+        raise ValueError(f"{path} must be an RGB picture of 8 or 16 bits, without transparency; got {got}.")
     return from_srgb(jnp.asarray(img_as_float32(picture)))

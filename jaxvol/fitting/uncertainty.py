@@ -1,8 +1,8 @@
 """How well do the images determine the parameters? Covariance from the triangle of a least-squares fit.
 
-If the residuals are independent and of equal variance σ², the covariance of the free variables around the
-truth is σ² (JᵀJ)⁻¹ to first order, and σ² is estimated by Σ r² / (m - n). JᵀJ = RᵀR is inverted through the
-singular values of R; the covariance of the parameters follows from the Jacobian of the bijections.
+If residuals are independent and of equal variance σ², estimated by Σ r² / (m - n), the covariance of the free
+variables around the truth is σ² (JᵀJ)⁻¹ to first order, with JᵀJ = RᵀR; that of the parameters follows from
+the Jacobian of the bijections.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from .constraints import Free, FreeVariables
 
 
 SHARE = 0.5
-"""A parameter is named for a direction if its share in it is at least this part of the largest."""
+"""A parameter is named for a direction if its share in it is at least this fraction of the largest."""
 
 TOUCHED = 0.01
 """A variance is infinite if the parameter's share in an undetermined direction of length 1 exceeds this."""
@@ -25,10 +25,11 @@ TOUCHED = 0.01
 class Uncertainty(NamedTuple):
     """Uncertainty of fitted parameters.
 
-    - `covariance`: in the order of `names`. If a direction that the residual does not determine changes a
-      parameter, its variance is infinite and its covariances are NaN.
-    - `names`: such as `.extinction[3]`.
-    - `undetermined`: for each such direction, the parameters that it changes most.
+    Attributes:
+        covariance: In the order of `names`. If a direction that the residual does not determine changes a
+            parameter, its variance is infinite and its covariances are NaN.
+        names: Such as `.extinction[3]`.
+        undetermined: For each such direction, the parameters that it changes most.
     """
 
     covariance: Float[np.ndarray, "parameters parameters"]
@@ -42,11 +43,7 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty(
-    triangle: Float[np.ndarray, "numbers numbers"],
-    count: int,
-    free: Free,
-    at: FreeVariables,
-    scale: float = 0.0,
+    triangle: Float[np.ndarray, "n n"], count: int, free: Free, at: FreeVariables, scale: float = 0.0
 ) -> Uncertainty:
     """Uncertainty of the parameters `free.forward(at)`, from the triangle [R c; 0 ρ] there, the number of
     residuals, and the norm `scale` of the compared data.
@@ -65,14 +62,11 @@ def uncertainty(
     spread = effects[:, determined] / singular[determined]
     covariance = variance * (spread @ spread.T) if np.isfinite(variance) else np.full((len(jac),) * 2, np.inf)
     names = free.names(at)
-    # Effect of each undetermined direction on each parameter, relative to the norm of the parameter's row of
-    # the Jacobian: where a bijection is nearly flat, the effect is small, yet the parameter is undetermined.
+    # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
+    # the parameter is undetermined
     norm = np.linalg.norm(jac, axis=1, keepdims=True)
     share = np.abs((jac / np.where(norm > 0, norm, 1)) @ directions[~determined].T)
-    undetermined = [
-        [name for name, part in zip(names, column, strict=True) if part >= SHARE * column.max()]
-        for column in share.T
-    ]
+    undetermined = [[names[i] for i in np.flatnonzero(row >= SHARE * row.max())] for row in share.T]
     touched = np.any(share > TOUCHED, axis=1)
     covariance[touched] = covariance[:, touched] = np.nan
     covariance[touched, touched] = np.inf

@@ -9,8 +9,6 @@ from ..bricks.opening import Openable, source_of
 from ..bricks.render import bricks_of, budget
 from ..bricks.sources import VoxelSource
 from ..bricks.split import TooLittleMemory
-from ..compositing.blending import Compositing
-from ..lighting.shading import Lighting
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import BrickReport
@@ -19,8 +17,8 @@ from ..scene.volume import Volume
 
 
 IN_MEMORY = 9
-"""Bytes for each byte of voxels, or less, that `render` takes: the voxels as read and in the device, a packed
-copy of 8-bit ones, what finding the extremes of blocks takes, and slopes."""
+"""Most bytes that `render` takes for each byte of voxels: these as read and in the device, a packed copy of
+8-bit ones, the extremes of blocks, and slopes."""
 
 HALVED = 4
 """How often a step may be halved so that bricks fit."""
@@ -36,25 +34,15 @@ def read_within(volume: Openable, memory: Any) -> tuple[Volume, VoxelSource, int
     while IN_MEMORY * source.dtype.itemsize * math.prod(-(-n // stride) for n in source.shape) > room:
         stride += 1
         if min(source.shape) // stride < 2:
-            raise ValueError(
-                f"memory must hold a copy of 2 voxels along each axis to plan with; got {room} bytes."
-            )
+            raise ValueError(f"memory must hold a copy of 2 voxels along each axis; got {room} bytes.")
     return source.subsampled(stride), source, room, stride
 
 
 def with_bricks(
-    source: VoxelSource,
-    transfer: Transfer,
-    camera: Camera,
-    march: March,
-    memory: int,
-    stride: int,
-    compositing: Compositing[Any],
-    lighting: Lighting | None,
+    source: VoxelSource, transfer: Transfer, camera: Camera, march: March, stride: int, **how: Any
 ) -> tuple[March, BrickReport]:
     """The march that was planned for a copy of every n-th voxel, with steps of 1/n, and shorter ones if
-    bricks fit only then; and the bricks."""
-    how: dict[str, Any] = {"memory": memory, "compositing": compositing, "lighting": lighting}
+    bricks fit only then; and the bricks. `how`: `memory`, `compositing` and `lighting`."""
     finer = stride
     while True:
         shorter = March(jnp.asarray(march.step) / finer, march.transforms, march.quadrature)

@@ -1,4 +1,4 @@
-"""Which march is the cheapest whose image is accurate enough? No more model than the scene needs."""
+"""Which march is the cheapest whose image is accurate enough?"""
 
 import math
 import time
@@ -31,22 +31,19 @@ from .search import COARSEST, Part, Search
 
 
 MARGIN = 0.95
-"""Part of the tolerance that is used."""
+"""Fraction of the tolerance that is used."""
 
 ENDS = 1 / 16
-"""Part of it for rays that end early, whose error is at most the transmittance at which they end."""
+"""Fraction of it for rays that end early, whose error is at most the transmittance at which they end."""
 
 GRADIENTS_END = 1e-4
 """Transmittance at which rays may end where gradients count."""
 
 OPAQUE = 0.01
-"""Part of the pixels that become opaque, below which there is nothing to end early."""
+"""Fraction of the pixels that become opaque, below which there is nothing to end early."""
 
 EMPTY = 0.05
-"""Part of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
-
-DECIDED = AdaptiveSampling, EarlyTermination, SpaceLeaping
-"""Transforms that a scene cannot bring along, besides `AlphaCorrection` at the exit."""
+"""Fraction of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
 
 UNPROVEN = "not proven by a copy; kept"
 
@@ -54,18 +51,20 @@ UNPROVEN = "not proven by a copy; kept"
 class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
-    - `march`, `volume`, `lighting`, `compositing`: what to pass to `render`. Where `bricks` is given,
-      `volume` is only the copy that was planned with.
-    - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels; where
-      nothing could be proven to be within the tolerance, just above it.
-    - `samples`: predicted for each pixel.
-    - `parts`: what was kept or left out, and why.
-    - `probed`: seconds that planning took, compilation included.
-    - `source`, `memory`: the volume and the budget, bytes, if there was one.
-    - `stride`: of the copy of every n-th voxel that was planned with, to which `error` and `samples`
-      belong; 1 where the volume fits.
-    - `bricks`: what to expect of `render_bricks`, of which nothing is read yet: at most `needed` bricks will
-      be, for this camera and others of as many pixels. None where the volume fits.
+    Attributes:
+        march: What to pass to `render`, with `volume`, `lighting` and `compositing`.
+        volume: Where `bricks` is given, only the copy that was planned with.
+        lighting: As given.
+        tolerance: As given.
+        error: Predicted, on the safe side; just above the tolerance where nothing could be proven.
+        samples: Predicted for each pixel.
+        parts: What was kept or left out, and why.
+        probed: Seconds that planning took, compilation included.
+        compositing: As given.
+        source: The volume, if there was a budget of memory.
+        memory: The budget, bytes.
+        stride: Of the copy that was planned with, to which `error` and `samples` belong; 1 if all fits.
+        bricks: What to expect of `render_bricks`; None if all fits.
     """
 
     march: March
@@ -90,10 +89,13 @@ class Plan(NamedTuple):
     def render(self, transfer: Transfer | Any, camera: Camera | Any, **options: Any) -> Rendering:
         """The image as planned.
 
-        **Arguments:** `transfer`, `camera`: as for the plan. `options`: `outputs` and `devices`, as for
-        `render`.
+        Args:
+            transfer: As for the plan.
+            camera: As for the plan.
+            options: `outputs` and `devices`, as for `render`.
 
-        **Returns:** as `render`.
+        Returns:
+            As `render`.
         """
         how = {"compositing": self.compositing, "lighting": self.lighting, **options}
         if self.bricks is not None:
@@ -103,28 +105,22 @@ class Plan(NamedTuple):
         return render_scene(scene, options.get("outputs", "all"), "replay", devices=options.get("devices"))
 
     def __str__(self) -> str:
-        transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
+        transforms = ", ".join(type(each).__name__ for each in self.march.transforms) or "no transform"
         missed = "" if self.within else "NOT PROVEN TO BE WITHIN THE TOLERANCE: "
         rmse = f"RMSE {self.error:.2g} predicted" if self.within else "RMSE unknown"
         lines = [
             f"{missed}step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}",
             f"{rmse}, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a pixel; "
             f"planned in {self.probed:.1f} s",
+            *(f"  {'+' if part.kept else '-'} {part.name:16}  {part.why}" for part in self.parts),
         ]
-        wide = max((len(part.name) for part in self.parts), default=0)
-        lines += [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
-        if self.source is None or self.memory is None:
-            return "\n".join(lines)
-        size, room = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
-        if self.bricks is None:
-            head = f"in memory: {size} of voxels, and what is made of them, fit into {room}"
-        else:
-            head = (
-                f"{' x '.join(map(str, self.bricks.counts))} bricks: {size} of voxels, and what is made of "
-                f"them, do not fit into {room}; at most {self.bricks.needed} are read. Planned on a copy of "
-                f"one voxel in {self.stride} along each axis, whose error is given below"
-            )
-        return "\n".join([head, *lines])
+        if self.bricks is not None:
+            counts = " x ".join(map(str, self.bricks.counts))
+            copy = f"planned on a copy of one voxel in {self.stride} along each axis, with this error:"
+            lines.insert(0, f"{counts} bricks: at most {self.bricks.needed} are read; {copy}")
+        elif self.source is not None:
+            lines.insert(0, f"in memory: {self.source.nbytes / 2**20:.1f} MiB of voxels fit")
+        return "\n".join(lines)
 
 
 def plan(
@@ -141,62 +137,59 @@ def plan(
     once: bool | Any = False,
     seed: int | Any = 0,
 ) -> Plan:
-    """Finds the cheapest way to render a scene within a tolerance, by rendering parts of it.
+    """Finds the cheapest way to render a scene within a tolerance, by rendering patches of it.
 
     At most 128 patches of 8 x 8 pixels are rendered by the midpoint rule, with steps of two voxels, one, a
-    half, and so on, until some are within the tolerance, compared with steps of a quarter of theirs. From
-    there:
+    half, and so on, until some are within the tolerance, compared with steps of a quarter of theirs. Then:
 
     - **step**: the longest within the tolerance, between two of these.
     - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule
-      takes more than 8 steps of a voxel; it is kept where it is faster, by what a sample costs on CPU
-      (`planning/search.py`: `RAY`, `SAMPLE`).
+      takes more than 8 steps of a voxel; it is kept where it is faster, by what a sample costs on CPU.
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
       0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces, and where a `Clip` cuts.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
-    - **bricks**: a volume that does not fit into `memory`, with what `render` makes of it (IN_MEMORY bytes
-      for each byte of voxels), is rendered by `render_bricks`. The march is planned on a copy of every n-th
-      voxel along each axis, and its step divided by n; the error is that of the copy: detail finer than n
-      voxels has been seen in samples only. A copy does not prove what is empty, so that `AlphaCorrection` and
-      `SpaceLeaping` are kept. Where the smallest bricks do not fit, the step is halved, up to four times.
+    - **bricks**: for a volume that does not fit into `memory`, with what `render` makes of it, the march is
+      planned on a copy of every n-th voxel along each axis, and its step divided by n, or by more until
+      bricks fit. The error is that of the copy; `AlphaCorrection` and `SpaceLeaping` are kept.
 
-    The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
-    estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
-    halvings of the step let expect. The noise of a lighting, such as `ScattererTemplates` without `blend`,
+    The error is the RMSE of linear colours, over black or over white, whichever is greater: an estimate from
+    some of the pixels, and from how images change with the last halvings of the step. The noise of a lighting
     counts as an error. `Jitter` and `EmptySpaceJitter` are not chosen: they change the structure of an error,
     not its size. On other devices than CPUs, the errors hold, but what is cheapest was not measured.
 
-    **Arguments:**
+    Args:
+        volume: A `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
+        transfer: As for `render`.
+        camera: As for `render`. An image of another camera needs a plan of its own.
+        tolerance: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
+        memory: Bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
+            quarter of the device's memory otherwise.
+        transforms: Those that belong to the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
+            kept.
+        compositing: As for `render`.
+        lighting: As for `render`.
+        gradients: Whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
+            (empty space, faces) is proven for this transfer function only.
+        once: Whether the march is for a single image. `"preintegrated"`, whose program takes longer to
+            compile than it saves, is then tried only where the midpoint rule is not within the tolerance.
+        seed: Of the choice of patches. With it, the plan depends on nothing but the scene.
 
-    - `volume`: a `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
-    - `transfer`, `camera`: as for `render`. An image of another camera needs a plan of its own.
-    - `tolerance`: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
-    - `memory`: bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
-      quarter of the device's memory otherwise.
-    - `transforms`: those that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
-      kept.
-    - `compositing`, `lighting`: as for `render`.
-    - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
-      (empty space, faces) is proven for this transfer function only.
-    - `once`: whether the march is for a single image. `"preintegrated"`, whose program takes longer to
-      compile than it saves, is then tried only where the midpoint rule is not within the tolerance.
-    - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene.
+    Returns:
+        A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
+        False and `Plan.parts` says so.
 
-    **Returns:** a `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which
-    takes images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
-
-    **Raises:** `ValueError` for arguments of another kind, a tolerance out of range, arrays that are traced
-    (plan outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides; for a source that
-    `bricks.source_of` refuses; and for less memory than a copy or the smallest bricks take.
+    Raises:
+        ValueError: For arguments of another kind, a tolerance out of range, arrays that are traced (plan
+            outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides; for a source that
+            `bricks.source_of` refuses; and for less memory than a copy or the smallest bricks take.
     """
     begun = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
     check_arguments(order, transfer=transfer, camera=camera, lighting=lighting)
-    gradients = flag("gradients", gradients)
-    once = flag("once", once)
+    gradients, once = flag("gradients", gradients), flag("once", once)
     source, room, stride = None, None, 1
     if memory is not None or not isinstance(volume, Volume):
         volume, source, room, stride = read_within(volume, memory)
@@ -204,7 +197,10 @@ def plan(
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, scene)
     space = March(1.0, given).locate(volume)
-    visible = _occupied(scene, given)
+    shown, mode = transfer, scene.compositing
+    if mode.resolves:
+        shown, _ = mode.marched(transfer, March(1.0, given), volume)
+    visible = mode.occupied(shown, Blocks.of(volume, slopes=shown.reads_gradient))
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
     proven, parts = proven_transforms(visible, space, given, copy=stride > 1)
     voxel = float(median_node_distance(space, visible.shape))
@@ -228,12 +224,11 @@ def plan(
     march = March(chosen.march.step, kept, chosen.march.quadrature)
     parts += tried
     if over:
-        name = _written(ending) if share else "EarlyTermination"
-        parts.append(Part(name, bool(share), f"{opaque:.1%} of the pixels become opaque"))
+        parts.append(Part("EarlyTermination", bool(share), f"{opaque:.1%} of the pixels become opaque"))
     bricks = None
     if source is not None and room is not None and stride > 1:
-        how = room, stride, scene.compositing, lighting
-        march, bricks = with_bricks(source, transfer, camera, march, *how)
+        how = {"memory": room, "compositing": scene.compositing, "lighting": lighting}
+        march, bricks = with_bricks(source, transfer, camera, march, stride, **how)
     return Plan(
         march=march,
         volume=volume,
@@ -252,7 +247,7 @@ def plan(
 
 
 def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[Transform, ...]]:
-    """The tolerance, and the transforms that are part of the scene."""
+    """The tolerance, and the transforms that belong to the scene."""
     if is_traced(jax.tree.leaves((scene, transforms, tolerance))):
         raise ValueError(
             "plan looks at the numbers of a scene, which are traced here: call it outside of jax.jit, "
@@ -261,20 +256,11 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     number("tolerance", tolerance, above=0, below=1)
     given = March(1.0, transforms).transforms  # checks them
     for each in given:
-        if isinstance(each, DECIDED) or (isinstance(each, AlphaCorrection) and not each.labels):
-            raise ValueError(
-                "transforms must be those that are part of the scene, such as a ToroidalMap; got "
-                f"{type(each).__name__}, on which the plan decides."
-            )
+        decided = isinstance(each, AdaptiveSampling | EarlyTermination | SpaceLeaping)
+        if decided or (isinstance(each, AlphaCorrection) and not each.labels):
+            name = type(each).__name__
+            raise ValueError(f"transforms must be those of the scene; got {name}, on which the plan decides.")
     return float(tolerance), given
-
-
-def _occupied(scene: Scene, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
-    """The blocks that may change a pixel."""
-    transfer, mode = scene.transfer, scene.compositing
-    if mode.resolves:
-        transfer, _ = mode.marched(transfer, March(1.0, given), scene.volume)
-    return mode.occupied(transfer, Blocks.of(scene.volume, slopes=transfer.reads_gradient))
 
 
 def proven_transforms(
@@ -282,25 +268,21 @@ def proven_transforms(
 ) -> tuple[tuple[Transform, ...], list[Part]]:
     """Transforms that proofs decide on, from the blocks that may hold anything visible. `copy`: these are of
     a copy, which does not prove that there is nothing in between."""
-    found: list[Transform] = []
-    at_faces = space.visible_at_faces(visible)
-    faces = sum(map(bool, at_faces))
-    aligned, why = True, "part of the scene"
-    if not any(isinstance(each, AlphaCorrection) for each in given):
-        aligned, why = bool(faces) or copy, "nothing is visible at the volume's faces: proven"
-        if faces:
-            cut = "" if len(at_faces) == 6 else " and cuts"
-            why = f"something may be visible at {faces} of the volume's {len(at_faces)} faces{cut}"
-        elif copy:
-            why = UNPROVEN
-        if aligned:
-            found.append(AlphaCorrection())
+    faces = [bool(each) for each in space.visible_at_faces(visible)]
+    aligned = any(isinstance(each, AlphaCorrection) for each in given)
+    added = () if aligned or not (any(faces) or copy) else (AlphaCorrection(),)
+    if aligned:
+        why = "part of the scene"
+    elif any(faces):
+        of_what = "faces" if len(faces) == 6 else "faces and cuts"
+        why = f"something may be visible at {sum(faces)} of the volume's {len(faces)} {of_what}"
+    else:
+        why = UNPROVEN if copy else "nothing is visible at the volume's faces: proven"
+    alpha = Part("AlphaCorrection", aligned or bool(added), why)
     empty = float(np.mean(~np.asarray(visible)))
-    leaps = empty >= EMPTY or copy
-    if leaps:
-        found.append(SpaceLeaping())
-    kept = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
-    return tuple(found), [Part("AlphaCorrection", aligned, why), Part("SpaceLeaping", leaps, kept)]
+    leaps = (SpaceLeaping(),) if empty >= EMPTY or copy else ()
+    proof = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
+    return (*added, *leaps), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
 
 
 def brightest_of(image: Rendering) -> float:
@@ -308,11 +290,3 @@ def brightest_of(image: Rendering) -> float:
     rgba = np.asarray(image.rgba, np.float64)
     seen = rgba[:, 3] > 1e-3
     return float(max(1.0, np.max(rgba[seen, :3] / rgba[seen, 3:], initial=0.0)))
-
-
-def _written(transform: Transform) -> str:
-    """A transform as it is written, with its parameter where that is what matters."""
-    name = type(transform).__name__
-    if isinstance(transform, EarlyTermination):
-        return f"{name}({float(transform.opacity_left):.2g})"
-    return name

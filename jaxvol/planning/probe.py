@@ -1,4 +1,4 @@
-"""How far is an image from the converged one, and what does it cost? Found out from a part of its pixels."""
+"""How far is an image from the converged one, and what does it cost? Found out from some of its pixels."""
 
 from typing import Any, NamedTuple
 
@@ -18,21 +18,20 @@ from ..scene.space import Space
 
 
 SIDE = 8
-"""Pixels along the side of a patch. The engine bounds empty space for beams of as many, so that a patch takes
-the samples that it takes in the whole image."""
+"""Pixels along the side of a patch, as of the engine's beams, so that its samples are those of the image."""
 
 PATCHES = 128
 """Patches that are rendered: a thirty-second of 512 x 512 pixels."""
 
 LIKELY = 7 / 8
-"""Part of the patches that are chosen where visible blocks lie on or near the middle ray of the patch; the
-others, where a ray meets the volume."""
+"""Fraction of the patches that are chosen where visible blocks lie on or near their middle ray; the others,
+where a ray meets the volume."""
 
 POINTS, NEAR = 256, 2
 """Points of the middle ray that are looked at, and blocks around each."""
 
 CONFIDENT = 2.0
-"""Standard errors that are added to an estimate from a part of the image. Were errors of patches normally
+"""Standard errors that are added to an estimate from some of the pixels. Were errors of patches normally
 distributed, 98 % of estimates would not be too low; where a few patches hold most of the error, fewer."""
 
 ROUNDING = 1e-6
@@ -42,11 +41,12 @@ ROUNDING = 1e-6
 class Probe(NamedTuple):
     """Patches of an image: one of each stratum of neighbours, of those that may show anything.
 
-    - `source`: their rays, patch by patch.
-    - `strata`: how many patches of the image each stands for; 0 for those that only fill up the program.
-    - `likely`: which were chosen where something is likely to be visible.
-    - `inside`: 1 for pixels of the image, 0 for those past its edges.
-    - `pixels`: of the whole image.
+    Attributes:
+        source: Their rays, patch by patch.
+        strata: How many patches of the image each stands for; 0 for those that only fill up the program.
+        likely: Which were chosen where something is likely to be visible.
+        inside: 1 for pixels of the image, 0 for those past its edges.
+        pixels: Of the whole image.
     """
 
     source: GivenRays
@@ -102,9 +102,8 @@ class Probe(NamedTuple):
         return render_scene(scene._replace(source=self.source, march=march), "all", "replay")
 
     def distance(self, image: Rendering, other: Rendering) -> float:
-        """Root mean square difference of both images' colours, over the whole image: over black or over
-        white, whichever is greater; plus CONFIDENT standard errors, since only a part of the pixels is
-        known."""
+        """Root mean square difference of colours over the whole image, over black or over white, whichever is
+        greater; plus CONFIDENT standard errors, since only some pixels are known."""
         a, b = (np.asarray(each.rgba, np.float64) for each in (image, other))
         color, opacity = a[:, :3] - b[:, :3], a[:, 3:] - b[:, 3:]
         squares = [np.mean(each**2, axis=-1) for each in (color, color - opacity)]
@@ -123,9 +122,11 @@ class Probe(NamedTuple):
 class Truth(NamedTuple):
     """What images are compared with.
 
-    - `image`: the most accurate one.
-    - `own`: its own error, as the last halvings of the step let expect; ten times their difference, where
-      that grew.
+    Attributes:
+        probe: The patches.
+        image: The most accurate one.
+        own: Its own error, as the last halvings of the step let expect; ten times their difference, where
+            that grew.
     """
 
     probe: Probe

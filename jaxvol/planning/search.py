@@ -1,6 +1,7 @@
 """Which step and which quadrature are the cheapest within a tolerance?"""
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import equinox as eqx
@@ -9,21 +10,19 @@ from ..compositing.blending import Over
 from ..march.march import March, Quadrature, Transform
 from ..ray import Scene
 from ..scene.rendering import Rendering
-from ..scene.transfer import Transfer
 from .probe import Probe, Truth
 
 
 SAMPLE = {"midpoint": 1.0, "preintegrated": 2.5}
-"""What a sample costs, as a multiple of one by the midpoint rule."""
+"""Cost of a sample, as a multiple of one by the midpoint rule."""
 
 RAY = 22.0
-"""What a pixel costs beside its samples, in samples by the midpoint rule: cells that are computed and not
-used, leaps, the ray. Fitted, like `SAMPLE`, to the times of `experiments.accuracy` (five scenes, two CPU
-cores), whose ratios they predict within 9 % in the mean, 28 % at most."""
+"""Cost of a pixel without its samples, in samples by the midpoint rule. Fitted, like `SAMPLE`, to the times
+of `experiments.accuracy` (two CPU cores), whose ratios they predict within 9 % in the mean, 28 % at most."""
 
 COARSEST, FINE, FINEST = 2.0, 1 / 32, 1 / 256
-"""Voxels of the longest step that is tried, and of the shortest: with the midpoint rule where cells can be
-integrated, too, and otherwise. A step is proven by images of a half and a quarter of it."""
+"""Voxels of the longest step that is tried, and of the shortest: by the midpoint rule where cells can be
+integrated, too; and otherwise."""
 
 BISECTIONS = 3
 """How often a step is sought between one that is within the goal and its double, which is not: to 9 %."""
@@ -34,7 +33,7 @@ even if they are four times as long; they may be longer where steps are shorter 
 
 
 class Part(NamedTuple):
-    """A part of a plan: what it is, whether it was kept or left out, and why."""
+    """What a plan keeps or leaves out, and why."""
 
     name: str
     kept: bool
@@ -42,7 +41,7 @@ class Part(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """A march, the error of its image, and samples for each pixel."""
+    """A march, the error of its image, and samples per pixel."""
 
     march: March
     error: float
@@ -50,29 +49,24 @@ class Trial(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """Of a pixel, in samples by the midpoint rule."""
+        """Per pixel, in samples by the midpoint rule."""
         return RAY + SAMPLE[self.march.quadrature] * self.samples
 
 
+@dataclass
 class Search:
-    """Marches of one scene, tried on a part of its pixels.
+    """Marches of one scene, tried on some of its pixels."""
 
-    - `goal`: the error that they may have. `beyond`: that of the image, above which the plan fails.
-    - `voxel`: world length that steps are counted in. `transforms`: of all marches.
-    """
-
-    def __init__(
-        self,
-        probe: Probe,
-        scene: Scene,
-        goal: float,
-        beyond: float,
-        voxel: float,
-        transforms: tuple[Transform, ...],
-    ):
-        self.probe, self.scene, self.goal, self.beyond = probe, scene, goal, beyond
-        self.voxel, self.transforms = voxel, transforms
-        self._images: dict[tuple[float, Quadrature], Rendering] = {}
+    probe: Probe
+    scene: Scene
+    goal: float
+    """The error that the marches may have."""
+    beyond: float
+    """That of the image, above which the plan fails."""
+    voxel: float
+    """World length that steps are counted in."""
+    transforms: tuple[Transform, ...]
+    _images: dict[tuple[float, Quadrature], Rendering] = field(default_factory=dict, init=False)
 
     def cheapest(self, *, once: bool) -> tuple[Trial, Truth, list[Part]]:
         """The cheapest march within the goal, what images were compared with, and what was tried. `once`: as
@@ -92,14 +86,13 @@ class Search:
             why = f"{step:.2g} voxels, the shortest tried: not proven to be within the tolerance"
         else:
             why = f"{step:.3g} voxels, {found.march.quadrature}: RMSE {found.error:.2g}"
-        parts = [Part(_name(found), True, why)]
+        step_part = Part(_name(found), True, why)
         if found.error > self.goal:
-            return found, truth, parts
+            return found, truth, [step_part]
+        other = None
         if found.march.quadrature == "preintegrated":
             why = "the midpoint rule would be slower within the tolerance"
-            return found, truth, [*parts, Part("preintegrated", True, why)]
-        other = None
-        if found.samples <= WORTHWHILE and step >= FAIR:
+        elif found.samples <= WORTHWHILE and step >= FAIR:
             why = f"{found.samples:.1f} samples a pixel: too few to save any"
         elif once:
             why = "not tried for one image: a program of its own takes longer to compile than it saves"
@@ -110,34 +103,26 @@ class Search:
             why = f"{_name(other)}, {fewer}: cost {other.cost / found.cost:.2f}"
         else:
             why = "not within the tolerance where it would be faster"
-        better = other is not None and other.cost < found.cost
-        parts.append(Part("preintegrated", better, why))
-        if other is None or not better:
-            return found, truth, parts
-        return other, truth, [parts[0]._replace(kept=False), parts[1]]
+        chosen = found if other is None or other.cost >= found.cost else other
+        integrated = Part("preintegrated", chosen.march.quadrature == "preintegrated", why)
+        return chosen, truth, [step_part._replace(kept=chosen is found), integrated]
 
     def image(self, step: float, quadrature: Quadrature) -> Rendering:
         """Of steps of this length, in voxels."""
-        key = step, quadrature
-        if key not in self._images:
-            self._images[key] = self.probe.render(self.scene, self._march(*key))
-        return self._images[key]
-
-    def _march(self, step: float, quadrature: Quadrature) -> March:
-        return March(step * self.voxel, self.transforms, quadrature)
+        if (step, quadrature) not in self._images:
+            march = March(step * self.voxel, self.transforms, quadrature)
+            self._images[step, quadrature] = self.probe.render(self.scene, march)
+        return self._images[step, quadrature]
 
     @property
     def _integrable(self) -> bool:
         """Whether cells can be integrated between their ends."""
-        known = False
-
-        def ask(transfer: Transfer) -> None:
-            nonlocal known
-            known = transfer.integrator() is not None
-
         # as shapes: its tables take seconds to compile, operation by operation
-        eqx.filter_eval_shape(ask, self.scene.transfer)
-        return known and isinstance(self.scene.compositing, Over)
+        known: list[bool] = []
+        eqx.filter_eval_shape(
+            lambda transfer: known.append(transfer.integrator() is not None), self.scene.transfer
+        )
+        return known[0] and isinstance(self.scene.compositing, Over)
 
     def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Trial, Truth]:
         """The longest steps within the goal, compared with steps of a quarter of them or less. If there are
@@ -166,7 +151,8 @@ class Search:
 
     def _trial(self, step: float, quadrature: Quadrature, truth: Truth) -> Trial:
         image = self.image(step, quadrature)
-        return Trial(self._march(step, quadrature), truth.error(image), self.probe.mean(image.samples))
+        march = March(step * self.voxel, self.transforms, quadrature)
+        return Trial(march, truth.error(image), self.probe.mean(image.samples))
 
     def _integrated(self, step: float, truth: Truth) -> Trial | None:
         """Pre-integration with the longest steps within the goal, if that may be faster than the midpoint

@@ -28,8 +28,8 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "fit: checkpoints of other fits are used",
-        "fitting.checkpoints:_agree",
-        lambda agree: lambda saved, expected: True,
+        "fitting.checkpoints:load",
+        lambda load: lambda path, like, about: load(path, like, {}),
         ("fitting/test_fit.py::test_a_checkpoint_of_another_fit_is_refused",),
     ),
     Fault(
@@ -51,9 +51,9 @@ FAULTS: list[Fault] = [
         ("fitting/test_choice.py::test_the_truth_is_chosen_in_nine_of_ten_noisy_trials",),
     ),
     Fault(
-        "choice: larger models start anew",
-        "fitting.candidates:_split",
-        lambda split: lambda expand, classes, found: split(lambda _: expand.args[0], classes, found),
+        "choice: larger models start from the beginning",
+        "fitting.candidates:_grow",
+        lambda grow: lambda expand, classes, found: grow(lambda _: expand.args[0], classes, found),
         ("fitting/test_choice.py::test_materials_share_what_they_have_in_common",),
     ),
     Fault(

@@ -25,7 +25,7 @@ PROBES = {
     "b below 0": (5.0, -5.0, (0.3, 1.2), (1.7, 2.9), (25.0, 95.0)),
     "apex on the axis": (0.0, 25.0, (1.0, 2.0), (0.9, 2.4), (0.0, 40.0)),
 }
-NAMES = [".a", ".b", ".beta_range[0]", ".beta_range[1]", ".sigma_range[0]", ".sigma_range[1]", ".last_gamma"]
+NAMES = [".a", ".b", ".beta_range[0]", ".beta_range[1]", ".sigma_range[0]", ".sigma_range[1]", ".gamma_range"]
 
 
 def flat(probe):

@@ -42,8 +42,8 @@ def test_bricks_are_planned_where_the_volume_does_not_fit(path):
     copy, source, room, stride = read_within(placed(path), IN_MEMORY * VOLUME.data.nbytes // 8)
     assert (copy.shape, stride) == ((24, 24, 24), 2)
     march = jv.March(0.02, (jv.Jitter(0),))
-    given = source, soft_transfer(), around(VOLUME), march, room, stride, Over(), None
-    finer, bricks = with_bricks(*given)
+    given = source, soft_transfer(), around(VOLUME), march, stride
+    finer, bricks = with_bricks(*given, memory=room, compositing=Over(), lighting=None)
     assert np.prod(bricks.counts) > 1
     assert float(finer.step) <= float(march.step) / 2
     assert finer.transforms == march.transforms

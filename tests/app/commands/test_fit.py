@@ -71,7 +71,7 @@ BAD = {
     "no picture": ({"--images": ["nowhere.png", "1.png"]}, "there is no file nowhere.png"),
     "no picture's file": ({"--images": ["cameras.json"] * 2}, "cannot be read as a picture"),
     "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
-    "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "each of the 3 images; got 2"),
+    "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "a camera for each of 3 images; got 2"),
     "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
     "checkpoint": ({"--checkpoint": ["0.png/x"]}, "checkpoint: 0.png/x cannot be written"),
 }
@@ -98,9 +98,13 @@ def test_pictures_cameras_and_transfer_functions_are_read_as_they_were_written(s
     assert np.array_equal(np.asarray(jv.to_srgb(views[1][1]) * 255).round(), imread(seen[1]))
     np.testing.assert_array_equal(views[0][0].position, (40, -30, 20))
     for cameras, message in (
-        ([{"position": [1, 2, 3], "focus": [0, 0, 0]}] * 2, "camera 0 must be an object with position"),
+        (
+            [{"position": [1, 2, 3], "focus": [0, 0, 0]}] * 2,
+            "camera 0 must be an object with fields of position",
+        ),
+        ([{"position": [1, 2, 3]}] * 2, "camera 0: Camera.__init__() missing"),
         ([{"position": [1, 2], "focal_point": [0, 0, 0]}] * 2, "camera 0: position must have shape (3,)"),
-        ({"position": [1, 2, 3]}, "must hold a list of cameras; got dict"),
+        ({"position": [1, 2, 3]}, "must hold a list with a camera for each of 2 images; got a dict"),
     ):
         (tmp_path / "bad.json").write_text(json.dumps(cameras))
         with pytest.raises(ValueError, match=re.escape(message)):
