@@ -19,16 +19,11 @@ def _figures(options: argparse.Namespace) -> None:
 
 
 def checkout() -> Path:
-    """The checkout of the repository: the one that this package is part of, else the working directory.
-
-    **Raises:** `ValueError` if neither holds the figures."""
+    """The checkout of the repository: the one that this package is part of, else the working directory."""
     for folder in (Path(__file__).parents[3], Path.cwd()):
         if (folder / "paper_figs" / "index.py").is_file():
             return folder
-    raise ValueError(
-        "the figures are drawn by scripts of the repository (paper_figs/, experiments/). Run this in a "
-        "checkout of the repository."
-    )
+    raise ValueError("the figures are drawn by scripts of the repository. Run this in a checkout of it.")
 
 
 def add_figures(commands: Any) -> None:
