@@ -15,14 +15,8 @@ from ..scene.volume import Volume
 from ..xla.platform import is_traced
 
 
-SAMPLED = 2**21
-"""Maximum number of voxels that are looked at."""
-
-ACROSS = 100
-"""Opacities are measured along this fraction of the volume's diagonal."""
-
-CUT = 0.25
-"""Fraction of the voxels at the volume's faces from which on the faces cut through the object."""
+SAMPLED = 2**21  # voxels that are looked at, at most
+CUT = 0.25  # fraction of the voxels at the volume's faces from which on the faces cut through the object
 
 BODY = 0.15
 """Least fraction of the voxels between the thresholds whose six neighbours lie between them, too, if they are
@@ -34,10 +28,9 @@ ROUGH, NOISY = 0.7, 0.1
 
 FLAT, MOST_LABELS = 0.8, 64
 """Whole numbers are labels if this fraction of those above the lowest equal their neighbour (0.92 in a
-segmented frog, 0.46 at most in scans, simulations and phantoms), and there are so many different ones at most."""
+segmented frog, 0.46 at most in scans, simulations and phantoms), and no more than so many differ."""
 
-INSIDE = 255
-"""Value of what has a label, in the volume that is shown."""
+INSIDE = 255  # value of what has a label, in the volume that is shown
 
 EDGE, SKIN, TISSUE = (70, 30, 18), (214, 130, 92), (190, 92, 62)
 DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
@@ -59,9 +52,10 @@ def sampled(volume: Volume) -> Shaped[np.ndarray, "nx ny nz"]:
 
 
 def unit_of(volume: Volume) -> float:
-    """The length to which opacities refer, so that they do not depend on the volume's units."""
+    """The length to which opacities refer, so that they do not depend on the volume's units: a hundredth of
+    its diagonal."""
     low, high = (np.asarray(corner) for corner in volume.corners)
-    return float(np.linalg.norm(high - low)) / ACROSS
+    return float(np.linalg.norm(high - low)) / 100
 
 
 def automatic_transfer(volume: Volume | Any) -> TransferFunction:

@@ -14,20 +14,11 @@ from ..scene.volume import Volume
 from .automatic import INSIDE, sampled, stride_of, unit_of
 
 
-VISIBLE = 0.1
-"""Opacity, along ACROSS of the diagonal, from which on a voxel counts as visible."""
-
-SPECK = 0.02
-"""Pieces smaller than this fraction of the largest connected one need not be in the picture."""
-
-REACH = 3
-"""Voxels of the cube around each visible one that connects it to others, such as the leaves of a tree."""
-
-NEAREST = 0.1
-"""Least distance of the camera from what is visible, as a fraction of the diagonal of that."""
-
-MARGIN = 1.06
-"""By how much more than what is visible the picture shows, in each direction."""
+VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
+SPECK = 0.02  # pieces smaller than this fraction of the largest one need not be in the picture
+REACH = 3  # voxels of the cube around each visible one that connects it to others, as the leaves of a tree
+NEAREST = 0.1  # least distance of the camera from what is visible, as a fraction of the diagonal of that
+MARGIN = 1.06  # by how much more than what is visible the picture shows, in each direction
 
 CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 """Of the unit cube."""

@@ -37,7 +37,7 @@ MIDDLE = 128
 
 class Scene(NamedTuple):
     """What is looked at, and how. Of a volume that is read in bricks from `source`, with so many bytes of
-    memory, `volume` is a copy of every n-th voxel in the same place. `march` is a `March`, once it is known."""
+    memory, `volume` is a copy of every n-th voxel in the same place. `march`: a `March`, once it is known."""
 
     volume: Volume
     transfer: Transfer
