@@ -23,11 +23,7 @@ from .scene import scene_of, with_march
 Picture = UInt8[np.ndarray, "height width 3"]
 
 FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
-"""Views of an orbit, evenly spaced, in which all that is visible is to be in the picture, and for which its
-march is planned."""
-
-GIF_FPS = 50
-"""Frames a second of a GIF, at most: browsers show those of less than 2/100 s for 10/100 s."""
+"""Evenly spaced views of an orbit that must show all that is visible, and for which its march is planned."""
 
 
 def _animate(options: argparse.Namespace) -> None:
@@ -36,7 +32,7 @@ def _animate(options: argparse.Namespace) -> None:
     kind = path.suffix.lower()
     if kind not in (".gif", ".mp4"):
         raise ValueError(f"--output: must end in .gif or .mp4; got {path}.")
-    fastest = GIF_FPS if kind == ".gif" else 240
+    fastest = 50 if kind == ".gif" else 240  # browsers show GIF frames of less than 2/100 s for 10/100 s
     if not 0 < options.fps <= fastest:
         raise ValueError(f"--fps of a {kind} must be above 0, and {fastest} at most; got {options.fps:g}.")
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:

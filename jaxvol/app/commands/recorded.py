@@ -15,8 +15,7 @@ from ...io.formats import files_of
 from ...scene.transfer import Transfer, TransferFunction
 
 
-KEYWORD = "jaxvol"
-"""Of the text in a PNG."""
+KEYWORD = "jaxvol"  # of the text in a PNG
 
 
 def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:

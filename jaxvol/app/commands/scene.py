@@ -28,11 +28,7 @@ from ..automatic import SAMPLED, automatic_transfer, labels_shown, stride_of, tr
 from ..framing import FRONT, framed, visible_points
 
 
-FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
-"""Transforms of a march whose step is given."""
-
-MIDDLE = 128
-"""Voxels along each axis, at most, of the part of a bricked volume that is looked at in full resolution."""
+FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
 
 
 class Scene(NamedTuple):
@@ -177,8 +173,8 @@ def transfer_of(options: argparse.Namespace, volume: Volume) -> Transfer:
 
 def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
     """The automatic one, from a copy and the middle of the volume at full resolution."""
-    low = [max(0, (n - MIDDLE) // 2) for n in source.shape]
-    high = [min(n, begin + MIDDLE) for n, begin in zip(source.shape, low, strict=True)]
+    low = [max(0, (n - 128) // 2) for n in source.shape]
+    high = [min(n, begin + 128) for n, begin in zip(source.shape, low, strict=True)]
     return transfer_by_copy(copy, np.asarray(source.read(low, high)))
 
 

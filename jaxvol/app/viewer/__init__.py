@@ -39,11 +39,11 @@ def view(
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
-    return. Beside the image are window and level, the volume's histogram, the points of the transfer
-    function, or its labels, the step, and every transform and the light to be turned on and off. While
-    something changes, the image is as coarse as it must be to follow within some 150 ms; at rest it has all
-    pixels. Its time, its step and an estimate of its error are shown live. It needs
-    `pip install jaxvol[notebooks]`. Programs that are compiled are kept, as by `keep_programs`.
+    return. Beside the image are window and level, the histogram, the points of the transfer function or its
+    labels, the step, and a switch for each transform and the light. While something changes, the image is as
+    coarse as it must be to follow within some 150 ms; at rest it has all pixels. Its time, step and estimated
+    error are shown. It needs `pip install jaxvol[notebooks]`. Compiled programs are kept, as by
+    `keep_programs`.
 
     Args:
         volume: what is looked at.

@@ -16,11 +16,8 @@ from .model import Model
 from .state import MAX_STEP, MIN_STEP
 
 
-MAX_LABEL_OPACITY = 4.0
-"""Factor of a label's extinction."""
-
-BINS, WIDTH, HEIGHT = 128, 320, 84
-"""Of the plot of the histogram."""
+MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
+BINS, WIDTH, HEIGHT = 128, 320, 84  # of the plot of the histogram
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ class _Panel:
                     self._add(control)
 
     def _show(self, pixels: Pixels, stage: Stage) -> None:
-        self.client.scene.set_background_image(pixels, "jpeg", JPEG_QUALITY[stage])
+        self.client.scene.set_background_image(pixels, "jpeg", jpeg_quality=JPEG_QUALITY[stage])
         self.client.flush()
 
     def _tell(self, text: str) -> None:

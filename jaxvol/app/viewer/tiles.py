@@ -21,11 +21,10 @@ from .state import Scene, State
 
 
 SIDE = 192
-"""Rays along a side of a tile. Each tile finds out again what is empty: at this size, that takes less time than
-its rays. A drag waits for one tile at most."""
+"""Rays along a side of a tile. Each tile searches for empty space again, which takes less time than its rays
+at this size, and a drag waits for one tile at most."""
 
-Pixels = UInt8[np.ndarray, "height width 3"]
-"""sRGB of a view or a part of it."""
+Pixels = UInt8[np.ndarray, "height width 3"]  # sRGB
 
 
 @dataclass(frozen=True)
