@@ -13,10 +13,9 @@ import jax
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
 from .commands.animate import add_animate
-from .commands.demo import add_demo
-from .commands.figures import add_figures
 from .commands.fit import add_fit
 from .commands.options import Parser, parsed
+from .commands.pages import add_demo, add_figures
 from .commands.render import add_plan, add_render
 from .commands.volumes import add_datasets, add_info, add_view
 
@@ -31,12 +30,8 @@ examples:
   jaxvol render "$FILE"
   jaxvol render "$FILE" --preset engine --direction -0.7 -1 0.25 -o engine.png
   jaxvol render --like engine.png --size 1024 1024 -o large.png
-  jaxvol render "$FILE" --cmap gray --compositing maximum -o maximum.png
-  jaxvol render large.npy --memory 512M
   jaxvol animate "$FILE" --preset engine --frames 48 -o engine.gif
-  jaxvol plan "$FILE" --preset engine --tolerance 0.001
   jaxvol fit "$FILE" --images a.png b.png --cameras cameras.json -o transfer.json
-  jaxvol render "$FILE" --transfer transfer.json --transparent --depth depth.npy
 """
 
 

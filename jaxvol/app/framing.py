@@ -65,6 +65,12 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
     From a distance D, a point that lies x beside the focal point, and z nearer than it, is in the picture if
     |x| <= t (D - z), where t is the tangent of half the angle. For parallel rays, z does not count, and D is
     the half height of the view."""
+    from scipy.optimize import brentq
+
+    def excess(shift: float, across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) -> float:
+        seen = (across - shift) / depth  # 0 where as much is free on both sides
+        return float(seen.max() + seen.min())
+
     views = views or [camera]
     width, height = camera.size
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -82,7 +88,8 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
         distance = max(distance, float(nearer.max()) + free, *needed.tolist())
         if len(views) == 1:
             depth = distance - nearer if perspective else np.ones(len(points))
-            focal = middle + axes @ (t * [_centering(each, depth) for each in across.T])
+            shifts = [brentq(excess, x.min(), x.max(), (x, depth)) for x in across.T]
+            focal = middle + axes @ (t * np.array(shifts))
     away = np.asarray(camera.position - camera.focal_point, np.float64)
     return Camera(
         focal + (away * (distance / np.linalg.norm(away)) if perspective else away),
@@ -92,14 +99,3 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
         size=camera.size,
         parallel_scale=None if perspective else distance,
     )
-
-
-def _centering(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) -> float:
-    """The shift that leaves as much free on both sides of points at such offsets and depths."""
-    from scipy.optimize import brentq
-
-    def excess(shift: float) -> float:
-        seen = (across - shift) / depth
-        return float(seen.max() + seen.min())
-
-    return float(brentq(excess, across.min(), across.max()))  # pyright: ignore[reportArgumentType]

@@ -20,8 +20,6 @@ from .options import add_command, add_output, add_scene, add_vector
 from .scene import scene_of, with_march
 
 
-Picture = UInt8[np.ndarray, "height width 3"]
-
 FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
 """Evenly spaced views of an orbit that must show all that is visible, and for which its march is planned."""
 
@@ -76,7 +74,7 @@ def angles_of(degrees: float, frames: int) -> list[float]:
     return [degrees * i / max(frames if closed else frames - 1, 1) for i in range(frames)]
 
 
-def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
+def _write_gif(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
     """Each frame has 256 colours of its own, and lasts for whole hundredths of a second."""
     from PIL import Image
 
@@ -85,7 +83,7 @@ def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
     next(pictures).save(path, save_all=True, append_images=pictures, **how)
 
 
-def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
+def _write_mp4(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
     """H.264 with colours at half the resolution, which every player shows."""
     from imageio.v3 import imopen
 

@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -59,7 +59,11 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
             recorded = _of_picture(command, given["like"], named="file" in given)
         except ValueError as fault:
             raise ValueError(f"--like: {str(fault)[:400]}") from fault
-        settings = _without_overridden(recorded, given) | given
+        replacing = [name for name, value in given.items() if value is not False]
+        overridden = set().union(*(OVERRIDES.get(name, ()) for name in replacing))
+        if given.get("compositing", "isosurface") != "isosurface":
+            overridden.add("isovalue")
+        settings = {name: value for name, value in recorded.items() if name not in overridden} | given
     on = {name for name, value in settings.items() if value is not False}
     for name in sorted(on):
         for other in sorted(on & OVERRIDES.get(name, set())):
@@ -91,15 +95,6 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     if not named:
         settings["file"] = volume_of_picture(path, found["file"]["name"], found["file"]["sha256"])
     return settings
-
-
-def _without_overridden(settings: Mapping[str, Any], later: Mapping[str, Any]) -> dict[str, Any]:
-    overridden = set().union(
-        *(OVERRIDES.get(name, ()) for name, value in later.items() if value is not False)
-    )
-    if later.get("compositing", "isosurface") != "isosurface":
-        overridden.add("isovalue")
-    return {name: value for name, value in settings.items() if name not in overridden}
 
 
 def memory_size(text: str) -> int:

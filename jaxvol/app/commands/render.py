@@ -44,7 +44,6 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> None:
-    """Print how large the image and the volume are, and what the image took."""
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     shape = scene.volume.shape if scene.source is None else scene.source.shape

@@ -123,7 +123,6 @@ def with_march(scene: Scene, options: argparse.Namespace, cameras: Sequence[Came
 
 
 def volume_of(options: argparse.Namespace) -> Volume:
-    """The volume in the file."""
     return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
 
 
@@ -156,7 +155,6 @@ def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
 
 
 def transfer_of(options: argparse.Namespace, volume: Volume) -> Transfer:
-    """The transfer function for a volume."""
     if is_automatic(options):
         return automatic_transfer(volume)
     if options.recorded_transfer is not None:

@@ -1,8 +1,7 @@
 """Looks at volumes: `view` in a notebook, and `serve` as a page of its own, which `jaxvol view FILE` shows.
 
-One model (`model`: camera, transfer function, march and light in a `State`, drawn by a thread, coarse
-while it changes and fine at rest) and one description of its controls (`controls`) have two faces,
-`notebook` and `page`.
+One `model`, whose `state` a thread draws in `tiles`, and one list of its `controls` have two faces, `notebook`
+and `page`.
 """
 
 from typing import TYPE_CHECKING, Any

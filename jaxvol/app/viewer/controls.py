@@ -191,8 +191,6 @@ def _label_controls(model: Model) -> list[Control]:
 
 
 def _march_controls(model: Model) -> list[Control]:
-    """Step, transforms, light."""
-
     def switch(name: str) -> Control:
         def turn(on: bool) -> None:
             enabled = model.state.enabled - {name}

@@ -18,7 +18,6 @@ JPEG_QUALITY: dict[Stage, int] = {"coarse": 85, "drawing": 88, "fine": 94}
 """With which images are sent to a browser."""
 
 MAX_SIDE = 2048  # pixels of a view's width and height
-REST = 0.12  # seconds without a change after which a fine image is begun
 INTERVAL = 0.25  # seconds after which an unfinished fine image is shown again
 BUDGET = 0.06  # seconds that a coarse image may take, of the 150 ms in which it is to follow the pointer
 
@@ -47,8 +46,9 @@ class Model:
         state: how, at first.
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
         tell: called likewise with a status of two lines.
-        rest: seconds without a change after which a fine image is begun.
     """
+
+    rest = 0.12  # seconds without a change after which a fine image is begun
 
     def __init__(
         self,
@@ -56,13 +56,11 @@ class Model:
         state: State,
         show: Callable[[Pixels, Stage], None],
         tell: Callable[[str], None],
-        rest: float = REST,
     ):
         self.scene, self.state = scene, state
         self._face = show, tell
         self._level = 2
         self._compiled: set[Any] = set()
-        self._rest = rest
         self._changed = threading.Condition()
         self._next: State | None = None
         self._idle, self._closed = True, False
@@ -139,7 +137,7 @@ class Model:
                 request, self._next = self._next, None
             try:
                 for part, _ in enumerate(self._draw(request)):
-                    if self._cancelled(0 if part else self._rest):
+                    if self._cancelled(0 if part else self.rest):
                         break
             except Exception as fault:  # told to the user, who may ask for another image
                 self._tell(f"not drawn:\n{' '.join(str(fault).split())}")

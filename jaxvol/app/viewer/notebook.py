@@ -59,8 +59,7 @@ class NotebookView(ipywidgets.HBox):
 
     @property
     def volume(self) -> Volume:
-        """What is looked at. Of voxels that are labels, shown without a transfer function, it is a smooth
-        volume with them."""
+        """What is looked at; of labels without a transfer function, a smooth volume with them."""
         return self.model.scene.volume
 
     @property

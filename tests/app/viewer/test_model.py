@@ -44,7 +44,8 @@ class Shown:
 
     def __init__(self):
         self.images, self.told = [], []
-        self.model = Model(*begun(), lambda *image: self.images.append(image), self.told.append, rest=0)
+        self.model = Model(*begun(), lambda *image: self.images.append(image), self.told.append)
+        self.model.rest = 0
 
     def after(self, change):
         """The fine image after a change of the state."""
@@ -212,7 +213,7 @@ def controlled(monkeypatch):
     models = []
 
     def made(*scene, **more):
-        models.append(Model(*begun(*scene, **more), lambda *_: None, lambda _: None, rest=0))
+        models.append(Model(*begun(*scene, **more), lambda *_: None, lambda _: None))
         controls = [control for group in controls_of(models[-1]).values() for control in group]
         return models[-1], {control.label or control.kind: control for control in controls}
 
