@@ -1,7 +1,7 @@
 """Looks at volumes: `view` in a notebook, and `serve` as a page of its own, which `jaxvol view FILE` shows.
 
-One `model`, whose `state` a thread draws in `tiles`, and one list of its `controls` have two faces, `notebook`
-and `page`.
+One `model`, whose `state` a thread draws in `tiles`, and one list of its `controls` have two faces,
+`notebook` and `page`.
 """
 
 from typing import TYPE_CHECKING, Any
