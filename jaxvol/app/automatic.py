@@ -63,9 +63,9 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
     Two thresholds part the values into three classes so that the variance within each is least (Otsu): what
     is around the object, the object, and what is dense in it. The border of the object is shown translucent,
-    what is dense in it nearly opaque. Where the volume's faces cut the object, as in most CT scans, where it
-    is grain, as in ultrasound, or only borders of what is dense, as in angiograms, it would hide what is
-    dense, which alone is shown then. It is a guess. Opacities do not depend on the volume's units.
+    what is dense in it nearly opaque. Only what is dense is shown where the object would hide it: where the
+    volume's faces cut the object, as in most CT scans, and where it is grain, as in ultrasound, or only the
+    border of what is dense, as in angiograms. Opacities do not depend on the volume's units.
 
     Args:
         volume: the `Volume`. Of more than 2 million voxels, every n-th is looked at.
@@ -90,7 +90,7 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
-    """The same from a copy of every n-th voxel, and a part at full resolution, which tells what is grain."""
+    """The same from a copy of every n-th voxel, and a part at full resolution, which shows grain."""
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:

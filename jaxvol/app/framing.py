@@ -62,7 +62,7 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
     """A camera with the directions, the angle and the size of another, placed so that the points just fill
     its picture, the whole window; or those of all `views` of it, turned about the middle of the points.
 
-    From a distance D, a point that lies x beside the focal point, and z nearer than it, is in the picture if
+    From a distance D, a point that lies x across from the focal point, and z nearer, is in the picture if
     |x| <= t (D - z), where t is the tangent of half the angle. For parallel rays, z does not count, and D is
     the half height of the view."""
     from scipy.optimize import brentq

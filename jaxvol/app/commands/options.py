@@ -140,7 +140,7 @@ def add_volume(parser: Parser, **more: Any) -> None:
 
 
 def add_sampling(parser: Parser) -> None:
-    """Add how images are sampled, and what is behind."""
+    """Add the step and the background of images."""
     text = "distance between samples, world length (default: half a voxel for fit; as planned for render)"
     parser.add_argument("--step", type=float, help=text)
     text = "linear RGB (default: white; black behind maximum, minimum and average)"

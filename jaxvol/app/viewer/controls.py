@@ -61,7 +61,7 @@ def _edit(model: Model, change: Callable[..., Any], *arguments: Any) -> None:
 
 
 def _range_controls(model: Model) -> list[Control]:
-    """The histogram behind the transfer function, and window and level."""
+    """The histogram with the transfer function, and window and level."""
     low, high, bars = histogram(model.scene.volume)
 
     def now() -> tuple[float, float]:
@@ -95,8 +95,7 @@ def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]
 
 
 def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, unit_distance: float) -> str:
-    """An SVG of the histogram, grey, behind the square root of the opacity, so that thin materials can be
-    told apart."""
+    """An SVG of the histogram and, as a line, the square root of the opacity, which shows thin materials."""
     values = np.linspace(low, high, 4 * BINS)
     extinction = np.interp(values, np.asarray(transfer.values), np.asarray(transfer.extinction))
 
@@ -133,7 +132,7 @@ def _point_controls(model: Model) -> list[Control]:
 
     def add_or_remove(option: str) -> None:
         nonlocal chosen
-        change = editing.with_point_after if option == "add behind" else editing.without_point
+        change = editing.with_point_after if option == "add after" else editing.without_point
         _edit(model, change, chosen)
         chosen = min(chosen, len(transfer().values) - 1)
 
@@ -151,7 +150,7 @@ def _point_controls(model: Model) -> list[Control]:
         Control("number", "value", value, edit(editing.with_value)),
         Control("color", "color", color, edit(editing.with_color)),
         Control("slider", "opacity", opacity, edit(editing.with_opacity, voxel)),
-        Control("buttons", "points", set=add_or_remove, choices=lambda: ["add behind", "remove"]),
+        Control("buttons", "points", set=add_or_remove, choices=lambda: ["add after", "remove"]),
     ]
 
 

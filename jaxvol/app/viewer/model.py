@@ -45,7 +45,7 @@ class Model:
         scene: what is viewed.
         state: how, at first.
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
-        tell: called likewise with a status of two lines.
+        set_status: called likewise with a status of two lines.
     """
 
     rest = 0.12  # seconds without a change after which a fine image is begun
@@ -55,10 +55,10 @@ class Model:
         scene: Scene,
         state: State,
         show: Callable[[Pixels, Stage], None],
-        tell: Callable[[str], None],
+        set_status: Callable[[str], None],
     ):
         self.scene, self.state = scene, state
-        self._face = show, tell
+        self._face = show, set_status
         self._level = 2
         self._compiled: set[Any] = set()
         self._changed = threading.Condition()
@@ -92,11 +92,11 @@ class Model:
 
     def apply(self, change: Callable[[State], State]) -> None:
         """Change the state by a function of it, and draw it. Bad input, such as points that make no transfer
-        function, changes nothing: what is wrong with it is told."""
+        function, changes nothing but the status."""
         try:
             self.state = change(self.state)
         except ValueError as fault:
-            self._tell(str(fault))
+            self._set_status(str(fault))
         else:
             self.ask(self.state)
 
@@ -115,7 +115,7 @@ class Model:
         height, width, _ = pixels.shape
         return f"{stage}: {width} x {height}, step {step:.3g} voxels\n{1e3 * seconds:.0f} ms"
 
-    def _tell(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         if not self._closed:
             self._face[1](text)
 
@@ -139,8 +139,8 @@ class Model:
                 for part, _ in enumerate(self._draw(request)):
                     if self._cancelled(0 if part else self.rest):
                         break
-            except Exception as fault:  # told to the user, who may ask for another image
-                self._tell(f"not drawn:\n{' '.join(str(fault).split())}")
+            except Exception as fault:  # for the user, who may ask for another image
+                self._set_status(f"not drawn:\n{' '.join(str(fault).split())}")
             with self._changed:
                 self._idle = self._next is None
                 self._changed.notify_all()
@@ -150,16 +150,16 @@ class Model:
         renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
         tiles = grid.tiles()
         if renderer.program_key not in self._compiled:
-            self._tell("compiling …\nfor these transforms; the program is kept for the next time")
+            self._set_status("compiling …\nfor these transforms; the program is kept for the next time")
             begun = time.perf_counter()
             renderer.overview()
             self._compiled.add(renderer.program_key)
-            self._tell(f"compiled in {time.perf_counter() - begun:.1f} s\n")
+            self._set_status(f"compiled in {time.perf_counter() - begun:.1f} s\n")
         begun, (most, factor) = time.perf_counter(), LEVELS[self._level]
         coarse = TileRenderer(self.scene, request, factor).coarse(most)
         seconds = time.perf_counter() - begun
         self._level = adapted(self._level, seconds, len(tiles))
-        self._tell(self._show(coarse, "coarse", seconds, request.step * factor))
+        self._set_status(self._show(coarse, "coarse", seconds, request.step * factor))
         yield
 
         pixels, (width, height) = grid.canvas(coarse), grid.size
@@ -172,13 +172,13 @@ class Model:
         for count, (column, row) in enumerate(tiles):
             if time.perf_counter() - shown > INTERVAL:
                 shown = time.perf_counter()
-                self._tell(f"{show('drawing')}, {count} of {len(tiles)} tiles")
+                self._set_status(f"{show('drawing')}, {count} of {len(tiles)} tiles")
             renderer.draw(pixels, grid, column, row)
             yield
         summary = show("fine")
-        self._tell(f"{summary}, estimating its error …")
+        self._set_status(f"{summary}, estimating its error …")
         image = renderer.overview()
         yield
         doubled = TileRenderer(self.scene, request, 2.0).overview()
         error = estimated_error(image, doubled, self.scene.given.quadrature)
-        self._tell(f"{summary}, RMSE {error:.2g} (estimate)")
+        self._set_status(f"{summary}, RMSE {error:.2g} (estimate)")

@@ -46,7 +46,7 @@ class NotebookView(ipywidgets.HBox):
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
         self._status = ipywidgets.HTML(layout=WIDE)
-        self.model = Model(scene, state, self._show, self._tell)
+        self.model = Model(scene, state, self._show, self._set_status)
         self._first = state
         self._pointer: tuple[float, float] | None = None
         self._widgets: list[tuple[Any, Control]] = []
@@ -94,7 +94,7 @@ class NotebookView(ipywidgets.HBox):
     def _show(self, pixels: Pixels, stage: Stage) -> None:
         self._in_loop(lambda: self.canvas.show(pixels, JPEG_QUALITY[stage]))
 
-    def _tell(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))
 
     def _in_loop(self, call: Callable[[], Any]) -> None:

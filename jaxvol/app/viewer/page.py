@@ -1,5 +1,5 @@
-"""A viewer as a page of its own, by viser: it turns the camera in the browser, and the image is what lies
-behind its scene, which is empty."""
+"""A viewer as a page of its own, by viser, which turns the camera in the browser. The image is the background
+of viser's scene, which is empty."""
 
 import contextlib
 import io
@@ -118,7 +118,7 @@ class _Panel:
     def __init__(self, client: viser.ClientHandle, scene: Scene, state: State):
         self.client = client
         self.status = client.gui.add_markdown("starting …  \n")
-        self.model = Model(scene, state, self._show, self._tell)
+        self.model = Model(scene, state, self._show, self._set_status)
         self._widgets: list[tuple[Any, Control]] = []
         for heading, controls in controls_of(self.model).items():
             with client.gui.add_folder(heading):
@@ -129,7 +129,7 @@ class _Panel:
         self.client.scene.set_background_image(pixels, "jpeg", jpeg_quality=JPEG_QUALITY[stage])
         self.client.flush()
 
-    def _tell(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
 
     def _add(self, control: Control) -> None:

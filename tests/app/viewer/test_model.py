@@ -236,7 +236,7 @@ def test_the_controls_change_the_points_that_they_show(controlled):
     assert (controls["window"].get(), controls["level"].get()) == (180, 170)
     assert controls["point"].get() == "3: 260"
     controls["point"].set("2: 110")
-    controls["points"].set("add behind")
+    controls["points"].set("add after")
     assert controls["point"].choices() == ["1: 80", "2: 110", "3: 185", "4: 260"]
     controls["point"].set("4: 260")
     controls["points"].set("remove")
