@@ -68,7 +68,7 @@ def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_pat
     assert pages.checkout() == ROOT
     monkeypatch.chdir(tmp_path)
     assert cli.main(["figures"]) == 2
-    assert "Run this in a checkout of the repository" in capsys.readouterr().err
+    assert "scripts of the repository. Run this in a checkout of it" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"only must be some of fig01.*; got fig02"):
         index.make(common.OUTPUT, only=["fig02"])
 

@@ -23,6 +23,7 @@ def _fit(options: argparse.Namespace) -> None:
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     march = March(step, FAST, "midpoint")
     with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", UserWarning)
         result = fit(
             ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
             flat_grey(volume, options.points, options.clim),
