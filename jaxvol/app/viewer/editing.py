@@ -73,7 +73,8 @@ def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
     """Without a point, of which at least two remain."""
     if len(transfer.values) <= 2:
         raise ValueError("a transfer function has at least 2 points.")
-    return TransferFunction(*(np.delete(getattr(transfer, name), index, axis=0) for name in POINTS))
+    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
+    return TransferFunction(*(np.delete(p, index, axis=0) for p in points))
 
 
 def padded(transfer: Any) -> Any:
