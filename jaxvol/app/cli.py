@@ -13,15 +13,11 @@ import jax
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
 from .commands.animate import add_animate
-from .commands.datasets import add_datasets
-from .commands.demo import add_demo
-from .commands.figures import add_figures
 from .commands.fit import add_fit
-from .commands.info import add_info
-from .commands.parsing import Parser, parsed
-from .commands.plan import add_plan
-from .commands.render import add_render
-from .commands.view import add_view
+from .commands.options import Parser, parsed
+from .commands.pages import add_demo, add_figures
+from .commands.render import add_plan, add_render
+from .commands.volumes import add_datasets, add_info, add_view
 
 
 COMMANDS = add_demo, add_render, add_animate, add_plan, add_fit, add_figures, add_info, add_datasets, add_view
@@ -34,25 +30,22 @@ examples:
   jaxvol render "$FILE"
   jaxvol render "$FILE" --preset engine --direction -0.7 -1 0.25 -o engine.png
   jaxvol render --like engine.png --size 1024 1024 -o large.png
-  jaxvol render "$FILE" --cmap gray --compositing maximum -o maximum.png
-  jaxvol render large.npy --memory 512M --config settings.toml
   jaxvol animate "$FILE" --preset engine --frames 48 -o engine.gif
-  jaxvol plan "$FILE" --preset engine --tolerance 0.001
   jaxvol fit "$FILE" --images a.png b.png --cameras cameras.json -o transfer.json
-  jaxvol render "$FILE" --transfer transfer.json --transparent --depth depth.npy
 """
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as in shells."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
-    **Returns:** the exit code: 0, or 2 for bad input, reported in one line; 1, with nothing said, where what
-    reads stdout has ended. Ctrl-C is reported in one line, too, and ends the process at once with code 130,
-    by `os._exit`: XLA does not stop compiling or computing for a signal. Files that are not whole are
-    removed."""
+    Args:
+        arguments: the words after `jaxvol`; by default those of the process.
+
+    Returns:
+        the exit code: 0; 2 for bad input, reported in one line; 1, with nothing said, where what reads stdout
+        has ended. Ctrl-C is reported in one line and ends the process at once with code 130, as in shells, by
+        `os._exit`: XLA does not stop for a signal. Unfinished files are removed.
+    """
     words = sys.argv[1:] if arguments is None else list(arguments)
     program = " ".join(["jaxvol", *words[:1]])
     options = argparse.Namespace()
@@ -82,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f"; the same command resumes from {checkpoint}" if checkpoint and checkpoint.exists() else ""
         print(f"\n{program}: interrupted{hint}", file=sys.stderr, flush=True)
         sys.stdout.flush()
-        os._exit(INTERRUPTED)
+        os._exit(130)
     return 0
 
 

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.app.automatic import framed, labels_shown, transfer_by_copy, visible_points
-from jaxvol.app.automatic.framing import MARGIN
-from jaxvol.app.automatic.histogram import SAMPLED, is_body, thresholds
-from jaxvol.app.automatic.labels import INSIDE
+from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_shown, thresholds
 from jaxvol.app.commands.animate import turned
-from jaxvol.app.commands.data import copy_of, middle_of
+from jaxvol.app.commands.scene import _transfer_of_bricks, copy_of
+from jaxvol.app.framing import MARGIN, framed, visible_points
 from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
 
@@ -97,7 +95,7 @@ def test_of_a_large_volume_a_copy_tells_the_same_if_grain_is_looked_at_as_it_is(
     source = source_of(volume)
     copy = copy_of(source, 2**28)
     assert max(copy.shape) <= 80
-    whole, found = jv.automatic_transfer(volume), transfer_by_copy(copy, middle_of(source))
+    whole, found = jv.automatic_transfer(volume), _transfer_of_bricks(copy, source)
     for name in ("values", "colors", "extinction"):
         np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-5)
     # waves of six voxels are grain to those who see every second voxel alone

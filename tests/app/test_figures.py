@@ -9,7 +9,7 @@ from skimage.io import imread
 from experiments import record
 from experiments.marches import BOTH
 from jaxvol.app import cli
-from jaxvol.app.commands import figures
+from jaxvol.app.commands import pages
 from paper_figs import common, contents, fig09, index, kim_table1, kisti_table, table1
 
 
@@ -63,12 +63,12 @@ def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_pat
     made = {path.name for path in (tmp_path / "made").iterdir()}
     assert made == {"fig12.webp", "index.html", "lee_fig1.webp"}
     assert str(tmp_path / "made" / "index.html") in capsys.readouterr().out
-    monkeypatch.setattr(figures, "__file__", str(tmp_path / "site-packages/jaxvol/app/commands/figures.py"))
+    monkeypatch.setattr(pages, "__file__", str(tmp_path / "site-packages/jaxvol/app/commands/pages.py"))
     monkeypatch.chdir(ROOT)
-    assert figures.checkout() == ROOT
+    assert pages.checkout() == ROOT
     monkeypatch.chdir(tmp_path)
     assert cli.main(["figures"]) == 2
-    assert "Run this in a checkout of the repository" in capsys.readouterr().err
+    assert "scripts of the repository. Run this in a checkout of it" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"only must be some of fig01.*; got fig02"):
         index.make(common.OUTPUT, only=["fig02"])
 

@@ -71,7 +71,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "viewer: a drag turns what is seen against the pointer",
-        "app.viewer.orbit:Orbit.turned",
+        "app.viewer.state:Orbit.turned",
         lambda turned: lambda self, right, down: turned(self, -right, -down),
         ("app/viewer/test_orbit.py::test_the_front_of_what_is_seen_follows_a_drag",),
     ),

@@ -16,19 +16,12 @@ from ..._util.checks import integer, output_file
 from ..._util.whole_files import whole_file
 from ...io.display import displayed
 from ...scene.camera import Camera
-from .frames import frames_of
 from .options import add_command, add_output, add_scene, add_vector
-from .scene import scene_of
+from .scene import scene_of, with_march
 
-
-Picture = UInt8[np.ndarray, "height width 3"]
 
 FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
-"""Views of an orbit, evenly spaced, in which all that is visible is to be in the picture, and for which its
-march is planned."""
-
-GIF_FPS = 50
-"""Frames a second of a GIF, at most: browsers show those of less than 2/100 s for 10/100 s."""
+"""Evenly spaced views of an orbit that must show all that is visible, and for which its march is planned."""
 
 
 def _animate(options: argparse.Namespace) -> None:
@@ -37,7 +30,7 @@ def _animate(options: argparse.Namespace) -> None:
     kind = path.suffix.lower()
     if kind not in (".gif", ".mp4"):
         raise ValueError(f"--output: must end in .gif or .mp4; got {path}.")
-    fastest = GIF_FPS if kind == ".gif" else 240
+    fastest = 50 if kind == ".gif" else 240  # browsers show GIF frames of less than 2/100 s for 10/100 s
     if not 0 < options.fps <= fastest:
         raise ValueError(f"--fps of a {kind} must be above 0, and {fastest} at most; got {options.fps:g}.")
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
@@ -49,9 +42,9 @@ def _animate(options: argparse.Namespace) -> None:
 
     scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))
     begun = time.perf_counter()
-    frames = frames_of(options, scene, views(scene.camera, PLANNED_VIEWS))
+    scene = with_march(scene, options, views(scene.camera, PLANNED_VIEWS))
     images = (
-        displayed(np.asarray(frames.render(camera).image(scene.background), np.float32))
+        displayed(np.asarray(scene.render(camera).image(scene.background), np.float32))
         for camera in views(scene.camera, count)
     )
     with whole_file(path) as part:
@@ -68,22 +61,20 @@ def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
     axis = np.asarray(axis, float)
     if not np.isfinite(axis).all() or not axis.any():
         raise ValueError(f"--axis must not be 0; got {' '.join(map(str, axis))}.")
-    rotation = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
-    position, focal, up = (
-        np.asarray(v, float) for v in (camera.position, camera.focal_point, camera.view_up)
-    )
-    place = jnp.asarray(focal + rotation.apply(position - focal)), jnp.asarray(rotation.apply(up))
-    return eqx.tree_at(lambda c: (c.position, c.view_up), camera, place)
+    turn = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
+    focal = np.asarray(camera.focal_point, float)
+    position = jnp.asarray(focal + turn.apply(np.asarray(camera.position, float) - focal))
+    up = jnp.asarray(turn.apply(np.asarray(camera.view_up, float)))
+    return eqx.tree_at(lambda c: (c.position, c.view_up), camera, (position, up))
 
 
 def angles_of(degrees: float, frames: int) -> list[float]:
-    """Angles of the frames: evenly spaced from 0 on, to `degrees`; or, where that ends at the beginning, to
-    one frame before it."""
+    """Angles from 0 to `degrees`, evenly spaced; where that is a whole turn, to one frame before it."""
     closed = degrees % 360 == 0
     return [degrees * i / max(frames if closed else frames - 1, 1) for i in range(frames)]
 
 
-def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
+def _write_gif(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
     """Each frame has 256 colours of its own, and lasts for whole hundredths of a second."""
     from PIL import Image
 
@@ -92,7 +83,7 @@ def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
     next(pictures).save(path, save_all=True, append_images=pictures, **how)
 
 
-def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
+def _write_mp4(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
     """H.264 with colours at half the resolution, which every player shows."""
     from imageio.v3 import imopen
 

@@ -1,17 +1,100 @@
-"""Options that several subcommands of `jaxvol` share."""
+"""Options of the subcommands of `jaxvol`, from the command line or from the picture that `--like` names."""
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from ..._util.checks import shortened
 from ...compositing.modes import MODES
 from ...scene.presets import PRESETS, SHADED
-from .parsing import Parser
+from .recorded import recorded_in, volume_of_picture
 
 
 SWITCH = argparse.BooleanOptionalAction
+
+OVERRIDES = {
+    "preset": {"cmap", "transfer", "recorded_transfer"},
+    "cmap": {"preset", "transfer", "recorded_transfer"},
+    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "unit_distance"},
+    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "unit_distance"},
+    "camera": {"direction", "parallel"},
+    "direction": {"camera"},
+    "parallel": {"camera"},
+    "step": {"tolerance"},
+    "tolerance": {"step"},
+}
+"""Options that exclude this one, which is an error, and that it overrides in a picture."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Raises `ValueError` for errors."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._negative_number_matcher = re.compile(r"^-(\d|\.\d)")  # argparse's own takes -1e-5 for a flag
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message} ({self.prog} --help lists the options)")
+
+    def defaults(self) -> dict[str, Any]:
+        """All options, as they are where nothing is given."""
+        return {action.dest: action.default for action in self._actions if action.dest != "help"}
+
+    def given(self, words: Sequence[str]) -> dict[str, Any]:
+        """The options that words give, without defaults."""
+        names = self.defaults()
+        found = vars(self.parse_args(words, argparse.Namespace(**dict.fromkeys(names))))
+        return {name: found[name] for name in names if found[name] is not None}
+
+
+def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
+    """The options of a command, their `defaults`, and the function that is to `execute` it."""
+    found = parser.parse_known_args(words)[0]
+    command: Parser = found.parser
+    settings = given = command.given(words[1:])
+    if "like" in given:
+        try:
+            recorded = _of_picture(command, given["like"], named="file" in given)
+        except ValueError as fault:
+            raise ValueError(f"--like: {str(fault)[:400]}") from fault
+        replacing = [name for name, value in given.items() if value is not False]
+        overridden = set().union(*(OVERRIDES.get(name, ()) for name in replacing))
+        if given.get("compositing", "isosurface") != "isosurface":
+            overridden.add("isovalue")
+        settings = {name: value for name, value in recorded.items() if name not in overridden} | given
+    on = {name for name, value in settings.items() if value is not False}
+    for name in sorted(on):
+        for other in sorted(on & OVERRIDES.get(name, set())):
+            both = " and ".join(f"--{each.replace('_', '-')}" for each in (name, other))
+            both = both.replace("--recorded-transfer", "the transfer function in the picture")
+            raise ValueError(f"{both} exclude each other; leave one out.")
+    defaults = command.defaults()
+    # two that not every command has: as the viewer composites, and what a picture may hold
+    options = {"compositing": "over", "recorded_transfer": None} | defaults | settings
+    if options.get("file", "") is None:
+        command.error("the following arguments are required: FILE")
+    return argparse.Namespace(execute=found.execute, defaults=defaults, **options)
+
+
+def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
+    """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
+    found = recorded_in(path)
+    known = [action for action in command._actions if action.type is not Path and action.dest != "help"]
+    flags = {flag for action in known for flag in action.option_strings}
+    words = [word for word in found["options"] if word != "--transparent" or word in flags]
+    for word in words:
+        if re.match(r"-[^\d.]", word) and word.partition("=")[0] not in flags:
+            raise ValueError(f"{path}: {command.prog} takes no {shortened(word)} from a picture.")
+    settings = command.given(words)
+    if "file" in settings:
+        raise ValueError(f"{path}: a picture names its volume elsewhere; got {shortened(words)}.")
+    if "transfer" in found:
+        settings["recorded_transfer"] = found["transfer"]
+    if not named:
+        settings["file"] = volume_of_picture(path, found["file"]["name"], found["file"]["sha256"])
+    return settings
 
 
 def memory_size(text: str) -> int:
@@ -24,37 +107,32 @@ def memory_size(text: str) -> int:
 
 
 def add_command(commands: Any, name: str, help: str, execute: Callable[[argparse.Namespace], None]) -> Parser:
-    """A subcommand, with its function."""
+    """Add a subcommand, with its function."""
     parser = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.")
     parser.set_defaults(execute=execute, parser=parser)
     return parser
 
 
 def add_output(parser: Parser, default: str, help: str) -> None:
-    """Where a command writes."""
     text = f"{help} (default: %(default)s)"
     parser.add_argument("-o", "--output", type=Path, default=Path(default), help=text)
 
 
 def add_vector(group: Any, flag: str, names: str, help: str, **more: Any) -> None:
-    """An option of several numbers, as many as there are names."""
+    """Add an option of several numbers, as many as there are names."""
     metavar = tuple(names.split())
-    group.add_argument(
-        flag, **{"type": float, "nargs": len(metavar), "metavar": metavar, "help": help} | more
-    )
+    more = {"type": float, "nargs": len(metavar), "metavar": metavar, "help": help} | more
+    group.add_argument(flag, **more)
 
 
 def add_size(parser: Parser) -> None:
-    """Of an image."""
     add_vector(parser, "--size", "W H", "pixels (default: 512 512)", type=int, default=(512, 512))
 
 
-def add_volume(parser: Parser) -> None:
-    """The volume that a command reads, and a file of options."""
+def add_volume(parser: Parser, **more: Any) -> None:
+    """Add the volume that a command reads."""
     text = "volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
-    parser.add_argument("file", type=Path, nargs="?", metavar="FILE", help=text)
-    text = "a file of options, by their names without dashes; those given here win"
-    parser.add_argument("--config", type=Path, metavar="TOML", help=text)
+    parser.add_argument("file", type=Path, metavar="FILE", help=text, **more)
     group = parser.add_argument_group("data: needed if the file and its name do not specify it")
     add_vector(group, "--shape", "X Y Z", "voxels, x fastest in the file", type=int)
     group.add_argument("--dtype", help="such as uint8 or uint16le")
@@ -62,7 +140,7 @@ def add_volume(parser: Parser) -> None:
 
 
 def add_sampling(parser: Parser) -> None:
-    """How images are sampled, and what is behind."""
+    """Add the step and the background of images."""
     text = "distance between samples, world length (default: half a voxel for fit; as planned for render)"
     parser.add_argument("--step", type=float, help=text)
     text = "linear RGB (default: white; black behind maximum, minimum and average)"
@@ -70,12 +148,10 @@ def add_sampling(parser: Parser) -> None:
 
 
 def add_clim(group: Any) -> None:
-    """The range of a transfer function."""
-    add_vector(group, "--clim", "LOW HIGH", "range of values that it covers (default: all)")
+    add_vector(group, "--clim", "LOW HIGH", "range of values of the transfer function (default: all)")
 
 
 def add_transfer(parser: Parser) -> None:
-    """The transfer function."""
     group = parser.add_argument_group("transfer function (default: what the histogram suggests)")
     presets = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
     group.add_argument("--preset", metavar="NAME", help=presets.replace("%", "%%"))
@@ -89,8 +165,8 @@ def add_transfer(parser: Parser) -> None:
 
 
 def add_scene(parser: Parser) -> None:
-    """A volume that is looked at through a camera."""
-    add_volume(parser)
+    """Add a volume that is looked at through a camera."""
+    add_volume(parser, nargs="?")
     add_sampling(parser)
     add_size(parser)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
@@ -100,20 +176,13 @@ def add_scene(parser: Parser) -> None:
     text = "RMSE of linear colours, by which step and transforms are chosen (default: 1/255; not with --step)"
     parser.add_argument("--tolerance", type=float, help=text)
     add_transfer(parser)
-    _add_appearance(parser)
-    _add_camera(parser)
-    _add_clip(parser)
 
-
-def _add_appearance(parser: Parser) -> None:
     group = parser.add_argument_group("appearance")
-    group.add_argument(
-        "--compositing",
-        choices=(*MODES, "isosurface"),
-        default="over",
-        help="how samples become a pixel: over (default), by emission and absorption; maximum, minimum, "
-        "average: that value of the ray, as classified; isosurface: where --isovalue is first crossed",
+    text = (
+        "how samples become a pixel: over (default), by emission and absorption; maximum, minimum, average: "
+        "that value of the ray, as classified; isosurface: where --isovalue is first crossed"
     )
+    group.add_argument("--compositing", choices=(*MODES, "isosurface"), default="over", help=text)
     text = "with --compositing isosurface: the value on it"
     group.add_argument("--isovalue", type=float, metavar="VALUE", help=text)
     text = (
@@ -122,16 +191,13 @@ def _add_appearance(parser: Parser) -> None:
     )
     group.add_argument("--shade", action=SWITCH, help=text)
 
-
-def _add_camera(parser: Parser) -> None:
     group = parser.add_argument_group("camera")
     text = "position and focal point in the world; the camera may be inside the volume"
     add_vector(group, "--camera", "X Y Z FX FY FZ", text)
     text = "without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)"
     add_vector(group, "--direction", "X Y Z", text)
-    add_vector(
-        group, "--view-up", "X Y Z", "what is up in the image (default: 0 0 1)", default=(0.0, 0.0, 1.0)
-    )
+    text = "what is up in the image (default: 0 0 1)"
+    add_vector(group, "--view-up", "X Y Z", text, default=(0.0, 0.0, 1.0))
     text = "degrees from the lower to the upper edge of the image (default: 30)"
     group.add_argument("--view-angle", type=float, default=30.0, metavar="DEGREES", help=text)
     text = "orthographic camera; use with --direction"
@@ -139,8 +205,6 @@ def _add_camera(parser: Parser) -> None:
     text = "magnification of the image (default: 1)"
     group.add_argument("--zoom", type=float, default=1.0, metavar="FACTOR", help=text)
 
-
-def _add_clip(parser: Parser) -> None:
     group = parser.add_argument_group("clip: show a part of the volume; box and planes in world coordinates")
     text = "show what is inside this box"
     add_vector(group, "--clip-box", "X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX", text)

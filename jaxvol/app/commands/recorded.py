@@ -1,5 +1,5 @@
-"""Which settings made a picture? They are written into a PNG, and read again as data that anyone may have
-made. A picture names no file but its volume, whose SHA-256 it holds."""
+"""The options that made a picture: written into a PNG, and read again as data that anyone may have made. A
+picture names no file but its volume, whose SHA-256 it holds."""
 
 import argparse
 import hashlib
@@ -15,20 +15,26 @@ from ...io.formats import files_of
 from ...scene.transfer import Transfer, TransferFunction
 
 
-KEYWORD = "jaxvol"
-"""Of the text in a PNG."""
+KEYWORD = "jaxvol"  # of the text in a PNG
 
 
 def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
-    """The text that a PNG carries, for `save_image`: the options that are not at their defaults. The transfer
-    function is written out if a file or a picture held it."""
-    settings = {
-        name.replace("_", "-"): value
-        for name, default in options.defaults.items()
-        if (value := getattr(options, name)) != default and not isinstance(value, Path)
-    }
+    """The text that a PNG carries, for `save_image`: the options that are not at their defaults, as words of
+    a command line, and the transfer function if a file or a picture held it."""
+    words: list[str] = []
+    for name, default in options.defaults.items():
+        value, flag = getattr(options, name), name.replace("_", "-")
+        if value == default or isinstance(value, Path):
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif isinstance(value, list):
+            for row in value if isinstance(value[0], list) else [value]:
+                words += [f"--{flag}", *map(str, row)]
+        else:
+            words.append(f"--{flag}={value}")
     file = {"name": str(options.file), "sha256": checksum(options.file)}
-    content: dict[str, Any] = {"settings": settings, "file": file}
+    content: dict[str, Any] = {"options": words, "file": file}
     from_file = options.transfer is not None or options.recorded_transfer is not None
     if from_file and isinstance(transfer, TransferFunction):
         content["transfer"] = transfer_fields(transfer)
@@ -36,9 +42,7 @@ def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
 
 
 def recorded_in(path: Path) -> dict[str, Any]:
-    """What `text_of` wrote: `settings` by name, unchecked, the `file` of the volume, and maybe a `transfer`.
-
-    **Raises:** `ValueError`, naming the picture, if it is no PNG, or says nothing, or something else."""
+    """What `text_of` wrote: `options`, unchecked words, the `file` of the volume, and maybe a `transfer`."""
     from PIL import Image
 
     if not path.is_file():
@@ -53,7 +57,8 @@ def recorded_in(path: Path) -> dict[str, Any]:
     content: Any = None
     try:
         content = json.loads(text)
-        known = isinstance(content["settings"], dict) and isinstance(content["file"]["name"], str)
+        known = isinstance(content["options"], list) and isinstance(content["file"]["name"], str)
+        known = known and all(isinstance(word, str) for word in content["options"])
         known = known and re.fullmatch("[0-9a-f]{64}", content["file"]["sha256"])
     except (ValueError, RecursionError, KeyError, TypeError):
         known = False
@@ -65,7 +70,7 @@ def recorded_in(path: Path) -> dict[str, Any]:
 
 
 def volume_of_picture(picture: Path, name: str, sha256: str) -> Path:
-    """The volume that a picture shows, unchanged: where it was, or beside the picture."""
+    """The volume that a picture shows, unchanged: where it was, or in the picture's folder."""
     for path in (Path(name), picture.parent / Path(name).name):
         if path.exists():
             if checksum(path) == sha256:
@@ -75,7 +80,7 @@ def volume_of_picture(picture: Path, name: str, sha256: str) -> Path:
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a volume: of the names and contents of its files. **Raises** `ValueError` without them."""
+    """SHA-256 of a volume: of the names and contents of its files."""
     files = files_of(path)
     if not files and any((path / name).is_file() for name in METADATA):
         files = sorted(file for file in path.rglob("*") if file.is_file())  # Zarr

@@ -1,32 +1,39 @@
-"""What do the options of a scene mean? What is looked at, how it looks, from where, and what is cut away."""
+"""From options to images: what is looked at, how it looks, from where, and by which march."""
 
 import argparse
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Shaped
 
-from ...bricks import VoxelSource
+from ...bricks import VoxelSource, levels_of, render_bricks
 from ...compositing.blending import Compositing, Over
 from ...compositing.isosurface import Isosurface
 from ...compositing.modes import MODES, compositing_of
-from ...compositing.projections import Average
 from ...fitting import read_transfer
+from ...io.formats import files_of, load
 from ...lighting import Lighting, Phong
-from ...march.march import Transform
-from ...march.transforms.clip import Clip
+from ...march.march import March, Transform
+from ...march.transforms import AlphaCorrection, Clip, EarlyTermination, SpaceLeaping
+from ...planning import Plan, plan
+from ...planning.memory import IN_MEMORY
+from ...render import PLANNED, render
 from ...scene.camera import Camera
 from ...scene.presets import SHADED, colormap, preset
+from ...scene.rendering import Rendering
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from ..automatic import FRONT, automatic_transfer, framed, labels_shown, transfer_by_copy, visible_points
-from .data import copy_of, middle_of, source_of, volume_of
+from ..automatic import SAMPLED, automatic_transfer, labels_shown, stride_of, transfer_by_copy
+from ..framing import FRONT, framed, visible_points
+
+
+FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
 
 
 class Scene(NamedTuple):
-    """What is looked at, and how. Of a volume that is read in bricks from `source`, `volume` is a copy of
-    every n-th voxel in the same place."""
+    """What is looked at, and how. Of a volume that is read in bricks from `source`, with so many bytes of
+    memory, `volume` is a copy of every n-th voxel in the same place. `march`: a `March`, once it is known."""
 
     volume: Volume
     transfer: Transfer
@@ -36,28 +43,97 @@ class Scene(NamedTuple):
     background: tuple[float, float, float]
     clip: tuple[Transform, ...]
     source: VoxelSource | None
+    memory: int | None
+    march: Any = None
+
+    def render(self, camera: Camera) -> Rendering:
+        """An image by `march`."""
+        how = {"compositing": self.compositing, "lighting": self.lighting}
+        if self.source is None:
+            found = render(self.volume, self.transfer, camera, self.march, **how)
+        else:
+            how["memory"] = self.memory
+            found = render_bricks(self.source, self.transfer, camera, self.march, **how)
+        return jax.block_until_ready(found)
+
+    def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
+        """The cheapest way to render the scene within a tolerance, for each camera."""
+        what: Any = self.volume if self.source is None else self.source
+        how: dict[str, Any] = {"transforms": self.clip, "once": len(cameras) == 1}
+        how |= {"compositing": self.compositing, "lighting": self.lighting}
+        if self.source is not None:
+            how["memory"] = self.memory
+        tolerance = PLANNED if tolerance is None else tolerance
+        return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
 
 
 def scene_of(
     options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Camera]] = lambda camera: [camera]
 ) -> Scene:
-    """The scene that the options describe. `orbit`: the views of a camera that turns, in which the automatic
-    camera shows all that is visible."""
-    mode, background, clip = _compositing(options), background_of(options), _clip(options)
+    """The scene that the options describe, without a march.
+
+    Args:
+        options: of a command that has those of `add_scene`.
+        orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
+    """
+    is_surface, background = options.compositing == "isosurface", background_of(options)
+    if is_surface == (options.isovalue is None):
+        raise ValueError("--compositing isosurface and --isovalue VALUE go together; one is missing.")
+    mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
+    clip: tuple[Transform, ...] = ()
+    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    if options.clip_box is not None or planes:
+        clip = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out),)
+    elif options.clip_inside_out:
+        raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
+
     automatic, source = is_automatic(options), None
     if options.memory is None:
         volume = volume_of(options)
         shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
         volume, transfer = shown
     else:
-        source = source_of(options)
+        header = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
+        header = {name: value for name, value in header.items() if value is not None}
+        source = levels_of(options.file, **header)[0]
         volume = copy_of(source, options.memory)
-        transfer = transfer_of(options, volume, middle_of(source) if automatic else None)
-    camera = _camera(options, volume)
-    if automatic and options.camera is None:
-        camera = framed(camera, visible_points(volume, transfer), orbit(camera))
-    camera = camera.zoom(options.zoom)
-    return Scene(volume, transfer, camera, mode, _lighting(options, mode), background, clip, source)
+        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume)
+
+    size, view = tuple(options.size), (options.view_up, options.view_angle)
+    if options.camera:
+        camera = Camera(options.camera[:3], options.camera[3:], *view, size=size)
+    else:
+        side = options.direction or FRONT
+        camera = Camera.looking_at(volume, side, *view, parallel=options.parallel, size=size)
+        if automatic:
+            camera = framed(camera, visible_points(volume, transfer), orbit(camera))
+    camera, lighting = camera.zoom(options.zoom), _lighting(options, mode)
+    return Scene(volume, transfer, camera, mode, lighting, background, clip, source, options.memory)
+
+
+def with_march(scene: Scene, options: argparse.Namespace, cameras: Sequence[Camera]) -> Scene:
+    """The scene with the given step; without one, with the shortest of those planned for the cameras."""
+    if options.step is not None:
+        return scene._replace(march=March(options.step, (*scene.clip, *FAST), "midpoint"))
+    found = min(scene.plans(cameras, options.tolerance), key=lambda plan: float(plan.march.step))
+    if not found.within:
+        print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
+    source = None if found.bricks is None else found.source
+    return scene._replace(volume=found.volume, march=found.march, source=source)
+
+
+def volume_of(options: argparse.Namespace) -> Volume:
+    return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
+
+
+def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
+    """Refuse to write a file (an option of these names) that is the volume, one of its slices, or another."""
+    used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
+    for name in names:
+        path = getattr(options, name)
+        if path is not None and path.resolve() in [other.resolve() for other in used]:
+            raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
+        used += [] if path is None else [path]
 
 
 def is_automatic(options: argparse.Namespace) -> bool:
@@ -67,49 +143,20 @@ def is_automatic(options: argparse.Namespace) -> bool:
 
 
 def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
-    """Linear RGB behind what is shown. The greater the values of a projection, the lighter it is: on white,
-    the greatest could not be seen.
-
-    **Raises:** `ValueError` for numbers that no image file can hold."""
+    """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
     if options.background is None:
         level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
     red, green, blue = options.background
     if not all(0 <= each <= 1 for each in options.background):
-        raise ValueError(
-            f"--background must be three numbers from 0 to 1 (linear RGB); got {red:g} {green:g} {blue:g}."
-        )
+        got = f"{red:g} {green:g} {blue:g}"
+        raise ValueError(f"--background must be three numbers from 0 to 1 (linear RGB); got {got}.")
     return red, green, blue
 
 
-def _compositing(options: argparse.Namespace) -> Compositing[Any]:
-    is_surface, value = options.compositing == "isosurface", options.isovalue
-    if is_surface and value is None:
-        raise ValueError("--compositing isosurface needs the value on the surface: --isovalue VALUE.")
-    if value is not None and not is_surface:
-        raise ValueError(
-            f"--isovalue goes with --compositing isosurface; got --compositing {options.compositing}."
-        )
-    return Isosurface(value) if is_surface else compositing_of(options.compositing)
-
-
-def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
-    """The light that the options ask for, or that is usual for what they show."""
-    shade = options.shade
-    if shade and isinstance(mode, Average):
-        raise ValueError("--shade needs a place that is shaded; leave it out with --compositing average.")
-    if shade is None:
-        shows_surfaces = options.preset in SHADED or is_automatic(options)
-        shade = (shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
-    return Phong() if shade else None
-
-
-def transfer_of(
-    options: argparse.Namespace, volume: Volume, part: Shaped[np.ndarray, "nx ny nz"] | None = None
-) -> Transfer:
-    """The transfer function for a volume. `part`: of the voxels as they are, where the volume is a copy."""
+def transfer_of(options: argparse.Namespace, volume: Volume) -> Transfer:
     if is_automatic(options):
-        return automatic_transfer(volume) if part is None else transfer_by_copy(volume, part)
+        return automatic_transfer(volume)
     if options.recorded_transfer is not None:
         return options.recorded_transfer
     if options.transfer is not None:
@@ -122,23 +169,26 @@ def transfer_of(
     return colormap(cmap, clim, unit_distance=unit)
 
 
-def _camera(options: argparse.Namespace, volume: Volume) -> Camera:
-    """Where the volume is looked at from, all of it unless the position is given."""
-    view: dict[str, Any] = {
-        "view_up": options.view_up,
-        "view_angle": options.view_angle,
-        "size": tuple(options.size),
-    }
-    if options.camera:
-        return Camera(options.camera[:3], options.camera[3:], **view)
-    return Camera.looking_at(volume, options.direction or FRONT, parallel=options.parallel, **view)
+def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
+    """The automatic one, from a copy and the middle of the volume at full resolution."""
+    low = [max(0, (n - 128) // 2) for n in source.shape]
+    high = [min(n, begin + 128) for n, begin in zip(source.shape, low, strict=True)]
+    return transfer_by_copy(copy, np.asarray(source.read(low, high)))
 
 
-def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:
-    """What is cut away, if anything is."""
-    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
-    if options.clip_box is None and not planes:
-        if options.clip_inside_out:
-            raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
-        return ()
-    return (Clip(options.clip_box, planes, inside_out=options.clip_inside_out),)
+def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
+    """The light that the options ask for, or that is usual for what they show."""
+    shade = options.shade
+    if shade is None:
+        shows_surfaces = options.preset in SHADED or is_automatic(options)
+        shade = (shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
+    return Phong() if shade else None
+
+
+def copy_of(source: VoxelSource, memory: int) -> Volume:
+    """A copy of every n-th voxel, stretched to the bounds of the whole: of those by which colours are chosen
+    for the whole, if they fit into so many bytes, and of fewer if not."""
+    most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
+    copy = source.subsampled(min(stride_of(source.shape, most), min(source.shape) // 2))
+    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, source.spacing, copy.shape, strict=True)]
+    return Volume(copy.data, whole, copy.origin)

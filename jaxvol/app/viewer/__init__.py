@@ -1,7 +1,6 @@
 """Looks at volumes: `view` in a notebook, and `serve` as a page of its own, which `jaxvol view FILE` shows.
 
-One model (`model`: camera, transfer function, march and light in a `State`, drawn by a thread, coarse
-while it changes and fine at rest) and one description of its controls (`controls`) have two faces,
+One `model`, whose `state` a thread draws in `tiles`, and one list of its `controls` have two faces,
 `notebook` and `page`.
 """
 
@@ -13,7 +12,7 @@ from ...compositing.modes import Mode
 from ...lighting.shading import Lighting
 from ...march.march import March
 from ...scene.camera import Camera
-from ...scene.transfer import TransferFunction
+from ...scene.transfer import Transfer
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs_by_default
 from .state import initial
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 def view(
     volume: Volume | Any,
-    transfer: TransferFunction | Any | None = None,
+    transfer: Transfer | Any | None = None,
     camera: Camera | Any | None = None,
     march: March | Any | None = None,
     *,
@@ -39,34 +38,38 @@ def view(
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
-    return. Beside the image are window and level, the volume's histogram, the points of the transfer
-    function, or its labels, the step, and every transform and the light to be turned on and off. While
-    something changes, the image is as coarse as it must be to follow within some 150 ms; at rest it has all
-    pixels. Its time, its step and an estimate of its error are shown live. It needs
-    `pip install jaxvol[notebooks]`. Programs that are compiled are kept, as by `keep_programs`.
+    return. Beside the image are window and level, the histogram, the points of the transfer function or its
+    labels, the step, and a switch for each transform and the light. While something changes, the image is as
+    coarse as it must be to follow within some 150 ms; at rest it has all pixels. Its time, step and estimated
+    error are shown. It needs `pip install jaxvol[notebooks]`. Compiled programs are kept, as by
+    `keep_programs`.
 
-    **Arguments:**
+    Args:
+        volume: what is looked at.
+        transfer: a `TransferFunction`, of which up to 16 points can be edited; a `LabelTransferFunction`,
+            whose labels can be hidden, and made fainter or denser; another is shown and not edited. By
+            default one that is found from the volume's values; voxels that seem to be labels get a colour
+            each.
+        camera: by default one that sees the whole volume, or, without a transfer function, what is visible of
+            it. Its size does not count.
+        march: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
+            voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`,
+            `AlphaCorrection` and `EarlyTermination`.
+        lighting: the light that can be turned on, by default `Phong`; none where an average is composited,
+            which lies nowhere.
+        lit: whether the light is on at first.
+        compositing: as for `render`.
+        background: linear RGB.
+        size: (width, height) of the image in the notebook's pixels.
 
-    - `volume`: what is looked at.
-    - `transfer`: a `TransferFunction`, of which up to 16 points can be edited; a `LabelTransferFunction`,
-      whose labels can be hidden, and made fainter or denser; or a `TransferFunction2D`, which is not edited.
-      By default one that is found from the volume's values; voxels that seem to be labels get a colour each.
-    - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
-      it. Its size does not count.
-    - `march`: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
-      voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`, `AlphaCorrection`
-      and `EarlyTermination`.
-    - `lighting`: the light that can be turned on, by default `Phong`; none where an average is composited,
-      which lies nowhere. `lit`: whether it is on at first.
-    - `compositing`: as for `render`.
-    - `background`: linear RGB.
-    - `size`: (width, height) of the image in the notebook's pixels.
+    Returns:
+        a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a widget `v`
+        renders what it shows.
 
-    **Returns:** a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a
-    widget `v` renders what it shows.
-
-    **Raises:** `ValueError` as `render` does, and for what it cannot show: another kind of transfer function,
-    an orthographic camera, other steps or backgrounds; `ImportError` without rendercanvas or ipywidgets.
+    Raises:
+        ValueError: as `render` does, and for what it cannot show: an orthographic camera, other steps or
+            backgrounds.
+        ImportError: without rendercanvas or ipywidgets.
     """
     try:
         from .notebook import NotebookView
@@ -79,16 +82,13 @@ def view(
 
 def serve(
     volume: Volume | Any,
-    transfer: TransferFunction | Any | None = None,
+    transfer: Transfer | Any | None = None,
     camera: Camera | Any | None = None,
     march: March | Any | None = None,
     *,
-    lighting: Lighting | Any | None = None,
-    lit: bool = True,
-    compositing: Mode | Compositing[Any] | Any = "over",
-    background: Any = (1.0, 1.0, 1.0),
     port: int | Any = 8080,
     title: str = "jaxvol",
+    **how: Any,
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
 
@@ -96,14 +96,21 @@ def serve(
     What a browser sends are numbers and colors of controls; nothing of it is evaluated or used as a path. It
     needs `pip install jaxvol[view]`.
 
-    **Arguments:** as for `view`, and:
+    Args:
+        volume: as for `view`.
+        transfer: as for `view`.
+        camera: as for `view`.
+        march: as for `view`.
+        port: from 1 to 65535; if it is taken, the next free one.
+        title: of the page's panel.
+        how: `lighting`, `lit`, `compositing` and `background`, as for `view`.
 
-    - `port`: from 1 to 65535; if it is taken, the next free one.
-    - `title`: of the page's panel.
+    Returns:
+        the `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
 
-    **Returns:** the `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
-
-    **Raises:** as `view`; `ImportError` if viser is missing.
+    Raises:
+        ValueError: as `view` does, and for another port.
+        ImportError: without viser.
     """
     try:
         from .page import Page
@@ -111,5 +118,4 @@ def serve(
         raise ImportError(f"serve needs {fault.name}: pip install jaxvol[view]") from fault
     port = integer("port", port, 1, 65535)
     keep_programs_by_default()
-    how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
-    return Page(*initial(volume, transfer, camera, march, size=(640, 480), **how), port=port, title=title)
+    return Page(*initial(volume, transfer, camera, march, **how), port=port, title=title)

@@ -5,26 +5,32 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from ...scene.labels import LabelTransferFunction
-from ...scene.transfer2d import TransferFunction2D
+from ...scene.transfer import TransferFunction
+from ...scene.volume import Volume
+from ..automatic import sampled
 from . import editing
 from .model import Model
 from .state import MAX_STEP, MIN_STEP
 
 
-MAX_LABEL_OPACITY = 4.0
-"""Factor of a label's extinction."""
+MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
+BINS, WIDTH, HEIGHT = 128, 320, 84  # of the plot of the histogram
 
 
 @dataclass(frozen=True)
 class Control:
     """Something to look at ("html") or to change.
 
-    - `get`: what it shows now: a text, a number, True or False, or a color: sRGB, `#rrggbb`.
-    - `set`: changes the model; of buttons, called with the text of one.
-    - `limits`: of a slider, lowest and highest number and the step between two.
-    - `choices`: of a dropdown or buttons, the texts that there are now.
+    Attributes:
+        kind: of widget.
+        label: beside it.
+        get: what it shows now: a text, a number, True or False, or a color: sRGB, `#rrggbb`.
+        set: changes the model; of buttons, called with the text of one.
+        limits: of a slider, lowest and highest number and the step between two.
+        choices: of a dropdown or buttons, the texts that there are now.
     """
 
     kind: Literal["html", "buttons", "number", "checkbox", "color", "slider", "log slider", "dropdown"]
@@ -38,143 +44,152 @@ class Control:
 def controls_of(model: Model) -> dict[str, list[Control]]:
     """A viewer's controls, by the heading of their group. When one has changed the model, others may have
     something else to show."""
-    return {
-        "transfer function": _TransferControls(model).controls(),
-        "march and light": _march_controls(model),
-    }
+    transfer = model.state.transfer
+    if isinstance(transfer, LabelTransferFunction):
+        controls = _label_controls(model)
+    elif isinstance(transfer, TransferFunction):
+        controls = _range_controls(model)
+        controls += _point_controls(model) if len(transfer.values) <= editing.MAX_POINTS else []
+    else:
+        controls = [Control("html", get=lambda: "of another kind, not edited here")]
+    return {"transfer function": controls, "march and light": _march_controls(model)}
 
 
-class _TransferControls:
-    """The controls of a model's transfer function; `chosen`: the index of the point or label that they
-    change."""
+def _edit(model: Model, change: Callable[..., Any], *arguments: Any) -> None:
+    """Replace the transfer function by `change(transfer, *arguments)`."""
+    model.apply(lambda state: replace(state, transfer=change(state.transfer, *arguments)))
 
-    def __init__(self, model: Model):
-        self.model, self.chosen = model, 0
 
-    def controls(self) -> list[Control]:
-        if isinstance(self.transfer, LabelTransferFunction):
-            return self._label()
-        if isinstance(self.transfer, TransferFunction2D):
-            return [Control("html", get=lambda: "a function of value and gradient, not edited here")]
-        if editing.has_editable_points(self.transfer):
-            return [*self._range(), *self._point()]
-        return self._range()
+def _range_controls(model: Model) -> list[Control]:
+    """The histogram with the transfer function, and window and level."""
+    low, high, bars = histogram(model.scene.volume)
 
-    @property
-    def transfer(self) -> Any:
-        return self.model.state.transfer
+    def now() -> tuple[float, float]:
+        return editing.window_level(model.state.transfer)
 
-    def edit(self, change: Callable[..., Any], *arguments: Any) -> None:
-        """Replace the transfer function by `change(transfer, *arguments)`."""
-        self.model.apply(lambda state: replace(state, transfer=change(state.transfer, *arguments)))
+    def set_window(window: float) -> None:
+        _edit(model, editing.with_window_level, window, now()[1])
 
-    def _choice(self, label: str, choices: Callable[[], list[str]]) -> Control:
-        def choose(choice: str) -> None:
-            self.chosen = choices().index(choice)
+    def set_level(level: float) -> None:
+        _edit(model, editing.with_window_level, now()[0], level)
 
-        return Control("dropdown", label, lambda: choices()[self.chosen], choose, choices=choices)
+    window, level = now()
+    width = window or high - low
+    windows = min(width / 100, window), 4 * width, width / 100
+    levels = level - window / 2 - width, level + window / 2 + width, width / 100
+    return [
+        Control("html", get=lambda: _plot(low, high, bars, model.state.transfer, model.scene.voxel)),
+        Control("slider", "window", lambda: now()[0], set_window, windows),
+        Control("slider", "level", lambda: now()[1], set_level, levels),
+    ]
 
-    def _range(self) -> list[Control]:
-        """The histogram behind the transfer function, and window and level."""
-        histogram, voxel = self.model.scene.histogram, self.model.scene.voxel
-        window, level = editing.window_level(self.transfer)
-        width = window or histogram.high - histogram.low
 
-        def get(index: int) -> float:
-            return editing.window_level(self.transfer)[index]
+def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]:
+    """The least and the greatest value, and log(1 + count) of the bins between them, 1 at most."""
+    values = sampled(volume).ravel().astype(np.float64)
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+    high = high if high > low else low + max(abs(low), 1.0)
+    counts = np.log1p(np.histogram(values, BINS, (low, high))[0])
+    return low, high, counts / max(counts.max(), 1)
 
-        return [
-            Control("html", get=lambda: histogram.plot(self.transfer, voxel)),
-            Control(
-                "slider",
-                "window",
-                lambda: get(0),
-                lambda value: self.edit(editing.with_window_level, value, get(1)),
-                limits=(min(width / 100, window), 4 * width, width / 100),
-            ),
-            Control(
-                "slider",
-                "level",
-                lambda: get(1),
-                lambda value: self.edit(editing.with_window_level, get(0), value),
-                limits=(level - window / 2 - width, level + window / 2 + width, width / 100),
-            ),
-        ]
 
-    def _point(self) -> list[Control]:
-        """A point, its value, colour and opacity, which is that of a layer as thick as a voxel."""
-        voxel = self.model.scene.voxel
+def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, unit_distance: float) -> str:
+    """An SVG of the histogram and, as a line, the square root of the opacity, which shows thin materials."""
+    values = np.linspace(low, high, 4 * BINS)
+    extinction = np.interp(values, np.asarray(transfer.values), np.asarray(transfer.extinction))
 
-        def value(index: int) -> float:
-            return float(f"{float(np.asarray(self.transfer.values)[index]):.6g}")
+    def points(heights: Float[np.ndarray, " n"]) -> str:
+        across, down = np.linspace(0, WIDTH, len(heights)), HEIGHT - (HEIGHT - 2) * heights
+        return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
 
-        def names() -> list[str]:
-            return [f"{index + 1}: {value(index):.5g}" for index in range(len(self.transfer.values))]
+    line = points(np.sqrt(-np.expm1(-extinction * unit_distance)))
+    return (
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="100%" xmlns="http://www.w3.org/2000/svg">'
+        f'<polygon points="0,{HEIGHT} {points(bars)} {WIDTH},{HEIGHT}" fill="#8888" />'
+        f'<polyline points="{line}" fill="none" stroke="currentColor" /></svg>'
+        f'<div style="display: flex; justify-content: space-between; font-size: 10px">'
+        f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
+    )
 
-        def add_or_remove(option: str) -> None:
-            change = editing.with_point_after if option == "add behind" else editing.without_point
-            self.edit(change, self.chosen)
-            self.chosen = min(self.chosen, len(self.transfer.values) - 1)
 
-        return [
-            self._choice("point", names),
-            Control(
-                "number",
-                "value",
-                lambda: value(self.chosen),
-                lambda value: self.edit(editing.with_value, self.chosen, value),
-            ),
-            Control(
-                "color",
-                "color",
-                lambda: editing.display_color(np.asarray(self.transfer.colors)[self.chosen]),
-                lambda color: self.edit(editing.with_color, self.chosen, color),
-            ),
-            Control(
-                "slider",
-                "opacity",
-                lambda: float(editing.opacities(self.transfer, voxel)[self.chosen]),
-                lambda opacity: self.edit(editing.with_opacity, self.chosen, opacity, voxel),
-            ),
-            Control("buttons", "points", set=add_or_remove, choices=lambda: ["add behind", "remove"]),
-        ]
+def _point_controls(model: Model) -> list[Control]:
+    """A point, its value, colour and opacity, which is that of a layer as thick as a voxel."""
+    voxel, chosen = model.scene.voxel, 0
 
-    def _label(self) -> list[Control]:
-        """A label, its colour, whether it is shown, and the factor of its extinction."""
-        labels = editing.labels_of(self.transfer)
+    def transfer() -> Any:
+        return model.state.transfer
 
-        def swatch() -> str:
-            color = editing.label_color(self.transfer, labels[self.chosen])
-            return f'<div style="background: {color}; height: 14px"></div>'
+    def names() -> list[str]:
+        return [f"{number}: {value:.5g}" for number, value in enumerate(transfer().values.tolist(), 1)]
 
-        def get(name: str) -> float:
-            return float(np.asarray(getattr(self.transfer, name))[labels[self.chosen]])
+    def choose(name: str) -> None:
+        nonlocal chosen
+        chosen = names().index(name)
 
-        def change(function: Callable[..., Any]) -> Callable[[Any], None]:
-            return lambda value: self.edit(function, {labels[self.chosen]: value})
+    def edit(change: Callable[..., Any], *more: Any) -> Callable[[Any], None]:
+        return lambda value: _edit(model, change, chosen, value, *more)
 
-        return [
-            self._choice("label", lambda: [str(label) for label in labels]),
-            Control("html", get=swatch),
-            Control(
-                "checkbox",
-                "shown",
-                lambda: bool(get("shown")),
-                change(LabelTransferFunction.with_visibility),
-            ),
-            Control(
-                "slider",
-                "opacity",
-                lambda: min(get("opacity"), MAX_LABEL_OPACITY),
-                change(LabelTransferFunction.with_opacity),
-                limits=(0.0, MAX_LABEL_OPACITY, 0.05),
-            ),
-        ]
+    def add_or_remove(option: str) -> None:
+        nonlocal chosen
+        change = editing.with_point_after if option == "add after" else editing.without_point
+        _edit(model, change, chosen)
+        chosen = min(chosen, len(transfer().values) - 1)
+
+    def value() -> float:
+        return float(f"{float(transfer().values[chosen]):.6g}")
+
+    def color() -> str:
+        return editing.display_color(np.asarray(transfer().colors)[chosen])
+
+    def opacity() -> float:
+        return float(transfer().opacity(voxel)[chosen])
+
+    return [
+        Control("dropdown", "point", lambda: names()[chosen], choose, choices=names),
+        Control("number", "value", value, edit(editing.with_value)),
+        Control("color", "color", color, edit(editing.with_color)),
+        Control("slider", "opacity", opacity, edit(editing.with_opacity, voxel)),
+        Control("buttons", "points", set=add_or_remove, choices=lambda: ["add after", "remove"]),
+    ]
+
+
+def _label_controls(model: Model) -> list[Control]:
+    """A label that can be seen, its densest colour, whether it is shown, and the factor of its extinction."""
+    stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
+    extinction = np.asarray(stacked.extinction)
+    labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
+    colors = np.asarray(stacked.colors)[labels, extinction[labels].argmax(axis=1)]
+    names, chosen = [str(label) for label in labels], 0
+
+    def choose(name: str) -> None:
+        nonlocal chosen
+        chosen = names.index(name)
+
+    def swatch() -> str:
+        return f'<div style="background: {editing.display_color(colors[chosen])}; height: 14px"></div>'
+
+    def get(name: str) -> float:
+        return float(np.asarray(getattr(model.state.transfer, name))[labels[chosen]])
+
+    def show(on: bool) -> None:
+        _edit(model, LabelTransferFunction.with_visibility, {labels[chosen]: on})
+
+    def set_opacity(opacity: float) -> None:
+        _edit(model, LabelTransferFunction.with_opacity, {labels[chosen]: opacity})
+
+    def opacity() -> float:
+        return min(get("opacity"), MAX_LABEL_OPACITY)
+
+    return [
+        Control("dropdown", "label", lambda: names[chosen], choose, choices=lambda: names),
+        Control("html", get=swatch),
+        Control("checkbox", "shown", lambda: bool(get("shown")), show),
+        Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),
+    ]
 
 
 def _march_controls(model: Model) -> list[Control]:
-    """Step, transforms, light."""
-
     def switch(name: str) -> Control:
         def turn(on: bool) -> None:
             enabled = model.state.enabled - {name}
@@ -188,7 +203,5 @@ def _march_controls(model: Model) -> list[Control]:
     limits = (MIN_STEP, MAX_STEP, MIN_STEP)
     step = Control("log slider", "step (voxels)", lambda: model.state.step, set_step, limits)
     switches = [switch(type(transform).__name__) for transform in model.scene.transforms]
-    if model.scene.lighting is not None:
-        light = Control("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
-        switches.append(light)
-    return [step, *switches]
+    light = Control("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
+    return [step, *switches, light] if model.scene.lighting is not None else [step, *switches]

@@ -12,22 +12,14 @@ from .tiles import Grid, Pixels, TileRenderer, estimated_error
 
 
 Stage = Literal["coarse", "drawing", "fine"]
-"""Of an image: coarse; fine, but for parts in whose place there is the coarse one; fine."""
+"""Of an image; `drawing`: fine, but for tiles in whose place there is the coarse one."""
 
 JPEG_QUALITY: dict[Stage, int] = {"coarse": 85, "drawing": 88, "fine": 94}
 """With which images are sent to a browser."""
 
-REST = 0.12
-"""Seconds without a change after which a fine image is begun."""
-
-MAX_SIDE = 2048
-"""Pixels of a view's width and height."""
-
-INTERVAL = 0.25
-"""Seconds after which an unfinished fine image is shown again."""
-
-BUDGET = 0.06
-"""Seconds that a coarse image may take, of the 150 ms in which it is to follow the pointer."""
+MAX_SIDE = 2048  # pixels of a view's width and height
+INTERVAL = 0.25  # seconds after which an unfinished fine image is shown again
+BUDGET = 0.06  # seconds that a coarse image may take, of the 150 ms in which it is to follow the pointer
 
 LEVELS = ((1, 4.0), (1, 2.0), (1, 1.0), (2, 1.0), (4, 1.0), (6, 1.0), (9, 1.0), (16, 1.0))
 """Coarse images, from the coarsest on: tiles, and how many times as long their steps are. One takes up to
@@ -49,27 +41,26 @@ class Model:
     """The state of a viewer, drawn whenever it changes, by a thread of its own. A newer state cancels a fine
     image between two tiles. A coarse image that was begun is finished, so that images follow a drag.
 
-    **Arguments:**
-
-    - `scene`: what is viewed. `state`: how, at first.
-    - `show`: called with an image, which is to be stretched over the view, and its `Stage`; and `tell` with a
-      status of two lines. In the thread that draws, and no more once it is closed.
-    - `rest`: seconds without a change after which a fine image is begun.
+    Args:
+        scene: what is viewed.
+        state: how, at first.
+        show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
+        set_status: called likewise with a status of two lines.
     """
+
+    rest = 0.12  # seconds without a change after which a fine image is begun
 
     def __init__(
         self,
         scene: Scene,
         state: State,
         show: Callable[[Pixels, Stage], None],
-        tell: Callable[[str], None],
-        rest: float = REST,
+        set_status: Callable[[str], None],
     ):
         self.scene, self.state = scene, state
-        self._face = show, tell
+        self._face = show, set_status
         self._level = 2
         self._compiled: set[Any] = set()
-        self._rest = rest
         self._changed = threading.Condition()
         self._next: State | None = None
         self._idle, self._closed = True, False
@@ -83,7 +74,7 @@ class Model:
             self._changed.notify_all()
 
     def close(self, *, wait: bool = True) -> None:
-        """Draw no more. `wait` until a part that was begun is finished."""
+        """Draw no more. `wait` until a tile that was begun is finished."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -101,11 +92,11 @@ class Model:
 
     def apply(self, change: Callable[[State], State]) -> None:
         """Change the state by a function of it, and draw it. Bad input, such as points that make no transfer
-        function, changes nothing: what is wrong with it is told."""
+        function, changes nothing but the status."""
         try:
             self.state = change(self.state)
         except ValueError as fault:
-            self._tell(str(fault))
+            self._set_status(str(fault))
         else:
             self.ask(self.state)
 
@@ -118,13 +109,13 @@ class Model:
             self.change(size=size, **changes)
 
     def _show(self, pixels: Pixels, stage: Stage, seconds: float, step: float) -> str:
-        """Show an image. Returns what there is to say of it. `step`: voxels."""
+        """Show an image of a step in voxels. Returns what there is to say of it."""
         if not self._closed:
             self._face[0](pixels, stage)
         height, width, _ = pixels.shape
         return f"{stage}: {width} x {height}, step {step:.3g} voxels\n{1e3 * seconds:.0f} ms"
 
-    def _tell(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         if not self._closed:
             self._face[1](text)
 
@@ -146,28 +137,29 @@ class Model:
                 request, self._next = self._next, None
             try:
                 for part, _ in enumerate(self._draw(request)):
-                    if self._cancelled(0 if part else self._rest):
+                    if self._cancelled(0 if part else self.rest):
                         break
-            except Exception as fault:  # told to the user, who may ask for another image
-                self._tell(f"not drawn:\n{' '.join(str(fault).split())}")
+            except Exception as fault:  # for the user, who may ask for another image
+                self._set_status(f"not drawn:\n{' '.join(str(fault).split())}")
             with self._changed:
                 self._idle = self._next is None
                 self._changed.notify_all()
 
     def _draw(self, request: State) -> Generator[None]:
-        """Yields after the coarse image, and after each part of the fine one."""
+        """Yields after the coarse image, and after each tile of the fine one."""
         renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
+        tiles = grid.tiles()
         if renderer.program_key not in self._compiled:
-            self._tell("compiling …\nfor these transforms; the program is kept for the next time")
+            self._set_status("compiling …\nfor these transforms; the program is kept for the next time")
             begun = time.perf_counter()
             renderer.overview()
             self._compiled.add(renderer.program_key)
-            self._tell(f"compiled in {time.perf_counter() - begun:.1f} s\n")
-        begun, (tiles, factor) = time.perf_counter(), LEVELS[self._level]
-        coarse = TileRenderer(self.scene, request, factor).image(Grid.coarse(request.size, tiles))
+            self._set_status(f"compiled in {time.perf_counter() - begun:.1f} s\n")
+        begun, (most, factor) = time.perf_counter(), LEVELS[self._level]
+        coarse = TileRenderer(self.scene, request, factor).coarse(most)
         seconds = time.perf_counter() - begun
-        self._level = adapted(self._level, seconds, len(grid))
-        self._tell(self._show(coarse, "coarse", seconds, request.step * factor))
+        self._level = adapted(self._level, seconds, len(tiles))
+        self._set_status(self._show(coarse, "coarse", seconds, request.step * factor))
         yield
 
         pixels, (width, height) = grid.canvas(coarse), grid.size
@@ -177,16 +169,16 @@ class Model:
             seconds = time.perf_counter() - begun
             return self._show(pixels[:height, :width].copy(), stage, seconds, request.step)
 
-        for count, (column, row) in enumerate(grid.center_first()):
+        for count, (column, row) in enumerate(tiles):
             if time.perf_counter() - shown > INTERVAL:
                 shown = time.perf_counter()
-                self._tell(f"{show('drawing')}, {count} of {len(grid)} tiles")
+                self._set_status(f"{show('drawing')}, {count} of {len(tiles)} tiles")
             renderer.draw(pixels, grid, column, row)
             yield
         summary = show("fine")
-        self._tell(f"{summary}, estimating its error …")
+        self._set_status(f"{summary}, estimating its error …")
         image = renderer.overview()
         yield
         doubled = TileRenderer(self.scene, request, 2.0).overview()
-        error = estimated_error(image, doubled, self.scene.quadrature)
-        self._tell(f"{summary}, RMSE {error:.2g} (estimate)")
+        error = estimated_error(image, doubled, self.scene.given.quadrature)
+        self._set_status(f"{summary}, RMSE {error:.2g} (estimate)")

@@ -21,22 +21,19 @@ from .state import Scene, State
 from .tiles import Pixels
 
 
-ZOOM_PER_NOTCH = 1.2
-"""How much nearer one notch of a mouse wheel brings the camera, which browsers report as 100."""
-
-WIDE, LABEL = {"width": "330px"}, {"description_width": "90px"}
-"""Layout and style of what stands in a line of its own."""
+WIDE = {"width": "330px"}  # layout of what stands in a line of its own
 
 
 class NotebookView(ipywidgets.HBox):
     """What `view` returns: an image with its controls, a widget of ipywidgets.
 
-    - `volume`, `camera`, `transfer`, `march`, `lighting`: as they are now, to be passed to `render`.
-    - `model`: the viewer's state, `model.state`; `model.wait()` waits until it is drawn.
-    - `canvas`: the image, a canvas of rendercanvas.
-    - `close()` ends the viewer's thread. A cell that shows another viewer does not.
+    Attributes:
+        model: the viewer's state, `model.state`; `model.wait()` waits until it is drawn.
+        canvas: the image, a canvas of rendercanvas.
 
-    **Arguments:** `scene`, `state`: what is looked at, and how at first. `view` makes them.
+    Args:
+        scene: what is looked at. `view` makes it.
+        state: how at first.
     """
 
     def __init__(self, scene: Scene, state: State):
@@ -49,18 +46,20 @@ class NotebookView(ipywidgets.HBox):
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
         self._status = ipywidgets.HTML(layout=WIDE)
-        self.model = Model(scene, state, self._show, self._tell)
+        self.model = Model(scene, state, self._show, self._set_status)
         self._first = state
         self._pointer: tuple[float, float] | None = None
         self._widgets: list[tuple[Any, Control]] = []
         self._updating = False
-        self.children = (self.canvas, ipywidgets.VBox(self._controls(), layout={"margin": "0 0 0 12px"}))
+        shown: list[ipywidgets.Widget] = [self._status]
+        for heading, controls in controls_of(self.model).items():
+            shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
+        self.children = (self.canvas, ipywidgets.VBox(shown, layout={"margin": "0 0 0 12px"}))
         self.model.ask(state)
 
     @property
     def volume(self) -> Volume:
-        """What is looked at. Of voxels that are labels, shown without a transfer function, it is a smooth
-        volume with them."""
+        """What is looked at; of labels without a transfer function, a smooth volume with them."""
         return self.model.scene.volume
 
     @property
@@ -84,7 +83,7 @@ class NotebookView(ipywidgets.HBox):
         return self.model.scene.light(self.model.state)
 
     def close(self) -> None:
-        """Remove the widget, and end its thread."""
+        """Remove the widget, and end its thread. A cell that shows another viewer does not end it."""
         self.model.close()
         self.canvas._is_closed = True  # its scheduler ends; in rendercanvas 2.7, its `close` calls itself
         ipywidgets.Widget.close(self.canvas)
@@ -95,7 +94,7 @@ class NotebookView(ipywidgets.HBox):
     def _show(self, pixels: Pixels, stage: Stage) -> None:
         self._in_loop(lambda: self.canvas.show(pixels, JPEG_QUALITY[stage]))
 
-    def _tell(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         self._in_loop(lambda: setattr(self._status, "value", text.replace("\n", "<br>")))
 
     def _in_loop(self, call: Callable[[], Any]) -> None:
@@ -107,8 +106,8 @@ class NotebookView(ipywidgets.HBox):
     def _pointed(self, event: dict[str, Any]) -> None:
         kind, at = event["event_type"], (float(event["x"]), float(event["y"]))
         if kind == "wheel":
-            factor = ZOOM_PER_NOTCH ** (-float(event["dy"]) / 100)
-            self.model.change(orbit=self.model.state.orbit.zoomed(factor))
+            notches = -float(event["dy"]) / 100  # of a mouse's wheel, as browsers report it
+            self.model.change(orbit=self.model.state.orbit.zoomed(1.2**notches))
         elif kind == "pointer_down":
             self._pointer = at
         elif kind == "pointer_up":
@@ -127,12 +126,6 @@ class NotebookView(ipywidgets.HBox):
 
     def _reset(self, _: Any = None) -> None:
         self.model.change(orbit=self._first.orbit)
-
-    def _controls(self) -> list[ipywidgets.Widget]:
-        shown: list[ipywidgets.Widget] = [self._status]
-        for heading, controls in controls_of(self.model).items():
-            shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
-        return shown
 
     def _widget(self, control: Control) -> ipywidgets.Widget:
         """A widget that shows what a control describes, and changes the model."""
@@ -169,7 +162,7 @@ def _widget_of_value(control: Control) -> Any:
     how["description"] = control.label
     if control.kind == "checkbox":
         return ipywidgets.Checkbox(indent=False, **how)
-    how["style"] = LABEL
+    how["style"] = {"description_width": "90px"}
     low, high, step = control.limits
     if control.kind == "dropdown":
         return ipywidgets.Dropdown(options=control.choices(), **how)
@@ -185,8 +178,7 @@ class PromptCanvas(RenderCanvas):
 
     rendercanvas does both at ticks of a scheduler, sends each image once more without loss, and its browser's
     part keeps moves of the pointer back for 20 ms: too long for a coarse image that is to follow within
-    150 ms. `pixels`: of the next image.
-    """
+    150 ms."""
 
     _esm = RenderCanvas._esm.replace("setThrottle(20)", "setThrottle(0)")
     pixels: Pixels | None = None
@@ -197,8 +189,8 @@ class PromptCanvas(RenderCanvas):
         self.request_draw(self._set_bitmap)
 
     def show(self, pixels: Pixels, quality: int) -> None:
-        """Send an image, in place of those that have not been sent. In the thread of the event loop.
-        `quality`: of JPEG, below 100."""
+        """Send an image, in place of those that have not been sent, as JPEG of a quality below 100. In the
+        thread of the event loop."""
         self.pixels, self._quality = pixels, quality
         self.request_draw()
 

@@ -1,5 +1,5 @@
-"""A viewer as a page of its own, by viser: it turns the camera in the browser, and the image is what lies
-behind its scene, which is empty."""
+"""A viewer as a page of its own, by viser, which turns the camera in the browser. The image is the background
+of viser's scene, which is empty."""
 
 import contextlib
 import io
@@ -16,27 +16,18 @@ from websockets.exceptions import ConnectionClosed
 
 from .controls import Control, controls_of
 from .model import JPEG_QUALITY, Model, Stage
-from .orbit import Orbit
-from .state import Scene, State
+from .state import Orbit, Scene, State
 from .tiles import Pixels
 
 
 HOST = "127.0.0.1"
-
 OWN_NAMES = {HOST, "localhost"}
 
 
 class _Server(viser.ViserServer):
-    """viser's server without what leaves this machine."""
-
     def request_share_url(self, verbose: bool = True) -> str | None:
         """None: no tunnel to a public address, which any client could ask for otherwise."""
         return None
-
-
-def _unless_never_opened(record: logging.LogRecord) -> bool:
-    # browsers open connections in advance, and close those that they do not need
-    return record.getMessage() != "opening handshake failed"
 
 
 class Page:
@@ -44,12 +35,16 @@ class Page:
 
     Each page (tab of a browser) has a view of its own.
 
-    - `url`: to open in a browser. `port`: on which it is served.
-    - `models`: of the pages that are open, by viser's numbers of clients.
-    - `close()` ends it.
+    Attributes:
+        url: to open in a browser.
+        port: on which it is served.
+        models: of the pages that are open, by viser's numbers of clients.
 
-    **Arguments:** `scene`, `state`: what is looked at, and how at first; `serve` makes them. `port` and
-    `title`: as for `serve`.
+    Args:
+        scene: what is looked at. `serve` makes it.
+        state: how at first.
+        port: as for `serve`.
+        title: as for `serve`.
     """
 
     def __init__(self, scene: Scene, state: State, *, port: int = 8080, title: str = "jaxvol"):
@@ -58,7 +53,9 @@ class Page:
         # viser's cameras have limits that suit scenes of about this size
         self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
         self.models: dict[int, Model] = {}
-        logging.getLogger("websockets.server").addFilter(_unless_never_opened)
+        # browsers open connections in advance, and close those that they do not need
+        log = logging.getLogger("websockets.server")
+        log.addFilter(lambda record: record.getMessage() != "opening handshake failed")
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self._server = _Server(host=HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
@@ -97,17 +94,14 @@ class Page:
         """A world point in viser's scene."""
         return (point - self._center) / self._radius
 
-    def _orbit(self, camera: viser.CameraHandle) -> Orbit:
-        """The camera of a page."""
-        position, focal = (self._center + self._radius * v for v in (camera.position, camera.look_at))
-        return Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
-
     async def _opened(self, client: viser.ClientHandle) -> None:
         model = _Panel(client, self._scene, self._state).model
         self.models[client.client_id] = model
 
         async def turned(camera: viser.CameraHandle) -> None:
-            model.resize(camera.image_width, camera.image_height, orbit=self._orbit(camera))
+            position, focal = (self._center + self._radius * v for v in (camera.position, camera.look_at))
+            orbit = Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
+            model.resize(camera.image_width, camera.image_height, orbit=orbit)
 
         client.camera.on_update(turned)
         await turned(client.camera)
@@ -124,7 +118,7 @@ class _Panel:
     def __init__(self, client: viser.ClientHandle, scene: Scene, state: State):
         self.client = client
         self.status = client.gui.add_markdown("starting …  \n")
-        self.model = Model(scene, state, self._show, self._tell)
+        self.model = Model(scene, state, self._show, self._set_status)
         self._widgets: list[tuple[Any, Control]] = []
         for heading, controls in controls_of(self.model).items():
             with client.gui.add_folder(heading):
@@ -132,28 +126,28 @@ class _Panel:
                     self._add(control)
 
     def _show(self, pixels: Pixels, stage: Stage) -> None:
-        quality = JPEG_QUALITY[stage]
-        self.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=quality)
+        self.client.scene.set_background_image(pixels, "jpeg", jpeg_quality=JPEG_QUALITY[stage])
         self.client.flush()
 
-    def _tell(self, text: str) -> None:
+    def _set_status(self, text: str) -> None:
         self.status.content = text.replace("\n", "  \n")  # in Markdown, a new line
 
     def _add(self, control: Control) -> None:
         widget = _widget(self.client.gui, control)
-        self._widgets.append((widget, control))
 
         # viser runs coroutines one after the other, and plain functions in any order
         async def changed(event: Any) -> None:
-            if event.client is None:  # changed by `_update`
-                return
-            control.set(_from_viser(widget.value))
-            for each in self._widgets:
-                _update(*each)
+            if event.client is not None:  # in a browser, and not by `_update`
+                value = widget.value
+                control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
+                for each in self._widgets:
+                    _update(*each)
 
         if control.kind == "buttons":
             widget.on_click(changed)
-        elif control.kind != "html":
+            return
+        self._widgets.append((widget, control))
+        if control.kind != "html":
             widget.on_update(changed)
 
 
@@ -163,7 +157,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
     if control.kind == "buttons":
         return gui.add_button_group(control.label, tuple(control.choices()))
     label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
-    value = _to_viser(control.get())
+    value = _value(control)
     if control.kind in ("slider", "log slider"):
         return gui.add_slider(label, *control.limits, value)
     if control.kind == "dropdown":
@@ -174,24 +168,18 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
 
 def _update(widget: Any, control: Control) -> None:
     """Let a widget show what the model has."""
-    if control.kind == "buttons":
-        return
     if control.kind == "html":
         widget.content = control.get()
         return
     if control.kind == "dropdown":
         widget.options = control.choices()
-    value = _to_viser(control.get())
+    value = _value(control)
     # what only rounding has changed is not sent back, or a slider would lag behind in a drag
     if not (isinstance(value, float) and math.isclose(value, widget.value, rel_tol=1e-5)):
         widget.value = value
 
 
-def _to_viser(value: Any) -> Any:
-    """viser's colours are three integers."""
-    is_color = isinstance(value, str) and value.startswith("#")
-    return tuple(round(255 * channel) for channel in to_rgb(value)) if is_color else value
-
-
-def _from_viser(value: Any) -> Any:
-    return "#{:02x}{:02x}{:02x}".format(*value) if isinstance(value, tuple) else value
+def _value(control: Control) -> Any:
+    """What a control shows; of a colour viser's three integers."""
+    value = control.get()
+    return tuple(round(255 * channel) for channel in to_rgb(value)) if control.kind == "color" else value

@@ -1,11 +1,17 @@
-"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace."""
+"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace.
 
-from dataclasses import dataclass
-from typing import Any, get_args
+The camera turns about its focal point as on a turntable: `view_up` stays up. Drags are given in units of the
+view's height, to the right and down, as the pointer moved.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from ..._util.checks import described, finite_array
+from ..._util.checks import finite_array
 from ...compositing.blending import Compositing
 from ...compositing.modes import Mode, compositing_of
 from ...compositing.projections import Average
@@ -22,39 +28,99 @@ from ...march.transforms import (
 )
 from ...ray import check_arguments
 from ...scene.camera import Camera
-from ...scene.labels import LabelTransferFunction
 from ...scene.occupancy import BLOCK
 from ...scene.space import median_node_distance
-from ...scene.transfer import TransferFunction
-from ...scene.transfer2d import TransferFunction2D
+from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from ..automatic import automatic_transfer, framed, labels_shown, visible_points
-from .histogram import Histogram
-from .orbit import Orbit
+from ..automatic import automatic_transfer, labels_shown
+from ..framing import framed, visible_points
 
 
-MIN_STEP, MAX_STEP, DEFAULT_STEP = 1 / 16, 16.0, 0.5
-"""Voxels; the last where no march is given."""
+MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
+STEEPEST = math.radians(89)  # elevation of a camera, at most: from straight above, nothing says what is up
 
-ENABLED = AlphaCorrection, SpaceLeaping, EarlyTermination
-"""Transforms that are applied where no march is given."""
+Vector = Float[np.ndarray, "3"]
 
-ViewedTransfer = TransferFunction | TransferFunction2D | LabelTransferFunction
+
+@dataclass(frozen=True)
+class Orbit:
+    """A perspective camera that looks at a point.
+
+    Attributes:
+        focal_point: world point.
+        toward: unit direction from there to the camera.
+        distance: between them, world length.
+        view_up: unit direction about which it turns.
+        view_angle: degrees, over the height of the image.
+    """
+
+    focal_point: Vector
+    toward: Vector
+    distance: float
+    view_up: Vector
+    view_angle: float
+
+    @classmethod
+    def at(cls, position: object, focal_point: object, view_up: object, view_angle: float) -> "Orbit":
+        """A camera at a world position. One that looks along `view_up` is turned away from it a little."""
+        position, focal, up = (np.asarray(v, np.float64) for v in (position, focal_point, view_up))
+        offset = position - focal
+        distance, length = float(np.linalg.norm(offset)), float(np.linalg.norm(up))
+        return cls(focal, offset / distance, distance, up / length, view_angle).turned(0, 0)
+
+    def turned(self, right: float, down: float) -> "Orbit":
+        """After a drag that turns what is seen, as if the pointer held its front: by half a turn for a drag
+        over the height of the view."""
+        up = self.view_up
+        height = math.asin(float(np.clip(self.toward @ up, -1, 1)))
+        level = self.toward - (self.toward @ up) * up
+        if np.linalg.norm(level) < 1e-9:
+            level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+        level = level / np.linalg.norm(level)
+        angle = -math.pi * right  # the camera moves against what is seen
+        level = math.cos(angle) * level + math.sin(angle) * np.cross(up, level)
+        height = min(max(height + math.pi * down, -STEEPEST), STEEPEST)
+        return replace(self, toward=math.cos(height) * level + math.sin(height) * up)
+
+    def panned(self, right: float, down: float) -> "Orbit":
+        """After a drag along the image: what lies at the focal point's distance stays under the pointer."""
+        height = 2 * self.distance * math.tan(math.radians(self.view_angle) / 2)
+        across = np.cross(-self.toward, self.view_up)
+        across = across / np.linalg.norm(across)
+        upward = np.cross(across, -self.toward)
+        return replace(self, focal_point=self.focal_point + height * (down * upward - right * across))
+
+    def zoomed(self, factor: float) -> "Orbit":
+        """Nearer by this factor: what lies at the focal point appears so many times as large."""
+        return replace(self, distance=self.distance / factor)
+
+    @property
+    def position(self) -> Vector:
+        """World position of the camera."""
+        return self.focal_point + self.distance * self.toward
+
+    def camera(self, size: tuple[int, int], window: object = None, corner: object = None) -> Camera:
+        """The camera, for an image of this size in pixels."""
+        place = (self.position, self.focal_point, self.view_up, self.view_angle)
+        return Camera(*place, size=size, window=window, corner=corner)  # pyright: ignore[reportArgumentType]
 
 
 @dataclass(frozen=True)
 class State:
     """All that the controls of a viewer change.
 
-    - `orbit`: the camera. `size`: (width, height) of the view, pixels.
-    - `transfer`: the transfer function.
-    - `step`: distance between samples, in voxels.
-    - `enabled`: names of the transforms that are applied. `lit`: whether there is light.
+    Attributes:
+        orbit: the camera.
+        size: (width, height) of the view, pixels.
+        transfer: the transfer function.
+        step: distance between samples, in voxels.
+        enabled: names of the transforms that are applied.
+        lit: whether there is light.
     """
 
     orbit: Orbit
     size: tuple[int, int]
-    transfer: ViewedTransfer
+    transfer: Transfer
     step: float
     enabled: frozenset[str]
     lit: bool
@@ -64,28 +130,29 @@ class State:
 class Scene:
     """What stays the same while a volume is viewed, and what the controls choose from.
 
-    - `transforms`: those that can be turned on, in the order in which they are applied.
-    - `lighting`: the light that can be turned on; None where nothing can be lit.
-    - `quadrature`, `max_samples`: of the march. `voxel`: world length of a step of 1.
-    - `compositing`: how cells become a pixel. `background`: linear RGB.
-    - `histogram`: of the volume.
+    Attributes:
+        volume: what is looked at.
+        transforms: those that can be turned on, in the order in which they are applied.
+        given: the march whose quadrature and `max_samples` are kept.
+        lighting: the light that can be turned on; None where nothing can be lit.
+        voxel: world length of a step of 1.
+        compositing: how cells become a pixel.
+        background: linear RGB.
     """
 
     volume: Volume
     transforms: tuple[Transform, ...]
+    given: March
     lighting: Lighting | None
-    quadrature: str
-    max_samples: int | None
     voxel: float
     compositing: Compositing[Any]
     background: tuple[float, float, float]
-    histogram: Histogram
 
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
         enabled = tuple(t for t in self.transforms if type(t).__name__ in state.enabled)
         step = state.step * step_factor * self.voxel
-        return March(step, enabled, self.quadrature, max_samples=self.max_samples)
+        return March(step, enabled, self.given.quadrature, max_samples=self.given.max_samples)
 
     def light(self, state: State) -> Lighting | None:
         """The light, if it is on."""
@@ -94,28 +161,27 @@ class Scene:
 
 def initial(
     volume: Volume | Any,
-    transfer: ViewedTransfer | Any | None,
-    camera: Camera | Any | None,
-    march: March | Any | None,
+    transfer: Transfer | Any | None = None,
+    camera: Camera | Any | None = None,
+    march: March | Any | None = None,
     *,
-    lighting: Lighting | Any | None,
-    lit: bool,
-    compositing: Mode | Compositing[Any] | Any,
-    background: Any,
-    size: tuple[int, int] | Any,
+    lighting: Lighting | Any | None = None,
+    lit: bool = True,
+    compositing: Mode | Compositing[Any] | Any = "over",
+    background: Any = (1.0, 1.0, 1.0),
+    size: tuple[int, int] | Any = (640, 480),
 ) -> tuple[Scene, State]:
     """What is viewed, and how at first. Arguments and errors as for `view`."""
-    if not isinstance(transfer, ViewedTransfer | None):
-        kinds = " or ".join(kind.__name__ for kind in get_args(ViewedTransfer))
-        raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
-    seen: Any = whole if camera is None else camera
+    chosen: Any = whole if camera is None else camera
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-        seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
+        chosen = framed(chosen, visible_points(volume, transfer)) if camera is None else chosen
     given = March(1.0, (), "midpoint") if march is None else march
-    names = {"volume": volume, "transfer": transfer, "camera": seen, "march": given, "lighting": lighting}
+    names = {"volume": volume, "transfer": transfer, "camera": chosen, "march": given, "lighting": lighting}
     check_arguments("view(volume, transfer, camera, march)", **names)
+    if chosen.parallel_scale is not None:
+        raise ValueError("the viewer's camera must be perspective; got one with a parallel_scale.")
     mode = compositing_of(compositing)
     mode.marched(transfer, given, volume)  # refuses what it cannot show
     can_be_lit = not isinstance(mode, Average)
@@ -124,32 +190,19 @@ def initial(
     r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = float(median_node_distance(given.locate(volume), blocks))
-    step = DEFAULT_STEP if march is None else float(given.step) / voxel
+    step = 0.5 if march is None else float(given.step) / voxel
     if not MIN_STEP <= step <= MAX_STEP:
         raise ValueError(
             f"march must have a step from {MIN_STEP * voxel:.4g} to {MAX_STEP * voxel:.4g}, {MIN_STEP:g} to "
             f"{MAX_STEP:g} voxels, to be shown; got one of {float(given.step):.4g}, {step:.4g} voxels."
         )
     # not a constant: their arrays are made on a device, and none may be in use before `jax.distributed`
-    offered = (
-        EmptySpaceJitter(seed=0),
-        Jitter(seed=0),
-        AdaptiveSampling(0.005),
-        AlphaCorrection(),
-        SpaceLeaping(),
-        EarlyTermination(1 / 256),
-    )
+    offered = EmptySpaceJitter(seed=0), Jitter(seed=0), AdaptiveSampling(0.005)
+    default = AlphaCorrection(), SpaceLeaping(), EarlyTermination(1 / 256)
     own = {type(transform) for transform in given.transforms}
-    scene = Scene(
-        volume,
-        transforms=(*given.transforms, *(each for each in offered if type(each) not in own)),
-        lighting=Phong() if lighting is None and can_be_lit else lighting,
-        quadrature=given.quadrature,
-        max_samples=given.max_samples,
-        voxel=voxel,
-        compositing=mode,
-        background=(r, g, b),
-        histogram=Histogram.of(volume),
-    )
-    enabled = frozenset(kind.__name__ for kind in (ENABLED if march is None else own))
-    return scene, State(Orbit.of(seen), whole.size, transfer, step, enabled, lit and can_be_lit)
+    others = (each for each in (*offered, *default) if type(each) not in own)
+    light = Phong() if lighting is None and can_be_lit else lighting
+    scene = Scene(volume, (*given.transforms, *others), given, light, voxel, mode, (r, g, b))
+    enabled = frozenset(type(t).__name__ for t in (default if march is None else given.transforms))
+    orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, float(chosen.view_angle))
+    return scene, State(orbit, whole.size, transfer, step, enabled, lit and can_be_lit)

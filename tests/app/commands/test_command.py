@@ -38,7 +38,7 @@ BAD = [
         ["render", "x.raw", "--memory", "0"],
         "--memory: must be a number of bytes, such as 256M or 2G; got '0'",
     ),
-    (["fit", "x.raw", "--images", "a.png"], "fit: error: the following arguments are required: cameras (ja"),
+    (["fit", "x.raw", "--images", "a.png"], "fit: error: the following arguments are required: --cameras (j"),
     (
         ["render", "x.raw", "--sise", "9", "9"],
         "jaxvol render: error: unrecognized arguments: --sise 9 9 (jaxvol render -",
@@ -67,7 +67,7 @@ def test_too_little_memory_is_told_in_one_line(volume_file, tmp_path, monkeypatc
     def full(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 16 bytes.")
 
-    monkeypatch.setattr("jaxvol.app.commands.render.frames_of", full)
+    monkeypatch.setattr("jaxvol.app.commands.render.with_march", full)
     assert main(["render", str(volume_file), "-o", str(tmp_path / "a.png")]) == 2
     printed = capsys.readouterr().err
     assert printed.startswith("jaxvol render: error: there is not enough memory (RESOURCE_EXHAUSTED")
@@ -87,10 +87,10 @@ BUSY = """
 import signal, sys
 import jax, jax.numpy as jnp
 import jaxvol.app.cli
-from jaxvol.app.commands import animate, frames
+from jaxvol.app.commands import animate, scene
 from tests.app.commands.conftest import Drawn
 
-frames.render = Drawn()
+scene.render = Drawn()
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
 def display(*_):
     print("under way", flush=True)

@@ -15,7 +15,7 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main
-from jaxvol.app.commands import demo
+from jaxvol.app.commands import pages
 
 
 SMALL = ["--size", "40", "30", "--resolution", "24"]
@@ -31,7 +31,7 @@ def codes(folder):
 def test_the_page_holds_the_code_that_made_its_pictures(tmp_path, capsys, monkeypatch, drawn):
     folder = tmp_path / "demo"
     monkeypatch.setattr(jv, "render", drawn)
-    monkeypatch.setattr(demo, "PICTURES", {f: demo.PICTURES[f] for f in (demo.head, demo.grain)})
+    monkeypatch.setattr(pages, "PICTURES", {f: pages.PICTURES[f] for f in (pages.head, pages.grain)})
     assert main(["demo", "-o", str(folder), *SMALL]) == 0
     assert "demo: before, after\n" in capsys.readouterr().out
     names = {"head.png", "before.png", "after.png"}

@@ -14,8 +14,8 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
-from jaxvol.app.commands.parsing import parsed
-from jaxvol.app.commands.recorded import KEYWORD, checksum
+from jaxvol.app.commands.options import parsed
+from jaxvol.app.commands.recorded import KEYWORD, checksum, text_of
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
@@ -45,7 +45,8 @@ def test_a_picture_is_made_again_bit_by_bit(picture, volume_file, tmp_path, draw
     said = text_in(picture)
     assert said["file"] == {"name": volume_file.name, "sha256": checksum(volume_file)}
     assert str(tmp_path) not in json.dumps(said)  # nobody gave an absolute path
-    assert said["settings"].keys() == {"preset", "shade", "size", "step", "direction", "background"}
+    flags = [word.partition("=")[0] for word in said["options"] if word.startswith("--")]
+    assert sorted(flags) == ["--background", "--direction", "--no-shade", "--preset", "--size", "--step"]
     assert like("b.png") == 0
     assert eqx.tree_equal(*drawn.scenes)
     assert drawn.how[0] == drawn.how[1]
@@ -76,6 +77,45 @@ def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path
     assert "transfer" not in text_in("c.png")
     assert like("d.png", "--clim", "0", "1") == 2
     assert "the transfer function in the picture and --clim exclude each other" in capsys.readouterr().err
+
+
+def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = {"name": volume_file.name, "sha256": checksum(volume_file)}
+
+    def found(recorded, *words):
+        png(tmp_path / "a.png", said(*recorded.split(), file=file))
+        return options("render", "--like", "a.png", *words)
+
+    recorded = "--preset=engine --clim 1 2 --unit-distance=3 --step=2 --size 8 8 --clip-plane 1 2 3 0 0 1"
+    assert found(recorded).clim == [1, 2]
+    given = found(recorded, "--transfer", "t.json", "--tolerance", "0.1", "--size", "9", "9")
+    assert (given.preset, given.clim, given.unit_distance) == (None, None, None)
+    assert (given.step, given.tolerance, given.size) == (None, 0.1, [9, 9])
+    given = found(recorded, "--cmap", "hot", "--clip-plane", *"000100")
+    assert (given.preset, given.clim, given.clip_plane) == (None, [1, 2], [[0, 0, 0, 1, 0, 0]])
+    surface = "--compositing=isosurface --isovalue=5"
+    assert found(surface, "--compositing", "maximum").isovalue is None
+    assert found(surface, "--compositing", "isosurface").isovalue == 5
+    flags = ("parallel", "transparent", "clip_inside_out")
+    recorded = " ".join(f"--{flag.replace('_', '-')}" for flag in flags)
+    off = [f"--no-{flag.replace('_', '-')}" for flag in flags]
+    assert all(getattr(found(recorded), flag) for flag in flags)
+    assert not any(getattr(found(recorded, *off), flag) for flag in flags)
+    assert not hasattr(options("plan", "--like", "a.png"), "transparent")
+    with pytest.raises(ValueError, match="--cmap and --preset exclude each other"):
+        found("--preset=head --cmap=hot")
+
+
+def test_every_option_is_recorded(volume_file, tmp_path):
+    words = "--size 40 30 --step 1 --view-up 0 -1.5e-05 0 --cmap #ff0000 --compositing maximum --no-shade "
+    words += "--parallel --clip-plane 1 2 3 0 0 1 --clip-plane 4 5 6 1 0 0 --memory 2M --zoom 1.25"
+    given = options("render", str(volume_file), *words.split())
+    transfer = jv.colormap("red", (0, 1))
+    png(tmp_path / "a.png", text_of(given, transfer)[KEYWORD])
+    again = vars(options("render", "--like", str(tmp_path / "a.png")))
+    assert again.pop("like") == tmp_path / "a.png"
+    assert again == {name: value for name, value in vars(given).items() if name != "like"}
 
 
 def test_the_volume_may_lie_beside_the_picture_and_must_be_the_same(picture, volume_file, tmp_path, capsys):
@@ -154,9 +194,9 @@ def unpacks_to_much(path):
     path.write_bytes(whole[:33] + chunk + whole[33:])
 
 
-def said(settings=None, **changed):
+def said(*words, **changed):
     file = {"name": "v.raw", "sha256": "0" * 64}
-    return json.dumps({"settings": settings or {}, "file": file} | changed)
+    return json.dumps({"options": words, "file": file} | changed)
 
 
 def volume(name):
@@ -173,15 +213,20 @@ BAD = {
     "no JSON": ("import os; os.remove('x')", "damaged"),
     "long number": ("9" * 5000, "damaged"),
     "long": ('"' + "x" * 2**20 + '"', "PNG"),
-    "option": (said({"evil": 1}), "jaxvol render has no option"),
-    "a file": (said({"transfer": "/dev/zero"}), "names no file but its volume"),
-    "a file among numbers": (said({"size": [9, 9, "/dev/zero"]}), "too many values"),
-    "a flag": (said({"size": [9, 9, "--depth", "a.npy"]}), "size must not hold"),
-    "a flag, and a value": (said({"preset": "--depth=a.npy"}), "which is not there"),
+    "option": (said("--evil=1"), "jaxvol render takes no '--evil=1' from a picture"),
+    "a file to read": (said("--transfer=/dev/zero"), "takes no '--transfer=/dev/zero'"),
+    "a file to write": (said("--size", "9", "9", "--depth", "a.npy"), "takes no '--depth'"),
+    "a file in short": (said("-oa.npy"), "takes no '-oa.npy'"),
+    "the beginning of a flag": (said("--dep=a.npy"), "takes no '--dep=a.npy'"),
+    "another picture": (said("--like=a.png"), "takes no '--like=a.png'"),
+    "another volume": (said("--size", "9", "9", "/dev/zero"), "a picture names its volume elsewhere"),
+    "the end of flags": (said("--", "/dev/zero"), "takes no '--'"),
+    "help": (said("--help"), "takes no '--help'"),
+    "a flag as a value": (said("--preset=--depth=a.npy"), "which is not there"),
+    "no words": (said(1), "damaged"),
+    "a value of another kind": (said("--step=much"), "argument --step: invalid float value: 'much'"),
+    "a long value": (said("--step=" + "9a" * 5000), "argument --step: invalid float value"),
     "keys": (said(file={"name": "a", "sha256": "0" * 64, "path": "b"}), "which is not there"),
-    "rivals": (said({"preset": "head", "cmap": "hot"}), "--cmap and --preset exclude each other"),
-    "programs": (said({"programs": "/"}), "has no option 'programs'"),
-    "kind": (said({"step": "1"}), "which is not there"),
     "file": (said(file="/etc/passwd"), "damaged"),
     "no file": (said(), "which is not there"),
     "a device": (volume("/dev/zero"), "/dev/zero is no volume"),

@@ -10,6 +10,9 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main
+from jaxvol.app.commands.render import why_empty
+from jaxvol.app.commands.scene import Scene
+from jaxvol.compositing.blending import Over
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import Phong
 from jaxvol.planning import Part, Plan
@@ -150,7 +153,7 @@ def plans(monkeypatch):
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
-    monkeypatch.setattr("jaxvol.app.commands.frames.plan", plan)
+    monkeypatch.setattr("jaxvol.app.commands.scene.plan", plan)
     return made
 
 
@@ -207,23 +210,44 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
     assert "nothing" not in capsys.readouterr().out
     drawn.level = 0.0
     assert render(tmp_path / "v.npy", *bone) == 0
-    why = (
-        r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values between 130 and inf\. A clim from"
-    )
+    why = "nothing is visible: .* from 20 to 90, .* shows values between 130 and inf. A clim from"
     assert re.search(why, capsys.readouterr().out)
     away = ["--camera", *["90"] * 3, *["200"] * 3]
     for words, why in (
         (["--clip-plane", *["20"] * 3, *"100"], "or what the clip leaves of it"),
-        (away, "nothing is seen: no ray of the camera meets the volume"),
-        (["--compositing", "isosurface", "--isovalue", "999"], "and none crosses .* 999"),
+        (away, "nothing is visible: no ray of the camera meets the volume"),
+        (["--compositing", "isosurface", "--isovalue", "999"], "and no ray crosses .* 999"),
     ):
         assert render(tmp_path / "v.npy", *bone, *words) == 0
         assert re.search(why, capsys.readouterr().out), why
     drawn.level = 1e-4
     assert render(tmp_path / "v.npy", *bone) == 0
-    assert re.search(
-        r"nothing is seen: the opacity is at most .*\. Use a shorter unit", capsys.readouterr().out
-    )
+    assert "nothing is visible: the opacity is at most" in capsys.readouterr().out
+
+
+DARK = np.full((3, 3), 0.5)
+NEVER = jv.TransferFunction([0, 1, 2], DARK, [0, 0, 0])
+HIDING = {
+    "below": (jv.TransferFunction([99, 110, 120], DARK, [0, 0, 1]), "shows values between 110 and inf. A"),
+    "above": (jv.TransferFunction([1, 2, 3], DARK, [1, 0, 0]), "shows values between -inf and 2. A clim fr"),
+    "between": (jv.TransferFunction([1, 2, 3], DARK, [0, 1, 0]), "shows values between 1 and 3. A clim"),
+    "no value": (NEVER, "the transfer function's opacity is 0 everywhere"),
+    "labels": (jv.LabelTransferFunction([NEVER]), "shows none of those"),
+}
+"""Where what a transfer function shows lies to the values of a volume."""
+
+
+@pytest.mark.parametrize("case", HIDING)
+def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
+    transfer, expected = HIDING[case]
+    volume = jv.Volume(np.linspace(20, 90, 8, dtype=np.float32).reshape(2, 2, 2))
+    camera, march = jv.Camera.looking_at(volume, size=(8, 8)), jv.March(0.1)
+    scene = Scene(volume, transfer, camera, Over(), None, (1, 1, 1), (), None, None, march)
+    empty = jv.Rendering(np.zeros((8, 8, 4), np.float32), np.zeros((8, 8), bool))
+    said = why_empty(scene, empty)
+    assert said is not None
+    assert said.startswith("the volume's values run from 20 to 90, and the transfer function")
+    assert expected in said
 
 
 def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monkeypatch, capsys, drawn):
@@ -239,7 +263,7 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
             is_leaf=lambda leaf: leaf is None,
         )
 
-    monkeypatch.setattr("jaxvol.app.commands.frames.render_bricks", render_bricks)
+    monkeypatch.setattr("jaxvol.app.commands.scene.render_bricks", render_bricks)
     words = ["--preset", "engine", "-o", tmp_path / "x.npy", "--memory"]
     assert render(volume_file, *words, "200K") == 0
     assert asked["memory"] == 200 * 2**10
@@ -288,12 +312,8 @@ BAD = {
     "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
     "nothing to turn": (["FILE", "--clip-inside-out"], "--clip-inside-out goes with --clip-box or"),
     "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
-    "shaded average": (
-        ["FILE", "--shade", "--compositing", "average"],
-        "--shade needs a place that is shaded",
-    ),
-    "no isovalue": (["FILE", "--compositing", "isosurface"], "--compositing isosurface needs the value"),
-    "isovalue": (["FILE", "--isovalue", "9"], "--isovalue goes with --compositing isosurface; got --comp"),
+    "no isovalue": (["FILE", "--compositing", "isosurface"], "isosurface and --isovalue VALUE go together"),
+    "isovalue": (["FILE", "--isovalue", "9"], "isosurface and --isovalue VALUE go together; one is missing"),
     "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "--step and --tolerance exclude each other"),
 }
 
@@ -302,7 +322,7 @@ BAD = {
 def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
     arguments, message = BAD[case]
     arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
-    monkeypatch.setattr("jaxvol.app.commands.frames.render", None)  # fails if it is called
+    monkeypatch.setattr("jaxvol.app.commands.scene.render", None)  # fails if it is called
     assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1

@@ -12,10 +12,6 @@ import jaxvol as jv
 from jaxvol.app.viewer.editing import (
     MAX_POINTS,
     display_color,
-    has_editable_points,
-    label_color,
-    labels_of,
-    opacities,
     padded,
     window_level,
     with_color,
@@ -48,7 +44,6 @@ def test_padding_changes_nothing_and_gives_one_shape():
     assert_same_function(padded(GIVEN), GIVEN)
     assert padded(without_point(GIVEN, 3)).values.shape == (MAX_POINTS,)
     many = jv.colormap("gray", (0, 1), n_colors=40)
-    assert not has_editable_points(many)
     assert padded(many) is many
 
 
@@ -66,7 +61,6 @@ def test_window_and_level_move_all_points():
 
 def test_a_point_is_set_as_it_is_shown():
     changed = with_opacity(with_color(GIVEN, 3, "#8040ff"), 3, 0.3, 0.5)
-    assert opacities(changed, 0.5)[3] == pytest.approx(0.3)
     assert changed.opacity(0.5)[3] == pytest.approx(0.3)
     assert display_color(np.asarray(changed.colors)[3]) == "#8040ff"
     np.testing.assert_allclose(changed.colors[3], jv.from_srgb([128 / 255, 64 / 255, 1]), atol=1e-6)
@@ -113,9 +107,3 @@ def test_what_is_no_color_opacity_or_value_is_refused():
         with_value(GIVEN, 3, math.inf)
     with pytest.raises(ValueError, match="Invalid hex color"):
         with_color(GIVEN, 1, "#12")
-
-
-def test_labels_that_can_be_seen_are_offered_each_in_its_densest_color():
-    transfer = jv.LabelTransferFunction({1: GIVEN, 3: without_point(GIVEN, 3)})
-    assert labels_of(transfer) == [1, 3]
-    assert label_color(transfer, 3) == "#00bc00"

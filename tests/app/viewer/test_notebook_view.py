@@ -70,12 +70,12 @@ def test_what_is_drawn_and_told_is_shown(shown, monkeypatch):
     images, pixels = [], np.zeros((210, 300, 3), np.uint8)
     monkeypatch.setattr(shown.canvas, "show", lambda *image: images.append(image))
     shown.model._show(pixels, "coarse", 0.1, 0.4)
-    shown.model._tell("one\ntwo")
+    shown.model._set_status("one\ntwo")
     assert images == [(pixels, 85)]
     assert shown._status.value == "one<br>two"
     shown.model.close()
     shown.model._show(pixels, "fine", 0.1, 0.4)
-    shown.model._tell("nothing more")
+    shown.model._set_status("nothing more")
     assert (len(images), shown._status.value) == (1, "one<br>two")
 
 
@@ -111,7 +111,7 @@ def test_the_widgets_change_the_model_and_show_what_it_has(shown):
     assert (found["window"].value, found["point"].value) == (180, "3: 260")
     assert found["point"].options == ("1: 80", "2: 110", "3: 260")
     found["point"].value = "2: 110"
-    found["add behind"].click()
+    found["add after"].click()
     assert len(shown.transfer.values) == len(found["point"].options) == 4
     found["step (voxels)"].value = 1.0
     assert shown.model.state.step == 1

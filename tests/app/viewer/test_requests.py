@@ -16,7 +16,8 @@ class Log(Model):
         self.gate = threading.Semaphore(0)
         self.parts = parts
         none: Any = None
-        super().__init__(none, none, none, self.told.append, rest)
+        self.rest = rest
+        super().__init__(none, none, none, self.told.append)
 
     def ask(self, request: Any):
         super().ask(request)

@@ -1,13 +1,17 @@
-"""`jaxvol demo`: what the toolkit does, on one page: pictures, and the functions below that make them."""
+"""`jaxvol demo`: a page of what the toolkit does, and the functions below that make its pictures. And `jaxvol
+figures`: a page of the papers' figures, by scripts and records that only a checkout of the repository has."""
 
 import argparse
 import html
+import importlib
 import inspect
+import sys
 from pathlib import Path
 from typing import Any
 
+from ..._util.checks import output_file
 from ..._util.whole_files import whole_folder
-from .options import add_command, add_output, add_size
+from .options import SWITCH, add_command, add_output, add_size
 
 
 def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
@@ -90,3 +94,28 @@ def add_demo(commands: Any) -> None:
     add_output(parser, "jaxvol-demo", "folder to write")
     add_size(parser)
     parser.add_argument("--resolution", type=int, default=320, metavar="N", help="voxels along the head")
+
+
+def _figures(options: argparse.Namespace) -> None:
+    folder = output_file("--output", options.output / "index.html").parent
+    sys.path.insert(0, str(checkout()))
+    index = importlib.import_module("paper_figs.index")
+    print(f"open {index.make(folder, run=options.run, only=options.only)}")
+
+
+def checkout() -> Path:
+    """The checkout of the repository: the one that this package is part of, else the working directory."""
+    for folder in (Path(__file__).parents[3], Path.cwd()):
+        if (folder / "paper_figs" / "index.py").is_file():
+            return folder
+    raise ValueError("the figures are drawn by scripts of the repository. Run this in a checkout of it.")
+
+
+def add_figures(commands: Any) -> None:
+    text = "make the figures and tables of the source papers, and a page of them, from recorded results"
+    parser = add_command(commands, "figures", text, _figures)
+    add_output(parser, "jaxvol-figures", "folder to write")
+    text = "some of them, such as fig09"
+    parser.add_argument("--only", nargs="+", default=(), metavar="NAME", help=text)
+    text = "measure and render everything again, with the volumes of JAXVOL_DATA: takes hours"
+    parser.add_argument("--run", action=SWITCH, default=False, help=text)

@@ -1,0 +1,193 @@
+"""Default transfer functions: from a volume's histogram, or with a colour for each of its labels."""
+
+import math
+from typing import Any, cast
+
+import jax
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from .._util.checks import described
+from .._util.srgb import from_srgb
+from ..scene.labels import LabelTransferFunction
+from ..scene.transfer import TransferFunction, extinction_of
+from ..scene.volume import Volume
+from ..xla.platform import is_traced
+
+
+SAMPLED = 2**21  # voxels that are looked at, at most
+CUT = 0.25  # fraction of the voxels at the volume's faces from which on the faces cut through the object
+
+BODY = 0.15
+"""Least fraction of the voxels between the thresholds whose six neighbours lie between them, too, if they are
+a body: 0.25 to 0.92 in scans and simulations, 0.09 at most in angiograms, where only rims of vessels do."""
+
+ROUGH, NOISY = 0.7, 0.1
+"""Grain has second differences above this fraction of first differences over two steps (0.6 at most in scans,
+0.8 in ultrasound, 1.7 in white noise), and above this fraction of the distance of the thresholds."""
+
+FLAT, MOST_LABELS = 0.8, 64
+"""Whole numbers are labels if this fraction of those above the lowest equal their neighbour (0.92 in a
+segmented frog, 0.46 at most in scans, simulations and phantoms), and no more than so many differ."""
+
+INSIDE = 255  # value of what has a label, in the volume that is shown
+
+EDGE, SKIN, TISSUE = (70, 30, 18), (214, 130, 92), (190, 92, 62)
+DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
+"""Colours, 8-bit sRGB: of the border's foot, the border, the object, what is dense, and what is densest."""
+
+
+def stride_of(shape: tuple[int, ...], most: int = SAMPLED) -> int:
+    """The least n so that every n-th voxel along each axis makes at most `most` voxels."""
+    stride = 1
+    while math.prod(-(-n // stride) for n in shape) > most:
+        stride += 1
+    return stride
+
+
+def sampled(volume: Volume) -> Shaped[np.ndarray, "nx ny nz"]:
+    """Every n-th voxel along each axis."""
+    stride = stride_of(volume.shape)
+    return np.asarray(volume.data)[::stride, ::stride, ::stride]
+
+
+def unit_of(volume: Volume) -> float:
+    """The length to which opacities refer, so that they do not depend on the volume's units: a hundredth of
+    its diagonal."""
+    low, high = (np.asarray(corner) for corner in volume.corners)
+    return float(np.linalg.norm(high - low)) / 100
+
+
+def automatic_transfer(volume: Volume | Any) -> TransferFunction:
+    """A transfer function that shows what a volume holds, from its histogram.
+
+    Two thresholds part the values into three classes so that the variance within each is least (Otsu): what
+    is around the object, the object, and what is dense in it. The border of the object is shown translucent,
+    what is dense in it nearly opaque. Only what is dense is shown where the object would hide it: where the
+    volume's faces cut the object, as in most CT scans, and where it is grain, as in ultrasound, or only the
+    border of what is dense, as in angiograms. Opacities do not depend on the volume's units.
+
+    Args:
+        volume: the `Volume`. Of more than 2 million voxels, every n-th is looked at.
+
+    Returns:
+        the `TransferFunction`.
+
+    Raises:
+        ValueError: for what is no volume, or traced.
+
+    Source: Otsu, "A Threshold Selection Method from Gray-Level Histograms", 1979.
+    """
+    if not isinstance(volume, Volume):
+        raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
+    if is_traced(volume):
+        raise ValueError(
+            "volume is traced here, and its histogram is needed: call automatic_transfer outside of jax.jit, "
+            "jax.vmap and jax.grad, and pass what it returns."
+        )
+    with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
+        return transfer_by_copy(volume, np.asarray(volume.data))
+
+
+def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
+    """The same from a copy of every n-th voxel, and a part at full resolution, which shows grain."""
+    values = sampled(copy).ravel().astype(np.float32)
+    low, high = float(values.min()), float(values.max())
+    if not low < high:
+        points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
+    else:
+        first, second = thresholds(values)
+        d = (second - first) / 4
+        points = [(second, DENSE, 0.45), (max((second + high) / 2, second + d / 2), BRIGHT, 0.9)]
+        data = np.asarray(copy.data)
+        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
+        if np.mean(outer > first) < CUT and is_body(part, first, second):
+            w = min(first - low, second - first) / 3
+            border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, 0.07)]
+            points = [*border, (second - d, TISSUE, 0.04), *points]
+        else:
+            points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
+    at, colors, opacities = zip(*points, strict=True)
+    linear = np.asarray(from_srgb(np.array(colors) / 255))
+    return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
+
+
+def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Otsu's two thresholds, moved to the middle of the means of the classes between which they lie."""
+    from skimage.filters import threshold_multiotsu
+
+    low, high = (float(end) for end in np.percentile(values, (0, 99.9)))
+    high = high if high > low else float(values.max())
+    clipped = np.clip(values, low, high)
+    try:
+        first, second = threshold_multiotsu(clipped, 3, nbins=256)
+    except ValueError:  # of fewer than three values
+        first, second = low + (high - low) / 3, low + 2 * (high - low) / 3
+    for _ in range(3):  # strays at the edge of a class join the nearer one
+        classes = [clipped[clipped <= first], clipped[(clipped > first) & (clipped <= second)]]
+        classes.append(clipped[clipped > second])
+        if min(map(len, classes)) == 0:
+            break
+        means = [float(each.mean(dtype=np.float64)) for each in classes]
+        first, second = (means[0] + means[1]) / 2, (means[1] + means[2]) / 2
+    return float(first), float(second)
+
+
+def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:
+    """Whether values between two thresholds fill a body, and are not only grain, or the borders of what is
+    dense. Of a large volume, every n-th voxel is compared with its neighbours."""
+    if min(data.shape) < 3:
+        return True
+    stride = stride_of(data.shape)
+    inner = [np.arange(1, n - 1, stride) for n in data.shape]
+
+    def shifted(axis: int, by: int) -> Shaped[np.ndarray, "mx my mz"]:
+        places = (places + by * (axis == each) for each, places in enumerate(inner))
+        return data[np.ix_(*places)].astype(np.float32)
+
+    here = shifted(0, 0)
+    middle = (here > first) & (here <= second)
+    if not middle.any():
+        return True
+    inside, bends, slopes = middle.copy(), 0.0, 0.0
+    for axis in range(3):
+        before, after = shifted(axis, -1), shifted(axis, 1)
+        for each in (before, after):
+            inside &= (each > first) & (each <= second)
+        bends += float(np.abs(2 * here - before - after)[middle].mean(dtype=np.float64)) / 3
+        slopes += float(np.abs(after - before)[middle].mean(dtype=np.float64)) / 3
+    is_grain = bends > ROUGH * slopes and bends > NOISY * (second - first)
+    return bool(inside.sum() >= BODY * middle.sum()) and not is_grain
+
+
+def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
+    """A volume and a transfer function that show each label but the lowest in its own colour; None if there
+    are no labels. The volume is smooth, 255 inside of all labels, and its labels reach two voxels beyond."""
+    import matplotlib
+    from matplotlib.colors import ListedColormap
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
+    data = np.asarray(volume.data)
+    if data.dtype.kind not in "iu":
+        return None
+    above = data[:-1] != data.min()
+    if not above.any() or np.mean(data[:-1][above] == data[1:][above]) < FLAT:
+        return None
+    kinds = np.unique(data)
+    if not 2 < len(kinds) <= MOST_LABELS:
+        return None
+    labels = np.searchsorted(kinds, data).astype(np.uint8)
+    # smoothed, so that the border of what has a label has a gradient
+    inside = gaussian_filter(np.where(labels > 0, np.float32(INSIDE), np.float32(0)), 0.8)
+    beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
+    place = volume.spacing, volume.origin
+    shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
+    tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
+    dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
+    colors = np.asarray(from_srgb(dark_then_light))
+    values, opacity = [0, 0.35 * INSIDE, 0.65 * INSIDE], extinction_of([0.0, 0.0, 0.9], unit_of(volume))
+    functions = {
+        label: TransferFunction(values, [colors[(label - 1) % len(colors)]] * 3, opacity)
+        for label in range(1, len(kinds))
+    }
+    return shown, LabelTransferFunction(functions)

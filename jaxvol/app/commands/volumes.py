@@ -1,0 +1,101 @@
+"""`jaxvol datasets`, `jaxvol info` and `jaxvol view`: volumes to fetch, what a file holds, and a page of the
+browser on which it is turned and changed."""
+
+import argparse
+import sys
+import threading
+import webbrowser
+from typing import Any
+
+import numpy as np
+
+from ...io import datasets
+from ...io.formats import says_its_spacing
+from ..viewer import serve
+from .options import SWITCH, add_command, add_transfer, add_volume
+from .scene import is_automatic, transfer_of, volume_of
+
+
+def _datasets(options: argparse.Namespace) -> None:
+    if options.action == "list":
+        for dataset in map(datasets.info, datasets.names()):
+            shape, size = " x ".join(map(str, dataset.shape)), f"{dataset.nbytes / 1e6:.3g} MB"
+            print(f"{dataset.name:34} {shape:>20} {dataset.dtype:8} {size:>12}  {dataset.title}")
+        return
+    if options.name is None:
+        raise ValueError("fetch needs a NAME: jaxvol datasets list prints them.")
+    path = datasets.fetch(options.name, progress=sys.stderr.isatty())
+    print(path)  # nothing else on stdout, for "$(jaxvol datasets fetch engine)"
+    dataset = datasets.info(options.name)
+    print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}", file=sys.stderr)
+    if dataset.spacing != (1, 1, 1):
+        print(f"jaxvol render {path} --spacing {_numbers(dataset.spacing)}", file=sys.stderr)
+
+
+def add_datasets(commands: Any) -> None:
+    text = "list the public Open SciVis volumes; or print the path of one, downloaded if need be"
+    parser = add_command(commands, "datasets", text, _datasets)
+    parser.add_argument("action", choices=("list", "fetch"), help="what to do")
+    parser.add_argument("name", nargs="?", help="of the volume to fetch, as listed")
+
+
+def _info(options: argparse.Namespace) -> None:
+    volume = volume_of(options)
+    data = np.asarray(volume.data)
+    assumed = options.spacing is None and not says_its_spacing(options.file)
+    # of every k-th voxel of a large volume: sorting all takes seconds and memory
+    some, shares = data.ravel()[:: max(1, data.size // 4_000_000)].astype(np.float32), (1, 25, 50, 75, 99)
+    percentiles = zip(shares, np.percentile(some, shares), strict=True)
+    counts, bars = np.log1p(np.histogram(data, 64)[0]), " ▁▂▃▄▅▆▇█"
+    heights = np.ceil(counts / counts.max() * (len(bars) - 1)).astype(int)
+    low, high = f"{float(data.min()):g}", f"{float(data.max()):g}"
+    bounds = zip("xyz", np.asarray(volume.bounds).reshape(3, 2), strict=True)
+    turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
+    axes = (f"{name} along ({_numbers(column, ', ')})" for name, column in zip("xyz", turn.T, strict=True))
+    rows = {
+        "shape": f"{_numbers(volume.shape, ' x ')} voxels (x, y, z), {data.size / 1e6:.3g} million",
+        "type": f"{data.dtype}, {data.nbytes / 1e6:.3g} MB of memory",
+        "spacing": _numbers(volume.spacing) + (" (assumed: the file does not say)" if assumed else ""),
+        "origin": _numbers(volume.origin),
+        "direction": "; ".join(axes),
+        "bounds": ", ".join(f"{name} {_numbers(ends, ' to ')}" for name, ends in bounds),
+        "values": f"{low} to {high}, mean {data.mean(dtype=np.float64):.6g}",
+        "percentiles": ", ".join(f"{share} %: {value:g}" for share, value in percentiles),
+        "lowest": f"{np.mean(data == data.min()):.1%} of the voxels have the least value",
+        "histogram": f"{low} |{''.join(bars[height] for height in heights)}| {high}, heights by logarithm",
+    }
+    if volume.labels is not None:
+        found = np.unique(np.asarray(volume.labels))
+        rows["labels"] = f"{found.size}, from {found[0]} to {found[-1]}"
+    for name, text in rows.items():
+        print(f"{name:12} {text}")
+
+
+def _numbers(values: Any, between: str = " ") -> str:
+    return between.join(f"{value:.6g}" for value in np.asarray(values))
+
+
+def add_info(commands: Any) -> None:
+    text = "print shape, type, place in the world and values of a volume file, as jaxvol loads it"
+    add_volume(add_command(commands, "info", text, _info))
+
+
+def _view(options: argparse.Namespace) -> None:
+    volume = volume_of(options)
+    transfer = None if is_automatic(options) else transfer_of(options, volume)
+    page = serve(volume, transfer, lit=options.shade, port=options.port, title=options.file.name)
+    print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
+    if options.browser:
+        webbrowser.open(page.url)
+    threading.Event().wait()
+
+
+def add_view(commands: Any) -> None:
+    text = "look at a volume file in the browser; only this machine can connect, and Ctrl-C ends it"
+    parser = add_command(commands, "view", text, _view)
+    add_volume(parser)
+    add_transfer(parser)
+    parser.add_argument("--shade", action=SWITCH, default=True, help="with light at first")
+    text = "of the page (default: 8080, or the next free)"
+    parser.add_argument("--port", type=int, default=8080, help=text)
+    parser.add_argument("--browser", action=SWITCH, default=True, help="open it")
