@@ -14,11 +14,8 @@ import numpy as np
 
 
 CHUNK = 2**20
-LONGEST_REASON = 200  # letters
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
-MOST_COMPRESSED = (
-    2000  # bytes of pixels per byte of a compressed file: a header that says more is not believed
-)
+MOST_COMPRESSED = 2000  # bytes of pixels for each of a compressed file; a header that says more is refused
 # RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
@@ -71,28 +68,15 @@ def decoding(path: Path) -> Iterator[None]:
     try:
         yield
     except CORRUPT as fault:
-        raise ValueError(
-            f"path: {path} cannot be read: corrupt, cut short or incomplete ({reason(fault)})."
-        ) from fault
+        told = f"corrupt, cut short or incomplete ({reason(fault)})"
+        raise ValueError(f"path: {path} cannot be read: {told}.") from fault
 
 
 def reason(fault: BaseException) -> str:
     """The last line of an error, without the place in ITK's source with which its errors begin."""
-    lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
-    told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", lines[-1]) if lines else ""
-    shown = "".join(letter if letter.isprintable() else "?" for letter in told[:LONGEST_REASON])
-    return shown.rstrip(".") or type(fault).__name__
-
-
-def numbers_in(text: str, count: int, what: str, separator: str | None = None) -> np.ndarray:
-    """`count` finite numbers in a text. **Raises** `ValueError`, which begins with `what`, for other text."""
-    try:
-        numbers = np.array(text.split(separator), float)
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.size != count or not np.isfinite(numbers).all():
-        raise ValueError(f"{what} must be {count} numbers; got {text[:80]!r}.")
-    return numbers
+    last = str(fault).strip().rpartition("\n")[2]
+    told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
+    return "".join(c if c.isprintable() else "?" for c in told).rstrip(".") or type(fault).__name__
 
 
 def as_array(

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ...io.formats import says_its_spacing
-from .data import volume_of
+from ...io.formats import read
+from ...scene.volume import Volume
 from .options import add_command, add_volume
 
 
@@ -16,9 +16,12 @@ SHARES = (1, 25, 50, 75, 99)
 
 
 def _info(options: argparse.Namespace) -> None:
-    volume = volume_of(options)
+    arguments = read(options.file, options.shape, options.dtype)
+    if options.spacing is not None:
+        arguments["spacing"] = options.spacing
+    volume = Volume(**arguments)
     data = np.asarray(volume.data)
-    assumed = options.spacing is None and not says_its_spacing(options.file)
+    assumed = "spacing" not in arguments
     # of every k-th voxel of a large volume: sorting all takes seconds and memory
     some = data.ravel()[:: max(1, data.size // 4_000_000)].astype(np.float32)
     percentiles = zip(SHARES, np.percentile(some, SHARES), strict=True)

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from ..._util.checks import Arrayable, described
-from ..._util.npy import npz_names, read_npy, read_npz
+from ..._util.npy import read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
 from .dicom import dicom_files, is_dicom, read_dicom, series_files
 from .kretz import read_kretz, refuse_kretz
 from .medical import nrrd_data, read_nifti, read_nrrd
 from .metaimage import metaimage_data, read_metaimage
-from .raw import ENDINGS as RAW, raw_json, raw_json_header, read_raw
+from .raw import ENDINGS as RAW, raw_json, read_raw
 from .save import save as save
-from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files, tiff_spacing
+from .tiff import read_tiff, read_tiff_folder, tiff_files
 
 
 READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
@@ -95,13 +95,7 @@ def load(
     files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for a format
     that needs SimpleITK or tifffile if it is missing.
     """
-    path = _existing(path)
-    if path.name.lower().endswith(RAW):
-        arguments = read_raw(path, shape, dtype)
-    elif shape is None and dtype is None:
-        arguments = _reader(path)(path)
-    else:
-        raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
+    arguments = read(path, shape, dtype)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arguments |= {name: value for name, value in given.items() if value is not None}
     try:
@@ -111,15 +105,21 @@ def load(
         raise ValueError(f"{path}: {fault}") from fault
 
 
-def _reader(path: Path) -> Callable[[Path], dict[str, Any]]:
-    """The reader for a file, by the ending of its name, or for a folder, by what is in it."""
+def read(path: str | os.PathLike[str] | Any, shape: Any = None, dtype: Any = None) -> dict[str, Any]:
+    """What a file or folder holds, as arguments of `Volume`; those of which it says nothing are missing."""
+    path = _existing(path)
+    name = path.name.lower()
+    if name.endswith(RAW):
+        return read_raw(path, shape, dtype)
+    if shape is not None or dtype is not None:
+        raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
     for ending, reader in READERS.items():
-        if path.name.lower().endswith(ending):
-            return reader
+        if name.endswith(ending):
+            return reader(path)
     if (path.is_dir() and dicom_files(path)) or (path.is_file() and is_dicom(path)):
-        return read_dicom  # on discs their names often have no ending
+        return read_dicom(path)  # on discs their names often have no ending
     if path.is_dir() and tiff_files(path):
-        return read_tiff_folder
+        return read_tiff_folder(path)
     fault = "is a directory without DICOM and TIFF files" if path.is_dir() else "has an unknown ending"
     raise ValueError(
         f"path: {path} {fault}; expected a folder of these, or a file ending in "
@@ -153,34 +153,19 @@ def _corners(volume: Volume) -> np.ndarray:
 
 
 def files_of(path: Path) -> list[Path]:
-    """The files that `load` reads for a volume: of a folder, its slices; beside a header, what it names; of
-    one DICOM file, those of its series. None where there is no volume.
-
-    **Raises:** `ValueError` for a file whose header cannot be read."""
+    """The files that `load` reads for a volume: of a folder, its slices; with a header, what it names; of one
+    DICOM file, those of its series. None where there is no volume. **Raises** as `load` for a bad header."""
     if path.is_dir():
         return dicom_files(path) or tiff_files(path)
     if not path.is_file():  # a device may have no end
         return []
     name = path.name.lower()
     if name.endswith(RAW):
-        beside = raw_json(path)
-        return [path] if beside is None else [path, beside]
+        return [path, *raw_json(path)]
     if name.endswith((".mhd", ".nrrd", ".nhdr")):
         data = metaimage_data(path) if name.endswith(".mhd") else nrrd_data(path)
         return [path, data] if data != path and data.is_file() else [path]
     return series_files(path) if is_dicom(path) else [path]
-
-
-def says_its_spacing(path: Path) -> bool:
-    """Whether a file of voxels, or the header beside it, says how far apart they lie; they are not read."""
-    name = path.name.lower()
-    if name.endswith(RAW):
-        return "spacing" in raw_json_header(path)
-    if name.endswith(".npz"):
-        return "spacing" in npz_names(path)
-    if name.endswith(TIFF):
-        return "spacing" in tiff_spacing(path)
-    return not (name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)))
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
@@ -209,10 +194,8 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
 
 
 def _existing(path: str | os.PathLike[str] | Any) -> Path:
-    if not isinstance(path, str | os.PathLike):
+    if not isinstance(path, str | os.PathLike) or not str(path):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
-    if not str(path):
-        raise ValueError("path must be that of a file or folder; got ''.")
     path = Path(path)
     if not path.exists():
         raise ValueError(

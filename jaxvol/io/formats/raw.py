@@ -45,7 +45,7 @@ def raw_header(
     match = SCIVIS_NAME.search(path.name)
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
     given = {"shape": shape, "dtype": dtype}
-    fields |= raw_json_header(path) | {name: value for name, value in given.items() if value is not None}
+    fields |= _json_fields(path) | {name: value for name, value in given.items() if value is not None}
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
             f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
@@ -55,25 +55,23 @@ def raw_header(
     return _shape(path, fields.pop("shape"), bits), _dtype(path, fields.pop("dtype")), fields
 
 
-def raw_json(path: Path) -> Path | None:
-    """The JSON file beside a raw file, if there is one."""
+def raw_json(path: Path) -> list[Path]:
+    """The JSON file of a raw file, if there is one: of its name with `.json` behind it, or as ending."""
     stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    candidates = (path.with_name(f"{name}.json") for name in (path.name, stem))
-    return next((file for file in candidates if file.is_file()), None)
+    return [file for name in (path.name, stem) if (file := path.with_name(f"{name}.json")).is_file()][:1]
 
 
-def raw_json_header(path: Path) -> dict[str, Any]:
-    """What the JSON file beside a raw file says, under the names of `load`'s arguments."""
-    beside = raw_json(path)
-    if beside is None:
-        return {}
-    try:
-        fields = json.loads(beside.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as fault:
-        raise ValueError(f"path: the header {beside} is not JSON ({fault}).") from fault
-    if not isinstance(fields, dict):
-        raise ValueError(f"path: the header {beside} must be a JSON object; got {type(fields).__name__}.")
-    return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
+def _json_fields(path: Path) -> dict[str, Any]:
+    """What the JSON file of a raw file says, under the names of `load`'s arguments."""
+    for file in raw_json(path):
+        try:
+            fields = json.loads(file.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as fault:
+            raise ValueError(f"path: the header {file} is not JSON ({fault}).") from fault
+        if not isinstance(fields, dict):
+            raise ValueError(f"path: the header {file} must be a JSON object; got {type(fields).__name__}.")
+        return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
+    return {}
 
 
 def _shape(path: Path, shape: Any, bits: int) -> tuple[int, int, int]:
