@@ -1,7 +1,5 @@
-"""Resamples what a swept probe acquired onto a Cartesian grid, which other programs read.
-
-Rendering under a `ToroidalMap` needs no such conversion.
-"""
+"""Resamples what a swept probe acquired onto a Cartesian grid, which other programs read. Rendering under a
+`ToroidalMap` needs no such conversion."""
 
 import math
 from typing import Any
@@ -39,6 +37,11 @@ def scan_convert(
     nodes, as rendering does, blurs what is smaller than the spacing, and mixes `fill_value` into the sector's
     faces, over one spacing. What it does to images: `experiments/scan_conversion.py`.
 
+    Differentiable with respect to float voxels and to the probe. For the probe, the grid must be given
+    (`spacing`, `shape` and `origin`), since its size cannot depend on traced values; where a node crosses a
+    face its value jumps, which the gradient does not see. Memory is taken for the result and for one plane of
+    nodes at a time; for floats, which are checked to be finite, as much again.
+
     **Arguments:**
 
     - `volume`: as acquired, `data[β, σ, γ]`. Its labels, if any, become those of the nearest sample, and 0
@@ -46,19 +49,12 @@ def scan_convert(
     - `probe`: the map that places the samples; the result lies in the same world.
     - `spacing`: of the grid, one number or three, world length (mm); by default the distance between the
       samples of a beam, as fine as they are anywhere.
-    - `shape`, `origin`: number of nodes along x, y, z, at least 2, and the world position of the first node;
-      by default those of the grid that just encloses the sector, centered on it.
+    - `shape`: number of nodes along x, y, z, at least 2; by default those that just enclose the sector.
+    - `origin`: the world position of the first node; by default such that the sector is in the middle.
     - `fill_value`: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
 
     **Returns:** a `Volume` with its spacing and origin. A grid node within rounding of a face counts as
     inside.
-
-    Beside the result, memory is taken for one plane of nodes at a time; and then on the host, where a result
-    of floats is checked to be finite, for as much as it takes itself and a byte a node.
-
-    Differentiable with respect to float voxels and to the probe. For the probe, the grid must be given
-    (`spacing`, `shape` and `origin`), since its size cannot depend on traced values; where a node crosses a
-    face its value jumps, which the gradient does not see.
 
     **Raises:** `ValueError` for arguments of other kinds, a spacing that is not positive, a grid of 2**31
     nodes or more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.

@@ -53,9 +53,9 @@ def test_linear_formats_keep_every_float(tmp_path):
 
 COLORS = np.zeros((2, 3, 3))
 BAD = {
-    "no image": ("x.png", np.zeros(4), r"image must have shape .*got \(4,\)"),
+    "no image": ("x.png", np.zeros(4), r"linear must have shape .*got \(4,\)"),
     "a rendering": ("x.png", object(), r"linear must be an array of numbers; .*rendering\.image\(\)"),
-    "NaN": ("x.png", COLORS + np.nan, "image must not be NaN or infinite; 18 of its 18 values are"),
+    "NaN": ("x.png", COLORS + np.nan, "linear must not be NaN; 18 of its values are"),
     "EXR": ("x.exr", COLORS, r"path: .* must end in one of \.png, .*\.npy; got .*x\.exr"),
     "opacity in JPEG": ("x.jpg", RGBA, r"and opacity must end in one of \.png, \.tif, \.tiff, \.npy;"),
     "one channel in PNG": (

@@ -22,9 +22,6 @@ from ...march.transforms import ToroidalMap
 
 MAGIC = b"KRETZFILE 1.0   "
 
-MOST_ITEMS = 2**16
-"""A file of so many items is refused, so that one of nothing but empty items does not take minutes."""
-
 UNEVEN = 0.01
 """How far an angle may be from evenly spaced ones, in steps: a part of a voxel by which it is misplaced."""
 
@@ -106,24 +103,19 @@ def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[str, tuple[int, i
         )
     found: dict[str, tuple[int, int]] = {}
     end = stream.tell()
-    for _ in range(MOST_ITEMS):
-        stream.seek(end)
-        head = stream.read(8)
-        if len(head) < 8 and not any(head):  # the end, or padding
-            break
+    while any(head := stream.read(8)):  # zeros: the end, or padding
         group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
         tag, begin = f"{group:04X}:{element:X}", end + 8
         end = begin + length
         if end > n_bytes:
             raise ValueError(
-                f"path: {path} is cut short: item {_name(tag)} is to end at byte {end}, and it has "
-                f"{n_bytes}."
+                f"path: {path} is cut short: item {_name(tag)} is to end at byte {end}, and it has {n_bytes}."
             )
-        if tag in MEANING and tag in found:
+        if tag in found:
             raise ValueError(f"path: {path} holds item {_name(tag)} twice.")
-        found[tag] = begin, length
-    else:
-        raise ValueError(f"path: {path} holds {MOST_ITEMS} items or more; expected some hundreds.")
+        if tag in MEANING:
+            found[tag] = begin, length
+        stream.seek(end)
     if missing := [_name(tag) for tag in MEANING if tag not in found]:
         raise ValueError(
             f"path: {path} has no item {', no item '.join(missing)}. Compressed files, several frames and "

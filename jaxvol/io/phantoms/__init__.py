@@ -1,9 +1,8 @@
 """Synthetic scenes that need no data files.
 
-Every phantom spans the world cube [-1, 1]³, with nodes on the cube's faces, and is the same scene at every
-resolution: shapes are signed distances and textures are waves, both in world units, and a shape's coverage
-falls off over a ramp of a fixed number of voxels. Drawn scenes have a file each; `canvas.py` and `shapes.py`
-are what they are drawn with.
+Every phantom is the same scene at every resolution: shapes are signed distances and textures are waves, both
+in world units, and a shape's coverage falls off over a ramp of a fixed number of voxels. Drawn scenes have a
+file each; `canvas.py` and `shapes.py` are what they are drawn with.
 """
 
 from collections.abc import Callable
@@ -44,14 +43,14 @@ FORMULAS: dict[str, Callable[[Block, Block, Block], Block]] = {
 }
 """Values at world points x, y, z, an open mesh, of phantoms whose images have a known answer."""
 
-DRAWN: dict[str, Callable[[int, np.random.Generator], np.ndarray | tuple[np.ndarray, np.ndarray]]] = {
-    "head": head.make,
-    "engine": engine.make,
-    "colon": colon.make,
-    "vessels": vessels.make,
-    "labels": frog.make,
+DRAWN: dict[str, Callable[[Canvas, np.random.Generator], np.ndarray | None]] = {
+    "head": head.draw,
+    "engine": engine.draw,
+    "colon": colon.draw,
+    "vessels": vessels.draw,
+    "labels": frog.draw,
 }
-"""Functions from a resolution and a random generator to voxels and, for some, labels."""
+"""Functions that paint a canvas, and return labels, if any."""
 
 PHANTOMS = (*DRAWN, *FORMULAS)
 
@@ -94,13 +93,12 @@ along +z | none |
     if name not in PHANTOMS:
         raise ValueError(f"name must be one of {', '.join(PHANTOMS)}; got {name!r}.")
     resolution = integer("resolution", resolution, 8)
-    rng, labels = np.random.default_rng(integer("seed", seed, 0)), None
+    rng = np.random.default_rng(integer("seed", seed, 0))
+    canvas, labels = Canvas(resolution), None
     if name in DRAWN:
-        made = DRAWN[name](resolution, rng)
-        data, labels = made if isinstance(made, tuple) else (made, None)
+        labels = DRAWN[name](canvas, rng)
     else:
-        canvas = Canvas(resolution)
         for where, at in canvas.slabs():
             canvas.values[where] = FORMULAS[name](*at)
-        data = canvas.values
-    return Volume(data, spacing=(2 / (resolution - 1),) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)
+    data = canvas.as_uint8() if name in DRAWN else canvas.values
+    return Volume(data, spacing=(canvas.spacing,) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)

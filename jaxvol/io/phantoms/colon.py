@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._util.checks import integer
-from .canvas import FAR, Canvas, PlaneWaves
+from .canvas import Canvas, plane_waves
 from .shapes import ball, box, capsule, lengths, to_segment
 
 
@@ -36,10 +36,10 @@ def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
     return np.stack([np.interp(even, length, fine[:, axis]) for axis in range(3)], axis=1)
 
 
-def make(n: int, rng: np.random.Generator) -> np.ndarray:
+def draw(canvas: Canvas, rng: np.random.Generator) -> None:
     wall, deepest, bend = 0.035, 0.2, colon_path(161)
     length = float(lengths(bend)[-1])
-    tissue, uneven = PlaneWaves(rng, 0.15, 0.6), PlaneWaves(rng, 0.25, 0.5)
+    tissue, uneven = plane_waves(rng, 0.15, 0.6), plane_waves(rng, 0.25, 0.5)
     polyps = []
     for place in np.linspace(0.08, 0.94, 7) + rng.uniform(-0.04, 0.04, 7):
         along, out, i = rng.normal(size=3), 0.155, int(place * 160)
@@ -47,26 +47,26 @@ def make(n: int, rng: np.random.Generator) -> np.ndarray:
         out *= np.cross(ahead, along) / np.linalg.norm(np.cross(ahead, along))
         polyps.append(ball(tuple((bend[i] + out).tolist()), float(rng.uniform(0.035, 0.06))))
 
-    lumen, along = Canvas(n, FAR), Canvas(n)
-    for i, (a, b) in enumerate(pairwise(bend.tolist())):
-        stretch = capsule(a, b, deepest)
-        for where, at in lumen.slabs(stretch.low, stretch.high, wall + 2 * lumen.spacing):
-            away, t = to_segment(*at, a, b)
-            nearer = away < lumen.values[where]
-            np.copyto(lumen.values[where], away, where=nearer)
-            np.copyto(along.values[where], (i + t) * (length / 160), where=nearer)
-    for where, at in lumen.slabs():
-        away, s = lumen.values[where], along.values[where]
-        if away.min() < 1:
-            # pouches between crescent folds, 0.17 apart, deeper on one side than on the other
-            fold = np.exp(-((np.abs(np.sin(np.pi * s / 0.17)) / 0.42) ** 2))
-            bumps = uneven(*at)
-            radius = 0.165 + 0.012 * bumps - fold * np.clip(0.045 + 0.035 * bumps, 0, 0.09)
-            away -= np.clip(radius, 0.07, deepest)
-    lumen.carve(polyps, 0.03)
+    def lumen(field: Canvas) -> None:
+        along = np.zeros_like(field.values)
+        for i, (a, b) in enumerate(pairwise(bend.tolist())):
+            stretch = capsule(a, b, deepest)
+            for where, at in field.slabs(stretch.low, stretch.high, wall + 2 * field.spacing):
+                away, t = to_segment(*at, a, b)
+                nearer = away < field.values[where]
+                np.copyto(field.values[where], away, where=nearer)
+                np.copyto(along[where], (i + t) * (length / 160), where=nearer)
+        for where, at in field.slabs():
+            away, s = field.values[where], along[where]
+            if away.min() < 1:
+                # pouches between crescent folds, 0.17 apart, deeper on one side than on the other
+                fold = np.exp(-((np.abs(np.sin(np.pi * s / 0.17)) / 0.42) ** 2))
+                bumps = uneven(*at)
+                radius = 0.165 + 0.012 * bumps - fold * np.clip(0.045 + 0.035 * bumps, 0, 0.09)
+                away -= np.clip(radius, 0.07, deepest)
+        field.carve(polyps, 0.03)
 
-    canvas = Canvas(n)
+    inside = canvas.field(lumen)
     canvas.paint(lambda x, y, z, d: 180 + 5 * tissue(x, y, z), box((0, 0, 0), (0.94,) * 3, 0.15))
-    canvas.paint(220, lumen, grown=wall)
-    canvas.paint(0, lumen)
-    return canvas.as_uint8()
+    canvas.paint(220, inside, grown=wall)
+    canvas.paint(0, inside)

@@ -5,7 +5,7 @@ The frog faces -y with its back towards +z, so its right side is towards -x.
 
 import numpy as np
 
-from .canvas import FAR, Canvas
+from .canvas import Canvas
 from .shapes import Point, Shape, ball, capsule, ellipsoid, pair, tube
 
 
@@ -18,9 +18,8 @@ ORGANS = (  # label, intensity, shape
 )
 
 
-def make(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    body = _body(n)
-    canvas = Canvas(n)
+def draw(canvas: Canvas, rng: np.random.Generator) -> np.ndarray:
+    body = canvas.field(_body)
     canvas.paint(120, body, SOFT)
     labels = (body.values < 0).astype(np.uint8)
     deepest = np.zeros_like(body.values)
@@ -32,11 +31,10 @@ def make(n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
             nearer = distance < deepest[where]
             np.copyto(labels[where], label, where=nearer)
             np.copyto(deepest[where], distance, where=nearer)
-    return canvas.as_uint8(), labels
+    return labels
 
 
-def _body(n: int) -> Canvas:
-    body = Canvas(n, FAR)
+def _body(body: Canvas) -> None:
     body.join(ellipsoid((0, 0.05, 0), (0.42, 0.6, 0.3)), 0.15)
     body.join(ellipsoid((0, -0.50, 0.04), (0.40, 0.38, 0.21)), 0.15)  # head
     body.join(pair(ball((0.2, -0.56, 0.21), 0.115)), 0.04)  # eyes
@@ -50,7 +48,6 @@ def _body(n: int) -> Canvas:
     fore = _toes(wrist, [(0.54, -0.68), (0.65, -0.74), (0.76, -0.70), (0.83, -0.60)])
     body.join(pair(*leg, *arm), 0.08)
     body.join(pair(*hind, *fore), 0.03)
-    return body
 
 
 def _toes(root: Point, tips: list[tuple[float, float]]) -> list[Shape]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .canvas import FAR, Canvas, PlaneWaves
+from .canvas import Canvas, plane_waves
 from .shapes import Block, Shape, ball, box, capsule, ellipsoid, lengths, pair, tube
 
 
@@ -36,12 +36,11 @@ _AIR = (
 _SEPTUM = box((0, -0.42, -0.06), (0.011, 0.24, 0.13), 0.005)
 
 
-def make(n: int, rng: np.random.Generator) -> np.ndarray:
-    tissue = PlaneWaves(rng, 0.12, 0.5)
-    folds = PlaneWaves(rng, 0.13, 0.2)
-    canvas = Canvas(n)
-    canvas.paint(lambda x, y, z, d: 78 + (22 + 4 * tissue(x, y, z)) * np.clip(-1 - d / 0.02, 0, 1), _skin(n))
-    canvas.paint(lambda x, y, z, d: 205 + 8 * tissue(x, y, z), _bones(n))
+def draw(canvas: Canvas, rng: np.random.Generator) -> None:
+    tissue, folds = plane_waves(rng, 0.12, 0.5), plane_waves(rng, 0.13, 0.2)
+    skin = canvas.field(_skin)
+    canvas.paint(lambda x, y, z, d: 78 + (22 + 4 * tissue(x, y, z)) * np.clip(-1 - d / 0.02, 0, 1), skin)
+    canvas.paint(lambda x, y, z, d: 205 + 8 * tissue(x, y, z), canvas.field(_bones))
 
     # two dense tables with the diploë between them
     middle = ellipsoid((0, 0.08, 0.30), (0.46, 0.60, 0.52)).distance
@@ -61,17 +60,13 @@ def make(n: int, rng: np.random.Generator) -> np.ndarray:
         grey = np.maximum(lining, np.clip(1.5 + d / 0.035, 0, 1))
         return 112 + 15 * grey + 2 * tissue(x, y, z) - 26 * np.maximum(furrow, midline)
 
-    cavity = Canvas(n, FAR)
-    cavity.join(_BRAIN, 0.05)
-    canvas.paint(brain, cavity)
+    canvas.paint(brain, canvas.field(lambda cavity: cavity.join(_BRAIN, 0.05)))
     for value, shapes in (*_SOFT, (0, _AIR), (120, [_SEPTUM]), (255, _teeth())):
         for shape in shapes:
             canvas.paint(value, shape)
-    return canvas.as_uint8()
 
 
-def _skin(n: int) -> Canvas:
-    skin = Canvas(n, FAR)
+def _skin(skin: Canvas) -> None:
     skin.join(ellipsoid((0, 0.08, 0.30), (0.54, 0.68, 0.60)), 0.16)
     skin.join(ellipsoid((0, -0.22, -0.18), (0.39, 0.44, 0.50)), 0.16)
     skin.join(pair(capsule((0.27, -0.07, -0.40), (0.10, -0.45, -0.56), 0.10)), 0.12)  # jaw
@@ -94,11 +89,9 @@ def _skin(n: int) -> Canvas:
     skin.join(pair(ellipsoid((0.51, 0.07, -0.10), (0.03, 0.05, 0.06), -0.4)), 0.04)
     skin.carve(pair(ellipsoid((0.555, 0.085, 0.03), (0.025, 0.07, 0.11), -0.45)), 0.03)
     skin.join(pair(ellipsoid((0.515, 0.005, -0.0), (0.022, 0.025, 0.04))), 0.03)
-    return skin
 
 
-def _bones(n: int) -> Canvas:
-    bone = Canvas(n, FAR)
+def _bones(bone: Canvas) -> None:
     bone.join(ellipsoid((0, 0.08, 0.30), (0.49, 0.63, 0.55)), 0.09)
     bone.join(ellipsoid((0, 0.31, -0.02), (0.36, 0.28, 0.22)), 0.08)  # occiput
     bone.join(box((0, -0.37, -0.13), (0.25, 0.20, 0.17), 0.12), 0.06)  # upper jaw
@@ -127,7 +120,6 @@ def _bones(n: int) -> Canvas:
         wings = pair(capsule((0.08, 0.21, z), (0.18, 0.22, z - 0.01), 0.028))
         bone.join([*arches, *wings, capsule((0, 0.38, z - 0.02), (0, 0.44, z - 0.05), 0.026)], 0.02)
     bone.carve(tube([(0, 0.30, -0.25), (0, 0.31, -1.2)], 0.058))
-    return bone
 
 
 def _arch(x: Any) -> Any:

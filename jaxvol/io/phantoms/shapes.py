@@ -27,8 +27,7 @@ class Shape(NamedTuple):
 
 
 def _around(distance: Distance, center: Point, half: Point) -> Shape:
-    low, high = (tuple(c + s * h for c, h in zip(center, half, strict=True)) for s in (-1, 1))
-    return Shape(distance, low, high)
+    return Shape(distance, np.subtract(center, half), np.add(center, half))
 
 
 def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
@@ -71,9 +70,7 @@ def capsule(a: Point, b: Point, radius: float, end_radius: float | None = None) 
         return away - (radius + t * (end - radius))
 
     wide = max(radius, end)
-    low = tuple(min(p, q) - wide for p, q in zip(a, b, strict=True))
-    high = tuple(max(p, q) + wide for p, q in zip(a, b, strict=True))
-    return Shape(distance, low, high)
+    return Shape(distance, np.minimum(a, b) - wide, np.maximum(a, b) + wide)
 
 
 def tube(points: Sequence[Point], radius: float) -> list[Shape]:
@@ -124,11 +121,11 @@ def ring(center: Point, radius: float, thickness: float) -> Shape:
 def pair(*shapes: Shape) -> list[Shape]:
     """Every shape and its mirror image in the plane x = 0."""
 
-    def mirror(shape: Shape) -> Shape:
+    def mirrored(shape: Shape) -> Shape:
         low, high = (-shape.high[0], *shape.low[1:]), (-shape.low[0], *shape.high[1:])
         return Shape(lambda x, y, z: shape.distance(-x, y, z), low, high)
 
-    return [side for shape in shapes for side in (shape, mirror(shape))]
+    return [side for shape in shapes for side in (shape, mirrored(shape))]
 
 
 def lengths(line: Float[np.ndarray, "points axes"]) -> Float[np.ndarray, " points"]:

@@ -111,8 +111,8 @@ BAD = {
         kretz({tag: GOOD[tag] for tag in GOOD if tag != VOXELS}, [((0xD600, 1), bytes(240))]),
         "no item D000:1 .*several frames.*uncompressed",
     ),
-    "compressed": (changed(VOXELS, bytes(40)), "4 x 5 x 6 = 120 bytes.*holds 40.*compressed"),
-    "too many voxels": (changed(VOXELS, bytes(121)), "= 120 bytes.*holds 121"),
+    "compressed": (changed(VOXELS, bytes(40)), "must have 120 bytes; it has 40.*compressed"),
+    "too many voxels": (changed(VOXELS, bytes(121)), "must have 120 bytes; it has 121"),
     "Cartesian": (
         without(PLANES, BEAMS),
         r"no item C300:1 .*, no item C300:2 .*Cartesian",
@@ -161,7 +161,7 @@ def test_neither_a_file_nor_a_header_takes_memory_or_time_that_the_other_does_no
     unwanted = kretz() + struct.pack("<HHI", 1, 1, 2**32 - 1)
     for content, length, message in (
         (voxels, len(voxels), "cut short"),
-        (kretz(), 2**33, "twice|items or more"),  # empty items, which take no disk space
+        (kretz(), 2**33, None),  # padding, which takes no disk space
         (unwanted, len(unwanted) + 2**32 - 1, None),
     ):
         path = write(tmp_path, content)
