@@ -45,11 +45,8 @@ def save_image(
     does not hold, NaN, infinite colours, and a path that cannot be written.
     """
     if not isinstance(path, str | os.PathLike):
-        swapped = isinstance(linear, str | os.PathLike)
-        raise ValueError(
-            f"path must be a str or a path; got {described(path)}."
-            + (" That is the image: the path comes first, as in save_png(path, image)." if swapped else "")
-        )
+        told = f"path must be a str or a path; got {described(path)}"
+        raise ValueError(f"{told}. It comes first, as in save_png(path, image).")
     image = _numbers("linear", linear, (0, 3, 4))
     channels = image.shape[2] if image.ndim == 3 else 0
     path = image_file("path", path, channels)

@@ -1,11 +1,7 @@
 """Public volumes by name: the Open SciVis Datasets, downloaded once by pooch, checked, and cached.
 
-    jv.datasets.names()
-    jv.datasets.info("engine")
-    volume = jv.datasets.load("engine")
-
-Files in the folder `$JAXVOL_DATA` are used in place. The list is that of klacansky.com/open-scivis-datasets,
-of the commit that `open_scivis.json` names.
+`volume = jv.datasets.load("engine")`. Files in the folder `$JAXVOL_DATA` are used in place. The list is that
+of klacansky.com/open-scivis-datasets, of the commit that `open_scivis.json` names.
 """
 
 import json
@@ -26,9 +22,6 @@ from ..formats import load as load_file
 
 OPEN_SCIVIS = "http://klacansky.com/open-scivis-datasets"
 
-TIMEOUT = 30
-"""Seconds without an answer, or without a byte, after which a server counts as gone."""
-
 
 @dataclass(frozen=True)
 class Dataset:
@@ -47,7 +40,6 @@ class Dataset:
 
     name: str
     title: str
-    category: str
     shape: tuple[int, int, int]
     dtype: str
     spacing: tuple[float, float, float]
@@ -75,7 +67,7 @@ class Dataset:
 def registry() -> dict[str, Dataset]:
     """All datasets, by name."""
     fields = json.loads(Path(__file__).with_name("open_scivis.json").read_text(encoding="utf-8"))["datasets"]
-    keys = ("name", "category", "size", "type", "spacing", "sha512sum", "description", "acknowledgement")
+    keys = ("name", "size", "type", "spacing", "sha512sum", "description", "acknowledgement")
     return {
         name: Dataset(name, *(tuple(v) if isinstance(v := each[key], list) else v for key in keys))
         for name, each in fields.items()
@@ -83,9 +75,7 @@ def registry() -> dict[str, Dataset]:
 
 
 def names() -> list[str]:
-    """Names of all datasets.
-
-    **Returns:** the names, sorted."""
+    """Names of all datasets, sorted."""
     return sorted(registry())
 
 
@@ -138,7 +128,7 @@ def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, prog
     if target.is_file():  # pooch would hash it each time, which takes minutes for many GB
         return _of_right_size(target, dataset)
     pooch.get_logger().setLevel("WARNING")
-    get: Any = pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT)
+    get: Any = pooch.HTTPDownloader(progressbar=progress, timeout=30)
     try:
         pooch.retrieve(dataset.url, f"sha512:{dataset.sha512}", target.name, target.parent, downloader=get)
     except OSError as fault:  # those of requests are among them

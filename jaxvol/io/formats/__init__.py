@@ -1,8 +1,7 @@
 """Loads volumes from files, with a reader chosen by the ending of the file's name, and saves them.
 
-A reader returns the arguments of `Volume` that the file holds; the caller's own arguments to `load` override
-them. Files are data: nothing is unpickled, and the content of a file is checked against its header before
-memory is allocated for it.
+A reader returns the arguments of `Volume` that the file holds. Nothing is unpickled, and the content of a
+file is checked against its header before memory is allocated for it.
 """
 
 import os
@@ -17,7 +16,7 @@ from ..._util.npy import read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
 from .dicom import dicom_files, is_dicom, read_dicom, series_files
-from .kretz import read_kretz, refuse_kretz
+from .kretz import read_kretz
 from .medical import nrrd_data, read_nifti, read_nrrd
 from .metaimage import metaimage_data, read_metaimage
 from .raw import ENDINGS as RAW, raw_json, read_raw
@@ -37,7 +36,6 @@ READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".dcm": read_dicom,
     ".tif": read_tiff,
     ".tiff": read_tiff,
-    ".vol": refuse_kretz,
 }
 
 
@@ -65,15 +63,13 @@ def load(
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
 
     Raw files store x fastest, like those of the Open SciVis datasets. The JSON file has the raw file's name
-    with `.json` appended, or in place of `.raw` or `.raw.gz`, and uses the datasets' keys `size`, `type` and
-    `spacing`, and `origin`; any of them may be missing. If the sources differ, an argument overrides the
-    JSON, and the JSON overrides the name; nothing is guessed.
+    with `.json` appended, or in place of `.raw` or `.raw.gz`, and the datasets' keys `size`, `type`,
+    `spacing`, `origin`, any of which may be missing. An argument overrides the JSON, and the JSON the name.
 
     Medical images are rescaled (CT in HU), float64 becomes float32, and axes are exchanged and reversed so
     that x, y, z increase towards the patient's left, back and head (LPS). An oblique image keeps its voxels,
-    and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie; their
-    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are converted to
-    smaller types, as described in `Volume`.
+    and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie. Integers
+    of 32 and 64 bits, from any kind of file, are converted to smaller types, as described in `Volume`.
 
     **Arguments:**
 
@@ -89,11 +85,10 @@ def load(
 
     **Returns:** the `Volume`, with voxels in the file's type except as described above.
 
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or shorter
-    than its header says, or without a header; for an image that is not 3-D or not scalar; for a folder of
-    several DICOM series, or of slices that do not fit together; for labels that lie elsewhere; for `.vol`
-    files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for a format
-    that needs SimpleITK or tifffile if it is missing.
+    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, of another size than
+    its header says, or without a header; for an image that is not 3-D or not scalar; for several DICOM series
+    in a folder, or slices that do not fit together; for labels that lie elsewhere; and for anything that
+    `Volume` rejects. `ImportError` for a format that needs SimpleITK or tifffile if it is missing.
     """
     arguments = read(path, shape, dtype)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
@@ -113,6 +108,9 @@ def read(path: str | os.PathLike[str] | Any, shape: Any = None, dtype: Any = Non
         return read_raw(path, shape, dtype)
     if shape is not None or dtype is not None:
         raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
+    if name.endswith(".vol"):
+        use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...)) or jv.scan_convert"
+        raise ValueError(f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}.")
     for ending, reader in READERS.items():
         if name.endswith(ending):
             return reader(path)
@@ -127,29 +125,18 @@ def read(path: str | os.PathLike[str] | Any, shape: Any = None, dtype: Any = Non
     )
 
 
-def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
+def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
-    other = load(labels)
-    here, there = _corners(volume), _corners(other)
+    labels = load(path)
+    here, there = (np.asarray(each.bounds) for each in (volume, labels))
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
-        raise ValueError(
-            f"labels: {labels} must lie where the volume does, with corners {here.tolist()}; it has "
-            f"{there.tolist()}."
-        )
-    values = np.asarray(other.data)
-    if values.dtype.kind == "f":
-        if not np.array_equal(values, np.rint(values)):
-            raise ValueError(f"labels: {labels} must hold integers; got {values.dtype} with fractions.")
-        with np.errstate(invalid="ignore"):  # `Volume` checks the range
-            values = values.astype(np.int64)
+        raise ValueError(f"labels: {path} must lie where the volume does, within {here}; it has {there}.")
+    values = np.asarray(labels.data)
+    if not np.array_equal(values, np.rint(values)):
+        raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
+    with np.errstate(invalid="ignore"):  # `Volume` checks the range
+        values = values.astype(np.int64) if values.dtype.kind == "f" else values
     return Volume(volume.data, volume.spacing, volume.origin, values, direction=volume.direction)
-
-
-def _corners(volume: Volume) -> np.ndarray:
-    """Where the first voxel lies in the world, and the last one along each axis."""
-    direction = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
-    edges = direction * np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
-    return np.asarray(volume.origin) + np.vstack([np.zeros(3), edges.T])
 
 
 def files_of(path: Path) -> list[Path]:
@@ -172,10 +159,9 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
     """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world, from a
     Kretz file (`.vol`) of GE Voluson scanners: `KRETZFILE 1.0`, uncompressed, of 8-bit voxels.
 
-    Read are the volume and its geometry, and nothing of the patient or the settings; of a Doppler scan, the
-    B-mode volume. Angles are taken as they stand in the file, with the middle beam at π/2; those of planes
-    and beams must be evenly spaced to 0.01 of a step, by which a voxel may be misplaced. The first sample of
-    a beam has depth γ = 0.
+    Angles are taken as they stand in the file, with the middle beam at π/2. The first sample of a beam has
+    depth γ = 0. The format is not published: the reader is written after those of SlicerHeart and
+    plooney/kretz, and tested on files of its tests alone, not on a scanner's own.
 
     **Arguments:** `path`: the file.
 
@@ -183,11 +169,8 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
     them with `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
 
     **Raises:** `ValueError` for a file that is missing, empty, corrupt, cut short, compressed, of another
-    kind, or lacks an item; for angles that are not evenly spaced; and for what `ToroidalMap` and `Volume`
-    reject. Sizes are compared with the file's before memory is taken.
-
-    The format is not published. The reader is tested on files written by its tests, after the readers of
-    SlicerHeart and plooney/kretz, and not on a scanner's own.
+    kind, or lacks an item; for angles that are not evenly spaced to 0.01 of a step; and for what
+    `ToroidalMap` and `Volume` reject.
     """
     data, probe = read_kretz(_existing(path))
     return Volume(data), probe

@@ -13,19 +13,18 @@ from .medical import orthonormal, simple_itk, toward_axes
 UID = "1.2.840.10008."
 
 PLAIN = {UID + end for end in ("1.2", "1.2.1", "1.2.2")}
-READABLE = PLAIN | {UID + end for end in ("1.2.1.99", "1.2.5")}
-READABLE |= {f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)}
-"""Transfer syntaxes that SimpleITK reads: deflated, run-length encoded, JPEG, JPEG-LS and JPEG 2000, too."""
+PACKED = {UID + end for end in ("1.2.1.99", "1.2.5")}
+PACKED |= {f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)}
+"""Transfer syntaxes that SimpleITK reads: deflated, run-length encoded, JPEG, JPEG-LS and JPEG 2000."""
 
 STORAGE = UID + "5.1.4.1.1."
 NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "481.5"))
-"""Kinds of files that often lie in a series' folder: presentation states, reports, documents, contours,
-plans."""
+"""Presentation states, reports, documents, contours and plans, which often lie in a series' folder."""
 
 KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
 """Elements of the meta information with which a file begins."""
 
-SERIES, DESCRIPTION = "0020|000e", "0008|103e"
+SERIES, DESCRIPTION, BITS = "0020|000e", "0008|103e", "0028|0100"
 PLACE = ("0020|0032", "0020|0037", "0028|0030")
 """Position, directions of rows and columns, and spacing of pixels."""
 
@@ -55,9 +54,8 @@ def series_files(path: Path) -> list[Path]:
 def read_dicom(path: Path) -> dict[str, Any]:
     """Reader for a folder that holds one series, or for one file of a series, whose others are in its folder.
 
-    **Raises:** `ValueError` naming the files, if the folder holds several series, or if slices of the series
-    are missing, there twice, of different sizes or directions, shifted sideways, cut short, or compressed in
-    a way that SimpleITK does not read.
+    **Raises:** `ValueError` for several series, and for slices that are missing, there twice, of different
+    sizes or directions, shifted sideways, cut short, or compressed in a way that SimpleITK does not read.
     """
     headers = _headers(path)
     for file, header in headers.items():
@@ -67,22 +65,32 @@ def read_dicom(path: Path) -> dict[str, Any]:
             f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
             f"{len(headers)}."
         )
-    first, *others = headers
-    for name in ("Size", "Spacing", "Direction"):
-        expected, *found = (np.array(getattr(header, f"Get{name}")()) for header in headers.values())
-        for file, each in zip(others, found, strict=True):
-            if not np.allclose(each, expected, rtol=1e-4, atol=1e-4):
-                raise ValueError(
-                    f"path: {path}: slices of one series must agree; {first.name} has {name.lower()} "
-                    f"{expected.round(4).tolist()}, and {file.name} {each.round(4).tolist()}. Is one of them "
-                    "an overview image?"
-                )
+    grids = {file: [*h.GetSize(), *h.GetSpacing(), *h.GetDirection()] for file, h in headers.items()}
+    first = next(iter(grids))
+    for file, grid in grids.items():
+        if not np.allclose(grid, grids[first], rtol=1e-4, atol=1e-4):
+            raise ValueError(
+                f"path: {path}: slices of one series must agree in size, spacing and directions; "
+                f"{first.name} and {file.name} do not: {grids[first]} and {grid}. Is one of them an overview image?"
+            )
     direction = orthonormal(f"path: {path}: rows and columns of {first.name}", headers[first].GetDirection())
-    files = sorted(headers, key=lambda file: float(np.array(headers[file].GetOrigin()) @ direction[:, 2]))
+    normal = direction[:, 2]
+    files = sorted(headers, key=lambda file: float(np.array(headers[file].GetOrigin()) @ normal))
     positions = np.array([headers[file].GetOrigin() for file in files])
     across, down, _ = headers[first].GetSpacing()
-    distance = _distance(path, files, positions, direction[:, 2], min(across, down))
-    return toward_axes(_pixels(headers, files), (across, down, distance), positions[0], direction)
+    step = float((positions[-1] - positions[0]) @ normal) / (len(files) - 1)
+    away = positions - positions[0] - np.outer(step * np.arange(len(files)), normal)
+    along = away @ normal
+    sideways = np.abs(away - np.outer(along, normal)).max(axis=1)
+    even = (np.abs(along) <= AWAY * step) & (sideways <= AWAY * min(across, down))
+    if step < 1e-6 or not even.all():
+        i = int(np.argmin(even))
+        raise ValueError(
+            f"path: {path} must hold slices evenly spaced along their normal; of {len(files)}, "
+            f"{files[i].name} lies {along[i]:.4g} too far along it, and {sideways[i]:.4g} sideways. Are "
+            "slices missing or there twice, or was the gantry tilted?"
+        )
+    return toward_axes(_pixels(headers, files), (across, down, step), positions[0], direction)
 
 
 def _pixels(headers: dict[Path, Any], files: list[Path]) -> np.ndarray:
@@ -96,8 +104,7 @@ def _pixels(headers: dict[Path, Any], files: list[Path]) -> np.ndarray:
 
 
 def _headers(path: Path) -> dict[Path, Any]:
-    """SimpleITK's readers of the slices of the only series in a folder, or of the one that a file belongs to,
-    with headers read."""
+    """Headers, by file, of the only series in a folder, or of the one that a file belongs to."""
     headers = {file: _header(file) for file in dicom_files(path if path.is_dir() else path.parent)}
     if path.is_file():
         series = _text(_header(path), SERIES)
@@ -113,10 +120,10 @@ def _headers(path: Path) -> dict[Path, Any]:
 
 
 def _header(path: Path) -> Any:
+    """SimpleITK's reader of a file, whose header has been read."""
     if not is_dicom(path):
         raise ValueError(
-            f'path: {path} is no DICOM file: it does not have "DICM" at byte 128. If it is no slice, remove '
-            "it."
+            f'path: {path} is no DICOM file: it has no "DICM" at byte 128. Remove it from there.'
         )
     reader = simple_itk(path).ImageFileReader()
     reader.SetImageIO("GDCMImageIO")
@@ -128,7 +135,7 @@ def _header(path: Path) -> Any:
 
 def _check_slice(path: Path, header: Any) -> None:
     syntax = _meta(path, SYNTAX)
-    if syntax not in READABLE:  # SimpleITK would take compressed bytes for pixels
+    if syntax not in PLAIN | PACKED:  # SimpleITK would take compressed bytes for pixels
         raise ValueError(
             f"path: {path} is stored in the transfer syntax {syntax}, which SimpleITK does not read. "
             "Decompress the series first, for example with gdcmconv --raw."
@@ -139,34 +146,10 @@ def _check_slice(path: Path, header: Any) -> None:
             f"path: {path} must hold one slice of one value per pixel; got size {size} and {channels} "
             "values. Files of several frames are not supported: save it as NRRD or NIfTI."
         )
-    bits = _text(header, "0028|0100")
-    n_bytes = math.prod(size) * (int(bits) // 8 if bits.isdigit() else 1)
-    check_pixels(path, n_bytes, compressed=syntax not in PLAIN)
+    n_bytes = int(_text(header, BITS)) // 8 if _text(header, BITS).isdecimal() else 1
+    check_pixels(path, math.prod(size) * n_bytes, compressed=syntax not in PLAIN)
     if missing := [tag for tag in PLACE if not _text(header, tag)]:
         raise ValueError(f"path: {path} must say where it lies: it has no element ({missing[0]}).")
-
-
-def _distance(
-    path: Path, files: list[Path], positions: np.ndarray, normal: np.ndarray, pixel: float
-) -> float:
-    """The distance between slices, which are in order and must be evenly spaced along their normal."""
-    heights = positions @ normal
-    gaps = np.diff(heights)
-    step = float(np.median(gaps))
-    uneven = np.abs(gaps - step)
-    if not (step >= 1e-6 and uneven.max() <= AWAY * step):
-        i = int(uneven.argmax())
-        raise ValueError(
-            f"path: {path} has unevenly spaced slices, or some are missing or there twice: the median "
-            f"distance is {step:g}, and {files[i].name} and {files[i + 1].name} are {gaps[i]:g} apart."
-        )
-    sideways = np.abs(positions - positions[0] - np.outer(heights - heights[0], normal)).max()
-    if sideways > AWAY * pixel:
-        raise ValueError(
-            f"path: {path} has slices that are shifted sideways by up to {sideways:.4g}, as by a tilted "
-            "gantry. Resample it on a rectangular grid."
-        )
-    return float(heights[-1] - heights[0]) / (len(files) - 1)
 
 
 def _text(header: Any, tag: str) -> str:

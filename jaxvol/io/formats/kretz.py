@@ -11,7 +11,6 @@ RAS axes, the sign of y.
 import math
 import struct
 from pathlib import Path
-from typing import BinaryIO, NoReturn
 
 import numpy as np
 from jaxtyping import UInt8
@@ -39,104 +38,83 @@ MEANING = {
 """By group and element."""
 
 
-def refuse_kretz(path: Path) -> NoReturn:
-    """Reader for `load`, whose result has no place for the geometry."""
-    raise ValueError(
-        f"path: {path} is ultrasound as acquired, whose voxels are placed by a probe. "
-        "Use volume, probe = jv.load_ultrasound(path), and render with March(step, (probe, ...)); "
-        "jv.scan_convert(volume, probe) makes a Cartesian volume of them."
-    )
-
-
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:
     """The voxels and the map of a `.vol` file. **Raises** `ValueError` for a file that is none, is cut short
     or compressed, lacks an item or holds one twice, or whose items contradict each other."""
-    n_bytes = file_size(path)
-    with path.open("rb") as stream:
-        items = _items(path, stream, n_bytes)
+    items = _items(path)
 
-        def read(tag: str, dtype: str, count: int = 1) -> np.ndarray:
-            """The numbers in an item."""
-            begin, length = items[tag]
-            expected = count * np.dtype(dtype).itemsize
-            if length != expected:
-                raise ValueError(
-                    f"path: {path}: item {_name(tag)} must have {expected} bytes; it has {length}. Of a "
-                    "compressed file, the voxels have less: save it uncompressed."
-                )
-            stream.seek(begin)
-            return np.frombuffer(stream.read(length), dtype)
-
-        planes, beams, samples = (int(read(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
-        if min(planes, beams, samples) < 2 or planes * beams * samples > MOST_VOXELS:
+    def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
+        expected = count * np.dtype(dtype).itemsize
+        if len(items[tag]) != expected:
             raise ValueError(
-                f"path: {path} must have at least 2 planes, beams and samples, and fewer than 2**31 voxels; "
-                f"its header says {planes} x {beams} x {samples}."
+                f"path: {path}: item {_name(tag)} must have {expected} bytes; it has {len(items[tag])}. Of a "
+                "compressed file, the voxels have less: save it uncompressed."
             )
-        voxels = read("D000:1", "u1", planes * beams * samples)
-        beta = _ends(path, "C300:1", read("C300:1", "<f8", planes))
-        sigma = _ends(path, "C300:2", read("C300:2", "<f8", beams))
-        resolution, first, apex = (float(read(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
+        return np.frombuffer(items[tag], dtype)
+
+    planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
+    if min(planes, beams, samples) < 2 or planes * beams * samples > MOST_VOXELS:
+        raise ValueError(
+            f"path: {path} must have at least 2 planes, beams and samples, and fewer than 2**31 voxels; its "
+            f"header says {planes} x {beams} x {samples}."
+        )
+    voxels = numbers("D000:1", "u1", planes * beams * samples).reshape(planes, beams, samples)
+    ends: list[tuple[float, float]] = []
+    for tag, count in (("C300:1", planes), ("C300:2", beams)):
+        angles = numbers(tag, "<f8", count)
+        with np.errstate(all="ignore"):  # NaN and infinity are refused below
+            even, step = np.linspace(angles[0], angles[-1], count, retstep=True)
+        if not (step > 0 and np.abs(angles - even).max() <= UNEVEN * step):
+            raise ValueError(
+                f"path: {path}: item {_name(tag)} must be evenly spaced angles that increase, up to {UNEVEN} "
+                f"of a step; got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
+            )
+        ends.append((float(angles[0]), float(angles[-1])))
+    resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
     if not 0 < resolution < math.inf:
         raise ValueError(
             f"path: {path}: item {_name('C100:1')} must be a positive length in metres; got {resolution}."
         )
     step = 1000 * resolution  # mm
     try:
-        probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (samples - 1) * step))
+        probe = ToroidalMap(apex * step, first * step, *ends, (0.0, (samples - 1) * step))
         nearest = float(probe.nearest_to_axis)
         if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
             raise ValueError(f"its outermost beams begin {-nearest:.4g} mm behind the motor axis.")
     except ValueError as fault:
         raise ValueError(f"path: {path} describes no probe: {fault}") from fault
-    return voxels.reshape(planes, beams, samples), probe
+    return voxels, probe
 
 
-def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[str, tuple[int, int]]:
-    """Where the content of each item begins, and its length, in bytes; all of `MEANING` are there. Only
-    headers are read."""
-    magic = stream.read(len(MAGIC))
-    if magic != MAGIC:
-        raise ValueError(
-            f"path: {path} is not a Kretz file: it must begin with {MAGIC!r}; got {magic!r}. "
-            "Other programs write files of other kinds that end in .vol."
-        )
-    found: dict[str, tuple[int, int]] = {}
-    end = stream.tell()
-    while any(head := stream.read(8)):  # zeros: the end, or padding
-        group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
-        tag, begin = f"{group:04X}:{element:X}", end + 8
-        end = begin + length
-        if end > n_bytes:
+def _items(path: Path) -> dict[str, bytes]:
+    """The contents of the items of `MEANING`, all of which are there."""
+    n_bytes, found = file_size(path), {}
+    with path.open("rb") as stream:
+        magic = stream.read(len(MAGIC))
+        if magic != MAGIC:
             raise ValueError(
-                f"path: {path} is cut short: item {_name(tag)} is to end at byte {end}, and it has {n_bytes}."
+                f"path: {path} is not a Kretz file: it must begin with {MAGIC!r}; got {magic!r}. "
+                "Other programs write files of other kinds that end in .vol."
             )
-        if tag in found:
-            raise ValueError(f"path: {path} holds item {_name(tag)} twice.")
-        if tag in MEANING:
-            found[tag] = begin, length
-        stream.seek(end)
+        while any(head := stream.read(8)):  # zeros: the end, or padding
+            group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
+            tag, end = f"{group:04X}:{element:X}", stream.tell() + length
+            if end > n_bytes:
+                raise ValueError(
+                    f"path: {path} is cut short: item {_name(tag)} is to end at byte {end}, and it ends at "
+                    f"{n_bytes}."
+                )
+            if tag in found:
+                raise ValueError(f"path: {path} holds item {_name(tag)} twice.")
+            if tag in MEANING:
+                found[tag] = stream.read(length)
+            stream.seek(end)
     if missing := [_name(tag) for tag in MEANING if tag not in found]:
         raise ValueError(
             f"path: {path} has no item {', no item '.join(missing)}. Compressed files, several frames and "
             "Cartesian volumes are not supported: save it as one uncompressed volume as acquired."
         )
     return found
-
-
-def _ends(path: Path, tag: str, angles: np.ndarray) -> tuple[float, float]:
-    """The first and the last of evenly spaced angles."""
-    first, last = float(angles[0]), float(angles[-1])
-    with np.errstate(all="ignore"):  # NaN and infinity are refused below
-        step = (last - first) / (len(angles) - 1)
-        away = np.abs(angles - np.linspace(first, last, len(angles))).max() / step
-    if not (step > 0 and away <= UNEVEN):
-        raise ValueError(
-            f"path: {path}: item {_name(tag)} must be evenly spaced angles that increase; got {len(angles)} "
-            f"from {first} to {last}, up to {away:.3g} steps away from even ones (at most {UNEVEN}). "
-            "Resample the volume at even angles first."
-        )
-    return first, last
 
 
 def _name(tag: str) -> str:

@@ -15,12 +15,6 @@ import numpy as np
 from ..._util.files import MOST_VOXELS, check_size, decoding, file_size
 
 
-NIFTI_HEADERS = {348, 540}
-"""Bytes of a header, of NIfTI-1 and NIfTI-2."""
-
-LONGEST_LINE, MOST_FIELDS = 2**16, 2**10
-"""Of a header in text. A file that has more is corrupt."""
-
 ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
@@ -46,7 +40,7 @@ def read_nifti(path: Path) -> dict[str, Any]:
     reader.SetImageIO("NiftiImageIO")
     with decoding(path), gzip.open(path) if packed else path.open("rb") as stream:
         begin = stream.read(4)  # of other files, ITK's library prints text of its own
-        if not {int.from_bytes(begin, order) for order in ("little", "big")} & NIFTI_HEADERS:
+        if not {int.from_bytes(begin, order) for order in ("little", "big")} & {348, 540}:
             raise ValueError(
                 f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; "
                 f"this one with the bytes {begin.hex(' ')}. Fetch or write it again."
@@ -75,10 +69,11 @@ def read_nrrd(path: Path) -> dict[str, Any]:
                 f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
                 f"got {encoding!r} and {source}."
             )
-        with source.open("rb") as stream:
-            stream.seek(begin)
-            packed = encoding != "raw"
-            held = gzip.GzipFile(fileobj=stream).seek(expected) if packed else source.stat().st_size - begin
+        held = source.stat().st_size - begin
+        if encoding != "raw":
+            with source.open("rb") as stream:
+                stream.seek(begin)
+                held = gzip.GzipFile(fileobj=stream).seek(expected)
         check_size(path, held, expected, more=True)
         return _volume(path, reader)
 
@@ -125,8 +120,8 @@ def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, s
     `last`."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
-        while last not in fields and len(fields) < MOST_FIELDS:
-            line = stream.readline(LONGEST_LINE).decode("latin-1").strip()
+        while last not in fields and len(fields) < 2**10:  # a file that has more is corrupt
+            line = stream.readline(2**16).decode("latin-1").strip()
             if not line:
                 break
             key, _, value = line.partition(separator)

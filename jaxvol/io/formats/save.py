@@ -10,7 +10,6 @@ from ..._util.checks import described, output_file
 from ..._util.files import reason
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume
-from ...xla.platform import is_traced
 from .medical import simple_itk
 
 
@@ -37,17 +36,15 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 
     **Returns:** the path.
 
-    **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
-    of voxels that the format cannot hold, and a file that cannot be written. `ImportError` if the format
-    needs SimpleITK, and it is missing.
+    **Raises:** `ValueError` for an unknown ending, a volume that has a field, labels or a type of voxels that
+    the format cannot hold, and a file that cannot be written. `ImportError` if the format needs SimpleITK,
+    and it is missing.
     """
     if not isinstance(volume, Volume):
-        hint = " The volume comes first, as in save(volume, path)." if isinstance(path, Volume) else ""
-        raise ValueError(f"volume must be a Volume; got {described(volume)}.{hint}")
+        told = f"volume must be a Volume; got {described(volume)}"
+        raise ValueError(f"{told}. The volume comes first, as in save(volume, path).")
     if not isinstance(path, str | os.PathLike):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
-    if is_traced(volume):
-        raise ValueError("volume must not be traced: save it outside of jit and grad.")
     if volume.field is not None:
         raise ValueError("volume must have voxels; got one with a field. Save an array of its values.")
     path = output_file("path", path)

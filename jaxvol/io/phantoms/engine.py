@@ -14,7 +14,7 @@ BORES, CRANK = (-0.42, 0.0, 0.42), -0.52  # x of the cylinders, z of the cranksh
 PORTS = [capsule((x, s * 0.37, 0.405), (x, s * 0.09, 0.33), 0.05) for x in BORES for s in (-1, 1)]
 
 
-def draw(canvas: Canvas, rng: np.random.Generator) -> None:
+def draw_engine(canvas: Canvas, rng: np.random.Generator) -> None:
     for value, build in ((90, _pipes), (150, _cast), (240, _steel)):
         canvas.paint(value, canvas.field(build))
 

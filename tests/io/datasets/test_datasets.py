@@ -26,7 +26,7 @@ SHAPE = (40, 30, 80)
 DATA = np.random.default_rng(0).integers(0, 2**16, SHAPE, dtype=np.uint16)
 CONTENT = DATA.astype("<u2").tobytes(order="F")
 SUM = hashlib.sha512(CONTENT).hexdigest()
-NOISE = Dataset("noise", "Noise of 2026", "Test", SHAPE, "uint16", (1.0, 2.0, 3.0), SUM, "", "")
+NOISE = Dataset("noise", "Noise of 2026", SHAPE, "uint16", (1.0, 2.0, 3.0), SUM, "", "")
 
 
 @pytest.fixture(autouse=True)

@@ -168,14 +168,14 @@ def huge(folder, paths):
 
 OTHER = {"0020|000e": "9.9", "0008|103e": "head"}
 BAD = {
-    "a tilted gantry": (tilted, r"shifted sideways by up to 2.*tilted gantry"),
+    "a tilted gantry": (tilted, r"evenly spaced.*0\.5 sideways\. .*gantry tilted"),
     "a slice is missing": (
         lambda folder, paths: paths[2].unlink(),
-        r"unevenly spaced slices, or some are missing .*: the median distance is 2\.5, .* are 5 apart",
+        r"evenly spaced.*IM\d+\.dcm lies -?0\.8333 too far along it, and [0-9.e-]+ sideways. Are slices missing",
     ),
     "a slice is there twice": (
         lambda folder, paths: (folder / "copy.dcm").write_bytes(paths[1].read_bytes()),
-        r"there twice: the median distance is 2\.5, and (IM\d+.dcm and copy.dcm|copy.* and IM.*) are 0 apart",
+        r"evenly spaced.*(IM\d+|copy)\.dcm lies -?[0-9.]+ too far along it.*there twice",
     ),
     "two series": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, tags=OTHER),
