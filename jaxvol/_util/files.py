@@ -53,15 +53,6 @@ def check_size(path: Path, size: int, expected: int, *, more: bool = False) -> N
         )
 
 
-def check_pixels(path: Path, expected: int, *, compressed: bool) -> None:
-    """Check that a file is large enough for so many bytes of pixels."""
-    size = path.stat().st_size
-    if size * (MOST_COMPRESSED if compressed else 1) < expected:
-        raise ValueError(
-            f"path: {path} is cut short: it has {size} bytes, and its header announces pixels of {expected}."
-        )
-
-
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
     """Turn any error of a decoder within the context into the `ValueError` of a corrupt file."""

@@ -19,41 +19,20 @@ def whole_file(path: Path) -> Iterator[Path]:
     replaced; a pipe or a device is written to."""
     name, path = path.name, path.resolve()
     special = path.exists() and not (path.is_file() or path.is_dir())
-    with _temporary_folder(Path(tempfile.gettempdir()) / name if special else path) as folder:
+    nearest = next(folder for folder in path.parents if folder.exists())  # on the same disk
+    folder = Path(tempfile.mkdtemp(prefix=".jaxvol-", dir=None if special else nearest))
+    _UNFINISHED.add(folder)
+    try:
         yield folder / name
         if special:
             with (folder / name).open("rb") as content, path.open("wb") as target:
                 shutil.copyfileobj(content, target)
         else:
-            _move(folder / name, path)
-
-
-@contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """An empty temporary folder to write files to. When the context ends they are moved into `path`, and
-    other files there stay; after an error nothing has changed."""
-    path = path.resolve()
-    with _temporary_folder(path) as folder:
-        yield folder
-        for file in sorted(file for file in folder.rglob("*") if not file.is_dir()):
-            _move(file, path / file.relative_to(folder))
-
-
-@contextmanager
-def _temporary_folder(path: Path) -> Iterator[Path]:
-    nearest = next(folder for folder in path.parents if folder.exists())  # on the same disk
-    folder = Path(tempfile.mkdtemp(prefix=".jaxvol-", dir=nearest))
-    _UNFINISHED.add(folder)
-    try:
-        yield folder
+            path.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(folder / name, path)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         _UNFINISHED.discard(folder)
-
-
-def _move(file: Path, path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    os.replace(file, path)
 
 
 def remove_unfinished() -> None:

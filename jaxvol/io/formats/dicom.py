@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, check_pixels, decoding
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, decoding
 from .medical import orthonormal, simple_itk, toward_axes
 
 
@@ -71,7 +71,7 @@ def read_dicom(path: Path) -> dict[str, Any]:
         if not np.allclose(grid, grids[first], rtol=1e-4, atol=1e-4):
             raise ValueError(
                 f"path: {path}: slices of one series must agree in size, spacing and directions; "
-                f"{first.name} and {file.name} do not: {grids[first]} and {grid}. Is one of them an overview image?"
+                f"{first.name} and {file.name} do not: {grids[first]} and {grid}. Is one an overview?"
             )
     direction = orthonormal(f"path: {path}: rows and columns of {first.name}", headers[first].GetDirection())
     normal = direction[:, 2]
@@ -147,7 +147,8 @@ def _check_slice(path: Path, header: Any) -> None:
             "values. Files of several frames are not supported: save it as NRRD or NIfTI."
         )
     n_bytes = int(_text(header, BITS)) // 8 if _text(header, BITS).isdecimal() else 1
-    check_pixels(path, math.prod(size) * n_bytes, compressed=syntax not in PLAIN)
+    held = path.stat().st_size * (1 if syntax in PLAIN else MOST_COMPRESSED)
+    check_size(path, held, math.prod(size) * n_bytes, more=True)
     if missing := [tag for tag in PLACE if not _text(header, tag)]:
         raise ValueError(f"path: {path} must say where it lies: it has no element ({missing[0]}).")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, check_pixels, file_size
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size
 
 
 ENDINGS = (".tif", ".tiff")
@@ -87,7 +87,8 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
                     f"{file.series[0].shape} ({axes}), and pages of {len(kinds)} kinds."
                 )
             packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
-            check_pixels(path, math.prod(shape) * first.dtype.itemsize, compressed=packed)
+            held = path.stat().st_size * (MOST_COMPRESSED if packed else 1)
+            check_size(path, held, math.prod(shape) * first.dtype.itemsize, more=True)
             images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
             return images.reshape(-1, *shape[-2:]), _spacing(tifffile, file)
     except MemoryError:
