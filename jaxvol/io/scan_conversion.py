@@ -53,8 +53,7 @@ def scan_convert(
     - `origin`: the world position of the first node; by default such that the sector is in the middle.
     - `fill_value`: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
 
-    **Returns:** a `Volume` with its spacing and origin. A grid node within rounding of a face counts as
-    inside.
+    **Returns:** a `Volume` with its spacing and origin. Nodes within rounding of a face count as inside.
 
     **Raises:** `ValueError` for arguments of other kinds, a spacing that is not positive, a grid of 2**31
     nodes or more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.

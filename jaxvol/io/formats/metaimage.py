@@ -1,8 +1,5 @@
-"""Reads MetaImage files (`.mha`, `.mhd`): a header in text, and the voxels behind it or in another file.
-
-SimpleITK hangs on some that are damaged, and leaves voxels unset where a header understates the number of
-compressed bytes, so that they are read here.
-"""
+"""Reads MetaImage files (`.mha`, `.mhd`), on some of which SimpleITK hangs, or leaves voxels unset where a
+header understates the number of compressed bytes."""
 
 import math
 import zlib

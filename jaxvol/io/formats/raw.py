@@ -1,7 +1,4 @@
-"""Reads arrays from files without a header.
-
-Shape and type are given by the caller, by a JSON file beside the file, or by its name.
-"""
+"""Reads arrays from files without a header: a caller, a JSON file or the name tells their shape and type."""
 
 import gzip
 import json
@@ -41,7 +38,7 @@ def raw_header(
     path: Path, shape: Any, dtype: Any, bits: int
 ) -> tuple[tuple[int, int, int], np.dtype, dict[str, Any]]:
     """Shape (nx, ny, nz) with less than 2**`bits` voxels, stored type, and spacing and origin where they are
-    known, of a raw file: as given by the caller, else by a JSON file beside it, else by its name."""
+    known, of a raw file: as given by the caller, else by its JSON file, else by its name."""
     match = SCIVIS_NAME.search(path.name)
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
     given = {"shape": shape, "dtype": dtype}
@@ -49,10 +46,27 @@ def raw_header(
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
             f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
-            f'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
+            f'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put {path.name}.json in its folder with '
             '{"size": [nx, ny, nz], "type": "uint8"}.'
         )
-    return _shape(path, fields.pop("shape"), bits), _dtype(path, fields.pop("dtype")), fields
+    shape, dtype = fields.pop("shape"), fields.pop("dtype")
+    try:
+        nx, ny, nz = map(operator.index, shape)
+    except (TypeError, ValueError):
+        nx = ny = nz = 0
+    if min(nx, ny, nz) < 1 or nx * ny * nz >= 2**bits:
+        raise ValueError(
+            f"shape must be three positive integers (nx, ny, nz) with a product less than 2**{bits}; got "
+            f"{shape!r} for {path}."
+        )
+    found = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
+    if found is None:
+        raise ValueError(
+            "dtype must be uint8, int8, uint16, int16, float16, float32 or float64, optionally with le or be "
+            f"appended for the byte order; got {dtype!r} for {path}."
+        )
+    order = ">" if (found[2] or "").lower() == "be" else "<"
+    return (nx, ny, nz), np.dtype(found[1].lower()).newbyteorder(order), fields
 
 
 def raw_json(path: Path) -> list[Path]:
@@ -72,26 +86,3 @@ def _json_fields(path: Path) -> dict[str, Any]:
             raise ValueError(f"path: the header {file} must be a JSON object; got {type(fields).__name__}.")
         return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
     return {}
-
-
-def _shape(path: Path, shape: Any, bits: int) -> tuple[int, int, int]:
-    try:
-        nx, ny, nz = map(operator.index, shape)
-    except (TypeError, ValueError):
-        nx = ny = nz = 0
-    if min(nx, ny, nz) < 1 or nx * ny * nz >= 2**bits:
-        raise ValueError(
-            "shape must be three positive integers (nx, ny, nz) with a product less than "
-            f"2**{bits}; got {shape!r} for {path}."
-        )
-    return nx, ny, nz
-
-
-def _dtype(path: Path, dtype: Any) -> np.dtype:
-    match = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
-    if match is None:
-        raise ValueError(
-            "dtype must be uint8, int8, uint16, int16, float16, float32 or float64, optionally with le or be "
-            f"appended for the byte order; got {dtype!r} for {path}."
-        )
-    return np.dtype(match[1].lower()).newbyteorder(">" if (match[2] or "").lower() == "be" else "<")

@@ -37,20 +37,16 @@ def tiff_files(folder: Path) -> list[Path]:
 
 
 def read_tiff_folder(folder: Path) -> dict[str, Any]:
-    """Reader for a folder of files of one page each, in the order of the numbers in their names.
-
-    **Raises:** `ValueError` naming the files for images of different sizes or types, and for a number that is
-    missing in a sequence.
-    """
-    files = tiff_files(folder)
+    """Reader for a folder of files of one page each, in the order of the numbers in their names. **Raises**
+    `ValueError` naming the files for images of different sizes or types, and for a number that is missing."""
+    files, slices = tiff_files(folder), []
     numbers = [int(found[-1]) for file in files if (found := re.findall(r"[0-9]+", file.stem))]
-    steps = np.diff(numbers)
-    if len(numbers) == len(files) and steps.size and np.all(steps > 0) and steps.min() != steps.max():
+    steps = np.diff(numbers).tolist()
+    if len(numbers) == len(files) and len(set(steps)) > 1 and min(steps) > 0:
         i = int(np.argmax(steps))
         raise ValueError(
             f"path: slices are missing in {folder}: {files[i].name} is followed by {files[i + 1].name}."
         )
-    slices: list[np.ndarray] = []
     for file in files:
         image, _ = _images(file)
         slices.append(image)

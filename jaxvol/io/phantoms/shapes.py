@@ -15,18 +15,17 @@ from jaxtyping import Float
 
 Point: TypeAlias = Sequence[float | int] | Float[np.ndarray, "3"]
 Block: TypeAlias = Float[np.ndarray, "_ _ _"]
-Distance: TypeAlias = Callable[[Block, Block, Block], Block]
 
 
 class Shape(NamedTuple):
     """Signed distance on an open mesh (x, y, z), and two corners of the bounding box."""
 
-    distance: Distance
+    distance: Callable[[Block, Block, Block], Block]
     low: Point
     high: Point
 
 
-def _around(distance: Distance, center: Point, half: Point) -> Shape:
+def _around(distance: Callable[[Block, Block, Block], Block], center: Point, half: Point) -> Shape:
     return Shape(distance, np.subtract(center, half), np.add(center, half))
 
 
