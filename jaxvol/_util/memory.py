@@ -8,7 +8,7 @@ import jax
 
 
 def require_room(wanted: int, of: str) -> None:
-    """**Raises** `ValueError` if the device has less than the bytes `wanted` by these arguments (`of`)."""
+    """Raises `ValueError` if the device has less than the bytes `wanted` by these arguments (`of`)."""
     if wanted > (room := memory_of_device()):
         asked, held = wanted / 2**30, room / 2**30
         raise ValueError(f"{of}: asks for {asked:.3g} GiB of memory, and the device has {held:.3g} GiB.")

@@ -14,7 +14,7 @@ def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The values as data[x, y, z], and `spacing` and `origin` where coordinates tell them.
 
     Axes named x, y and z are put in this order. Coordinates that fall are reversed, with the data. Axes
-    without coordinates have spacing 1 from 0 on. **Raises** `ValueError` for uneven coordinates.
+    without coordinates have spacing 1 from 0 on. Raises `ValueError` for uneven coordinates.
     """
     if sorted(map(str, value.dims)) == ["x", "y", "z"]:
         value = value.transpose("x", "y", "z")

@@ -18,7 +18,7 @@ Word: TypeAlias = UInt32[Array, "..."]
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:
     """The 32-bit word of a seed: an integer in [0, 2³²), which if traced is taken modulo 2³², or a key of
-    `jax.random`. **Raises** `ValueError` for anything else."""
+    `jax.random`. Raises `ValueError` for anything else."""
     if is_key(seed):
         return jax.random.bits(seed, (), jnp.uint32)
     if is_traced(seed) and jnp.shape(seed) == () and jnp.issubdtype(jnp.result_type(seed), jnp.integer):

@@ -10,9 +10,11 @@ from .checks import Arrayable
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
     """Linear colour to sRGB display values, both in [0, 1]; values outside are clipped.
 
-    **Arguments:** `linear`: colours, of any shape.
+    Args:
+        linear: colours, of any shape.
 
-    **Returns:** the values, of the same shape.
+    Returns:
+        The values, of the same shape.
 
     Source: IEC 61966-2-1.
     """
@@ -22,9 +24,11 @@ def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
     """sRGB display values (as of a matplotlib colormap) to linear colour, both in [0, 1].
 
-    **Arguments:** `display`: values, of any shape.
+    Args:
+        display: values, of any shape.
 
-    **Returns:** the colours, of the same shape.
+    Returns:
+        The colours, of the same shape.
 
     Source: IEC 61966-2-1.
     """

@@ -53,7 +53,7 @@ def _on_device(array: Array | np.ndarray) -> Array:
 
 
 def check_shape(shape: tuple[int, ...]) -> None:
-    """**Raises** `ValueError` unless an array of this shape can be a volume's voxels."""
+    """Raises `ValueError` unless an array of this shape can be a volume's voxels."""
     if len(shape) != 3 or min(shape) < 2:
         raise ValueError(
             f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {shape}. "
@@ -62,7 +62,7 @@ def check_shape(shape: tuple[int, ...]) -> None:
 
 
 def check_type(dtype: np.dtype) -> None:
-    """**Raises** `ValueError` unless voxels of this type are supported or can be converted."""
+    """Raises `ValueError` unless voxels of this type are supported or can be converted."""
     if dtype.kind not in "bui" and dtype.name not in (*DTYPES, "float64"):
         raise ValueError(
             f"data must be of type {', '.join(DTYPES)}; got {dtype}. Convert it, for example with "

@@ -30,19 +30,20 @@ def save_image(
     A viewer blends a transparent PNG over its background in sRGB, `Rendering.image` blends in linear light;
     the two look different where the opacity lies between 0 and 1.
 
-    **Arguments:**
+    Args:
+        path: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
+        linear: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA, (height,
+            width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which may
+            be infinite. 8-bit formats clip to [0, 1].
+        text: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries, as `Image.info` of Pillow has
+            them; other formats carry none.
 
-    - `path`: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
-    - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
-      (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
-      may be infinite. 8-bit formats clip to [0, 1].
-    - `text`: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries, as `Image.info` of Pillow has
-      them; other formats carry none.
+    Returns:
+        The path. Its folder is created if it does not exist. The file appears whole or not at all.
 
-    **Returns:** the path. Its folder is created if it does not exist. The file appears whole or not at all.
-
-    **Raises:** `ValueError` for input that is not an array, an unknown extension, a shape that the format
-    does not hold, NaN, infinite colours, and a path that cannot be written.
+    Raises:
+        ValueError: for input that is not an array, an unknown extension, a shape that the format does not
+            hold, NaN, infinite colours, and a path that cannot be written.
     """
     if not isinstance(path, str | os.PathLike):
         told = f"path must be a str or a path; got {described(path)}"
@@ -78,14 +79,15 @@ def save_image(
 def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
     """`save_image` for a path that must end in `.png`.
 
-    **Arguments:**
+    Args:
+        path: as for `save_image`.
+        linear: as for `save_image`, with three or four channels.
 
-    - `path`: as for `save_image`.
-    - `linear`: as for `save_image`, with three or four channels.
+    Returns:
+        The path.
 
-    **Returns:** the path.
-
-    **Raises:** `ValueError` as `save_image` does, and for another ending.
+    Raises:
+        ValueError: as `save_image` does, and for another ending.
     """
     if isinstance(path, str | os.PathLike) and Path(path).suffix.lower() != ".png":
         raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")
@@ -105,13 +107,13 @@ def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -
     of theirs, since resampling would hide what samples do. It is for notebooks, where the picture appears
     under the cell.
 
-    **Arguments:**
+    Args:
+        images: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
+            Values outside of [0, 1] are clipped. Sizes may differ.
+        columns: how many images stand in a row at most.
 
-    - `images`: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
-      Values outside of [0, 1] are clipped. Sizes may differ.
-    - `columns`: how many images stand in a row at most.
-
-    **Raises:** `ValueError` for no image, an image of another shape, NaN, and a number of columns below 1.
+    Raises:
+        ValueError: for no image, an image of another shape, NaN, and a number of columns below 1.
     """
     if not isinstance(images, Mapping) or not images:
         raise ValueError(

@@ -42,21 +42,22 @@ def scan_convert(
     face its value jumps, which the gradient does not see. Memory is taken for the result and for one plane of
     nodes at a time; for floats, which are checked to be finite, as much again.
 
-    **Arguments:**
+    Args:
+        volume: as acquired, `data[β, σ, γ]`. Its labels, if any, become those of the nearest sample, and 0
+            outside.
+        probe: the map that places the samples; the result lies in the same world.
+        spacing: of the grid, one number or three, world length (mm); by default the distance between the
+            samples of a beam, as fine as they are anywhere.
+        shape: number of nodes along x, y, z, at least 2; by default those that just enclose the sector.
+        origin: the world position of the first node; by default such that the sector is in the middle.
+        fill_value: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
 
-    - `volume`: as acquired, `data[β, σ, γ]`. Its labels, if any, become those of the nearest sample, and 0
-      outside.
-    - `probe`: the map that places the samples; the result lies in the same world.
-    - `spacing`: of the grid, one number or three, world length (mm); by default the distance between the
-      samples of a beam, as fine as they are anywhere.
-    - `shape`: number of nodes along x, y, z, at least 2; by default those that just enclose the sector.
-    - `origin`: the world position of the first node; by default such that the sector is in the middle.
-    - `fill_value`: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
+    Returns:
+        A `Volume` with its spacing and origin. Nodes within rounding of a face count as inside.
 
-    **Returns:** a `Volume` with its spacing and origin. Nodes within rounding of a face count as inside.
-
-    **Raises:** `ValueError` for arguments of other kinds, a spacing that is not positive, a grid of 2**31
-    nodes or more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.
+    Raises:
+        ValueError: for arguments of other kinds, a spacing that is not positive, a grid of 2**31 nodes or
+            more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.
     """
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a Volume; got {described(volume)}.")

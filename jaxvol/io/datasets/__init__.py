@@ -27,15 +27,14 @@ OPEN_SCIVIS = "http://klacansky.com/open-scivis-datasets"
 class Dataset:
     """What is known of a dataset without fetching it.
 
-    **Attributes:**
-
-    - `name`: what `fetch` and `load` call it.
-    - `title`: as published.
-    - `shape`: number of voxels along x, y, z.
-    - `dtype`: their type, little-endian.
-    - `spacing`: between neighbouring voxels, in the units of its authors.
-    - `sha512`: of the raw file, in hexadecimal digits.
-    - `acknowledgement`: to cite where the data are shown.
+    Attributes:
+        name: what `fetch` and `load` call it.
+        title: as published.
+        shape: number of voxels along x, y, z.
+        dtype: their type, little-endian.
+        spacing: between neighbouring voxels, in the units of its authors.
+        sha512: of the raw file, in hexadecimal digits.
+        acknowledgement: to cite where the data are shown.
     """
 
     name: str
@@ -82,11 +81,14 @@ def names() -> list[str]:
 def info(name: str | Any) -> Dataset:
     """What is known of a dataset; nothing is fetched.
 
-    **Arguments:** `name`: one of `names()`, or the title that it was published under; case is ignored.
+    Args:
+        name: one of `names()`, or the title that it was published under; case is ignored.
 
-    **Returns:** its entry in the published list.
+    Returns:
+        Its entry in the published list.
 
-    **Raises:** `ValueError` for a name that is not in the list.
+    Raises:
+        ValueError: for a name that is not in the list.
     """
     wanted = name.strip().lower() if isinstance(name, str) else None
     for dataset in registry().values():
@@ -102,18 +104,20 @@ def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, prog
     `.raw.gz`, then in the cache. If it is in neither, it is downloaded (`pip install jaxvol[datasets]`), and
     kept if its SHA-512 is the published one.
 
-    **Arguments:**
+    Args:
+        name: one of `names()`; case is ignored. `info(name).nbytes` tells how much will be fetched.
+        folder: the cache; by default `jaxvol/datasets` in the user's (`$XDG_CACHE_HOME`).
+        progress: show a progress bar of what is downloaded.
 
-    - `name`: one of `names()`; case is ignored. `info(name).nbytes` tells how much will be fetched.
-    - `folder`: the cache; by default `jaxvol/datasets` in the user's (`$XDG_CACHE_HOME`).
-    - `progress`: show a progress bar of what is downloaded.
+    Returns:
+        The path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of one that
+        was there before, only the size is checked.
 
-    **Returns:** the path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of
-    one that was there before, only the size is checked.
-
-    **Raises:** `ValueError` for a name that is not in the list, a file of another size, or a download with
-    another SHA-512; `OSError` where the server cannot be reached, has no such file, or does not send all of
-    it; `ImportError` if a download needs pooch, and it is missing.
+    Raises:
+        ValueError: for a name that is not in the list, a file of another size, or a download with another
+            SHA-512.
+        OSError: where the server cannot be reached, has no such file, or does not send all of it.
+        ImportError: if a download needs pooch, and it is missing.
     """
     dataset = info(name)
     own = os.environ.get("JAXVOL_DATA")
@@ -154,16 +158,19 @@ def _of_right_size(path: Path, dataset: Dataset) -> Path:
 def load(name: str | Any, *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Volume:
     """A dataset as a `Volume`; it is fetched first, if it is not on this machine yet.
 
-    **Arguments:**
+    Args:
+        name: as for `fetch`.
+        folder: as for `fetch`.
+        progress: as for `fetch`.
 
-    - `name`: as for `fetch`.
-    - `folder`: as for `fetch`.
-    - `progress`: as for `fetch`.
+    Returns:
+        The volume, with the published spacing.
 
-    **Returns:** the volume, with the published spacing.
-
-    **Raises:** `ValueError` as `fetch`, and for one of 2³¹ voxels or more: give the path that `fetch` returns
-    to `render_bricks`. `OSError` and `ImportError` as `fetch`.
+    Raises:
+        ValueError: as `fetch`, and for one of 2³¹ voxels or more: give the path that `fetch` returns to
+            `render_bricks`.
+        OSError: as `fetch`.
+        ImportError: as `fetch`.
     """
     dataset = info(name)
     voxels = math.prod(dataset.shape)

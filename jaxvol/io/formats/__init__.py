@@ -71,24 +71,26 @@ def load(
     and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie. Integers
     of 32 and 64 bits, from any kind of file, are converted to smaller types, as described in `Volume`.
 
-    **Arguments:**
+    Args:
+        path: the file.
+        shape: number of voxels along x, y, z; raw files only.
+        dtype: uint8, int8, uint16, int16, float16, float32 or float64, little-endian unless it ends in `be`
+            (`uint16be`); raw files only.
+        spacing: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
+        origin: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
+        direction: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
+        labels: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
+            at the same place: it becomes the volume's labels.
 
-    - `path`: the file.
-    - `shape`: number of voxels along x, y, z; raw files only.
-    - `dtype`: uint8, int8, uint16, int16, float16, float32 or float64, little-endian unless it ends in
-      `be` (`uint16be`); raw files only.
-    - `spacing`: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
-    - `origin`: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
-    - `direction`: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
-    - `labels`: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
-      at the same place: it becomes the volume's labels.
+    Returns:
+        The `Volume`, with voxels in the file's type except as described above.
 
-    **Returns:** the `Volume`, with voxels in the file's type except as described above.
-
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, of another size than
-    its header says, or without a header; for an image that is not 3-D or not scalar; for several DICOM series
-    in a folder, or slices that do not fit together; for labels that lie elsewhere; and for anything that
-    `Volume` rejects. `ImportError` for a format that needs SimpleITK or tifffile if it is missing.
+    Raises:
+        ValueError: for a file that is missing, empty, corrupt, of unknown kind, of another size than its
+            header says, or without a header; for an image that is not 3-D or not scalar; for several DICOM
+            series in a folder, or slices that do not fit together; for labels that lie elsewhere; and for
+            anything that `Volume` rejects.
+        ImportError: for a format that needs SimpleITK or tifffile if it is missing.
     """
     arguments = read(path, shape, dtype)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
@@ -141,7 +143,7 @@ def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
 
 def files_of(path: Path) -> list[Path]:
     """The files that `load` reads for a volume: of a folder, its slices; with a header, what it names; of one
-    DICOM file, those of its series. None where there is no volume. **Raises** as `load` for a bad header."""
+    DICOM file, those of its series. None where there is no volume. Raises as `load` for a bad header."""
     if path.is_dir():
         return dicom_files(path) or tiff_files(path)
     if not path.is_file():  # a device may have no end
@@ -163,14 +165,17 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
     depth γ = 0. The format is not published: the reader is written after those of SlicerHeart and
     plooney/kretz, and tested on files of its tests alone, not on a scanner's own.
 
-    **Arguments:** `path`: the file.
+    Args:
+        path: the file.
 
-    **Returns:** the volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render
-    them with `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
+    Returns:
+        The volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render them with
+        `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
 
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, cut short, compressed, of another
-    kind, or lacks an item; for angles that are not evenly spaced to 0.01 of a step; and for what
-    `ToroidalMap` and `Volume` reject.
+    Raises:
+        ValueError: for a file that is missing, empty, corrupt, cut short, compressed, of another kind, or
+            lacks an item; for angles that are not evenly spaced to 0.01 of a step; and for what
+            `ToroidalMap` and `Volume` reject.
     """
     data, probe = read_kretz(_existing(path))
     return Volume(data), probe

@@ -54,8 +54,9 @@ def series_files(path: Path) -> list[Path]:
 def read_dicom(path: Path) -> dict[str, Any]:
     """Reader for a folder that holds one series, or for one file of a series, whose others are in its folder.
 
-    **Raises:** `ValueError` for several series, and for slices that are missing, there twice, of different
-    sizes or directions, shifted sideways, cut short, or compressed in a way that SimpleITK does not read.
+    Raises:
+        ValueError: for several series, and for slices that are missing, there twice, of different sizes or
+            directions, shifted sideways, cut short, or compressed in a way that SimpleITK does not read.
     """
     headers = _headers(path)
     for file, header in headers.items():

@@ -39,7 +39,7 @@ MEANING = {
 
 
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:
-    """The voxels and the map of a `.vol` file. **Raises** `ValueError` for a file that is none, is cut short
+    """The voxels and the map of a `.vol` file. Raises `ValueError` for a file that is none, is cut short
     or compressed, lacks an item or holds one twice, or whose items contradict each other."""
     items = _items(path)
 

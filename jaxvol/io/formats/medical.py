@@ -25,7 +25,7 @@ a squared length from 1: files hold directions of a few decimal places."""
 
 
 def simple_itk(path: Path) -> Any:
-    """The module SimpleITK. **Raises** `ImportError` that says what to install for `path`."""
+    """The module SimpleITK. Raises `ImportError` that says what to install for `path`."""
     try:
         import SimpleITK  # pyright: ignore[reportMissingImports]
     except ImportError as fault:
@@ -79,7 +79,7 @@ def read_nrrd(path: Path) -> dict[str, Any]:
 
 
 def _read_header(path: Path, reader: Any) -> int:
-    """Read the header of an image, which must be one of a volume. **Returns** the number of its voxels."""
+    """Read the header of an image, which must be one of a volume. Returns the number of its voxels."""
     reader.SetFileName(str(path))
     reader.ReadImageInformation()
     size, channels = reader.GetSize(), reader.GetNumberOfComponents()
@@ -88,7 +88,7 @@ def _read_header(path: Path, reader: Any) -> int:
 
 
 def check_volume(path: Path, size: Any, channels: Any) -> None:
-    """**Raises** `ValueError` for an image that is no volume of one value per voxel."""
+    """Raises `ValueError` for an image that is no volume of one value per voxel."""
     if len(size) != 3 or channels != 1 or min(size) < 1 or math.prod(size) > MOST_VOXELS:
         raise ValueError(
             f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; got size "
@@ -130,7 +130,7 @@ def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, s
 
 
 def orthonormal(what: str, direction: Any) -> np.ndarray:
-    """The orthonormal directions (columns) nearest to those of a file, which are rounded there. **Raises**
+    """The orthonormal directions (columns) nearest to those of a file, which are rounded there. Raises
     `ValueError`, which begins with `what`, if they are farther from that than by rounding."""
     columns = np.reshape(np.asarray(direction, float), (3, 3))
     if not np.allclose(columns.T @ columns, np.eye(3), rtol=0, atol=ROUNDED):

@@ -29,16 +29,17 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
     voxel where it was in the world. A file that is there is replaced, at once when the new one is whole.
 
-    **Arguments:**
+    Args:
+        volume: with voxels, not with a `field`. It comes first; `save_png`, of images, has the path first.
+        path: the file to write. Folders are made where they are missing.
 
-    - `volume`: with voxels, not with a `field`. It comes first; `save_png`, of images, has the path first.
-    - `path`: the file to write. Folders are made where they are missing.
+    Returns:
+        The path.
 
-    **Returns:** the path.
-
-    **Raises:** `ValueError` for an unknown ending, a volume that has a field, labels or a type of voxels that
-    the format cannot hold, and a file that cannot be written. `ImportError` if the format needs SimpleITK,
-    and it is missing.
+    Raises:
+        ValueError: for an unknown ending, a volume that has a field, labels or a type of voxels that the
+            format cannot hold, and a file that cannot be written.
+        ImportError: if the format needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
         told = f"volume must be a Volume; got {described(volume)}"

@@ -37,7 +37,7 @@ def tiff_files(folder: Path) -> list[Path]:
 
 
 def read_tiff_folder(folder: Path) -> dict[str, Any]:
-    """Reader for a folder of files of one page each, in the order of the numbers in their names. **Raises**
+    """Reader for a folder of files of one page each, in the order of the numbers in their names. Raises
     `ValueError` naming the files for images of different sizes or types, and for a number that is missing."""
     files, slices = tiff_files(folder), []
     numbers = [int(found[-1]) for file in files if (found := re.findall(r"[0-9]+", file.stem))]
@@ -96,7 +96,7 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _check_last(path: Path, file: Any) -> None:
-    """**Raises** `ValueError` if more pages follow: tifffile leaves out what lies beyond the file's end."""
+    """Raises `ValueError` if more pages follow: tifffile leaves out what lies beyond the file's end."""
     format, handle = file.tiff, file.filehandle
     handle.seek(file.pages[-1].aspage().offset)
     (tags,) = struct.unpack(format.tagnoformat, handle.read(format.tagnosize))

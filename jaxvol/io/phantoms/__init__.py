@@ -66,28 +66,29 @@ def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> V
     | name | type | what |
     |---|---|---|
     | `head` | uint8 | CT-like head, face towards -y, crown towards +z; the -z face cuts the neck. Air 0, \
-skin 78, muscle 100, brain and cord 105 to 130, bone 185 to 225, teeth 255 |
+    skin 78, muscle 100, brain and cord 105 to 130, bone 185 to 225, teeth 255 |
     | `engine` | uint8 | three-cylinder engine, crankshaft along x, cut open towards -y: pipes 90, cast \
-block 150, steel parts 240 |
+    block 150, steel parts 240 |
     | `colon` | uint8 | winding tube with folds and polyps along `colon_path`: lumen and outside 0, tissue \
-180, wall 220 |
+    180, wall 220 |
     | `vessels` | uint8 | branching tubes (230 on 0) from a root at the -z face, radii 0.12 to 0.02 |
     | `labels` | uint8 | frog facing -y, with organs, soft-edged, and `labels`: 0 outside, 1 body, 2 and 3 \
-lungs (right, left), 4 liver, 5 stomach; organs that touch share a curved face |
+    lungs (right, left), 4 liver, 5 stomach; organs that touch share a curved face |
     | `plane` | float32 | 1 / (1 + exp(-(u_z - h) / 0.004)) with h = 0.25 + 0.35 u_x; seen along +z |
     | `cut_block` | float32 | 0.5 + 0.1 sin(40 u_z) for u_x < 0.5, cut by the box's faces; else `plane` |
     | `sphere` | float32 | 1 / (1 + exp((r - 0.5) / 0.008)) |
     | `constant`, `linear`, `gaussian` | float32 | 1; (x + 1) / 2; exp(-r² / (2 · 0.3²)) |
 
-    **Arguments:**
+    Args:
+        name: of the table.
+        resolution: nodes along each axis, at least 8.
+        seed: of the textures of `head` and `colon`, polyps and folds of `colon`, and the tree of `vessels`.
 
-    - `name`: of the table.
-    - `resolution`: nodes along each axis, at least 8.
-    - `seed`: of the textures of `head` and `colon`, polyps and folds of `colon`, and the tree of `vessels`.
+    Returns:
+        The `Volume`; that of `labels` has labels.
 
-    **Returns:** the `Volume`; that of `labels` has labels.
-
-    **Raises:** `ValueError` for an unknown name and for numbers that are no integers or too small.
+    Raises:
+        ValueError: for an unknown name and for numbers that are no integers or too small.
     """
     if name not in PHANTOMS:
         raise ValueError(f"name must be one of {', '.join(PHANTOMS)}; got {name!r}.")

@@ -35,29 +35,30 @@ def toroidal_phantom(
     | name | what | mean echo |
     |---|---|---|
     | `shells` | reverberation: echoes 2 mm thick, 12 mm apart along every beam, each weaker than the one \
-before | 220, falling by 15 % each; 8 between |
+    before | 220, falling by 15 % each; 8 between |
     | `spheres` | rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
-tissue 60; cysts 4; targets 130, 160, 190 |
+    tissue 60; cysts 4; targets 130, 160, 190 |
     | `wires` | the spheres, and between them wires 3 mm thick, along x, along y and obliquely in depth | as \
-spheres; wires 255 |
+    spheres; wires 255 |
     | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
-90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
+    90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
 
     Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe; the grains of the
     speckle do.
 
-    **Arguments:**
+    Args:
+        name: of the table.
+        shape: nodes along (β, σ, γ), at least 8 each.
+        probe: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
+        speckle: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
+            (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
+        seed: of the speckle.
 
-    - `name`: of the table.
-    - `shape`: nodes along (β, σ, γ), at least 8 each.
-    - `probe`: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
-    - `speckle`: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
-      (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
-    - `seed`: of the speckle.
+    Returns:
+        A uint8 volume as acquired, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe.
 
-    **Returns:** a uint8 volume as acquired, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe.
-
-    **Raises:** `ValueError` for an unknown name and for arguments of other kinds.
+    Raises:
+        ValueError: for an unknown name and for arguments of other kinds.
     """
     if name not in SCENES:
         raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")

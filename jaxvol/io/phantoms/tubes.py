@@ -20,11 +20,14 @@ def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
 
     The path for a fly-through camera. It is the same for every seed and resolution.
 
-    **Arguments:** `points`: their number.
+    Args:
+        points: their number.
 
-    **Returns:** the points, in world coordinates.
+    Returns:
+        The points, in world coordinates.
 
-    **Raises:** `ValueError` for fewer than 2 points.
+    Raises:
+        ValueError: for fewer than 2 points.
     """
     from scipy.interpolate import CubicSpline  # here, so that a first image does not wait for it
 
