@@ -15,10 +15,10 @@ from ..._util.checks import Arrayable, described
 from ..._util.npy import read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
-from .dicom import dicom_files, is_dicom, read_dicom, series_files
+from .dicom import dicom_files, is_dicom, read_dicom, series_headers
 from .kretz import read_kretz
-from .medical import nrrd_data, read_nifti, read_nrrd
-from .metaimage import metaimage_data, read_metaimage
+from .medical import nrrd_header, read_nifti, read_nrrd
+from .metaimage import metaimage_header, read_metaimage
 from .raw import ENDINGS as RAW, raw_json, read_raw
 from .save import save as save
 from .tiff import read_tiff, read_tiff_folder, tiff_files
@@ -134,10 +134,10 @@ def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
         raise ValueError(f"labels: {path} must lie where the volume does, within {here}; it has {there}.")
     values = np.asarray(labels.data)
-    if not np.array_equal(values, np.rint(values)):
-        raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
-    with np.errstate(invalid="ignore"):  # `Volume` checks the range
-        values = values.astype(np.int64) if values.dtype.kind == "f" else values
+    if values.dtype.kind == "f":
+        if not np.array_equal(values, np.rint(values)):
+            raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
+        values = values.astype(np.int64)
     return Volume(volume.data, volume.spacing, volume.origin, values, direction=volume.direction)
 
 
@@ -152,9 +152,9 @@ def files_of(path: Path) -> list[Path]:
     if name.endswith(RAW):
         return [path, *raw_json(path)]
     if name.endswith((".mhd", ".nrrd", ".nhdr")):
-        data = metaimage_data(path) if name.endswith(".mhd") else nrrd_data(path)
+        data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
         return [path, data] if data != path and data.is_file() else [path]
-    return series_files(path) if is_dicom(path) else [path]
+    return list(series_headers(path)) if is_dicom(path) else [path]
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:

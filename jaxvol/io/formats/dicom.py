@@ -46,11 +46,6 @@ def dicom_files(folder: Path) -> list[Path]:
     return [file for file in images if not _meta(file, KIND).startswith(NO_IMAGES)]
 
 
-def series_files(path: Path) -> list[Path]:
-    """The files of the series to which a file belongs, in its folder."""
-    return list(_headers(path))
-
-
 def read_dicom(path: Path) -> dict[str, Any]:
     """Reader for a folder that holds one series, or for one file of a series, whose others are in its folder.
 
@@ -58,7 +53,7 @@ def read_dicom(path: Path) -> dict[str, Any]:
         ValueError: for several series, and for slices that are missing, there twice, of different sizes or
             directions, shifted sideways, cut short, or compressed in a way that SimpleITK does not read.
     """
-    headers = _headers(path)
+    headers = series_headers(path)
     for file, header in headers.items():
         _check_slice(file, header)
     if not 2 <= len(headers) <= MOST_VOXELS // math.prod(next(iter(headers.values())).GetSize()):
@@ -104,7 +99,7 @@ def _pixels(headers: dict[Path, Any], files: list[Path]) -> np.ndarray:
     return np.stack(planes, axis=2)
 
 
-def _headers(path: Path) -> dict[Path, Any]:
+def series_headers(path: Path) -> dict[Path, Any]:
     """Headers, by file, of the only series in a folder, or of the one that a file belongs to."""
     headers = {file: _header(file) for file in dicom_files(path if path.is_dir() else path.parent)}
     if path.is_file():

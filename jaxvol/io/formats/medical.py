@@ -63,7 +63,7 @@ def read_nrrd(path: Path) -> dict[str, Any]:
     with decoding(path):
         voxels = _read_header(path, reader)
         expected = voxels * sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
-        encoding, begin, source = _nrrd_header(path)
+        encoding, begin, source = nrrd_header(path)
         if encoding not in ("raw", "gzip", "gz") or not source.is_file():
             raise ValueError(
                 f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
@@ -102,13 +102,8 @@ def _volume(path: Path, reader: Any) -> dict[str, Any]:
     return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
 
 
-def nrrd_data(path: Path) -> Path:
-    """The file that holds the voxels of an NRRD file: itself, or another, which may be missing."""
-    return _nrrd_header(path)[2]
-
-
-def _nrrd_header(path: Path) -> tuple[str, int, Path]:
-    """The encoding of an NRRD file; where its voxels begin, and in which file."""
+def nrrd_header(path: Path) -> tuple[str, int, Path]:
+    """The encoding of an NRRD file; where its voxels begin, and in which file, which may be missing."""
     found, end = text_header(path, ":")
     fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
     named, encoding = fields.get("datafile"), fields.get("encoding", "").lower()

@@ -20,7 +20,7 @@ TYPES = {f"MET_{name}": code for name, code in zip(NAMES.split(), CODES.split(),
 def read_metaimage(path: Path) -> dict[str, Any]:
     """Reader for `.mha` and `.mhd` of binary voxels."""
     file_size(path)
-    fields, begin, source = _header(path)
+    fields, begin, source = metaimage_header(path)
     shape = [_natural(size) for size in fields.get("DimSize", "").split()]
     check_volume(path, shape, _natural(fields.get("ElementNumberOfChannels", "1")))
     kind = fields.get("ElementType", "")
@@ -56,13 +56,8 @@ def read_metaimage(path: Path) -> dict[str, Any]:
     return toward_axes(as_array(content, shape, dtype, "F"), spacing, origin, direction)
 
 
-def metaimage_data(path: Path) -> Path:
-    """The file that holds the voxels of a MetaImage: itself, or another, which may be missing."""
-    return _header(path)[2]
-
-
-def _header(path: Path) -> tuple[dict[str, str], int, Path]:
-    """The fields of the header; where it ends, and the file of the voxels."""
+def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
+    """The fields of the header; where it ends, and the file of the voxels, which may be missing."""
     fields, end = text_header(path, "=", "ElementDataFile")
     named = fields.get("ElementDataFile")
     if named is None:
