@@ -26,7 +26,7 @@ class Canvas:
         self.spacing = 2 / (resolution - 1)
         self.values = np.full((resolution,) * 3, fill, np.float32)
 
-    def field(self, build: Callable[["Canvas"], object]) -> "Canvas":
+    def field(self, build: Callable[..., None]) -> "Canvas":
         """A field of distances at the same nodes, to which `build` joins shapes."""
         field = Canvas(len(self.axis), FAR)
         build(field)

@@ -26,7 +26,7 @@ class Shape(NamedTuple):
 
 
 def _around(distance: Callable[[Block, Block, Block], Block], center: Point, half: Point) -> Shape:
-    return Shape(distance, np.subtract(center, half), np.add(center, half))
+    return Shape(distance, np.subtract(center, half, dtype=float), np.add(center, half, dtype=float))
 
 
 def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
