@@ -7,8 +7,6 @@ from typing import TypeAlias, TypeVar
 T = TypeVar("T")
 
 Axes: TypeAlias = tuple[int, int, int]
-"""x, y and z, as 0, 1 and 2, in some order."""
-
 XYZ: Axes = (0, 1, 2)
 
 

@@ -14,11 +14,8 @@ import numpy as np
 
 
 CHUNK = 2**20
-LONGEST_REASON = 200  # letters
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
-MOST_COMPRESSED = (
-    2000  # bytes of pixels per byte of a compressed file: a header that says more is not believed
-)
+MOST_COMPRESSED = 2000  # bytes of pixels for each of a compressed file; a header that says more is refused
 # RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
@@ -56,43 +53,21 @@ def check_size(path: Path, size: int, expected: int, *, more: bool = False) -> N
         )
 
 
-def check_pixels(path: Path, expected: int, *, compressed: bool) -> None:
-    """Check that a file is large enough for so many bytes of pixels."""
-    size = path.stat().st_size
-    if size * (MOST_COMPRESSED if compressed else 1) < expected:
-        raise ValueError(
-            f"path: {path} is cut short: it has {size} bytes, and its header announces pixels of {expected}."
-        )
-
-
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
     """Turn any error of a decoder within the context into the `ValueError` of a corrupt file."""
     try:
         yield
     except CORRUPT as fault:
-        raise ValueError(
-            f"path: {path} cannot be read: corrupt, cut short or incomplete ({reason(fault)})."
-        ) from fault
+        told = f"corrupt, cut short or incomplete ({reason(fault)})"
+        raise ValueError(f"path: {path} cannot be read: {told}.") from fault
 
 
 def reason(fault: BaseException) -> str:
     """The last line of an error, without the place in ITK's source with which its errors begin."""
-    lines = [line.strip() for line in str(fault).splitlines() if line.strip()]
-    told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", lines[-1]) if lines else ""
-    shown = "".join(letter if letter.isprintable() else "?" for letter in told[:LONGEST_REASON])
-    return shown.rstrip(".") or type(fault).__name__
-
-
-def numbers_in(text: str, count: int, what: str, separator: str | None = None) -> np.ndarray:
-    """`count` finite numbers in a text. **Raises** `ValueError`, which begins with `what`, for other text."""
-    try:
-        numbers = np.array(text.split(separator), float)
-    except ValueError:
-        numbers = np.empty(0)
-    if numbers.size != count or not np.isfinite(numbers).all():
-        raise ValueError(f"{what} must be {count} numbers; got {text[:80]!r}.")
-    return numbers
+    last = str(fault).strip().rpartition("\n")[2]
+    told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
+    return "".join(c if c.isprintable() else "?" for c in told).rstrip(".") or type(fault).__name__
 
 
 def as_array(

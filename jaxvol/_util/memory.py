@@ -8,9 +8,10 @@ import jax
 
 
 def require_room(wanted: int, of: str) -> None:
-    """**Raises** `ValueError` if the device has less than the bytes `wanted` by these arguments (`of`)."""
+    """Raises `ValueError` if the device has less than the bytes `wanted` by these arguments (`of`)."""
     if wanted > (room := memory_of_device()):
-        raise ValueError(f"{of}: asks for {_spelled(wanted)} of memory, and the device has {_spelled(room)}.")
+        asked, held = wanted / 2**30, room / 2**30
+        raise ValueError(f"{of}: asks for {asked:.3g} GiB of memory, and the device has {held:.3g} GiB.")
 
 
 def memory_of_device() -> int:
@@ -31,7 +32,3 @@ def give_back() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)
-
-
-def _spelled(count: int) -> str:
-    return f"{count / 2**30:.3g} GiB"

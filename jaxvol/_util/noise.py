@@ -1,6 +1,6 @@
 """Per-pixel random numbers: hashes, and a tile of blue noise."""
 
-from functools import cache
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from ..xla.platform import is_traced
-from .checks import described, integer
+from .checks import integer
 from .vec3 import Vec3
 
 
@@ -18,14 +18,11 @@ Word: TypeAlias = UInt32[Array, "..."]
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:
     """The 32-bit word of a seed: an integer in [0, 2³²), which if traced is taken modulo 2³², or a key of
-    `jax.random`. **Raises** `ValueError` for anything else."""
+    `jax.random`. Raises `ValueError` for anything else."""
     if is_key(seed):
         return jax.random.bits(seed, (), jnp.uint32)
-    if is_traced(seed):
-        seed = jnp.asarray(seed)
-        if seed.shape != () or not jnp.issubdtype(seed.dtype, jnp.integer):
-            raise ValueError(f"seed must be an integer, or a key of jax.random; got {described(seed)}.")
-        return seed.astype(jnp.uint32)
+    if is_traced(seed) and jnp.shape(seed) == () and jnp.issubdtype(jnp.result_type(seed), jnp.integer):
+        return jnp.asarray(seed).astype(jnp.uint32)
     word = integer("seed", seed, 0, 2**32 - 1, otherwise=", or a key of jax.random")
     return jnp.asarray(word, jnp.uint32)
 
@@ -46,14 +43,15 @@ def hashed_uniforms(x: Int[Array, ""], y: Int[Array, ""], seed: UInt32[Array, ""
     drawing them must not show in the frame time. Source: pcg3d of Jarzynski and Olano,
     "Hash Functions for GPU Rendering", JCGT 9(3), 2020.
     """
-    a, b, c = (_scrambled(key.astype(jnp.uint32)) for key in (x, y, seed))
-    for last in (False, True):
+
+    def mix(a: Word, b: Word, c: Word) -> tuple[Word, Word, Word]:
         a = a + b * c
         b = b + c * a
-        c = c + a * b
-        if not last:
-            a, b, c = (word ^ (word >> np.uint32(16)) for word in (a, b, c))
-    return _unit(a, dtype), _unit(b, dtype), _unit(c, dtype)
+        return a, b, c + a * b
+
+    mixed = mix(*(_scrambled(key.astype(jnp.uint32)) for key in (x, y, seed)))
+    a, b, c = (_unit(word, dtype) for word in mix(*map(_folded, mixed)))
+    return a, b, c
 
 
 def hashed_uniforms_4(
@@ -63,19 +61,24 @@ def hashed_uniforms_4(
 
     Source: pcg4d of Jarzynski and Olano, as above.
     """
-    a, b, c, d = map(_scrambled, (a, b, c, d))
-    for last in (False, True):
+
+    def mix(a: Word, b: Word, c: Word, d: Word) -> tuple[Word, Word, Word, Word]:
         a = a + b * d
         b = b + c * a
         c = c + a * b
-        d = d + b * c
-        if not last:
-            a, b, c, d = (word ^ (word >> np.uint32(16)) for word in (a, b, c, d))
-    return _unit(a, jnp.float32), _unit(b, jnp.float32), _unit(c, jnp.float32), _unit(d, jnp.float32)
+        return a, b, c, d + b * c
+
+    mixed = mix(*map(_scrambled, (a, b, c, d)))
+    w, x, y, z = (_unit(word, jnp.float32) for word in mix(*map(_folded, mixed)))
+    return w, x, y, z
 
 
 def _scrambled(word: Word) -> Word:
     return word * np.uint32(1664525) + np.uint32(1013904223)
+
+
+def _folded(word: Word) -> Word:
+    return word ^ (word >> np.uint32(16))
 
 
 def _unit(word: Word, dtype: Any) -> Float[Array, "..."]:
@@ -83,59 +86,11 @@ def _unit(word: Word, dtype: Any) -> Float[Array, "..."]:
     return (word >> np.uint32(8)).astype(dtype) * (2.0**-24)
 
 
-@cache
-def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
-    """Ranks 0 … side² - 1 on a torus, with neighbours far apart in rank: void and cluster (Ulichney 1993).
-
-    Each rank goes to the largest void: the pixel farthest, by a Gaussian of `sigma` pixels, from those taken
-    so far. At first, points in the tightest clusters are moved there.
-    """
-    distance = np.minimum(np.arange(side), side - np.arange(side))
-    bell = np.exp(-(distance**2) / (2 * sigma**2)).astype(np.float32)
-    kernel = np.tile(np.outer(bell, bell), (2, 2))
-    taken = np.zeros((side, side), bool)
-    density = np.zeros((side, side), np.float32)
-
-    def put(index: int, sign: int) -> None:
-        y, x = divmod(index, side)
-        taken[y, x] = sign > 0
-        density[...] += sign * kernel[side - y : 2 * side - y, side - x : 2 * side - x]
-
-    def largest_void() -> int:
-        return int(np.where(taken, np.inf, density).argmin())
-
-    def tightest_cluster() -> int:
-        return int(np.where(taken, density, -np.inf).argmax())
-
-    first = side * side // 10
-    for index in np.random.default_rng(0).permutation(side * side)[:first]:
-        put(int(index), 1)
-    while True:
-        moved = tightest_cluster()
-        put(moved, -1)
-        void = largest_void()
-        put(void, 1)
-        if void == moved:
-            break
-
-    # ranks below `first`: remove points from the tightest clusters; ranks above: fill the largest voids
-    start = taken.copy(), density.copy()
-    order = []
-    for _ in range(first):
-        order.append(tightest_cluster())
-        put(order[-1], -1)
-    order.reverse()
-    taken[...], density[...] = start
-    for _ in range(first, side * side):
-        order.append(largest_void())
-        put(order[-1], 1)
-    ranks = np.empty(side * side, np.int64)
-    ranks[order] = np.arange(side * side)
-    return ranks.reshape(side, side)
-
-
 def blue_tile() -> Float[Array, "side side"]:
-    """Blue noise on a torus: numbers in (0, 1), each equally often, with low frequencies suppressed."""
-    ranks = _blue_ranks()
+    """Blue noise on a torus: numbers in (0, 1), each equally often, with low frequencies suppressed.
+
+    The file holds ranks 0 … 128² - 1 by void and cluster (Ulichney 1993), with a Gaussian of 1.9 pixels.
+    """
+    ranks = np.load(Path(__file__).with_name("blue_noise.npy"))
     with jax.ensure_compile_time_eval():
         return jnp.asarray((ranks + 0.5) / ranks.size, jnp.float32)

@@ -22,30 +22,21 @@ def read_npy(path: Path) -> dict[str, np.ndarray]:
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
-    names = npz_names(path)
-    if "data" in names:
-        arguments = {name: name for name in VOLUME if name in names}
-    elif len(names) == 1:
-        arguments = {"data": names[0]}
-    else:
-        raise ValueError(
-            f"path: {path} must hold an array called data, or one array; got {sorted(names)}. "
-            "Save it with np.savez(path, data=...)."
-        )
-    arrays = {}
-    with decoding(path), zipfile.ZipFile(path) as archive:
-        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        for argument, name in arguments.items():
-            with archive.open(members[name]) as stream:
-                arrays[argument] = _array(path, stream, members[name].file_size)
-    return arrays
-
-
-def npz_names(path: Path) -> list[str]:
-    """Names of the arrays in an `.npz` file."""
     file_size(path)
     with decoding(path), zipfile.ZipFile(path) as archive:
-        return [name.removesuffix(".npy") for name in archive.namelist()]
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        if len(members) == 1:
+            members = {"data": next(iter(members.values()))}
+        if "data" not in members:
+            raise ValueError(
+                f"path: {path} must hold an array called data, or one array; got {sorted(members)}. "
+                "Save it with np.savez(path, data=...)."
+            )
+        arrays = {}
+        for name in filter(members.__contains__, VOLUME):
+            with archive.open(members[name]) as stream:
+                arrays[name] = _array(path, stream, members[name].file_size)
+    return arrays
 
 
 def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -68,7 +59,7 @@ def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dt
 
 def _array(path: Path, stream: Stream, size: int) -> np.ndarray:
     shape, fortran, dtype = npy_header(path, stream)
-    if not 0 < math.prod(shape) <= MOST_VOXELS or min(shape, default=1) < 0:
+    if min(shape, default=1) < 1 or math.prod(shape) > MOST_VOXELS:
         raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
     expected = math.prod(shape) * dtype.itemsize
     check_size(path, size - stream.tell(), expected)

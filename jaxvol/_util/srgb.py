@@ -2,10 +2,8 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from ..xla.platform import is_traced
 from .checks import Arrayable
 
 
@@ -20,7 +18,7 @@ def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    return _to_srgb(_array(linear))
+    return _to_srgb(jnp.asarray(linear))
 
 
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
@@ -34,26 +32,20 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    return _from_srgb(_array(display))
-
-
-def _array(values: Arrayable) -> Array | np.ndarray:
-    if isinstance(values, jax.Array):
-        return values
-    return jnp.asarray(values) if is_traced(values) else np.asarray(values)
+    return _from_srgb(jnp.asarray(display))
 
 
 # Jitted: one program for each shape, rather than one for each operation.
 
 
 @jax.jit
-def _to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
+def _to_srgb(linear: Array) -> Float[Array, "*image"]:
     linear = jnp.clip(linear, 0, 1)
     curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
     return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
 @jax.jit
-def _from_srgb(display: Arrayable) -> Float[Array, "*image"]:
+def _from_srgb(display: Array) -> Float[Array, "*image"]:
     display = jnp.clip(display, 0, 1)
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)

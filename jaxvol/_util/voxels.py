@@ -14,26 +14,20 @@ from .files import MOST_VOXELS
 
 DTYPES = ("uint8", "int8", "uint16", "int16", "float16", "bfloat16", "float32")
 
-WHOLE = {
-    "uint8": (0, 2**8 - 1),
-    "int8": (-(2**7), 2**7 - 1),
-    "uint16": (0, 2**16 - 1),
-    "int16": (-(2**15), 2**15 - 1),
-    "float32": (-(2**24), 2**24),
-}
+WHOLE = {name: (int(np.iinfo(name).min), int(np.iinfo(name).max)) for name in DTYPES[:4]}
+WHOLE["float32"] = -(2**24), 2**24
 """The range of integers that each type holds exactly, smallest type first."""
 
 
 def voxel_array(data: Arrayable) -> Array:
-    data = given_array("data", data)
+    """`data` as an array of JAX of a supported type, which is checked to hold finite voxels."""
+    data = _given_array("data", data)
     check_shape(data.shape)
+    check_type(data.dtype)
     if data.size > MOST_VOXELS:
         raise ValueError(f"data must have fewer than 2**31 voxels; got {data.size} (shape {data.shape}).")
-    if data.dtype.kind in "bui" and str(data.dtype) not in DTYPES:
-        return on_device(_narrow(data))
-    check_type(data.dtype)
-    if data.dtype.kind in "ui":
-        return on_device(data)
+    if data.dtype.kind in "bui":
+        return _on_device(data if data.dtype.name in DTYPES else _narrow(data))
     if is_traced(data):
         message = "data must be finite; got some voxels that are NaN or infinite. Replace them first."
         return require(jnp.asarray(data), finite, message)
@@ -47,10 +41,10 @@ def voxel_array(data: Arrayable) -> Array:
             f"data must be finite{beyond}; got {np.sum(~finite(stored))} of {stored.size} voxels that are "
             "NaN or infinite. Replace them, or rescale all, first."
         )
-    return on_device(stored if stored.dtype != data.dtype else data)
+    return _on_device(stored if stored.dtype != data.dtype else data)
 
 
-def on_device(array: Array | np.ndarray) -> Array:
+def _on_device(array: Array | np.ndarray) -> Array:
     """As an array of JAX, which does not change with the NumPy array that it was made of."""
     if isinstance(array, jax.Array):
         return array
@@ -59,7 +53,7 @@ def on_device(array: Array | np.ndarray) -> Array:
 
 
 def check_shape(shape: tuple[int, ...]) -> None:
-    """**Raises** `ValueError` unless an array of this shape can be a volume's voxels."""
+    """Raises `ValueError` unless an array of this shape can be a volume's voxels."""
     if len(shape) != 3 or min(shape) < 2:
         raise ValueError(
             f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {shape}. "
@@ -68,7 +62,7 @@ def check_shape(shape: tuple[int, ...]) -> None:
 
 
 def check_type(dtype: np.dtype) -> None:
-    """**Raises** `ValueError` unless voxels of this type are supported or can be converted."""
+    """Raises `ValueError` unless voxels of this type are supported or can be converted."""
     if dtype.kind not in "bui" and dtype.name not in (*DTYPES, "float64"):
         raise ValueError(
             f"data must be of type {', '.join(DTYPES)}; got {dtype}. Convert it, for example with "
@@ -80,8 +74,8 @@ def _narrow(data: Array | np.ndarray) -> np.ndarray:
     """The same integers in the smallest type that voxels may have."""
     if is_traced(data):
         raise ValueError(
-            f"data must be of type {', '.join(DTYPES)} if traced; got {data.dtype}, whose range is not "
-            "known before the program runs. Convert them: data.astype(jnp.float32)."
+            f"data must be of type {', '.join(DTYPES)} if traced; got {data.dtype}, whose range is not known "
+            "before the program runs. Convert them: data.astype(jnp.float32)."
         )
     low, high = int(data.min()), int(data.max())
     for dtype, (least, most) in WHOLE.items():
@@ -94,38 +88,35 @@ def _narrow(data: Array | np.ndarray) -> np.ndarray:
 
 
 def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:
-    labels = given_array("labels", labels)
+    """`labels` as an array of JAX of integers of at most 32 bits."""
+    labels = _given_array("labels", labels)
     if labels.dtype.kind not in "bui":
-        raise ValueError(
-            f"labels must be integers; got {labels.dtype}. Convert them: labels.astype(np.int32)."
-        )
+        raise ValueError(f"labels must be integers; got {labels.dtype}. Use labels.astype(np.int32).")
     if labels.shape != shape:
         raise ValueError(f"labels must have the shape of data, {shape}; got shape {labels.shape}.")
     if labels.dtype.kind == "b":
         return jnp.asarray(labels, jnp.uint8)
     if labels.dtype.itemsize < 4 or labels.dtype == np.int32 or is_traced(labels):
-        return on_device(labels)
+        return _on_device(labels)
     low, high = int(labels.min()), int(labels.max())
     if low < -(2**31) or high >= 2**31:
         raise ValueError(
             f"labels must lie within int32; got {labels.dtype} from {low} to {high}. Renumber them: "
             "np.unique(labels, return_inverse=True)."
         )
-    return on_device(np.asarray(labels).astype(np.int32))
+    return _on_device(np.asarray(labels).astype(np.int32))
 
 
-def given_array(name: str, value: Arrayable) -> Array | np.ndarray:
+def _given_array(name: str, value: Arrayable) -> Array | np.ndarray:
     """`value` as a JAX array or, in native byte order, a NumPy array."""
-    if isinstance(value, str | os.PathLike):
-        raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
     if isinstance(value, jax.Array):
         return value
     if is_traced(value):
         return jnp.asarray(value)
+    if isinstance(value, str | os.PathLike):
+        raise ValueError(f"{name} must be an array; got {described(value)}. jv.load(path) reads files.")
     if isinstance(value, np.ma.MaskedArray):
-        raise ValueError(
-            f"{name} must be an array without a mask; got a masked one. Fill it: data.filled(0)."
-        )
+        raise ValueError(f"{name} must be an array without a mask; got one with. Fill it: data.filled(0).")
     try:
         array = np.asarray(value)
     except ValueError as fault:  # sequences of different lengths

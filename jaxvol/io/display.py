@@ -27,41 +27,35 @@ def save_image(
     | `.tif`, `.tiff` | linear float32, unchanged; with opacity, premultiplied (associated alpha) |
     | `.npy` | linear float32, unchanged; read it with `numpy.load` |
 
-    **Arguments:**
-
-    - `path`: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
-    - `linear`: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA,
-      (height, width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which
-      may be infinite. 8-bit formats clip to [0, 1].
-    - `text`: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries beside the image, as
-      `Image.info` of Pillow has them; other formats carry none.
-
-    **Returns:** the path. Its folder is created if it does not exist. The file appears whole or not at all.
-
-    **Raises:** `ValueError` for input that is not an array, an unknown extension, a shape that the format
-    does not hold, NaN, infinite colours, and a path that cannot be written.
-
     A viewer blends a transparent PNG over its background in sRGB, `Rendering.image` blends in linear light;
     the two look different where the opacity lies between 0 and 1.
+
+    Args:
+        path: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
+        linear: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA, (height,
+            width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which may
+            be infinite. 8-bit formats clip to [0, 1].
+        text: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries, as `Image.info` of Pillow has
+            them; other formats carry none.
+
+    Returns:
+        The path. Its folder is created if it does not exist. The file appears whole or not at all.
+
+    Raises:
+        ValueError: for input that is not an array, an unknown extension, a shape that the format does not
+            hold, NaN, infinite colours, and a path that cannot be written.
     """
     if not isinstance(path, str | os.PathLike):
-        swapped = isinstance(linear, str | os.PathLike)
-        raise ValueError(
-            f"path must be a str or a path; got {described(path)}."
-            + (" That is the image: the path comes first, as in save_png(path, image)." if swapped else "")
-        )
-    image = _numbers("linear", linear, "rendering.image() or rendering.rgba")
-    channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else -1
-    if channels not in (3, 4, 0) or 0 in image.shape:
-        raise ValueError(
-            "image must have shape (height, width, 3), (height, width, 4) or (height, width); got "
-            f"{image.shape}."
-        )
+        told = f"path must be a str or a path; got {described(path)}"
+        raise ValueError(f"{told}. It comes first, as in save_png(path, image).")
+    image = _numbers("linear", linear, (0, 3, 4))
+    channels = image.shape[2] if image.ndim == 3 else 0
     path = image_file("path", path, channels)
     ending = path.suffix.lower()
-    bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
-    if bad.any():
-        raise ValueError(f"image must not be NaN or infinite; {bad.sum()} of its {image.size} values are.")
+    if channels and not np.isfinite(image).all():
+        raise ValueError(
+            f"linear must not be infinite; {np.isinf(image).sum()} of its {image.size} values are."
+        )
     with whole_file(path) as part:
         if ending == ".npy":
             np.save(part, image)
@@ -69,8 +63,7 @@ def save_image(
             from tifffile import imwrite
 
             kind = "minisblack" if channels == 0 else "rgb"
-            extra = ["assocalpha"] if channels == 4 else None
-            imwrite(part, image, photometric=kind, extrasamples=extra)
+            imwrite(part, image, photometric=kind, extrasamples=["assocalpha"] if channels == 4 else None)
         else:
             from PIL import Image
             from PIL.PngImagePlugin import PngInfo
@@ -86,20 +79,26 @@ def save_image(
 def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
     """`save_image` for a path that must end in `.png`.
 
-    **Arguments:** `path`, `linear`: as for `save_image`, with three or four channels.
+    Args:
+        path: as for `save_image`.
+        linear: as for `save_image`, with three or four channels.
 
-    **Returns:** the path.
+    Returns:
+        The path.
 
-    **Raises:** `ValueError` as `save_image` does, and for another ending.
+    Raises:
+        ValueError: as `save_image` does, and for another ending.
     """
     if isinstance(path, str | os.PathLike) and Path(path).suffix.lower() != ".png":
         raise ValueError(f"path must end in .png; got {Path(path)}. save_image writes other formats.")
     return save_image(path, linear)
 
 
-GAP, TITLE, INSET = 6, 20, 1e-3
-"""Pixels between images that are shown side by side, and of the line above each that names it; and
-by how much an image is drawn smaller on each side, since versions of matplotlib before 3.11 may draw one row
+GAP, TITLE = 6, 20
+"""Pixels between images that `show_images` draws, and of the line above each that names it."""
+
+INSET = 1e-3
+"""Pixels by which an image is drawn smaller on each side: versions of matplotlib before 3.11 may draw one row
 more or less where an edge lies exactly between two pixels."""
 
 
@@ -108,19 +107,19 @@ def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -
     of theirs, since resampling would hide what samples do. It is for notebooks, where the picture appears
     under the cell.
 
-    **Arguments:**
+    Args:
+        images: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
+            Values outside of [0, 1] are clipped. Sizes may differ.
+        columns: how many images stand in a row at most.
 
-    - `images`: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
-      Values outside of [0, 1] are clipped. Sizes may differ.
-    - `columns`: how many images stand in a row at most.
-
-    **Raises:** `ValueError` for no image, an image of another shape, NaN, and a number of columns below 1.
+    Raises:
+        ValueError: for no image, an image of another shape, NaN, and a number of columns below 1.
     """
     if not isinstance(images, Mapping) or not images:
         raise ValueError(
             f"images must be a dict of at least one image, such as {{'head': ...}}; got {described(images)}."
         )
-    shown = {str(name): _displayed(name, image) for name, image in images.items()}
+    shown = {name: _numbers(f"images[{name!r}]", image, (0, 3)) for name, image in images.items()}
     columns = min(integer("columns", columns, 1), len(shown))
     rows = math.ceil(len(shown) / columns)
     height, width = (max(image.shape[axis] for image in shown.values()) for axis in (0, 1))
@@ -134,46 +133,34 @@ def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -
         left, top = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE
         box = left + INSET, down - top - image.shape[0] + INSET, *(n - 2 * INSET for n in image.shape[1::-1])
         axes = figure.add_axes(np.divide(box, (across, down, across, down)).tolist())
-        axes.imshow(image, cmap="gray", vmin=0, vmax=1, interpolation="none")
+        axes.imshow(np.asarray(to_srgb(image)), cmap="gray", vmin=0, vmax=1, interpolation="none")
         axes.set_axis_off()
-        axes.set_title(name, fontsize=9, loc="left", pad=3)
+        axes.set_title(str(name), fontsize=9, loc="left", pad=3)
     plt.show()
 
 
-def _displayed(name: Any, image: Any) -> Float[np.ndarray, "height width *channels"]:
-    what = f"images[{name!r}]"
-    linear = _numbers(what, image, "rendering.image()")
-    if 0 in linear.shape or (linear.ndim != 2 and linear.shape[2:] != (3,)):
-        raise ValueError(f"{what} must have shape (height, width, 3) or (height, width); got {linear.shape}.")
-    if np.isnan(linear).any():
-        raise ValueError(f"{what} must not be NaN; {np.isnan(linear).sum()} of its values are.")
-    return np.asarray(to_srgb(linear))
-
-
-def _numbers(name: str, image: Any, instead: str) -> Float[np.ndarray, "..."]:
+def _numbers(name: str, image: Any, channels: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """An image with one of these numbers of channels; 0: no axis of channels."""
     try:
-        return np.asarray(image, np.float32)
+        numbers = np.asarray(image, np.float32)
     except (TypeError, ValueError) as fault:
-        raise ValueError(
-            f"{name} must be an array of numbers; got {described(image)}. For a Rendering, pass {instead}."
-        ) from fault
-
-
-CHANNELS: dict[str, tuple[int, ...]] = {
-    ".png": (3, 4),
-    ".jpg": (3,),
-    ".jpeg": (3,),
-    ".tif": (3, 4, 0),
-    ".tiff": (3, 4, 0),
-    ".npy": (3, 4, 0),
-}
-"""Numbers of channels that each format can hold; 0: no axis of channels."""
+        told = f"{name} must be an array of numbers; got {described(image)}"
+        raise ValueError(f"{told}. For a Rendering, pass rendering.image().") from fault
+    shapes = ["(height, width)" if n == 0 else f"(height, width, {n})" for n in channels]
+    found = 0 if numbers.ndim == 2 else numbers.shape[2] if numbers.ndim == 3 else -1
+    if found not in channels or numbers.size == 0:
+        raise ValueError(f"{name} must have shape {' or '.join(shapes)}; got {numbers.shape}.")
+    if np.isnan(numbers).any():
+        raise ValueError(f"{name} must not be NaN; {np.isnan(numbers).sum()} of its values are.")
+    return numbers
 
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
-    """Check that an image with this many channels can be written to `path`, before it is rendered."""
+    """Check that an image with this many channels (0: no axis of channels) can be written to `path`, before
+    it is rendered."""
     path, what = Path(path), {0: "one channel", 3: "colours", 4: "colours and opacity"}[channels]
-    allowed = [ending for ending, counts in CHANNELS.items() if channels in counts]
+    allowed = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
+    allowed = {0: allowed[3:], 3: allowed, 4: (".png", *allowed[3:])}[channels]
     if path.suffix.lower() not in allowed:
         raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(allowed)}; got {path}.")
     return output_file(name, path)

@@ -1,7 +1,5 @@
-"""Resamples what a swept probe acquired onto a Cartesian grid, which other programs read.
-
-Rendering under a `ToroidalMap` needs no such conversion.
-"""
+"""Resamples what a swept probe acquired onto a Cartesian grid, which other programs read. Rendering under a
+`ToroidalMap` needs no such conversion."""
 
 import math
 from typing import Any
@@ -39,35 +37,40 @@ def scan_convert(
     nodes, as rendering does, blurs what is smaller than the spacing, and mixes `fill_value` into the sector's
     faces, over one spacing. What it does to images: `experiments/scan_conversion.py`.
 
-    **Arguments:**
-
-    - `volume`: as acquired, `data[β, σ, γ]`. Its labels, if any, become those of the nearest sample, and 0
-      outside.
-    - `probe`: the map that places the samples; the result lies in the same world.
-    - `spacing`: of the grid, one number or three, world length (mm); by default the distance between the
-      samples of a beam, as fine as they are anywhere.
-    - `shape`, `origin`: number of nodes along x, y, z, at least 2, and the world position of the first node;
-      by default those of the grid that just encloses the sector, centered on it.
-    - `fill_value`: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
-
-    **Returns:** a `Volume` with its spacing and origin. A grid node within rounding of a face counts as
-    inside.
-
-    Beside the result, memory is taken for one plane of nodes at a time; and then on the host, where a result
-    of floats is checked to be finite, for as much as it takes itself and a byte a node.
-
     Differentiable with respect to float voxels and to the probe. For the probe, the grid must be given
     (`spacing`, `shape` and `origin`), since its size cannot depend on traced values; where a node crosses a
-    face its value jumps, which the gradient does not see.
+    face its value jumps, which the gradient does not see. Memory is taken for the result and for one plane of
+    nodes at a time; for floats, which are checked to be finite, as much again.
 
-    **Raises:** `ValueError` for arguments of other kinds, a spacing that is not positive, a grid of 2**31
-    nodes or more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.
+    Args:
+        volume: as acquired, `data[β, σ, γ]`. Its labels, if any, become those of the nearest sample, and 0
+            outside.
+        probe: the map that places the samples; the result lies in the same world.
+        spacing: of the grid, one number or three, world length (mm); by default the distance between the
+            samples of a beam, as fine as they are anywhere.
+        shape: number of nodes along x, y, z, at least 2; by default those that just enclose the sector.
+        origin: the world position of the first node; by default such that the sector is in the middle.
+        fill_value: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
+
+    Returns:
+        A `Volume` with its spacing and origin. Nodes within rounding of a face count as inside.
+
+    Raises:
+        ValueError: for arguments of other kinds, a spacing that is not positive, a grid of 2**31 nodes or
+            more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.
     """
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a Volume; got {described(volume)}.")
     if not isinstance(probe, ToroidalMap):
         raise ValueError(f"probe must be a ToroidalMap; got {described(probe)}.")
-    fill = _fill(fill_value, volume.data.dtype)
+    dtype = volume.data.dtype
+    try:
+        fill = float(fill_value)
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"fill_value must be a number; got {described(fill_value)}.") from fault
+    limits, whole = (np.iinfo(dtype), True) if dtype.kind in "ui" else (jnp.finfo(dtype), False)
+    if not float(limits.min) <= fill <= float(limits.max) or (whole and not fill.is_integer()):
+        raise ValueError(f"fill_value must be of the voxels' type, {dtype.name}; got {fill_value!r}.")
     first, last = probe.gamma_range
     wide: Any = (last - first) / (volume.shape[2] - 1) if spacing is None else spacing
     steps = require(
@@ -76,10 +79,9 @@ def scan_convert(
         "spacing must be positive along every axis; got {got}.",
     )
     nodes, first = _grid(probe, steps, shape, origin)
-    itemsize = volume.data.dtype.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)
-    require_room(
-        math.prod(nodes) * itemsize, f"a grid of {' x '.join(map(str, nodes))} nodes (spacing, shape)"
-    )
+    itemsize = dtype.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)
+    sizes = " x ".join(map(str, nodes))
+    require_room(math.prod(nodes) * itemsize, f"a grid of {sizes} nodes (spacing, shape)")
     data, labels = _resampled(volume, probe, first, steps, nodes, fill)
     return Volume(data, steps, first, labels)
 
@@ -121,18 +123,6 @@ def _resampled(
     return jax.lax.map(plane, x)
 
 
-def _fill(value: Any, kind: np.dtype) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(f"fill_value must be a number; got {described(value)}.") from fault
-    whole = kind.kind in "ui"
-    limits = np.iinfo(kind) if whole else jnp.finfo(kind)
-    if not float(limits.min) <= number <= float(limits.max) or (whole and not number.is_integer()):
-        raise ValueError(f"fill_value must be a value of the voxels' type, {kind.name}; got {value!r}.")
-    return number
-
-
 def _grid(
     probe: ToroidalMap, spacing: Float[Array, "3"], shape: Any, origin: Arrayable | None
 ) -> tuple[tuple[int, int, int], Float[Array, "3"]]:
@@ -140,8 +130,7 @@ def _grid(
     if shape is None:
         if is_traced(probe, spacing):
             raise ValueError(
-                "shape, spacing and origin must be given where the probe is traced: the size of the grid "
-                "cannot depend on it. Take those of a scan_convert outside of the transformation."
+                "shape, spacing and origin must be given where the probe is traced: no size can depend on it."
             )
         low, high = (np.asarray(corner, np.float64) for corner in probe.corners)
         # a sector that is a whole number of spacings wide gets no further node from rounding
@@ -151,10 +140,7 @@ def _grid(
         raise ValueError(f"shape must be three numbers of nodes, along x, y and z; got {shape!r}.")
     nodes = nx, ny, nz = tuple(integer("shape", n, 2) for n in shape)
     if math.prod(nodes) > MOST_VOXELS:
-        raise ValueError(
-            "spacing must be so wide, or shape so small, that the grid has fewer than 2**31 nodes; got "
-            f"{nodes}."
-        )
+        raise ValueError(f"spacing and shape must make a grid of fewer than 2**31 nodes; got {nodes}.")
     if origin is None:
         return (nx, ny, nz), probe.center - (jnp.asarray(nodes, spacing.dtype) - 1) * spacing / 2
     return (nx, ny, nz), finite_array("origin", origin, (3,))

@@ -9,7 +9,7 @@ import pytest
 
 from jaxvol._util import whole_files
 from jaxvol._util.checks import output_file
-from jaxvol._util.whole_files import whole_file, whole_folder
+from jaxvol._util.whole_files import whole_file
 
 
 def test_a_file_takes_its_place_at_the_end(tmp_path):
@@ -25,23 +25,18 @@ def test_a_file_takes_its_place_at_the_end(tmp_path):
 
 def test_after_an_error_all_is_as_it_was(tmp_path):
     (tmp_path / "a.png").write_text("old")
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "folder" / "b").write_text("old")
-    for context, path, inside in ((whole_file, "a.png", "."), (whole_folder, "folder", "b")):
-        with contextlib.suppress(ZeroDivisionError), context(tmp_path / path) as part:
-            (part / inside).write_text("new")
-            raise ZeroDivisionError
+    with contextlib.suppress(ZeroDivisionError), whole_file(tmp_path / "a.png") as part:
+        part.write_text("new")
+        raise ZeroDivisionError
     assert (tmp_path / "a.png").read_text() == "old"
-    assert (tmp_path / "folder" / "b").read_text() == "old"
-    assert sorted(os.listdir(tmp_path)) == ["a.png", "folder"]
+    assert os.listdir(tmp_path) == ["a.png"]
 
 
 def test_folders_are_made_for_what_becomes_whole_and_not_left_behind_otherwise(tmp_path):
-    for context, inside in ((whole_file, "."), (whole_folder, "b")):
-        with contextlib.suppress(ZeroDivisionError), context(tmp_path / "deep" / "down" / "a") as part:
-            (part / inside).write_text("half")
-            raise ZeroDivisionError
-        assert os.listdir(tmp_path) == []
+    with contextlib.suppress(ZeroDivisionError), whole_file(tmp_path / "deep" / "down" / "a") as part:
+        part.write_text("half")
+        raise ZeroDivisionError
+    assert os.listdir(tmp_path) == []
     output_file("path", tmp_path / "deep" / "down" / "a")
     assert os.listdir(tmp_path) == []
     with whole_file(tmp_path / "deep" / "down" / "a") as part:
@@ -52,23 +47,6 @@ def test_folders_are_made_for_what_becomes_whole_and_not_left_behind_otherwise(t
         output_file("path", tmp_path / "file" / "deep" / "a")
 
 
-def test_files_of_a_folder_take_their_places_beside_others(tmp_path):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    (folder / "mine").write_text("kept")
-    (folder / "a").write_text("old")
-    with whole_folder(folder) as part:
-        (part / "deep").mkdir()
-        (part / "a").write_text("new")
-        (part / "deep" / "b").write_text("new")
-        assert (folder / "a").read_text() == "old"
-    found = {
-        file.relative_to(folder).as_posix(): file.read_text() for file in folder.rglob("*") if file.is_file()
-    }
-    assert found == {"mine": "kept", "a": "new", "deep/b": "new"}
-    assert os.listdir(tmp_path) == ["folder"]
-
-
 def test_after_an_interruption_nothing_appears(tmp_path, monkeypatch):
     """Not even by a thread that goes on, since the process ends at once."""
     monkeypatch.chdir(tmp_path)
@@ -76,8 +54,7 @@ def test_after_an_interruption_nothing_appears(tmp_path, monkeypatch):
 
     def write():
         gone = contextlib.suppress(FileNotFoundError)
-        with gone, whole_folder(Path("deep/folder")) as folder, whole_file(Path("a.png")) as part:
-            (folder / "b").write_text("half")
+        with gone, whole_file(Path("a.png")) as part:
             part.write_text("half")
             begun.set()
             removed.wait()
@@ -113,10 +90,3 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path):
     os.close(reader)
     assert pipe.is_fifo()
     assert os.listdir(tmp_path) == ["pipe"]
-
-
-def test_a_folder_may_be_the_working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    with whole_folder(Path()) as part:
-        (part / "a").write_text("new")
-    assert os.listdir(tmp_path) == ["a"]

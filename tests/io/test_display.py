@@ -53,9 +53,9 @@ def test_linear_formats_keep_every_float(tmp_path):
 
 COLORS = np.zeros((2, 3, 3))
 BAD = {
-    "no image": ("x.png", np.zeros(4), r"image must have shape .*got \(4,\)"),
+    "no image": ("x.png", np.zeros(4), r"linear must have shape .*got \(4,\)"),
     "a rendering": ("x.png", object(), r"linear must be an array of numbers; .*rendering\.image\(\)"),
-    "NaN": ("x.png", COLORS + np.nan, "image must not be NaN or infinite; 18 of its 18 values are"),
+    "NaN": ("x.png", COLORS + np.nan, "linear must not be NaN; 18 of its values are"),
     "EXR": ("x.exr", COLORS, r"path: .* must end in one of \.png, .*\.npy; got .*x\.exr"),
     "opacity in JPEG": ("x.jpg", RGBA, r"and opacity must end in one of \.png, \.tif, \.tiff, \.npy;"),
     "one channel in PNG": (
@@ -82,7 +82,7 @@ def test_bad_paths_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"path must end in \.png; got .*x\.jpg"):
         jv.save_png(tmp_path / "x.jpg", COLORS)
     for save in (jv.save_png, jv.save_image):
-        with pytest.raises(ValueError, match=r"path .* got a NumPy array of shape .* the path comes first"):
+        with pytest.raises(ValueError, match=r"path .* got a NumPy array of shape .* comes first"):
             save(COLORS, tmp_path / "x.png")
         with pytest.raises(ValueError, match="path must be a str or a path; got 5"):
             save(5, COLORS)

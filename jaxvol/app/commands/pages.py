@@ -5,12 +5,13 @@ import argparse
 import html
 import importlib
 import inspect
+import shutil
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from ..._util.checks import output_file
-from ..._util.whole_files import whole_folder
 from .options import SWITCH, add_command, add_output, add_size
 
 
@@ -78,13 +79,18 @@ PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit
 
 def _demo(options: argparse.Namespace) -> None:
     page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'
-    with whole_folder(options.output) as folder:
+    output_file("--output", options.output / "index.html")
+    with TemporaryDirectory() as made:  # after an error nothing has changed
+        folder = Path(made)
         for section, pictures in PICTURES.items():
             print(f"{options.output}: {', '.join(pictures)}", flush=True)
             section(folder, tuple(options.size), options.resolution)
             images = "".join(f'<img src="{name}.png" alt="{name}" width="32%"> ' for name in pictures)
             page += f"{images}<pre>{html.escape(inspect.getsource(section))}</pre>\n"
         (folder / "index.html").write_text(page, encoding="utf-8")
+        options.output.mkdir(parents=True, exist_ok=True)
+        for file in folder.iterdir():
+            shutil.copy(file, options.output)
     print(f"open {options.output / 'index.html'}")
 
 

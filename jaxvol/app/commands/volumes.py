@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ...io import datasets
-from ...io.formats import says_its_spacing
+from ...io.formats import read
+from ...scene.volume import Volume
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
 from .scene import is_automatic, transfer_of, volume_of
@@ -40,9 +41,12 @@ def add_datasets(commands: Any) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    volume = volume_of(options)
+    arguments = read(options.file, options.shape, options.dtype)
+    if options.spacing is not None:
+        arguments["spacing"] = options.spacing
+    volume = Volume(**arguments)
     data = np.asarray(volume.data)
-    assumed = options.spacing is None and not says_its_spacing(options.file)
+    assumed = "spacing" not in arguments
     # of every k-th voxel of a large volume: sorting all takes seconds and memory
     some, shares = data.ravel()[:: max(1, data.size // 4_000_000)].astype(np.float32), (1, 25, 50, 75, 99)
     percentiles = zip(shares, np.percentile(some, shares), strict=True)

@@ -1,8 +1,7 @@
 """Loads volumes from files, with a reader chosen by the ending of the file's name, and saves them.
 
-A reader returns the arguments of `Volume` that the file holds; the caller's own arguments to `load` override
-them. Files are data: nothing is unpickled, and the content of a file is checked against its header before
-memory is allocated for it.
+A reader returns the arguments of `Volume` that the file holds. Nothing is unpickled, and the content of a
+file is checked against its header before memory is allocated for it.
 """
 
 import os
@@ -13,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from ..._util.checks import Arrayable, described
-from ..._util.npy import npz_names, read_npy, read_npz
+from ..._util.npy import read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
-from .dicom import dicom_files, is_dicom, read_dicom, series_files
-from .kretz import read_kretz, refuse_kretz
-from .medical import nrrd_data, read_nifti, read_nrrd
-from .metaimage import metaimage_data, read_metaimage
-from .raw import ENDINGS as RAW, raw_json, raw_json_header, read_raw
+from .dicom import dicom_files, is_dicom, read_dicom, series_headers
+from .kretz import read_kretz
+from .medical import nrrd_header, read_nifti, read_nrrd
+from .metaimage import metaimage_header, read_metaimage
+from .raw import ENDINGS as RAW, raw_json, read_raw
 from .save import save as save
-from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files, tiff_spacing
+from .tiff import read_tiff, read_tiff_folder, tiff_files
 
 
 READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
@@ -37,7 +36,6 @@ READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".dcm": read_dicom,
     ".tif": read_tiff,
     ".tiff": read_tiff,
-    ".vol": refuse_kretz,
 }
 
 
@@ -65,43 +63,36 @@ def load(
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
 
     Raw files store x fastest, like those of the Open SciVis datasets. The JSON file has the raw file's name
-    with `.json` appended, or in place of `.raw` or `.raw.gz`, and uses the datasets' keys `size`, `type` and
-    `spacing`, and `origin`; any of them may be missing. If the sources differ, an argument overrides the
-    JSON, and the JSON overrides the name; nothing is guessed.
+    with `.json` appended, or in place of `.raw` or `.raw.gz`, and the datasets' keys `size`, `type`,
+    `spacing`, `origin`, any of which may be missing. An argument overrides the JSON, and the JSON the name.
 
     Medical images are rescaled (CT in HU), float64 becomes float32, and axes are exchanged and reversed so
     that x, y, z increase towards the patient's left, back and head (LPS). An oblique image keeps its voxels,
-    and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie; their
-    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are converted to
-    smaller types, as described in `Volume`.
+    and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie. Integers
+    of 32 and 64 bits, from any kind of file, are converted to smaller types, as described in `Volume`.
 
-    **Arguments:**
+    Args:
+        path: the file.
+        shape: number of voxels along x, y, z; raw files only.
+        dtype: uint8, int8, uint16, int16, float16, float32 or float64, little-endian unless it ends in `be`
+            (`uint16be`); raw files only.
+        spacing: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
+        origin: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
+        direction: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
+        labels: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
+            at the same place: it becomes the volume's labels.
 
-    - `path`: the file.
-    - `shape`: number of voxels along x, y, z; raw files only.
-    - `dtype`: uint8, int8, uint16, int16, float16, float32 or float64, little-endian unless it ends in
-      `be` (`uint16be`); raw files only.
-    - `spacing`: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
-    - `origin`: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
-    - `direction`: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
-    - `labels`: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
-      at the same place: it becomes the volume's labels.
+    Returns:
+        The `Volume`, with voxels in the file's type except as described above.
 
-    **Returns:** the `Volume`, with voxels in the file's type except as described above.
-
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or shorter
-    than its header says, or without a header; for an image that is not 3-D or not scalar; for a folder of
-    several DICOM series, or of slices that do not fit together; for labels that lie elsewhere; for `.vol`
-    files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for a format
-    that needs SimpleITK or tifffile if it is missing.
+    Raises:
+        ValueError: for a file that is missing, empty, corrupt, of unknown kind, of another size than its
+            header says, or without a header; for an image that is not 3-D or not scalar; for several DICOM
+            series in a folder, or slices that do not fit together; for labels that lie elsewhere; and for
+            anything that `Volume` rejects.
+        ImportError: for a format that needs SimpleITK or tifffile if it is missing.
     """
-    path = _existing(path)
-    if path.name.lower().endswith(RAW):
-        arguments = read_raw(path, shape, dtype)
-    elif shape is None and dtype is None:
-        arguments = _reader(path)(path)
-    else:
-        raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
+    arguments = read(path, shape, dtype)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arguments |= {name: value for name, value in given.items() if value is not None}
     try:
@@ -111,15 +102,24 @@ def load(
         raise ValueError(f"{path}: {fault}") from fault
 
 
-def _reader(path: Path) -> Callable[[Path], dict[str, Any]]:
-    """The reader for a file, by the ending of its name, or for a folder, by what is in it."""
+def read(path: str | os.PathLike[str] | Any, shape: Any = None, dtype: Any = None) -> dict[str, Any]:
+    """What a file or folder holds, as arguments of `Volume`; those of which it says nothing are missing."""
+    path = _existing(path)
+    name = path.name.lower()
+    if name.endswith(RAW):
+        return read_raw(path, shape, dtype)
+    if shape is not None or dtype is not None:
+        raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
+    if name.endswith(".vol"):
+        use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...)) or jv.scan_convert"
+        raise ValueError(f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}.")
     for ending, reader in READERS.items():
-        if path.name.lower().endswith(ending):
-            return reader
+        if name.endswith(ending):
+            return reader(path)
     if (path.is_dir() and dicom_files(path)) or (path.is_file() and is_dicom(path)):
-        return read_dicom  # on discs their names often have no ending
+        return read_dicom(path)  # on discs their names often have no ending
     if path.is_dir() and tiff_files(path):
-        return read_tiff_folder
+        return read_tiff_folder(path)
     fault = "is a directory without DICOM and TIFF files" if path.is_dir() else "has an unknown ending"
     raise ValueError(
         f"path: {path} {fault}; expected a folder of these, or a file ending in "
@@ -127,92 +127,63 @@ def _reader(path: Path) -> Callable[[Path], dict[str, Any]]:
     )
 
 
-def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
+def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
-    other = load(labels)
-    here, there = _corners(volume), _corners(other)
+    labels = load(path)
+    here, there = (np.asarray(each.bounds) for each in (volume, labels))
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
-        raise ValueError(
-            f"labels: {labels} must lie where the volume does, with corners {here.tolist()}; it has "
-            f"{there.tolist()}."
-        )
-    values = np.asarray(other.data)
+        raise ValueError(f"labels: {path} must lie where the volume does, within {here}; it has {there}.")
+    values = np.asarray(labels.data)
     if values.dtype.kind == "f":
         if not np.array_equal(values, np.rint(values)):
-            raise ValueError(f"labels: {labels} must hold integers; got {values.dtype} with fractions.")
-        with np.errstate(invalid="ignore"):  # `Volume` checks the range
-            values = values.astype(np.int64)
+            raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
+        values = values.astype(np.int64)
     return Volume(volume.data, volume.spacing, volume.origin, values, direction=volume.direction)
 
 
-def _corners(volume: Volume) -> np.ndarray:
-    """Where the first voxel lies in the world, and the last one along each axis."""
-    direction = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
-    edges = direction * np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
-    return np.asarray(volume.origin) + np.vstack([np.zeros(3), edges.T])
-
-
 def files_of(path: Path) -> list[Path]:
-    """The files that `load` reads for a volume: of a folder, its slices; beside a header, what it names; of
-    one DICOM file, those of its series. None where there is no volume.
-
-    **Raises:** `ValueError` for a file whose header cannot be read."""
+    """The files that `load` reads for a volume: of a folder, its slices; with a header, what it names; of one
+    DICOM file, those of its series. None where there is no volume. Raises as `load` for a bad header."""
     if path.is_dir():
         return dicom_files(path) or tiff_files(path)
     if not path.is_file():  # a device may have no end
         return []
     name = path.name.lower()
     if name.endswith(RAW):
-        beside = raw_json(path)
-        return [path] if beside is None else [path, beside]
+        return [path, *raw_json(path)]
     if name.endswith((".mhd", ".nrrd", ".nhdr")):
-        data = metaimage_data(path) if name.endswith(".mhd") else nrrd_data(path)
+        data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
         return [path, data] if data != path and data.is_file() else [path]
-    return series_files(path) if is_dicom(path) else [path]
-
-
-def says_its_spacing(path: Path) -> bool:
-    """Whether a file of voxels, or the header beside it, says how far apart they lie; they are not read."""
-    name = path.name.lower()
-    if name.endswith(RAW):
-        return "spacing" in raw_json_header(path)
-    if name.endswith(".npz"):
-        return "spacing" in npz_names(path)
-    if name.endswith(TIFF):
-        return "spacing" in tiff_spacing(path)
-    return not (name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)))
+    return list(series_headers(path)) if is_dicom(path) else [path]
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
     """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world, from a
     Kretz file (`.vol`) of GE Voluson scanners: `KRETZFILE 1.0`, uncompressed, of 8-bit voxels.
 
-    Read are the volume and its geometry, and nothing of the patient or the settings; of a Doppler scan, the
-    B-mode volume. Angles are taken as they stand in the file, with the middle beam at π/2; those of planes
-    and beams must be evenly spaced to 0.01 of a step, by which a voxel may be misplaced. The first sample of
-    a beam has depth γ = 0.
+    Angles are taken as they stand in the file, with the middle beam at π/2. The first sample of a beam has
+    depth γ = 0. The format is not published: the reader is written after those of SlicerHeart and
+    plooney/kretz, and tested on files of its tests alone, not on a scanner's own.
 
-    **Arguments:** `path`: the file.
+    Args:
+        path: the file.
 
-    **Returns:** the volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render
-    them with `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
+    Returns:
+        The volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render them with
+        `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
 
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, cut short, compressed, of another
-    kind, or lacks an item; for angles that are not evenly spaced; and for what `ToroidalMap` and `Volume`
-    reject. Sizes are compared with the file's before memory is taken.
-
-    The format is not published. The reader is tested on files written by its tests, after the readers of
-    SlicerHeart and plooney/kretz, and not on a scanner's own.
+    Raises:
+        ValueError: for a file that is missing, empty, corrupt, cut short, compressed, of another kind, or
+            lacks an item; for angles that are not evenly spaced to 0.01 of a step; and for what
+            `ToroidalMap` and `Volume` reject.
     """
     data, probe = read_kretz(_existing(path))
     return Volume(data), probe
 
 
 def _existing(path: str | os.PathLike[str] | Any) -> Path:
-    if not isinstance(path, str | os.PathLike):
+    if not isinstance(path, str | os.PathLike) or not str(path):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
-    if not str(path):
-        raise ValueError("path must be that of a file or folder; got ''.")
     path = Path(path)
     if not path.exists():
         raise ValueError(

@@ -2,49 +2,34 @@
 
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, check_pixels, decoding, numbers_in
-from .medical import simple_itk
-from .orientation import orthonormal, toward_axes
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, decoding
+from .medical import orthonormal, simple_itk, toward_axes
 
 
 UID = "1.2.840.10008."
 
 PLAIN = {UID + end for end in ("1.2", "1.2.1", "1.2.2")}
-READABLE = PLAIN | {UID + end for end in ("1.2.1.99", "1.2.5")}
-READABLE |= {f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)}
-"""Transfer syntaxes that SimpleITK reads: deflated, run-length encoded, JPEG, JPEG-LS and JPEG 2000, too."""
+PACKED = {UID + end for end in ("1.2.1.99", "1.2.5")}
+PACKED |= {f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)}
+"""Transfer syntaxes that SimpleITK reads: deflated, run-length encoded, JPEG, JPEG-LS and JPEG 2000."""
 
 STORAGE = UID + "5.1.4.1.1."
 NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "481.5"))
-"""Kinds of files that often lie beside a series: presentation states, reports, documents, contours, plans."""
-
-META_BYTES = 2**16
-"""Where kind and transfer syntax must be found: files begin with some hundred bytes of meta information."""
+"""Presentation states, reports, documents, contours and plans, which often lie in a series' folder."""
 
 KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
-"""Elements of the meta information."""
+"""Elements of the meta information with which a file begins."""
 
-SERIES = "0020|000e"
-"""The element that tells the series."""
+SERIES, DESCRIPTION, BITS = "0020|000e", "0008|103e", "0028|0100"
+PLACE = ("0020|0032", "0020|0037", "0028|0030")
+"""Position, directions of rows and columns, and spacing of pixels."""
 
 AWAY = 0.1
 """The part of a voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
-
-
-class Slice(NamedTuple):
-    """What the header of a file says of it. `axes`: directions of rows and columns, as columns."""
-
-    path: Path
-    series: str
-    description: str
-    size: tuple[int, int]
-    spacing: tuple[float, float]
-    position: np.ndarray
-    axes: np.ndarray
 
 
 def is_dicom(path: Path) -> bool:
@@ -58,151 +43,120 @@ def dicom_files(folder: Path) -> list[Path]:
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR")
     named = [file for file in files if file.suffix.lower() == ".dcm" and not file.name.startswith(".")]
     images = [file for file in files if file in named or is_dicom(file)]
-    return [file for file in images if not (_meta(file, KIND) or "").startswith(NO_IMAGES)]
+    return [file for file in images if not _meta(file, KIND).startswith(NO_IMAGES)]
 
 
 def read_dicom(path: Path) -> dict[str, Any]:
     """Reader for a folder that holds one series, or for one file of a series, whose others are in its folder.
 
-    **Raises:** `ValueError` naming the files, if the folder holds several series, or if slices of the series
-    are missing, there twice, of different sizes or directions, shifted sideways, cut short, or compressed in
-    a way that SimpleITK does not read.
+    Raises:
+        ValueError: for several series, and for slices that are missing, there twice, of different sizes or
+            directions, shifted sideways, cut short, or compressed in a way that SimpleITK does not read.
     """
-    slices = _slices(path)
-    first = slices[0]
-    for each in slices[1:]:
-        for name in ("size", "spacing", "axes"):
-            expected, found = (np.array(getattr(which, name)) for which in (first, each))
-            if not np.allclose(found, expected, rtol=1e-4, atol=1e-4):
-                raise ValueError(
-                    f"path: {path}: slices of one series must agree; {first.path.name} has {name} "
-                    f"{expected.round(4).tolist()}, and {each.path.name} {found.round(4).tolist()}. Is one "
-                    "of them an overview image?"
-                )
-    if not 2 <= len(slices) <= MOST_VOXELS // math.prod(first.size):
+    headers = series_headers(path)
+    for file, header in headers.items():
+        _check_slice(file, header)
+    if not 2 <= len(headers) <= MOST_VOXELS // math.prod(next(iter(headers.values())).GetSize()):
         raise ValueError(
             f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
-            f"{len(slices)} of {first.size} pixels."
+            f"{len(headers)}."
         )
-    direction = orthonormal(f"path: {path}: rows and columns of {first.path.name}", first.axes)
+    grids = {file: [*h.GetSize(), *h.GetSpacing(), *h.GetDirection()] for file, h in headers.items()}
+    first = next(iter(grids))
+    for file, grid in grids.items():
+        if not np.allclose(grid, grids[first], rtol=1e-4, atol=1e-4):
+            raise ValueError(
+                f"path: {path}: slices of one series must agree in size, spacing and directions; "
+                f"{first.name} and {file.name} do not: {grids[first]} and {grid}. Is one an overview?"
+            )
+    direction = orthonormal(f"path: {path}: rows and columns of {first.name}", headers[first].GetDirection())
     normal = direction[:, 2]
-    slices = sorted(slices, key=lambda each: float(each.position @ normal))
-    spacing = (*first.spacing, _distance(path, slices, normal))
-    return toward_axes(_pixels(slices), spacing, slices[0].position, direction)
+    files = sorted(headers, key=lambda file: float(np.array(headers[file].GetOrigin()) @ normal))
+    positions = np.array([headers[file].GetOrigin() for file in files])
+    across, down, _ = headers[first].GetSpacing()
+    step = float((positions[-1] - positions[0]) @ normal) / (len(files) - 1)
+    away = positions - positions[0] - np.outer(step * np.arange(len(files)), normal)
+    along = away @ normal
+    sideways = np.abs(away - np.outer(along, normal)).max(axis=1)
+    even = (np.abs(along) <= AWAY * step) & (sideways <= AWAY * min(across, down))
+    if step < 1e-6 or not even.all():
+        i = int(np.argmin(even))
+        raise ValueError(
+            f"path: {path} must hold slices evenly spaced along their normal; of {len(files)}, "
+            f"{files[i].name} lies {along[i]:.4g} too far along it, and {sideways[i]:.4g} sideways. Are "
+            "slices missing or there twice, or was the gantry tilted?"
+        )
+    return toward_axes(_pixels(headers, files), (across, down, step), positions[0], direction)
 
 
-def series_files(path: Path) -> list[Path]:
-    """The files of the series to which this one belongs, in its folder. **Raises:** as `read_dicom`."""
-    return [each.path for each in _slices(path)]
+def _pixels(headers: dict[Path, Any], files: list[Path]) -> np.ndarray:
+    """Rescaled values [x, y, z], of a type that holds those of all slices: each may have its own scale."""
+    planes = []
+    for file in files:
+        with decoding(file):
+            plane = simple_itk(file).GetArrayFromImage(headers[file].Execute())[0].T
+        planes.append(plane.astype(np.float32) if plane.dtype == np.float64 else plane)
+    return np.stack(planes, axis=2)
 
 
-def _slices(path: Path) -> list[Slice]:
-    """The slices of the only series in a folder, or of that to which a file belongs."""
+def series_headers(path: Path) -> dict[Path, Any]:
+    """Headers, by file, of the only series in a folder, or of the one that a file belongs to."""
     headers = {file: _header(file) for file in dicom_files(path if path.is_dir() else path.parent)}
     if path.is_file():
         series = _text(_header(path), SERIES)
-        return [_slice(file, found) for file, found in headers.items() if _text(found, SERIES) == series]
-    found = [_slice(file, header) for file, header in headers.items()]
-    series = {each.series: f"{each.description or 'no description'} (as {each.path.name})" for each in found}
-    if len(series) > 1:
+        return {file: header for file, header in headers.items() if _text(header, SERIES) == series}
+    examples = {_text(header, SERIES): file for file, header in headers.items()}
+    if len(examples) > 1:
+        told = [f"{_text(headers[file], DESCRIPTION)} (as {file.name})" for file in examples.values()]
         raise ValueError(
-            f"path: {path} holds several series: {', '.join(series.values())}. Give the path of one file of "
-            "the series that you want, or put each into a folder of its own."
+            f"path: {path} holds several series: {', '.join(told)}. Give the path of one file of the series "
+            "that you want, or put each into a folder of its own."
         )
-    return found
+    return headers
 
 
 def _header(path: Path) -> Any:
     """SimpleITK's reader of a file, whose header has been read."""
     if not is_dicom(path):
         raise ValueError(
-            f'path: {path} is no DICOM file: it does not have "DICM" at byte 128. If it is no slice, remove '
-            "it."
+            f'path: {path} is no DICOM file: it has no "DICM" at byte 128. Remove it from there.'
         )
-    reader = _reader(path)
+    reader = simple_itk(path).ImageFileReader()
+    reader.SetImageIO("GDCMImageIO")
+    reader.SetFileName(str(path))
     with decoding(path):
         reader.ReadImageInformation()
     return reader
 
 
-def _slice(path: Path, reader: Any) -> Slice:
+def _check_slice(path: Path, header: Any) -> None:
     syntax = _meta(path, SYNTAX)
-    if syntax not in READABLE:  # SimpleITK would take compressed bytes for pixels
+    if syntax not in PLAIN | PACKED:  # SimpleITK would take compressed bytes for pixels
         raise ValueError(
             f"path: {path} is stored in the transfer syntax {syntax}, which SimpleITK does not read. "
             "Decompress the series first, for example with gdcmconv --raw."
         )
-    (width, height, *depth), channels = reader.GetSize(), reader.GetNumberOfComponents()
-    if channels != 1 or depth not in ([], [1]):
+    size, channels = header.GetSize(), header.GetNumberOfComponents()
+    if channels != 1 or len(size) != 3 or size[2] != 1:
         raise ValueError(
-            f"path: {path} must hold one slice of one value per pixel; got size {reader.GetSize()} and "
-            f"{channels} values. Files of several frames are not supported: save it as NRRD or NIfTI."
+            f"path: {path} must hold one slice of one value per pixel; got size {size} and {channels} "
+            "values. Files of several frames are not supported: save it as NRRD or NIfTI."
         )
-    bits = _text(reader, "0028|0100")
-    n_bytes = width * height * (int(bits) // 8 if bits.isdigit() else 1)
-    check_pixels(path, n_bytes, compressed=syntax not in PLAIN)
-    position, axes, (down, across) = (  # spacing between rows, then between columns
-        numbers_in(_text(reader, tag), count, f"path: {path} must say where it lies: element ({tag})", "\\")
-        for tag, count in (("0020|0032", 3), ("0020|0037", 6), ("0028|0030", 2))
-    )
-    if min(down, across) <= 0:
-        raise ValueError(f"path: {path}: the spacing of its pixels must be positive; got {down}, {across}.")
-    series, description = _text(reader, SERIES), _text(reader, "0008|103e")
-    return Slice(path, series, description, (width, height), (across, down), position, axes.reshape(2, 3).T)
+    n_bytes = int(_text(header, BITS)) // 8 if _text(header, BITS).isdecimal() else 1
+    held = path.stat().st_size * (1 if syntax in PLAIN else MOST_COMPRESSED)
+    check_size(path, held, math.prod(size) * n_bytes, more=True)
+    if missing := [tag for tag in PLACE if not _text(header, tag)]:
+        raise ValueError(f"path: {path} must say where it lies: it has no element ({missing[0]}).")
 
 
-def _distance(path: Path, slices: list[Slice], normal: np.ndarray) -> float:
-    """The distance between slices, which are in order and must be evenly spaced along their normal."""
-    positions = np.stack([each.position for each in slices])
-    heights = positions @ normal
-    gaps = np.diff(heights)
-    step = float(np.median(gaps))
-    uneven = np.abs(gaps - step)
-    if step < 1e-6 or uneven.max() > AWAY * step:
-        i = int(uneven.argmax())
-        one, other = (slices[k].path.name for k in (i, i + 1))
-        raise ValueError(
-            f"path: {path} has unevenly spaced slices, or some are missing or there twice: the median "
-            f"distance is {step:g}, and {one} and {other} are {gaps[i]:g} apart."
-        )
-    sideways = np.abs(positions - positions[0] - np.outer(heights - heights[0], normal)).max()
-    if sideways > AWAY * min(slices[0].spacing):
-        raise ValueError(
-            f"path: {path} has slices that are shifted sideways by up to {sideways:.4g}, as by a tilted "
-            "gantry. Resample it on a rectangular grid."
-        )
-    return float(heights[-1] - heights[0]) / (len(slices) - 1)
+def _text(header: Any, tag: str) -> str:
+    return header.GetMetaData(tag).strip() if header.HasMetaDataKey(tag) else ""
 
 
-def _pixels(slices: list[Slice]) -> np.ndarray:
-    """Rescaled values [x, y, z], of a type that holds those of all slices: each may have its own scale."""
-    sitk = simple_itk(slices[0].path)
-    planes: list[np.ndarray] = []
-    for each in slices:
-        with decoding(each.path):
-            image = sitk.GetArrayFromImage(_reader(each.path).Execute())
-        plane = image.reshape(image.shape[-2:]).T
-        planes.append(plane.astype(np.float32) if plane.dtype == np.float64 else plane)
-    return np.stack(planes, axis=2)
-
-
-def _reader(path: Path) -> Any:
-    reader = simple_itk(path).ImageFileReader()
-    reader.SetImageIO("GDCMImageIO")
-    reader.SetFileName(str(path))
-    return reader
-
-
-def _text(reader: Any, tag: str) -> str:
-    return reader.GetMetaData(tag).strip() if reader.HasMetaDataKey(tag) else ""
-
-
-def _meta(path: Path, element: bytes) -> str | None:
-    """A UID from the meta information with which a file begins; None if it is not there."""
+def _meta(path: Path, element: bytes) -> str:
+    """A UID from the meta information, which is some hundred bytes; "" if it is not there."""
     with path.open("rb") as stream:
-        content = stream.read(META_BYTES)
+        content = stream.read(2**16)
     at = content.find(element, 132)
-    length = int.from_bytes(content[at + 6 : at + 8], "little")
-    if at < 0 or length > 64:
-        return None
-    return content[at + 8 : at + 8 + length].rstrip(b"\0 ").decode("latin-1")
+    length = int.from_bytes(content[at + 6 : at + 8], "little") if at >= 0 else 0
+    return content[at + 8 : at + 8 + length].rstrip(b"\0 ").decode("latin-1") if length <= 64 else ""

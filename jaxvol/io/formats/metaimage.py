@@ -1,8 +1,5 @@
-"""Reads MetaImage files (`.mha`, `.mhd`): a header in text, and the voxels behind it or in another file.
-
-SimpleITK hangs on some that are damaged, and leaves voxels unset where a header understates the number of
-compressed bytes, so that they are read here.
-"""
+"""Reads MetaImage files (`.mha`, `.mhd`), on some of which SimpleITK hangs, or leaves voxels unset where a
+header understates the number of compressed bytes."""
 
 import math
 import zlib
@@ -11,38 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, as_array, check_size, decoding, file_size, numbers_in
-from .medical import text_header
-from .orientation import orthonormal, toward_axes
+from ..._util.files import as_array, check_size, decoding, file_size
+from .medical import check_volume, orthonormal, text_header, toward_axes
 
 
-TYPES = {
-    "MET_CHAR": "i1",
-    "MET_UCHAR": "u1",
-    "MET_SHORT": "i2",
-    "MET_USHORT": "u2",
-    "MET_INT": "i4",
-    "MET_UINT": "u4",
-    "MET_LONG": "i4",
-    "MET_ULONG": "u4",
-    "MET_LONG_LONG": "i8",
-    "MET_ULONG_LONG": "u8",
-    "MET_FLOAT": "f4",
-    "MET_DOUBLE": "f8",
-}
+NAMES = "CHAR UCHAR SHORT USHORT INT UINT LONG ULONG LONG_LONG ULONG_LONG FLOAT DOUBLE"
+CODES = "i1 u1 i2 u2 i4 u4 i4 u4 i8 u8 f4 f8"
+TYPES = {f"MET_{name}": code for name, code in zip(NAMES.split(), CODES.split(), strict=True)}
 
 
 def read_metaimage(path: Path) -> dict[str, Any]:
     """Reader for `.mha` and `.mhd` of binary voxels."""
     file_size(path)
-    fields, begin = _header(path)
+    fields, begin, source = metaimage_header(path)
     shape = [_natural(size) for size in fields.get("DimSize", "").split()]
-    channels, kind = fields.get("ElementNumberOfChannels", "1"), fields.get("ElementType", "")
-    if len(shape) != 3 or channels != "1" or min(shape) < 1 or math.prod(shape) > MOST_VOXELS:
-        raise ValueError(
-            f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; got "
-            f"DimSize = {fields.get('DimSize', '')[:60]} and {channels[:20]} values per voxel."
-        )
+    check_volume(path, shape, _natural(fields.get("ElementNumberOfChannels", "1")))
+    kind = fields.get("ElementType", "")
     if kind not in TYPES or not _flag(fields, "BinaryData", "T"):
         raise ValueError(
             f"path: {path}: ElementType must be one of {', '.join(TYPES)}, and BinaryData true; got "
@@ -50,35 +31,7 @@ def read_metaimage(path: Path) -> dict[str, Any]:
         )
     msb = any(_flag(fields, f"{prefix}ByteOrderMSB") for prefix in ("", "BinaryData", "Element"))
     dtype = np.dtype(TYPES[kind]).newbyteorder(">" if msb else "<")
-    content = _content(path, fields, begin, math.prod(shape) * dtype.itemsize)
-    spacing = _numbers(path, fields, ("ElementSpacing", "ElementSize"), np.ones(3))
-    origin = _numbers(path, fields, ("Offset", "Position", "Origin"), np.zeros(3))
-    turn = _numbers(path, fields, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3))
-    # the axes of the data follow each other; here they are columns
-    direction = orthonormal(f"path: {path}: TransformMatrix", turn.T)
-    return toward_axes(as_array(content, shape, dtype, "F"), spacing, origin, direction)
-
-
-def metaimage_data(path: Path) -> Path:
-    """The file that holds the voxels of a MetaImage: itself, or another, which may be missing.
-
-    **Raises:** `ValueError` if it has no header."""
-    named = _header(path)[0]["ElementDataFile"]
-    return path if named.upper() == "LOCAL" else path.parent / named
-
-
-def _header(path: Path) -> tuple[dict[str, str], int]:
-    fields, end = text_header(path, "=", "ElementDataFile")
-    if "ElementDataFile" not in fields:
-        raise ValueError(
-            f"path: {path} cannot be read: it has no header of a MetaImage that ends in ElementDataFile."
-        )
-    return fields, end
-
-
-def _content(path: Path, fields: dict[str, str], begin: int, expected: int) -> bytes:
-    """The bytes of the voxels, `expected` in number."""
-    source = metaimage_data(path)
+    expected = math.prod(shape) * dtype.itemsize
     if not source.is_file():
         raise ValueError(f"path: {path} cannot be read: there is no file of its voxels, {str(source)[:80]}.")
     held = source.stat().st_size
@@ -92,17 +45,39 @@ def _content(path: Path, fields: dict[str, str], begin: int, expected: int) -> b
         if _flag(fields, "CompressedData"):  # by zlib or gzip, to the stream's own end
             content = zlib.decompressobj(wbits=47).decompress(stream.read(), expected + 1)
             check_size(path, len(content), expected)
-            return content
-        check_size(path, max(held - begin, 0), expected, more=True)
-        return stream.read(expected)
+        else:
+            check_size(path, max(held - begin, 0), expected, more=True)
+            content = stream.read(expected)
+    spacing = _numbers(path, fields, ("ElementSpacing", "ElementSize"), np.ones(3))
+    origin = _numbers(path, fields, ("Offset", "Position", "Origin"), np.zeros(3))
+    # the axes of the data follow each other; here they are columns
+    turn = _numbers(path, fields, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3)).T
+    direction = orthonormal(f"path: {path}: TransformMatrix", turn)
+    return toward_axes(as_array(content, shape, dtype, "F"), spacing, origin, direction)
+
+
+def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
+    """The fields of the header; where it ends, and the file of the voxels, which may be missing."""
+    fields, end = text_header(path, "=", "ElementDataFile")
+    named = fields.get("ElementDataFile")
+    if named is None:
+        raise ValueError(
+            f"path: {path} cannot be read: it has no header of a MetaImage that ends in ElementDataFile."
+        )
+    return fields, end, path if named.upper() == "LOCAL" else path.parent / named
 
 
 def _numbers(path: Path, fields: dict[str, str], keys: tuple[str, ...], default: np.ndarray) -> np.ndarray:
     """The numbers of the first of these keys that is there, in the shape of `default`."""
-    for key in keys:
-        if key in fields:
-            return numbers_in(fields[key], default.size, f"path: {path}: {key}").reshape(default.shape)
-    return default
+    text = next((fields[key] for key in keys if key in fields), None)
+    if text is None:
+        return default
+    try:
+        return np.array(text.split(), float).reshape(default.shape)
+    except ValueError as fault:
+        raise ValueError(
+            f"path: {path}: {keys[0]} must be {default.size} numbers; got {text[:80]!r}."
+        ) from fault
 
 
 def _natural(text: str) -> int:

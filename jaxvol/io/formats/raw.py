@@ -1,7 +1,4 @@
-"""Reads arrays from files without a header.
-
-Shape and type are given by the caller, by a JSON file beside the file, or by its name.
-"""
+"""Reads arrays from files without a header: a caller, a JSON file or the name tells their shape and type."""
 
 import gzip
 import json
@@ -41,59 +38,51 @@ def raw_header(
     path: Path, shape: Any, dtype: Any, bits: int
 ) -> tuple[tuple[int, int, int], np.dtype, dict[str, Any]]:
     """Shape (nx, ny, nz) with less than 2**`bits` voxels, stored type, and spacing and origin where they are
-    known, of a raw file: as given by the caller, else by a JSON file beside it, else by its name."""
+    known, of a raw file: as given by the caller, else by its JSON file, else by its name."""
     match = SCIVIS_NAME.search(path.name)
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
     given = {"shape": shape, "dtype": dtype}
-    fields |= raw_json_header(path) | {name: value for name, value in given.items() if value is not None}
+    fields |= _json_fields(path) | {name: value for name, value in given.items() if value is not None}
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
             f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
-            f'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put {path.name}.json beside it with '
+            f'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put {path.name}.json in its folder with '
             '{"size": [nx, ny, nz], "type": "uint8"}.'
         )
-    return _shape(path, fields.pop("shape"), bits), _dtype(path, fields.pop("dtype")), fields
-
-
-def raw_json(path: Path) -> Path | None:
-    """The JSON file beside a raw file, if there is one."""
-    stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    candidates = (path.with_name(f"{name}.json") for name in (path.name, stem))
-    return next((file for file in candidates if file.is_file()), None)
-
-
-def raw_json_header(path: Path) -> dict[str, Any]:
-    """What the JSON file beside a raw file says, under the names of `load`'s arguments."""
-    beside = raw_json(path)
-    if beside is None:
-        return {}
-    try:
-        fields = json.loads(beside.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as fault:
-        raise ValueError(f"path: the header {beside} is not JSON ({fault}).") from fault
-    if not isinstance(fields, dict):
-        raise ValueError(f"path: the header {beside} must be a JSON object; got {type(fields).__name__}.")
-    return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
-
-
-def _shape(path: Path, shape: Any, bits: int) -> tuple[int, int, int]:
+    shape, dtype = fields.pop("shape"), fields.pop("dtype")
     try:
         nx, ny, nz = map(operator.index, shape)
     except (TypeError, ValueError):
         nx = ny = nz = 0
     if min(nx, ny, nz) < 1 or nx * ny * nz >= 2**bits:
         raise ValueError(
-            "shape must be three positive integers (nx, ny, nz) with a product less than "
-            f"2**{bits}; got {shape!r} for {path}."
+            f"shape must be three positive integers (nx, ny, nz) with a product less than 2**{bits}; got "
+            f"{shape!r} for {path}."
         )
-    return nx, ny, nz
-
-
-def _dtype(path: Path, dtype: Any) -> np.dtype:
-    match = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
-    if match is None:
+    found = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
+    if found is None:
         raise ValueError(
             "dtype must be uint8, int8, uint16, int16, float16, float32 or float64, optionally with le or be "
             f"appended for the byte order; got {dtype!r} for {path}."
         )
-    return np.dtype(match[1].lower()).newbyteorder(">" if (match[2] or "").lower() == "be" else "<")
+    order = ">" if (found[2] or "").lower() == "be" else "<"
+    return (nx, ny, nz), np.dtype(found[1].lower()).newbyteorder(order), fields
+
+
+def raw_json(path: Path) -> list[Path]:
+    """The JSON file of a raw file, if there is one: of its name with `.json` behind it, or as ending."""
+    stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+    return [file for name in (path.name, stem) if (file := path.with_name(f"{name}.json")).is_file()][:1]
+
+
+def _json_fields(path: Path) -> dict[str, Any]:
+    """What the JSON file of a raw file says, under the names of `load`'s arguments."""
+    for file in raw_json(path):
+        try:
+            fields = json.loads(file.read_text(encoding="utf-8"))
+        except (ValueError, RecursionError) as fault:
+            raise ValueError(f"path: the header {file} is not JSON ({fault}).") from fault
+        if not isinstance(fields, dict):
+            raise ValueError(f"path: the header {file} must be a JSON object; got {type(fields).__name__}.")
+        return {name: fields[key] for key, name in JSON_KEYS.items() if key in fields}
+    return {}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, check_pixels, file_size
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size
 
 
 ENDINGS = (".tif", ".tiff")
@@ -24,63 +24,47 @@ def read_tiff(path: Path) -> dict[str, Any]:
     return {"data": images.transpose(2, 1, 0)} | spacing
 
 
-def tiff_spacing(path: Path) -> dict[str, Any]:
-    """The spacing that a file tells, as `read_tiff` has it; its images are not read."""
-    with _tifffile(path).TiffFile(path) as file:
-        return _spacing(file)
-
-
 def tiff_files(folder: Path) -> list[Path]:
     """The TIFF files in a folder, with numbers in their names in numeric order."""
     files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS and file.is_file()]
 
-    def key(file: Path) -> list[tuple[int, str]]:
-        words = re.split(r"([0-9]+)", file.name.lower())
-        return [(int(word), "") if word.isdigit() else (-1, word) for word in words]
+    def key(file: Path) -> list[Any]:
+        words: list[Any] = re.split(r"([0-9]+)", file.name.lower())
+        words[1::2] = map(int, words[1::2])
+        return words
 
     return sorted(files, key=key)
 
 
 def read_tiff_folder(folder: Path) -> dict[str, Any]:
-    """Reader for a folder of files of one page each, in the order of the numbers in their names.
-
-    **Raises:** `ValueError` naming the files for images of different sizes or types, and for a number that is
-    missing in a sequence.
-    """
-    files = tiff_files(folder)
+    """Reader for a folder of files of one page each, in the order of the numbers in their names. Raises
+    `ValueError` naming the files for images of different sizes or types, and for a number that is missing."""
+    files, slices = tiff_files(folder), []
     numbers = [int(found[-1]) for file in files if (found := re.findall(r"[0-9]+", file.stem))]
-    steps = np.diff(numbers)
-    if len(numbers) == len(files) and steps.size and np.all(steps > 0) and steps.min() != steps.max():
+    steps = np.diff(numbers).tolist()
+    if len(numbers) == len(files) and len(set(steps)) > 1 and min(steps) > 0:
         i = int(np.argmax(steps))
         raise ValueError(
             f"path: slices are missing in {folder}: {files[i].name} is followed by {files[i + 1].name}."
         )
-    slices: list[np.ndarray] = []
     for file in files:
-        images, _ = _images(file)
-        if len(images) != 1:
-            raise ValueError(f"path: {file} must hold one image, as a slice of {folder}; got {len(images)}.")
-        slices.append(images[0])
-        first, last = (f"{each.shape} of {each.dtype}" for each in (slices[0], slices[-1]))
-        if first != last or len(slices) * images.size > MOST_VOXELS:
+        image, _ = _images(file)
+        slices.append(image)
+        first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (slices[0], image))
+        if len(image) != 1 or first != last or len(slices) * image.size > MOST_VOXELS:
             raise ValueError(
-                f"path: the slices in {folder} must have the same size and type, and fewer than 2**31 "
-                f"voxels; {files[0].name} has {first}, and {file.name} {last}."
+                f"path: each file in {folder} must hold one image of the same size and type, fewer than "
+                f"2**31 voxels in all; {files[0].name} has {first}, and {file.name} {len(image)} of {last}."
             )
-    return {"data": np.stack(slices).transpose(2, 1, 0)}
-
-
-def _tifffile(path: Path) -> Any:
-    try:
-        import tifffile  # pyright: ignore[reportMissingImports]
-    except ImportError as fault:
-        raise ImportError(f"reading {path} needs tifffile: pip install jaxvol[io]") from fault
-    return tifffile
+    return {"data": np.concatenate(slices).transpose(2, 1, 0)}
 
 
 def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """The images [z, y, x] in a file, and their spacing where it is known."""
-    tifffile = _tifffile(path)
+    try:
+        import tifffile  # pyright: ignore[reportMissingImports]
+    except ImportError as fault:
+        raise ImportError(f"reading {path} needs tifffile: pip install jaxvol[io]") from fault
     file_size(path)
     try:
         with tifffile.TiffFile(path) as file:
@@ -99,9 +83,10 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
                     f"{file.series[0].shape} ({axes}), and pages of {len(kinds)} kinds."
                 )
             packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
-            check_pixels(path, math.prod(shape) * first.dtype.itemsize, compressed=packed)
+            held = path.stat().st_size * (MOST_COMPRESSED if packed else 1)
+            check_size(path, held, math.prod(shape) * first.dtype.itemsize, more=True)
             images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
-            return images.reshape(-1, *shape[-2:]), _spacing(file)
+            return images.reshape(-1, *shape[-2:]), _spacing(tifffile, file)
     except MemoryError:
         raise
     except Exception as fault:
@@ -111,8 +96,7 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _check_last(path: Path, file: Any) -> None:
-    """**Raises** `ValueError` if the pages that were found are followed by others: tifffile leaves out what
-    lies beyond the end of the file."""
+    """Raises `ValueError` if more pages follow: tifffile leaves out what lies beyond the file's end."""
     format, handle = file.tiff, file.filehandle
     handle.seek(file.pages[-1].aspage().offset)
     (tags,) = struct.unpack(format.tagnoformat, handle.read(format.tagnosize))
@@ -122,11 +106,11 @@ def _check_last(path: Path, file: Any) -> None:
         raise ValueError(f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
 
 
-def _spacing(file: Any) -> dict[str, Any]:
+def _spacing(tifffile: Any, file: Any) -> dict[str, Any]:
     """Spacing (x, y, z) as OME or ImageJ wrote it, in mm, or in its own unit if that is none of length."""
     try:
         if file.is_ome:
-            image = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"]["Image"]
+            image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
             told = (image[0] if isinstance(image, list) else image)["Pixels"]
             units = [told.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
             steps = [float(told[f"PhysicalSize{axis}"]) for axis in "XYZ"]

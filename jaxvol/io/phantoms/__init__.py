@@ -1,9 +1,8 @@
 """Synthetic scenes that need no data files.
 
-Every phantom spans the world cube [-1, 1]³, with nodes on the cube's faces, and is the same scene at every
-resolution: shapes are signed distances and textures are waves, both in world units, and a shape's coverage
-falls off over a ramp of a fixed number of voxels. Drawn scenes have a file each; `canvas.py` and `shapes.py`
-are what they are drawn with.
+Every phantom is the same scene at every resolution: shapes are signed distances and textures are waves, both
+in world units, and a shape's coverage falls off over a ramp of a fixed number of voxels. Drawn scenes have a
+file each; `canvas.py` and `shapes.py` are what they are drawn with.
 """
 
 from collections.abc import Callable
@@ -13,11 +12,12 @@ import numpy as np
 
 from ..._util.checks import integer
 from ...scene.volume import Volume
-from . import colon, engine, frog, head, vessels
+from .bodies import draw_frog, draw_head
 from .canvas import Canvas
-from .colon import colon_path as colon_path
+from .engine import draw_engine
 from .shapes import Block
 from .toroidal import toroidal_phantom as toroidal_phantom
+from .tubes import colon_path as colon_path, draw_colon, draw_vessels
 
 
 def _plane(x: Block, y: Block, z: Block) -> Block:
@@ -44,14 +44,14 @@ FORMULAS: dict[str, Callable[[Block, Block, Block], Block]] = {
 }
 """Values at world points x, y, z, an open mesh, of phantoms whose images have a known answer."""
 
-DRAWN: dict[str, Callable[[int, np.random.Generator], np.ndarray | tuple[np.ndarray, np.ndarray]]] = {
-    "head": head.make,
-    "engine": engine.make,
-    "colon": colon.make,
-    "vessels": vessels.make,
-    "labels": frog.make,
+DRAWN: dict[str, Callable[[Canvas, np.random.Generator], np.ndarray | None]] = {
+    "head": draw_head,
+    "engine": draw_engine,
+    "colon": draw_colon,
+    "vessels": draw_vessels,
+    "labels": draw_frog,
 }
-"""Functions from a resolution and a random generator to voxels and, for some, labels."""
+"""Functions that paint a canvas, and return labels, if any."""
 
 PHANTOMS = (*DRAWN, *FORMULAS)
 
@@ -59,48 +59,46 @@ PHANTOMS = (*DRAWN, *FORMULAS)
 def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> Volume:
     """A synthetic volume on the cube [-1, 1]³, `resolution` nodes along each axis.
 
-    Spacing is 2 / (resolution - 1) and the origin (-1, -1, -1). The value at a world point does not
-    depend on the resolution, except at boundaries of the uint8 phantoms, which are ramps 2 voxels
-    wide (in `labels`, 0.06 world units at every resolution). `u` below is (world + 1) / 2, which
-    ranges over the unit cube.
+    The value at a world point does not depend on the resolution, except at boundaries of the uint8 phantoms,
+    which are ramps 2 voxels wide (in `labels`, 0.06 world units at every resolution). `u` below is
+    (world + 1) / 2, which ranges over the unit cube.
 
-    | name | type | what | seed |
-    |---|---|---|---|
+    | name | type | what |
+    |---|---|---|
     | `head` | uint8 | CT-like head, face towards -y, crown towards +z; the -z face cuts the neck. Air 0, \
-skin 78, muscle 100, brain and cord 105 to 130, bone 185 to 225, teeth 255 | brain folds, tissue texture |
+    skin 78, muscle 100, brain and cord 105 to 130, bone 185 to 225, teeth 255 |
     | `engine` | uint8 | three-cylinder engine, crankshaft along x, cut open towards -y: pipes 90, cast \
-block 150, steel parts 240 | none |
+    block 150, steel parts 240 |
     | `colon` | uint8 | winding tube with folds and polyps along `colon_path`: lumen and outside 0, tissue \
-180, wall 220 | polyps, folds, tissue texture |
-    | `vessels` | uint8 | branching tubes (230 on 0) from a root at the -z face, radii 0.12 to 0.02 world \
-units, less than 3 % filled | the tree |
+    180, wall 220 |
+    | `vessels` | uint8 | branching tubes (230 on 0) from a root at the -z face, radii 0.12 to 0.02 |
     | `labels` | uint8 | frog facing -y, with organs, soft-edged, and `labels`: 0 outside, 1 body, 2 and 3 \
-lungs (right, left), 4 liver, 5 stomach; organs that touch share a curved face | none |
-    | `plane` | float32 | inclined plane, 1 / (1 + exp(-(u_z - h) / 0.004)) with h = 0.25 + 0.35 u_x; seen \
-along +z | none |
-    | `cut_block` | float32 | 0.5 + 0.1 sin(40 u_z) for u_x < 0.5, cut by the box's faces; \
-`plane` elsewhere | none |
-    | `sphere` | float32 | 1 / (1 + exp((r - 0.5) / 0.008)) | none |
-    | `constant`, `linear`, `gaussian` | float32 | 1; (x + 1) / 2; exp(-r² / (2 · 0.3²)) | none |
+    lungs (right, left), 4 liver, 5 stomach; organs that touch share a curved face |
+    | `plane` | float32 | 1 / (1 + exp(-(u_z - h) / 0.004)) with h = 0.25 + 0.35 u_x; seen along +z |
+    | `cut_block` | float32 | 0.5 + 0.1 sin(40 u_z) for u_x < 0.5, cut by the box's faces; else `plane` |
+    | `sphere` | float32 | 1 / (1 + exp((r - 0.5) / 0.008)) |
+    | `constant`, `linear`, `gaussian` | float32 | 1; (x + 1) / 2; exp(-r² / (2 · 0.3²)) |
 
-    **Arguments:** `name`: of the table. `resolution`: nodes along each axis, at least 8. `seed`: of what the
-    table's last column names.
+    Args:
+        name: of the table.
+        resolution: nodes along each axis, at least 8.
+        seed: of the textures of `head` and `colon`, polyps and folds of `colon`, and the tree of `vessels`.
 
-    **Returns:** the `Volume`; that of `labels` has labels.
+    Returns:
+        The `Volume`; that of `labels` has labels.
 
-    **Raises:** `ValueError` for an unknown name, a resolution that is not an integer of at least 8,
-    and a seed that is not a non-negative integer.
+    Raises:
+        ValueError: for an unknown name and for numbers that are no integers or too small.
     """
     if name not in PHANTOMS:
         raise ValueError(f"name must be one of {', '.join(PHANTOMS)}; got {name!r}.")
     resolution = integer("resolution", resolution, 8)
-    rng, labels = np.random.default_rng(integer("seed", seed, 0)), None
+    rng = np.random.default_rng(integer("seed", seed, 0))
+    canvas, labels = Canvas(resolution), None
     if name in DRAWN:
-        made = DRAWN[name](resolution, rng)
-        data, labels = made if isinstance(made, tuple) else (made, None)
+        labels = DRAWN[name](canvas, rng)
     else:
-        canvas = Canvas(resolution)
         for where, at in canvas.slabs():
             canvas.values[where] = FORMULAS[name](*at)
-        data = canvas.values
-    return Volume(data, spacing=(2 / (resolution - 1),) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)
+    data = canvas.as_uint8() if name in DRAWN else canvas.values
+    return Volume(data, spacing=(canvas.spacing,) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)

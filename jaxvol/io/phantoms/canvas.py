@@ -1,8 +1,8 @@
 """Rasterises shapes at the nodes of the cube [-1, 1]³, as values or as signed distances; and textures.
 
-A shape is evaluated only near its bounding box, in slabs small enough for the cache. A *field* is a canvas
-of signed distances, `FAR` where there is nothing, that shapes are joined to and carved from; a canvas of
-values is painted, later layers over earlier ones.
+A *field* is a canvas of signed distances, `FAR` where there is nothing, that shapes are joined to and carved
+from; a canvas of values is painted, later layers over earlier ones. A shape is evaluated only near its
+bounding box, in slabs small enough for the cache.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +26,12 @@ class Canvas:
         self.spacing = 2 / (resolution - 1)
         self.values = np.full((resolution,) * 3, fill, np.float32)
 
+    def field(self, build: Callable[..., None]) -> "Canvas":
+        """A field of distances at the same nodes, to which `build` joins shapes."""
+        field = Canvas(len(self.axis), FAR)
+        build(field)
+        return field
+
     def slabs(
         self, low: Point = (-1.0,) * 3, high: Point = (1.0,) * 3, reach: float = 0.0
     ) -> Iterator[tuple[tuple[slice, slice, slice], tuple[Block, Block, Block]]]:
@@ -41,25 +47,19 @@ class Canvas:
             where = (slice(start, stop), slice(first[1], last[1]), slice(first[2], last[2]))
             yield where, (self.axis[start:stop, None, None], y[None, :, None], z[None, None, :])
 
-    def _distances(self, shapes: Shape | Iterable[Shape], blend: float):
-        """Index and distance of every shape, slab by slab, evaluated up to 2 `blend` outside its box."""
-        for shape in [shapes] if isinstance(shapes, Shape) else shapes:
-            for where, at in self.slabs(shape.low, shape.high, 2 * blend + 2 * self.spacing):
-                yield where, shape.distance(*at)
-
-    def join(self, shapes: Shape | Iterable[Shape], blend: float = 0.0) -> None:
+    def join(self, shapes: Shape | Iterable[Shape], blend: float = 0.0, sign: int = 1) -> None:
         """Union with a field of distances; seams are rounded over a distance `blend`.
 
         A shape's distance is evaluated up to 2 `blend` outside its box. Shapes that blend into it later need
         it equally far out, so the first shape of a field is given the widest blend that follows.
         """
-        for where, distance in self._distances(shapes, blend):
-            self.values[where] = smooth_min(self.values[where], distance, blend)
+        for shape in [shapes] if isinstance(shapes, Shape) else shapes:
+            for where, at in self.slabs(shape.low, shape.high, 2 * blend + 2 * self.spacing):
+                self.values[where] = sign * smooth_min(sign * self.values[where], shape.distance(*at), blend)
 
     def carve(self, shapes: Shape | Iterable[Shape], blend: float = 0.0) -> None:
         """Difference from a field of distances; edges are rounded over a distance `blend`."""
-        for where, distance in self._distances(shapes, blend):
-            self.values[where] = -smooth_min(-self.values[where], distance, blend)
+        self.join(shapes, blend, -1)
 
     def paint(
         self,
@@ -68,10 +68,8 @@ class Canvas:
         width: float | None = None,
         grown: float = 0.0,
     ) -> None:
-        """Paint a material over the present values, within a shape or field that is `grown` by a distance.
-
-        `value`: a number or a function of (x, y, z, distance); `width`: of the ramp at the boundary.
-        """
+        """Paint a number, or a function of (x, y, z, distance), over the present values, within a shape or
+        field that is `grown` by a distance. `width`: of the ramp at the boundary."""
         width = RAMP * self.spacing if width is None else width
         field = isinstance(shape, Canvas)
         for where, at in self.slabs() if field else self.slabs(shape.low, shape.high, width + grown):
@@ -92,23 +90,23 @@ def smooth_min(a: Block, b: Block, blend: float) -> Block:
     return np.minimum(a, b) - overlap**2 / (4 * blend)
 
 
-class PlaneWaves:
-    """A smooth random texture, the same at every resolution: a sum of plane waves with wavelengths of a given
-    range, variance 1."""
+def plane_waves(rng: np.random.Generator, shortest: float, longest: float) -> Callable[..., Block]:
+    """A smooth random texture, the same at every resolution: a sum of 32 plane waves with wavelengths of a
+    given range, variance 1."""
+    direction = rng.normal(size=(32, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    wave_vector = 2 * np.pi * direction / rng.uniform(shortest, longest, (32, 1))
+    phase = rng.uniform(0, 2 * np.pi, 32)
 
-    def __init__(self, rng: np.random.Generator, shortest: float, longest: float, count: int = 32):
-        direction = rng.normal(size=(count, 3))
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        self.wave_vector = 2 * np.pi * direction / rng.uniform(shortest, longest, (count, 1))
-        self.phase = rng.uniform(0, 2 * np.pi, count)
-
-    def __call__(self, x: Block, y: Block, z: Block) -> Block:
+    def texture(x: Block, y: Block, z: Block) -> Block:
         # the cosine as the real part of a product of three exponentials: one matrix product sums all waves
         ex, ey, ez = (
             np.exp(1j * np.outer(v.ravel(), k)).astype(np.complex64)
-            for v, k in zip((x, y, z), self.wave_vector.T, strict=True)
+            for v, k in zip((x, y, z), wave_vector.T, strict=True)
         )
-        ex = ex * (np.exp(1j * self.phase) * np.sqrt(2 / len(self.phase))).astype(np.complex64)
-        exy = (ex[:, None, :] * ey).reshape(-1, len(self.phase))
+        ex = ex * (np.exp(1j * phase) * np.sqrt(2 / 32)).astype(np.complex64)
+        exy = (ex[:, None, :] * ey).reshape(-1, 32)
         real, imaginary = exy.real @ ez.real.T, exy.imag @ ez.imag.T
         return (real - imaginary).reshape(x.size, y.size, z.size)
+
+    return texture

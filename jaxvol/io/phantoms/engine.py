@@ -6,7 +6,7 @@ Later fields cover earlier ones: pipes, the cast block, steel parts.
 
 import numpy as np
 
-from .canvas import FAR, Canvas
+from .canvas import Canvas
 from .shapes import box, capsule, cylinder, ellipsoid, ring, tube
 
 
@@ -14,15 +14,12 @@ BORES, CRANK = (-0.42, 0.0, 0.42), -0.52  # x of the cylinders, z of the cranksh
 PORTS = [capsule((x, s * 0.37, 0.405), (x, s * 0.09, 0.33), 0.05) for x in BORES for s in (-1, 1)]
 
 
-def make(n: int, rng: np.random.Generator) -> np.ndarray:
-    canvas = Canvas(n)
-    for value, field in ((90, _pipes(n)), (150, _cast(n)), (240, _steel(n))):
-        canvas.paint(value, field)
-    return canvas.as_uint8()
+def draw_engine(canvas: Canvas, rng: np.random.Generator) -> None:
+    for value, build in ((90, _pipes), (150, _cast), (240, _steel)):
+        canvas.paint(value, canvas.field(build))
 
 
-def _cast(n: int) -> Canvas:
-    cast = Canvas(n, FAR)
+def _cast(cast: Canvas) -> None:
     cast.join(box((0, 0, -0.87), (0.72, 0.56, 0.06)), 0.04)  # base plate
     cast.join(box((0, 0, -0.55), (0.66, 0.38, 0.30), 0.08), 0.04)
     cast.join(box((0, 0, 0.0), (0.66, 0.27, 0.30), 0.04), 0.04)
@@ -38,11 +35,10 @@ def _cast(n: int) -> Canvas:
     cast.carve(box((0.42, -0.42, 0.0), (0.175, 0.42, 0.25), 0.03), 0.02)  # the cut-away
     cast.carve(box((0.0, -0.52, -0.52), (0.54, 0.32, 0.17), 0.05), 0.02)
     cast.carve([box((0, y, 0.285), (0.72, 0.02, 0.008), 0.004) for y in (-0.31, 0.31)])  # gasket line
-    return cast
 
 
-def _pipes(n: int) -> Canvas:
-    pipes, inside = Canvas(n, FAR), []
+def _pipes(pipes: Canvas) -> None:
+    inside = []
     exhaust = [[(x, 0.30, 0.40), (x, 0.52, 0.38), (x, 0.66, 0.26), (x, 0.69, 0.1)] for x in BORES]
     exhaust += [[(-0.42, 0.69, 0.1), (0.42, 0.69, 0.1), (0.52, 0.69, 0.05), (0.55, 0.69, -0.1)]]
     exhaust += [[(0.55, 0.69, -0.1), (0.55, 0.69, -0.75)]]
@@ -58,11 +54,9 @@ def _pipes(n: int) -> Canvas:
     pipes.join([cylinder(1, (x, s * 0.345, 0.405), 0.11, 0.018) for x in BORES for s in (-1, 1)])  # flanges
     pipes.join(cylinder(2, (0.55, 0.69, -0.72), 0.13, 0.02))
     pipes.carve([*inside, *PORTS, capsule((0.55, 0.69, -0.6), (0.55, 0.69, -0.9), 0.06)])
-    return pipes
 
 
-def _steel(n: int) -> Canvas:
-    steel = Canvas(n, FAR)
+def _steel(steel: Canvas) -> None:
     steel.join(cylinder(0, (0, 0, CRANK), 0.065, 0.92))
     for x, angle in zip(BORES, (0.5, 0.5 + 2 * np.pi / 3, 0.5 + 4 * np.pi / 3), strict=True):
         py, pz = 0.11 * float(np.sin(angle)), CRANK + 0.11 * float(np.cos(angle))
@@ -101,4 +95,3 @@ def _steel(n: int) -> Canvas:
     bolts += [(x, y, -0.745) for x in (-0.62, 0.62) for y in (-0.46, 0.46)]
     for x, y, z in bolts:
         steel.join([cylinder(2, (x, y, z), 0.042, 0.03, sides=6), cylinder(2, (x, y, z - 0.1), 0.02, 0.1)])
-    return steel

@@ -15,20 +15,18 @@ from jaxtyping import Float
 
 Point: TypeAlias = Sequence[float | int] | Float[np.ndarray, "3"]
 Block: TypeAlias = Float[np.ndarray, "_ _ _"]
-Distance: TypeAlias = Callable[[Block, Block, Block], Block]
 
 
 class Shape(NamedTuple):
     """Signed distance on an open mesh (x, y, z), and two corners of the bounding box."""
 
-    distance: Distance
+    distance: Callable[[Block, Block, Block], Block]
     low: Point
     high: Point
 
 
-def _around(distance: Distance, center: Point, half: Point) -> Shape:
-    low, high = (tuple(c + s * h for c, h in zip(center, half, strict=True)) for s in (-1, 1))
-    return Shape(distance, low, high)
+def _around(distance: Callable[[Block, Block, Block], Block], center: Point, half: Point) -> Shape:
+    return Shape(distance, np.subtract(center, half, dtype=float), np.add(center, half, dtype=float))
 
 
 def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
@@ -71,9 +69,7 @@ def capsule(a: Point, b: Point, radius: float, end_radius: float | None = None) 
         return away - (radius + t * (end - radius))
 
     wide = max(radius, end)
-    low = tuple(min(p, q) - wide for p, q in zip(a, b, strict=True))
-    high = tuple(max(p, q) + wide for p, q in zip(a, b, strict=True))
-    return Shape(distance, low, high)
+    return Shape(distance, np.minimum(a, b) - wide, np.maximum(a, b) + wide)
 
 
 def tube(points: Sequence[Point], radius: float) -> list[Shape]:
@@ -124,11 +120,11 @@ def ring(center: Point, radius: float, thickness: float) -> Shape:
 def pair(*shapes: Shape) -> list[Shape]:
     """Every shape and its mirror image in the plane x = 0."""
 
-    def mirror(shape: Shape) -> Shape:
+    def mirrored(shape: Shape) -> Shape:
         low, high = (-shape.high[0], *shape.low[1:]), (-shape.low[0], *shape.high[1:])
         return Shape(lambda x, y, z: shape.distance(-x, y, z), low, high)
 
-    return [side for shape in shapes for side in (shape, mirror(shape))]
+    return [side for shape in shapes for side in (shape, mirrored(shape))]
 
 
 def lengths(line: Float[np.ndarray, "points axes"]) -> Float[np.ndarray, " points"]:

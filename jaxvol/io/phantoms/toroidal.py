@@ -4,7 +4,7 @@ The scene lies in the world, in mm, in front of a probe whose motor axis is the 
 points along z. It is sampled at the nodes of the probe's beams, and speckle is applied.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import reduce
 from typing import Any
 
@@ -21,9 +21,6 @@ from .shapes import Block, Shape, ball, capsule, ellipsoid, tube
 SOFT = 1.2  # mm over which a boundary falls from full to none
 GRAIN = 0.35  # mm along a beam over which speckle is correlated: half the pulse length
 
-Scene = Callable[[Block, Block, Block, Block], Block]
-"""Mean echo, 0 to 255, at world points x, y, z of depth γ; all in mm."""
-
 
 def toroidal_phantom(
     name: str,
@@ -38,32 +35,30 @@ def toroidal_phantom(
     | name | what | mean echo |
     |---|---|---|
     | `shells` | reverberation: echoes 2 mm thick, 12 mm apart along every beam, each weaker than the one \
-before | 220, falling by 15 % each; 8 between |
+    before | 220, falling by 15 % each; 8 between |
     | `spheres` | rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
-tissue 60; cysts 4; targets 130, 160, 190 |
+    tissue 60; cysts 4; targets 130, 160, 190 |
     | `wires` | the spheres, and between them wires 3 mm thick, along x, along y and obliquely in depth | as \
-spheres; wires 255 |
+    spheres; wires 255 |
     | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
-90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
+    90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
 
-    Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe, which only
-    determine where it is sampled; the grains of the speckle do.
+    Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe; the grains of the
+    speckle do.
 
-    **Arguments:**
+    Args:
+        name: of the table.
+        shape: nodes along (β, σ, γ), at least 8 each.
+        probe: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
+        speckle: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
+            (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
+        seed: of the speckle.
 
-    - `name`: of the table.
-    - `shape`: nodes along (β, σ, γ), at least 8 each. The data are stored as acquired, `data[β, σ, γ]`,
-      depth fastest in memory.
-    - `probe`: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
-    - `speckle`: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
-      (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
-    - `seed`: of the speckle.
+    Returns:
+        A uint8 volume as acquired, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe.
 
-    **Returns:** a uint8 volume, whose own spacing has no meaning, and the probe.
-
-    **Raises:** `ValueError` for an unknown name, a shape that is not three integers of at least 8, a probe
-    that is not a `ToroidalMap`, a `speckle` that is not true or false, and a seed that is not a
-    non-negative integer.
+    Raises:
+        ValueError: for an unknown name and for arguments of other kinds.
     """
     if name not in SCENES:
         raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")
@@ -101,17 +96,17 @@ def _speckle(
     impulse = np.zeros(shape[-1])
     impulse[shape[-1] // 2] = 1
     # standard deviation of white noise of variance 1 after filtering
-    deviation = np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2))
-    re, im = (
-        gaussian_filter1d(rng.standard_normal(shape, np.float32), grain, mode="wrap") / np.float32(deviation)
-        for _ in range(2)
-    )
+    deviation = np.float32(np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2)))
+    noise = (rng.standard_normal(shape, np.float32) for _ in range(2))
+    re, im = (gaussian_filter1d(white, grain, mode="wrap") / deviation for white in noise)
     return np.sqrt(re * re + im * im) * np.float32(np.sqrt(2 / np.pi))
 
 
-def _paint(echo: Block, value: float, distance: Block) -> None:
-    """Paint a material over the present echo, where the distance to it is negative."""
-    echo += np.clip(0.5 - distance / SOFT, 0, 1) * (value - echo)
+def _painted(echo: Block, layers: Iterable[tuple[float, Block]]) -> Block:
+    """Paint materials over the echo, one over the other, where the distance to each is negative."""
+    for value, distance in layers:
+        echo += np.clip(0.5 - distance / SOFT, 0, 1) * (value - echo)
+    return echo
 
 
 def _shells(x: Block, y: Block, z: Block, gamma: Block) -> Block:
@@ -122,43 +117,37 @@ def _shells(x: Block, y: Block, z: Block, gamma: Block) -> Block:
 
 
 def _spheres(x: Block, y: Block, z: Block, gamma: Block) -> Block:
-    echo = np.full_like(x, 60)
-    for radius, across, target in ((6, -30, 130), (9, -4, 160), (12, 28, 190)):
-        for value, side in ((4, -20), (target, 20)):
-            _paint(echo, value, ball((across, side, 95), radius).distance(x, y, z))
-    return echo
+    return _painted(np.full_like(x, 60), ((value, sphere.distance(x, y, z)) for value, sphere in SPHERES))
 
 
 def _wires(x: Block, y: Block, z: Block, gamma: Block) -> Block:
-    echo = _spheres(x, y, z, gamma)
-    for wire in WIRES:
-        _paint(echo, 255, wire.distance(x, y, z))
-    return echo
+    return _painted(_spheres(x, y, z, gamma), ((255, wire.distance(x, y, z)) for wire in WIRES))
 
 
 def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     # origin at the navel; x from crown to rump, y from right to left, z from back to front
     at = x, y, 100 - z
     either_side = x, abs(y), at[2]
-    echo = np.full_like(x, 30)
-    _paint(echo, 4, ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at))
     head, limbs = _joined(HEAD, at, 4), _joined(LIMBS, either_side, 2)
     body = _joined(TRUNK, at, 8)
     body = smooth_min(smooth_min(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
     body = smooth_min(smooth_min(limbs, body, 4), _joined(CORD, at, 0), 2)
-    _paint(echo, 120, body)
-    _paint(echo, 70, body + 2)
-    _paint(echo, 170, head + 2.5)
-    _paint(echo, 40, head + 4.5)
-    _paint(echo, 170, _joined(SPINE, at, 0))
-    _paint(echo, 170, _joined(BONES, either_side, 0))
-    return echo
+    fluid = ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at)
+    skull = (170, head + 2.5), (40, head + 4.5)
+    bones = (170, _joined(SPINE, at, 0)), (170, _joined(BONES, either_side, 0))
+    return _painted(np.full_like(x, 30), [(4, fluid), (120, body), (70, body + 2), *skull, *bones])
 
 
 def _joined(shapes: Iterable[Shape], at: tuple[Block, Block, Block], blend: float) -> Block:
     """Distance to the union of shapes, with rounded seams."""
     return reduce(lambda a, b: smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
 
+
+SPHERES = [
+    (value, ball((across, side, 95), radius))
+    for radius, across, target in ((6, -30, 130), (9, -4, 160), (12, 28, 190))
+    for value, side in ((4, -20), (target, 20))
+]
 
 WIRES = [
     capsule((-60, 0, 110), (60, 0, 110), 1.5),
@@ -196,4 +185,5 @@ SPINE = [ball((x, 0, -10 - 0.004 * (30 - abs(x - 4)) * x), 1.8) for x in range(-
 CORD = tube([(13, 0, 12), (11, -9, 20), (18, -19, 21), (29, -25, 15), (36, -27, 4), (38, -27, -10)], 2.2)
 
 
-SCENES: dict[str, Scene] = {"shells": _shells, "spheres": _spheres, "wires": _wires, "fetus": _fetus}
+SCENES = {"shells": _shells, "spheres": _spheres, "wires": _wires, "fetus": _fetus}
+"""Functions from world points x, y, z of depth γ, all in mm, to the mean echo there, 0 to 255."""

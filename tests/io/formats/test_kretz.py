@@ -111,8 +111,8 @@ BAD = {
         kretz({tag: GOOD[tag] for tag in GOOD if tag != VOXELS}, [((0xD600, 1), bytes(240))]),
         "no item D000:1 .*several frames.*uncompressed",
     ),
-    "compressed": (changed(VOXELS, bytes(40)), "4 x 5 x 6 = 120 bytes.*holds 40.*compressed"),
-    "too many voxels": (changed(VOXELS, bytes(121)), "= 120 bytes.*holds 121"),
+    "compressed": (changed(VOXELS, bytes(40)), "must have 120 bytes; it has 40.*compressed"),
+    "too many voxels": (changed(VOXELS, bytes(121)), "must have 120 bytes; it has 121"),
     "Cartesian": (
         without(PLANES, BEAMS),
         r"no item C300:1 .*, no item C300:2 .*Cartesian",
@@ -123,10 +123,10 @@ BAD = {
         kretz(GOOD | {(0xC000, n): b"\xff\xff" for n in (1, 2, 3)}),
         r"fewer than 2\*\*31 voxels; its header says 65535 x 65535 x 65535",
     ),
-    "a size of four bytes": (changed((0xC000, 1), bytes(4)), r"C000:1 .* must have 2 bytes \(H\); it has 4"),
-    "too few angles": (changed(BEAMS, SIGMA[:4].tobytes()), r"C300:2 .* must have 40 bytes \(5d\)"),
-    "uneven angles": (changed(PLANES, uneven(BETA, 0.1)), r"C300:1 .* evenly spaced.*up to 0\.1 steps"),
-    "falling angles": (changed(PLANES, BETA[::-1].tobytes()), "increase; got 4 from 2.0 to 1.1"),
+    "a size of four bytes": (changed((0xC000, 1), bytes(4)), r"C000:1 .* must have 2 bytes; it has 4"),
+    "too few angles": (changed(BEAMS, SIGMA[:4].tobytes()), "C300:2 .* must have 40 bytes"),
+    "uneven angles": (changed(PLANES, uneven(BETA, 0.1)), r"C300:1 .* evenly spaced.*up to 0\.01 of a step"),
+    "falling angles": (changed(PLANES, BETA[::-1].tobytes()), "increase, .*; got 4 from 2.0 to 1.1"),
     "an angle of NaN": (changed(PLANES, uneven(BETA, np.nan)), "evenly spaced angles"),
     "angles in degrees": (changed(PLANES, np.rad2deg(BETA).tobytes()), "no probe: beta_range must lie"),
     "no resolution at all": (changed(STEP, f64(0)), "positive length in metres; got 0.0"),
@@ -161,7 +161,7 @@ def test_neither_a_file_nor_a_header_takes_memory_or_time_that_the_other_does_no
     unwanted = kretz() + struct.pack("<HHI", 1, 1, 2**32 - 1)
     for content, length, message in (
         (voxels, len(voxels), "cut short"),
-        (kretz(), 2**33, "twice|items or more"),  # empty items, which take no disk space
+        (kretz(), 2**33, None),  # padding, which takes no disk space
         (unwanted, len(unwanted) + 2**32 - 1, None),
     ):
         path = write(tmp_path, content)
