@@ -1,7 +1,7 @@
 """Where is nothing visible? What marches ask, and which stretches of a beam of neighbouring rays are empty.
 
-A beam is a group of rays that share one query. At each distance from their origins, the rays lie in a
-bounding box whose faces move linearly with the distance.
+A beam is a group of rays that share one query: at each distance from their origins, they lie in a bounding
+box whose faces move linearly with the distance.
 """
 
 from abc import abstractmethod
@@ -50,19 +50,16 @@ class EmptySpaceIndex(eqx.Module):
 
 
 class View(NamedTuple):
-    """The camera's rays, as `Transform.empty_space` may ask for them.
-
-    - `ray`: origin and unit direction of the ray through a column and a row.
-    - `size`: (width, height).
-    - `corner`: (column, row) of the image's first pixel, which keys random numbers.
-    - `first_hit`: marches the rays of these columns and rows, with leaps by an index, and returns the
-      distances to their first visible samples, infinite where there are none.
-    """
+    """The camera's rays, as `Transform.empty_space` may ask for them."""
 
     ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
+    """Origin and unit direction of the ray through a column and a row."""
     size: tuple[int, int]
+    """(width, height)."""
     corner: tuple[Int[Array, ""], Int[Array, ""]]
+    """(column, row) of the image's first pixel, which keys random numbers."""
     first_hit: Callable[[EmptySpaceIndex, Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
+    """From an index to leap by, and columns and rows, to the distances of the first visible samples."""
 
 
 class Box(eqx.Module):

@@ -99,12 +99,12 @@ class March(eqx.Module):
       `"midpoint"`: those in its middle; the error falls with d².
       `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
       along it, the colour weighted by the extinction. The error falls with d², too, and narrow peaks of the
-      transfer function are not missed. Where there are none, `"midpoint"` may be more accurate, in half to
-      two thirds of the time. What the front of a cell hides of its back is neglected: for a cell of opacity α
-      and optical depth τ, this errs by at most α τ / 8 times the difference of its colours. Extinction times
-      the range of values must stay below 3e38 in float32, or the image is NaN. Between two control points of
-      extinction 0, the gradient is exact for their sum, and for each off by some 1e-4 of it.
-      A cell has the label, and the light, of its middle, which is also what a `Selection` compares.
+      transfer function are not missed; where there are none, `"midpoint"` may be more accurate, in half to
+      two thirds of the time. What the front of a cell, of opacity α and optical depth τ, hides of its back is
+      neglected: at most α τ / 8 times the difference of its colours. Extinction times the range of values
+      must stay below 3e38 in float32, or the image is NaN. Between two control points of extinction 0, the
+      gradient is exact for their sum, and for each off by some 1e-4 of it. A cell has the label, and the
+      light, of its middle, which is also what a `Selection` compares.
     - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
       2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
       default 131 072, so that every march ends.
@@ -132,15 +132,12 @@ class March(eqx.Module):
     ):
         self.step = number("step", step, above=0)
         if not isinstance(transforms, tuple | list):
-            raise ValueError(
-                f"transforms must be a tuple, such as (AlphaCorrection(),); got {described(transforms)}."
-            )
+            raise ValueError(f"transforms must be a tuple (AlphaCorrection(),); got {described(transforms)}.")
         self.transforms = tuple(transforms)
-        kinds = [type(transform) for transform in transforms]
-        for transform in transforms:
+        kinds = list(map(type, transforms))
+        for transform, kind in zip(transforms, kinds, strict=True):
             if not isinstance(transform, Transform):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
-            kind = type(transform)
             if (count := kinds.count(kind)) > 1:
                 raise ValueError(f"transforms must each be given once; got {kind.__name__} {count} times.")
         if quadrature not in get_args(Quadrature):
@@ -156,10 +153,12 @@ class March(eqx.Module):
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """The index of the first transform that has one."""
-        indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
-        for transform, index in zip(self.transforms, indices, strict=True):
+        found = None
+        for transform in self.transforms:
+            index = transform.empty_space(occupancy, view)
             _check_kind(transform, "empty_space", index, EmptySpaceIndex | None)
-        return next((index for index in indices if index is not None), None)
+            found = index if found is None else found
+        return found
 
     def overriding(self, seam: str) -> list[Transform]:
         """The transforms that override a seam."""
@@ -206,7 +205,12 @@ class March(eqx.Module):
         """The pieces of a cell, front to back."""
         pieces = (cell,)
         for transform in self.transforms:
-            pieces = tuple(part for piece in pieces for part in _cut(transform, piece, ray, volume))
+            divided = [transform.cut(piece, ray, volume) for piece in pieces]
+            for parts in divided:
+                _check_kind(transform, "cut", parts, tuple)
+                for part in parts or (None,):
+                    _check_kind(transform, "cut", part, Cell)
+            pieces = tuple(part for parts in divided for part in parts)
         return pieces
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
@@ -248,24 +252,11 @@ def within(ray: Ray, depth: Scalar) -> Scalar:
 
 
 def _checked(transform: Transform, seam: str, answer: Any, expected: Array) -> Array:
-    """A transform's answer, if it is an array like the one expected."""
     check_answer(transform, seam, answer, expected)
     return answer
 
 
 def _check_kind(transform: Transform, seam: str, answer: Any, kind: Any) -> None:
     if not isinstance(answer, kind):
-        wanted = getattr(kind, "__name__", str(kind))
-        raise ValueError(
-            f"{type(transform).__name__}.{seam} must return a {wanted}; got {described(answer)}."
-        )
-
-
-def _cut(transform: Transform, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-    pieces = transform.cut(cell, ray, volume)
-    _check_kind(transform, "cut", pieces, tuple)
-    if not pieces:
-        raise ValueError(f"{type(transform).__name__}.cut must return at least one cell; got ().")
-    for piece in pieces:
-        _check_kind(transform, "cut", piece, Cell)
-    return pieces
+        name, wanted = f"{type(transform).__name__}.{seam}", getattr(kind, "__name__", str(kind))
+        raise ValueError(f"{name} must return a {wanted}; got {described(answer)}.")

@@ -5,8 +5,7 @@ steps, counted from `Strides.phase` steps before the ray's first cell: of two ru
 other, so that leaps do not change which runs are taken.
 
 Both engines make three calls: `predicted` prepares the march, once for each image, `begin` makes a ray's
-state, and `Strides.next` chooses the next run. Gradients take strides as given; the image jumps where one
-changes.
+state, and `Strides.next` chooses the next run. Gradients take strides as given.
 """
 
 from abc import abstractmethod
@@ -31,8 +30,7 @@ RUN = 4
 
 
 class Run(NamedTuple):
-    """RUN cells in a row from depth `front` on, without `Transform.shift`; each `stride` steps long, a static
-    power of two."""
+    """RUN cells from depth `front` on, without `Transform.shift`, of `stride` steps each, a power of two."""
 
     front: Scalar
     stride: int
@@ -70,16 +68,14 @@ class StrideControl(Transform):
 
 
 class Strides(eqx.Module):
-    """How long the cells of a ray are.
-
-    - `steps`: length of each cell of the current run, in steps.
-    - `phase`: steps from where the first of all runs begins to the ray's first cell; None if 0 for all rays.
-    - `error`: sum of the squared errors that are predicted of all runs so far; None where nobody asks for it.
-    """
+    """How long the cells of a ray are."""
 
     steps: Int[Array, ""]
+    """Length of each cell of the current run, in steps."""
     phase: Int[Array, ""] | None
+    """Steps from where the first of all runs begins to the ray's first cell; None if 0 for all rays."""
     error: Scalar | None
+    """Sum of the squared predicted errors of all runs so far; None where nobody asks for it."""
 
     def next(
         self,
@@ -92,10 +88,8 @@ class Strides(eqx.Module):
         leaves: Bool[Array, ""],
         finished: Bool[Array, ""],
     ) -> tuple["Strides", Int[Array, ""]]:
-        """Chooses the run that holds the step `ahead` of `index`, up to which all is transparent. Returns the
-        state, and the steps from `index` to that run, 0 if it is the current one.
-
-        `leaves`: whether the ray has left the volume there. `finished`: whether it takes no more cells."""
+        """The state in the run that holds the step `ahead` of `index`, up to which all is transparent, and
+        the steps from `index` to that run. `leaves`: whether the ray has left the volume there."""
         control = stride_control(march)
         assert control is not None
         march, control, ray, transmittance = jax.lax.stop_gradient((march, control, ray, transmittance))
@@ -177,9 +171,7 @@ def predicted(
 
 
 def stride_control(march: March) -> StrideControl | None:
-    """The transform that chooses strides, if there is one.
-
-    **Raises:** `ValueError` if there are several."""
+    """The transform that chooses strides, if there is one; several are an error."""
     found = [transform for transform in march.transforms if isinstance(transform, StrideControl)]
     if len(found) > 1:
         raise ValueError(f"transforms must have one StrideControl at most; got {len(found)}.")
@@ -196,8 +188,7 @@ def _phase(march: March, ray: Ray, control: StrideControl) -> Int[Array, ""] | N
     """Random where `start` or `shift` are, which move samples too little to break the wood grain of runs."""
     if not march.overriding("start") and not march.may_shift:
         return None
-    part = jax.lax.stop_gradient(march.start(ray) - march.shift(ray))
-    # its lower digits, of which the part of a step is nearly independent; all of it is exact
-    part = 32 * part
+    # the lower digits of a part of a step, which are nearly independent of it; all of this is exact
+    part = 32 * jax.lax.stop_gradient(march.start(ray) - march.shift(ray))
     run = RUN * control.longest
     return jnp.floor((part - jnp.floor(part)) * run).astype(jnp.int32) & (run - 1)

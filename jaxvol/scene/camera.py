@@ -4,6 +4,7 @@ Names and conventions are those of VTK and PyVista: `view_angle` and `parallel_s
 the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from .volume import Volume, corners_of
 
 
 ALONG = 1e-3
-"""`looking_at` treats directions as parallel up to this sine of the angle between them."""
+"""Sine of the angle up to which `looking_at` treats directions as parallel."""
 
 
 class Camera(eqx.Module):
@@ -34,11 +35,11 @@ class Camera(eqx.Module):
     - `parallel_scale`: half the height of the view, in world length. Makes the camera orthographic, with
       ray origins in the plane through `position`.
     - `size`: (width, height) of the image in pixels.
-    - `window`: the part of the image plane that is shown, (left, right, bottom, top) relative to its
-      center, in units of half the height of the whole view. By default the whole view,
-      (-width/height, width/height, -1, 1). Set by `crop` and `zoom`.
-    - `corner`: column and row of the first pixel in the image that this one was cropped from, by default
-      (0, 0), which key random numbers. Set by `crop`.
+    - `window`: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
+      half heights of the whole view; by default that, (-width/height, width/height, -1, 1). Set by `crop` and
+      `zoom`.
+    - `corner`: (column, row) of the first pixel in the image that this one was cropped from, by default
+      (0, 0); keys random numbers. Set by `crop`.
 
     **Raises:** `ValueError` for a camera at its focal point, a `view_up` along the view direction, and an
     angle, scale or size out of range.
@@ -101,9 +102,8 @@ class Camera(eqx.Module):
         parallel: bool | Any = False,
         size: tuple[int, int] | Any = (512, 512),
     ) -> "Camera":
-        """A camera that sees the whole volume from the side that `direction` points to.
-
-        Like VTK's `ResetCamera`: the bounding sphere of the volume just fits into the view.
+        """A camera that sees the whole volume from the side that `direction` points to: as by VTK's
+        `ResetCamera`, its bounding sphere just fits into the view.
 
         **Arguments:**
 
@@ -116,15 +116,12 @@ class Camera(eqx.Module):
         a `Volume`.
         """
         if not isinstance(volume, Volume):
-            raise ValueError(
-                f"volume must be a jaxvol Volume; got {described(volume)}. "
-                "Pass jv.Volume(data, spacing=...) for an array."
-            )
-        direction = finite_array("direction", direction, (3,))
-        direction = require(direction, lambda d: (d != 0).any(), "direction must not be zero.")
+            raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
+        direction, view_up = (
+            require(finite_array(name, vector, (3,)), lambda v: (v != 0).any(), f"{name} must not be zero.")
+            for name, vector in (("direction", direction), ("view_up", view_up))
+        )
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
-        view_up = finite_array("view_up", view_up, (3,))
-        view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
         width, height = _image_size(size)
         cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
         place = volume.origin, volume.spacing, volume.direction, cells
@@ -160,7 +157,8 @@ class Camera(eqx.Module):
         `center`: in fractions of width and height from the top left.
         """
         factor = number("zoom factor", factor, above=0)
-        return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
+        window = _zoomed(self.window, factor, finite_array("center", center, (2,)))
+        return replace(self, window=window, corner=None)
 
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
@@ -191,35 +189,23 @@ class Camera(eqx.Module):
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
-    def _showing(
-        self, window: Float[Array, "4"], size: tuple[int, int], corner: Float[Array, "2"] | None = None
-    ) -> "Camera":
-        camera = Camera(
-            self.position,
-            self.focal_point,
-            self.view_up,
-            self.view_angle,
-            size=size,
-            parallel_scale=self.parallel_scale,
-            window=window,
-        )
-        return camera if corner is None else eqx.tree_at(lambda camera: camera.corner, camera, corner)
+    def _showing(self, window: Scalar, size: tuple[int, int], corner: Scalar) -> "Camera":
+        camera = replace(self, window=window, size=size, corner=None)
+        return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
     def _column(self, column: Scalar | int) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
-        left, right = self.window[0], self.window[1]
+        left, right, _, _ = self.window
         return left + (right - left) * (column / self.size[0])
 
     def _row(self, row: Scalar | int) -> Scalar:
-        bottom, top = self.window[2], self.window[3]
+        _, _, bottom, top = self.window
         return top - (top - bottom) * (row / self.size[1])
 
 
 class GivenRays(eqx.Module):
-    """Rays given by world origins and unit directions.
-
-    Random numbers along a ray are keyed by its pixel, (column, row); without `pixels` that is
-    (`first` + index in the flattened array, 0)."""
+    """World origins and unit directions. A ray's pixel, (column, row), keys its random numbers; without
+    `pixels` it is (`first` + index in the flattened array, 0)."""
 
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
@@ -256,7 +242,7 @@ def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float
 
 def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
     """`Camera.crop` to `count` whole rows from a traced row `first` on; they may reach past the image."""
-    left, right = camera.window[0], camera.window[1]
+    left, right, _, _ = camera.window
     below, above = (camera._row(row.astype(camera.window.dtype)) for row in (first + count, first))
     corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
     return camera._showing(jnp.stack([left, right, below, above]), (camera.size[0], count), corner)
@@ -283,9 +269,7 @@ def _fitted_view(
 
 
 @jax.jit
-def _zoomed(
-    window: Float[Array, "4"], factor: Float[Array, ""], center: Float[Array, "2"]
-) -> Float[Array, "4"]:
+def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     """1/`factor` of a window."""
     left, right, bottom, top = window
     x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]

@@ -1,13 +1,13 @@
 """Transfer functions of segmented volumes: one for each label."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
 from .._util.checks import described, finite_array, integer, require
 from .._util.piecewise_linear import (
@@ -32,16 +32,15 @@ class LabelTransferFunction(Transfer):
     **Arguments:**
 
     - `functions`: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
-      label that is not seen. A label that is not named, or lies beyond the last, is not seen either. Labels
-      are 0 to 255 here; renumber others, as by `np.unique(labels, return_inverse=True)`.
-
-    A function with fewer control points than another is padded with copies of its last point beyond it.
+      label that is not seen, as others without a function are not. Labels are 0 to 255; renumber others, as
+      by `np.unique(labels, return_inverse=True)`.
 
     The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
-    `AlphaCorrection(labels=True)` cuts cells there.
+    `AlphaCorrection(labels=True)` cuts cells there, where `"preintegrated"` otherwise takes the label in the
+    middle of a cell.
 
-    `with_visibility` and `with_opacity` hide labels, and make them fainter or denser. What is hidden is leapt
-    over, as all that is transparent. Other factors, or labels hidden and shown, compile nothing again.
+    What `with_visibility` hides is leapt over. Other factors, or labels hidden and shown, compile nothing
+    again.
 
     **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
     rendering a volume without labels.
@@ -62,16 +61,15 @@ class LabelTransferFunction(Transfer):
         if not seen:
             raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
         points = max(function.values.shape[0] for function in seen)
-        first = _continued(seen[0], points)
-        hidden = TransferFunction(first.values, 0 * first.colors, 0 * first.extinction)
-        each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
+        hidden = jax.tree.map(lambda leaf: 0 * leaf, seen[0])
+        hidden = eqx.tree_at(lambda function: function.values, hidden, seen[0].values)
+        each = [_continued(hidden if function is None else function, points) for function in [*given, None]]
         self.stacked = _stacked(each)
         self.opacity = jnp.asarray(np.ones(len(each)), self.stacked.extinction.dtype)
         self.shown = jnp.asarray(np.ones(len(each)), bool)
 
     def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
-        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
-        the opacity that it had. Other labels stay as they are.
+        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
 
         **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
         found = self.shown
@@ -85,10 +83,8 @@ class LabelTransferFunction(Transfer):
         """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
         keep theirs, which are 1 at first.
 
-        f is a factor of the extinction, at all values alike: what has the opacity α at f = 1 has
-        1 - (1 - α)^f, so that f = 0.5 makes 0.68 of 0.9, and 0.05 of 0.1. The image does not depend on the
-        step, and f may exceed 1. f is differentiable. Where it is 0, as where an extinction is, its
-        derivative misses what is leapt over (`SpaceLeaping`).
+        f is a factor of the extinction: what has the opacity α at f = 1 has 1 - (1 - α)^f. It may exceed 1,
+        and is differentiable; where it is 0, its derivative misses what is leapt over (`SpaceLeaping`).
 
         **Raises:** `ValueError` for labels beyond the last one, and for factors that are negative or not
         finite."""
@@ -120,55 +116,57 @@ class LabelTransferFunction(Transfer):
 
     def classifier(self) -> Classify:
         """Look-up of colour and extinction, by label and value."""
-        tables = jax.vmap(TransferFunction.rows)(self._seen)
-        hidden, points = tables.shape[0] - 1, tables.shape[1]
-        rows = tables.reshape(-1, tables.shape[2])
+        functions = self._tables(TransferFunction.rows)
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             value, label = measured
-            label = jnp.where((label < 0) | (label > hidden), hidden, label)
-            values = gather(self.stacked.values, label)
-            row = table_row(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
+            values, row_at = functions(label)
+            row = row_at(jnp.maximum(points_below(values, value) - 1, 0))
             return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return classify
 
     def integrator(self) -> Classify:
-        """The means for the label in the middle of a cell: where it changes along one, `AlphaCorrection(
-        labels=True)` cuts it."""
-        stacked = jax.lax.stop_gradient(self.stacked.values)
-        tables = jax.vmap(TransferFunction.span_rows)(self._seen)
-        hidden, spans = tables.shape[0] - 1, tables.shape[1]
-        rows = tables.reshape(-1, tables.shape[2])
+        """The means for the label in the middle of a cell."""
+        functions = self._tables(TransferFunction.span_rows)
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, label, (front,), (back,) = measured
-            label = jnp.where((label < 0) | (label > hidden), hidden, label)
-            values = gather(stacked, label)
+            values, row_at = functions(label)
             i, j = (points_below(values, end) for end in (front, back))
-            a, b = (table_row(rows, label * spans + span) for span in (i, j))
-            return mean_by_rows(a, b, front, back, i == j)
+            return mean_by_rows(row_at(i), row_at(j), front, back, i == j)
 
         return integrate
 
+    def _tables(self, table_of: Callable[[TransferFunction], Array]) -> Callable[[Any], tuple[Array, Any]]:
+        """From a label to the control points of its function, and the look-up of its table's rows."""
+        tables = jax.vmap(table_of)(self._seen)
+        hidden, count, rows = tables.shape[0] - 1, tables.shape[1], tables.reshape(-1, tables.shape[2])
+
+        def of(label: Any) -> tuple[Array, Any]:
+            label = jnp.where((label < 0) | (label > hidden), hidden, label)
+            return gather(self.stacked.values, label), lambda row: table_row(rows, label * count + row)
+
+        return of
+
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        bound = jnp.zeros_like(blocks.low)
-        for label, values, extinction in self._functions():
-            own = upper_bound_between(values, extinction, blocks.low, blocks.high)
-            bound = jnp.where(blocks.may_hold(label), jnp.maximum(bound, own), bound)
-        return jnp.where(self.visible(blocks), bound, 0)
+        return jnp.where(
+            self.visible(blocks), self._greatest(upper_bound_between, blocks, blocks.low.dtype), 0
+        )
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        seen = jnp.zeros(blocks.low.shape, bool)
-        for label, values, extinction in self._functions():
-            seen |= positive_between(values, extinction, blocks.low, blocks.high) & blocks.may_hold(label)
-        return seen
+        return self._greatest(positive_between, blocks, bool)
 
-    def _functions(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
-        """Each label, with the control points and extinctions of its function, without their gradients."""
+    def _greatest(
+        self, between: Callable[..., Array], blocks: Blocks, dtype: Any
+    ) -> Shaped[Array, "bx by bz"]:
+        """The greatest answer of the functions whose labels a block may hold, without a gradient."""
         functions = jax.lax.stop_gradient(self._seen)
-        for label in range(functions.values.shape[0] - 1):
-            yield label, functions.values[label], functions.extinction[label]
+        greatest = jnp.zeros(blocks.low.shape, dtype)
+        for label, points in enumerate(zip(functions.values[:-1], functions.extinction[:-1], strict=True)):
+            found = jnp.maximum(greatest, between(*points, blocks.low, blocks.high))
+            greatest = jnp.where(blocks.may_hold(label), found, greatest)
+        return greatest
 
 
 def _by_label(functions: Any) -> list[TransferFunction | None]:

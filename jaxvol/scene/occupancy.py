@@ -53,8 +53,7 @@ class Blocks(eqx.Module):
 
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
-        """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: whether
-        their ranges are needed."""
+        """The blocks of a volume, computed once for each array; ranges of `slopes` only where asked for."""
         labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
         low, high = map(volume.in_grid_order, memoized(volume.data, _ranges))
         if volume.field is not None:  # its values need not lie between those of the voxels
@@ -86,16 +85,12 @@ class Blocks(eqx.Module):
 
 
 class SlopeRanges(eqx.Module):
-    """Ranges of slopes in each block, including the nodes on its faces.
-
-    - `low`, `high`: least and greatest slope along x, y, z, in value units per node.
-    - `steepest`: greatest length of a node's three slopes, per node.
-    - `spacing`: of the volume.
-    """
+    """Ranges of slopes along x, y, z, in value units per node, in each block, including its faces."""
 
     low: Float[Array, "3 bx by bz"]
     high: Float[Array, "3 bx by bz"]
     steepest: Float[Array, "bx by bz"]
+    """Greatest length of a node's three slopes."""
     spacing: Float[Array, "3"]
 
     @classmethod
@@ -152,14 +147,13 @@ class Sums(eqx.Module):
 
 
 class Occupancy(eqx.Module):
-    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it.
-
-    - `origin`, `size`: corner of the grid and side lengths of a cell, along the axes of `frame` or the world.
-    """
+    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it."""
 
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
+    """Corner of the grid, along the axes of `frame` or the world."""
     size: Vec3
+    """Side lengths of a cell."""
     frame: Frame | None = None
 
     def distance(self) -> UInt8[Array, " cells"]:
@@ -171,11 +165,8 @@ class Occupancy(eqx.Module):
 
         def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             reached, distance, rounds = state
-            return (
-                with_neighbours(reached, jnp.logical_or),
-                distance + (~reached).astype(distance.dtype),
-                rounds + 1,
-            )
+            distance += (~reached).astype(distance.dtype)
+            return with_neighbours(reached, jnp.logical_or), distance, rounds + 1
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
@@ -228,15 +219,14 @@ def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"]
     whole = (data.shape[0] - 1) // BLOCK
     if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
         return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
-    low, high = jax.lax.map(
-        lambda first: of(jax.lax.dynamic_slice_in_dim(data, first, BLOCK + 1)),
-        BLOCK * jnp.arange(whole),
-        batch_size=LAYERS,
+    begins = BLOCK * jnp.arange(whole)
+    layers = jax.lax.map(
+        lambda x: of(jax.lax.dynamic_slice_in_dim(data, x, BLOCK + 1)), begins, batch_size=LAYERS
     )
-    low, high = low[:, 0], high[:, 0]
+    parts = [jax.tree.map(lambda layer: layer[:, 0], layers)]
     if whole * BLOCK < data.shape[0] - 1:
-        last_low, last_high = of(data[whole * BLOCK :])
-        low, high = jnp.concatenate([low, last_low]), jnp.concatenate([high, last_high])
+        parts.append(of(data[whole * BLOCK :]))
+    low, high = (jnp.concatenate(part) for part in zip(*parts, strict=True))
     return low, high
 
 

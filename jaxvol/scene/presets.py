@@ -1,6 +1,5 @@
 """Transfer functions by name: presets for kinds of data, and any matplotlib colormap."""
 
-from difflib import get_close_matches
 from typing import Any
 
 import jax
@@ -138,11 +137,10 @@ def preset(
 
     **Arguments:**
 
-    - `name`: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values:
-      Hounsfield units for `ct_…`, 0 to 255 for the others.
-    - `clim`: (low, high) in the volume's values; the preset's own range is stretched linearly to it.
-      For example, CT stored as Hounsfield units + 1000 needs `clim=(0, 4000)`.
-    - `unit_distance`: world length to which the preset's opacities refer; they are designed for 1 mm.
+    - `name`: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values.
+    - `clim`: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
+      Hounsfield units + 1000 needs (0, 4000).
+    - `unit_distance`: world length to which the opacities refer; they are designed for 1 mm.
 
     **Returns:** the `TransferFunction`, its colours linear.
 
@@ -150,11 +148,10 @@ def preset(
     """
     if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
-    _, (own_low, own_high), points = PRESETS[name]
-    low, high = _range((own_low, own_high) if clim is None else clim)
+    _, own_range, points = PRESETS[name]
     values, colors, opacities = zip(*points, strict=True)
-    fraction = (np.array(values) - own_low) / (own_high - own_low)
-    return TransferFunction(low + fraction * (high - low), colors, extinction_of(opacities, unit_distance))
+    stretched = np.interp(values, own_range, _range(own_range if clim is None else clim))
+    return TransferFunction(stretched, colors, extinction_of(opacities, unit_distance))
 
 
 def colormap(
@@ -168,13 +165,12 @@ def colormap(
 
     **Arguments:**
 
-    - `cmap`: a matplotlib colormap or its name; or one colour for the whole range, such as `"tomato"`,
-      `"#ff6347"` or (1, 0.39, 0.28); or several colours, a list or an (m, 3) array, evenly spaced over the
-      range and interpolated linearly in sRGB, as in matplotlib. All colours are sRGB and are converted to
-      linear. Their alpha is ignored; `opacity` applies.
+    - `cmap`: a matplotlib colormap or its name; or one colour, such as `"tomato"`, `"#ff6347"` or
+      (1, 0.39, 0.28); or several, a list or an (m, 3) array, evenly spaced over the range and interpolated
+      in sRGB. All are sRGB and are converted to linear. Their alpha is ignored.
     - `clim`: (low, high), the volume's values at which the colormap begins and ends.
-    - `opacity`: `"linear"`: from 0 to 1 over the range. `"sigmoid"`: `1/(1 + exp(-x))` for x from -10
-      to 10 over the range. An array in [0, 1]: opacities evenly spaced over the range.
+    - `opacity`: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
+      10; or an array of evenly spaced ones, in [0, 1].
     - `unit_distance`: thickness, in world length, of a layer that has these opacities.
     - `n_colors`: number of control points, at least 2.
 
@@ -205,15 +201,11 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
         if len(rgb) == 0 or rgb.min() < 0 or rgb.max() > 1:
             raise ValueError
     except (ValueError, TypeError) as fault:
-        near = get_close_matches(cmap.lower(), list(colormaps), 3) if isinstance(cmap, str) else []
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
         got = repr(cmap) if isinstance(cmap, list | tuple) else described(cmap)
         raise ValueError(
-            "cmap must be a matplotlib colormap or its name, or one or several colours, by name or sRGB in "
-            f"[0, 1]; got {got}.{hint}"
+            f"cmap must be a matplotlib colormap, or colours by name or sRGB in [0, 1]; got {got}."
         ) from fault
-    positions = np.linspace(0, 1, len(rgb))
-    return np.stack([np.interp(at, positions, channel) for channel in rgb.T], axis=-1)
+    return np.stack([np.interp(at, np.linspace(0, 1, len(rgb)), channel) for channel in rgb.T], axis=-1)
 
 
 def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:

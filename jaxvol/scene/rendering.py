@@ -5,10 +5,9 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import finite
+from .._util.checks import finite_array
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 
@@ -20,11 +19,10 @@ class BrickReport(NamedTuple):
     """What an image by `render_bricks` took.
 
     - `counts`: bricks along x, y and z. `needed`: how many of them may hold anything visible.
-    - `loads`: how often a brick was read: less than `needed` where bricks lie outside of the view, or behind
-      what is opaque. `reloads`: how many of these were not the first of their brick (`method="reload"`).
+    - `loads`: how often a brick was read. `reloads`: of these, all but the first of each brick.
     - `bytes_read`: of voxels, with what is read around each brick.
-    - `stored`: voxels along x, y and z that are held at a time, for which programs are compiled.
-      `bytes_held`: memory that these take, with what is made of them and with the next ones.
+    - `stored`: voxels along x, y and z that are held at a time. `bytes_held`: memory that these take, with
+      what is made of them and with the next ones.
     """
 
     counts: tuple[int, int, int]
@@ -39,8 +37,7 @@ class BrickReport(NamedTuple):
 class Details(NamedTuple):
     """Outputs that cost time, each None where it was not asked for. See `Rendering`.
 
-    `selected`: the state of a `Selection` after the march, which `ray.resolve` makes pixels from; None
-    in an image.
+    `selected`: the final state of a `Selection`, for `ray.resolve`; None in an image.
     """
 
     depth: Float[Array, "*rays"] | None = None
@@ -65,16 +62,13 @@ class Rendering(eqx.Module):
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
     - `error`: under `AdaptiveSampling`, a cautious estimate of how far a pixel's colour is wrong because of
-      the distance of its samples, without a gradient; infinite where nothing can be predicted. In the scenes
-      of `experiments.adaptive_error`, it is several times the true error, and less in at most 3 % of the
-      pixels. It may be somewhat smaller where rays leap.
+      the distance of its samples, without a gradient; infinite where nothing can be predicted. It is mostly
+      several times the true error (`experiments.adaptive_error`).
     - `normal`: of a mode that shows surfaces (`Isosurface`), the unit normal in the world; 0 where nothing is
       visible.
 
-    The last five raise `AttributeError` where they were not asked for (`outputs="rgba"`), `error` without
-    `AdaptiveSampling`, and `normal` under other modes.
-
-    Modes other than `"over"` say what their depth is.
+    All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
+    other than `"over"` say what their depth is.
     """
 
     rgba: Float[Array, "*rays 4"]
@@ -115,25 +109,15 @@ class Rendering(eqx.Module):
         """Linear RGB over a background: one colour (3,), or an image of the same shape.
 
         **Raises:** `ValueError` for a background of another shape, or that is not finite."""
-        background = self._background(background)
+        if not is_traced(background):  # a traced one may be NaN, which then shows in the image
+            background = finite_array("background", background, (..., 3))
+        background = jnp.asarray(background, self.rgba.dtype)
         if background.shape not in ((3,), (*self.rgba.shape[:-1], 3)):
             raise ValueError(
                 f"background must be one colour (3,) or an image {(*self.rgba.shape[:-1], 3)}; "
                 f"got shape {background.shape}."
             )
         return _over(self.rgba, background)
-
-    def _background(self, background: Any) -> Float[Array, "..."]:
-        """The background as an array. A traced one may be NaN, which then shows in the image."""
-        if not is_traced(background):
-            given = background
-            try:
-                background = np.asarray(given, np.float32)
-            except (TypeError, ValueError) as fault:
-                raise ValueError(f"background must be linear RGB numbers; got {given!r}.") from fault
-            if not np.all(finite(background)):
-                raise ValueError("background must be finite; got NaN or infinity.")
-        return jnp.asarray(background, self.rgba.dtype)
 
 
 @jax.jit

@@ -94,23 +94,22 @@ class Line(NamedTuple):
 
 
 class Ray(eqx.Module):
-    """One ray, clipped to the volume.
-
-    - `entry`, `direction`: world point where the ray enters the volume, and its unit direction.
-    - `t_in`: distance from the ray's origin to the entry. `length`: from entry to exit; 0 on a miss.
-      Depths along a march are measured from the entry, so that float32 resolves them for far cameras, too.
-    - `path`: the ray in grid coordinates.
-    - `pixel`: (column, row); keys everything random along the ray.
-    - `gaps`: depths between entry and exit where the ray is outside the volume.
-    """
+    """One ray, clipped to the volume. Depths along it are measured from the entry, so that float32 resolves
+    them for far cameras, too."""
 
     entry: Vec3
+    """World point where the ray enters the volume."""
     direction: Vec3
+    """Unit direction in the world."""
     t_in: Scalar
+    """Distance from the ray's origin to the entry."""
     length: Scalar
+    """Distance from entry to exit; 0 on a miss."""
     path: Path
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
+    """(column, row); keys everything random along the ray."""
     gaps: tuple[Gap, ...] = ()
+    """Depths between entry and exit where the ray is outside the volume."""
 
     def contains(self, depth: Scalar) -> Bool[Array, "..."]:
         """Whether this depth is inside the volume: neither past the exit nor in a gap."""
@@ -124,8 +123,7 @@ class Ray(eqx.Module):
 
 
 def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
-    """Clip a ray to the volume and to what lies ahead of its origin, which may be inside. It is `invalid` if
-    a number of it, or of the space, is NaN or infinite."""
+    """Clip a ray to the volume and to what lies ahead of its origin; `invalid` if a number is not finite."""
     # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
@@ -142,8 +140,7 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
-    """Where `fault` is true, a ray that is never marched and renders as NaN: comparisons with NaN are false,
-    and a march might never end."""
+    """Where `fault` is true, a ray that is never marched, which might not end, and renders as NaN."""
     t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
     return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
 
@@ -159,12 +156,10 @@ class Straight(Path):
 
 
 class Affine(Space):
-    """A grid given by spacing, origin and direction.
-
-    `low`, `high`: its first and its last node, along the axes of `frame`, or, without one, the world's.
-    """
+    """A grid given by spacing, origin and direction."""
 
     low: Vec3
+    """The first node, along the axes of `frame`, or, without one, the world's; `high`: the last one."""
     high: Vec3
     spacing: Vec3
     frame: Frame | None
@@ -239,8 +234,7 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
 def node_distance(
     space: Space, shape: tuple[int, ...], first: Int[Array, "3"] | None = None
 ) -> Float[Array, "bx by bz"]:
-    """By block, the least world distance between neighbouring nodes, in its middle. `first`: index of the
-    first block."""
+    """The least world distance between neighbouring nodes in the middle of each block, from `first` on."""
     first = jnp.zeros(3, jnp.int32) if first is None else first
     dtype = space.middle[0].dtype
     middle = [
@@ -254,15 +248,14 @@ def node_distance(
     return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))
 
 
-@partial(jax.jit, static_argnums=1)  # operation by operation, it takes seconds to compile
+@partial(jax.jit, static_argnums=1)  # operations by themselves take seconds to compile
 def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
     """The median of `node_distance` over all blocks: the size of a voxel."""
     return jnp.median(node_distance(space, shape))
 
 
 def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:
-    """Gradient of the value by a world point, in value units per world length: `Volume.gradient` times the
-    transposed Jacobian of `space.coordinate`."""
+    """`Volume.gradient`, by a world point: times the transposed Jacobian of `space.coordinate`."""
     coordinate, transpose = jax.vjp(space.coordinate, point)
     slopes = volume.gradient(coordinate)
     per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))

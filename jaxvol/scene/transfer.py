@@ -1,8 +1,7 @@
 """Which colour and extinction has this value?
 
-A transfer function answers three questions: what it reads at a place besides the value (`attributes`), how
-that becomes colour and extinction (`classifier`), and how great the extinction can be in a block of the
-volume (`majorant`). Only the second has no default.
+A transfer function says what it reads at a place besides the value (`attributes`), how that becomes colour
+and extinction (`classifier`), and how great the extinction can be in a block of the volume (`majorant`).
 """
 
 from abc import abstractmethod
@@ -44,11 +43,8 @@ Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 
 
 class Classification(NamedTuple):
-    """A transfer function applied to one volume, in two stages: `measure` at a grid coordinate, then
-    `classify`.
-
-    The stages are separate because measuring fetches from memory, and an engine keeps what was fetched.
-    """
+    """A transfer function applied to one volume: `measure` at a grid coordinate fetches from memory; what it
+    found, `classify` turns into colour and extinction."""
 
     measure: Callable[[Vec3], Measured]
     attributes: Callable[[Vec3], Measured]
@@ -69,8 +65,7 @@ class Classification(NamedTuple):
 
     @staticmethod
     def spanned(attributes: Measured, front: Measured, back: Measured) -> Measured:
-        """What `integrate` needs of a cell: from what is measured at its ends, and the attributes in its
-        middle."""
+        """What `integrate` needs, from the attributes in a cell's middle and what is measured at its ends."""
         return ((front[0] + back[0]) / 2, *attributes, front, back)
 
     @property
@@ -102,8 +97,8 @@ class Transfer(eqx.Module):
 
     @property
     def reads_gradient(self) -> bool:
-        """Whether `attributes` reads the volume's gradient, so that it is worth storing slopes, and the
-        ranges of them in blocks (`Blocks.slopes`). By default not."""
+        """Whether `attributes` reads the volume's gradient, so that slopes and their ranges in blocks
+        (`Blocks.slopes`) are stored. By default not."""
         return False
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
@@ -151,10 +146,7 @@ class Transfer(eqx.Module):
 
 
 def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
-    """A transfer function applied to a volume: to its points, and where cells are `integrated`
-    (`quadrature="preintegrated"`), also to these.
-
-    **Raises:** `ValueError` for that, where the transfer function has no `integrator`."""
+    """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
         raise ValueError(
@@ -183,10 +175,8 @@ class TransferFunction(Transfer):
     - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
       `1 - exp(-extinction w)`.
 
-    Extinction is interpolated. VTK interpolates opacity; the two agree at the points, and
-    differ between points where the opacity of a unit distance is high.
-
-    Put a step between values of the data rather than at one: interpolation may round a value to either side.
+    VTK interpolates opacity instead; the two differ between points where opacities are high. Put a step
+    between values of the data: interpolation may round a value to either side.
 
     Where it fails, and where not: `experiments/stability.py`, "extinction without bound".
 

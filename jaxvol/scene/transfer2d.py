@@ -30,30 +30,19 @@ class TransferFunction2D(Transfer):
     """Colour and extinction by the value and the magnitude of its gradient: a table, bilinear between its
     lines and constant beyond them.
 
-    A boundary between two materials is where values change most, so that it is told from a material that has
-    its values. In a plot of magnitude against value, each boundary is an arc, whose top is its middle.
+    In a plot of magnitude against value, each boundary between two materials is an arc, which is told from a
+    material that has its values.
 
     **Arguments:**
 
-    - `values`: (n,) increasing, in value units; n ≥ 2. Two of them may be equal, and make a step, as in a
-      `TransferFunction`. They carry no gradient.
-    - `magnitudes`: (m,) increasing, ≥ 0 where they matter, in value units per world length; m ≥ 2. Two may be
-      equal. They carry no gradient.
+    - `values`: (n,) increasing, in value units; n ≥ 2. `magnitudes`: (m,) increasing, in value units per
+      world length; m ≥ 2. Two neighbours may be equal, and make a step. They carry no gradient.
     - `colors`: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
     - `extinction`: (n, m), in 1/length, ≥ 0.
 
-    The magnitude is that of `volume.gradient`: of central differences at the nodes, interpolated, and divided
-    by the volume's spacing. The image depends on the spacing through the magnitude, too, and so does its
-    gradient. Under a `ToroidalMap`, which bends the grid, it is still that of the straight grid: choose a
-    spacing for which that has a meaning.
-
-    Look-up, `majorant` and leaping are exact. The extinction along a ray has a kink where the ray passes from
-    voxel to voxel or from cell to cell of the table, and where the gradient is 0, at which the derivative of
-    the magnitude is taken as 0.
-
-    Not known: the integral over a cell (`quadrature="preintegrated"` is refused, since value and magnitude do
-    not run along a straight line together), and how much it varies: `AdaptiveSampling` takes its shortest
-    steps wherever something is visible. `"average"` is refused.
+    The magnitude is that of `volume.gradient`, also under a `ToroidalMap`, which bends the grid: choose a
+    spacing for which that has a meaning. Where the gradient is 0, the derivative of its magnitude is taken as
+    0. `quadrature="preintegrated"` and `"average"` are refused; `AdaptiveSampling` takes its shortest steps.
 
     **Raises:** `ValueError` for fewer than two lines, lines that do not increase or of which three are equal,
     negative extinction, NaN or infinity, or shapes that do not fit together.
@@ -79,8 +68,7 @@ class TransferFunction2D(Transfer):
     def from_transfer(
         cls, transfer: TransferFunction | Any, magnitudes: Arrayable, inside: Arrayable = 0.0
     ) -> "TransferFunction2D":
-        """A transfer function whose boundaries are emphasised: its extinction times a factor, which grows
-        with the gradient's magnitude. Its colours are kept.
+        """A transfer function, its extinction times a factor that grows with the gradient's magnitude.
 
         **Arguments:**
 
@@ -93,8 +81,7 @@ class TransferFunction2D(Transfer):
         **Raises:** `ValueError` for what is no `TransferFunction`, magnitudes that are not two increasing
         numbers, and a factor outside [0, 1].
 
-        Source: Levoy 1988, who weights opacities by the magnitude. Here extinctions are, so that the image
-        does not depend on the step."""
+        Source: Levoy 1988, who weights opacities."""
         if not isinstance(transfer, TransferFunction):
             raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
         magnitudes = require(
@@ -117,15 +104,13 @@ class TransferFunction2D(Transfer):
 
         **Arguments:**
 
-        - `points`: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`, in any order.
-          `opacity` in [0, 1] is that of a layer of thickness `unit_distance`, as for
-          `TransferFunction.from_points`. From there it falls to 0 on the sides of a rectangle, whose half
-          sides are the two reaches: the extinction is that of the point, times
-          (1 - |value - that of the point| / reach) and the same of the magnitude.
-        - `unit_distance`: world length.
+        - `points`: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`, in any order. The
+          extinction of each is that of this `opacity`, times (1 - |value - that of the point| / reach), and
+          the same of the magnitude.
+        - `unit_distance`: thickness of a layer that has these opacities, world length.
 
-        Where points overlap, extinctions are added, exactly; colours are means weighted by them on the lines
-        through points and sides, and bilinear between.
+        Where points overlap, extinctions are added; colours are means weighted by them on the lines through
+        points and sides, and bilinear between.
 
         **Raises:** `ValueError` for no points or what is none, an opacity outside [0, 1], reaches that are
         not positive, and places that are traced: lines carry no gradient.
@@ -134,33 +119,31 @@ class TransferFunction2D(Transfer):
         try:
             values, magnitudes, colors, opacities, reaches = zip(*points, strict=True)
         except (TypeError, ValueError) as fault:
-            raise ValueError(
-                "points must be one or more of (value, magnitude, (r, g, b), opacity, "
-                f"(reach, magnitude_reach)); got {points!r}."
-            ) from fault
+            form = "(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))"
+            raise ValueError(f"points must be one or more of {form}; got {points!r}.") from fault
         if is_traced(values, magnitudes, reaches):
             raise ValueError("values, magnitudes and reaches of points must be numbers; some are traced.")
         count = len(values)
-        positive = "reaches must be positive; got {got}."
         places = _numbers("values", values, (count,)), _numbers("magnitudes", magnitudes, (count,))
-        reach = require(_numbers("reaches", reaches, (count, 2)), lambda reach: reach > 0, positive)
-        lines, away, falls = [], [], []  # away: how far lines are from each point, in reaches
-        for place, far in zip(places, reach.T, strict=True):
-            low, high = (side[:, None] for side in (place - far, place + far))
-            lines.append(np.unique([place - far, place, place + far]))
-            away.append(np.abs(lines[-1] - place[:, None]) / far[:, None])
-            # exactly 0 on the sides, where the quotient may round to less than 1
-            falls.append(np.where((low < lines[-1]) & (lines[-1] < high), np.maximum(1 - away[-1], 0), 0))
-        # (points, values, magnitudes)
-        away, (along, across) = [away[0][:, :, None], away[1][:, None]], falls
-        tents = along[:, :, None] * across[:, None]
+        reach = _numbers("reaches", reaches, (count, 2))
+        reach = require(reach, lambda reach: reach > 0, "reaches must be positive; got {got}.")
+
+        def axis(place: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Lines, the tent of each point on them, and how far they are from it, in reaches."""
+            ends = np.stack([place - reach, place, place + reach], axis=1)
+            lines = np.unique(ends)
+            tents = np.stack([np.interp(lines, end, (0, 1, 0)) for end in ends])  # exactly 0 on the sides
+            return lines, tents, np.abs(lines - place[:, None]) / reach[:, None]
+
+        (lines, along, far), (others, across, away) = map(axis, places, reach.T)
+        tents = along[:, :, None] * across[:, None]  # (points, values, magnitudes)
         each = extinction_of(opacities, unit_distance)[:, None, None] * tents
         extinction = jnp.sum(each, axis=0)
         rgb = finite_array("colors", colors, (count, 3))
         mean = jnp.einsum("pnm,pc->nmc", each, rgb) / jnp.where(extinction > 0, extinction, 1)[..., None]
         # where nothing is seen, the colour of the nearest point, so that it reaches to its sides
-        nearest = rgb[np.argmin(np.maximum(*away), axis=0)]
-        return cls(lines[0], lines[1], jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
+        nearest = rgb[np.argmin(np.maximum(far[:, :, None], away[:, None]), axis=0)]
+        return cls(lines, others, jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
 
     def __call__(self, value: Scalar, magnitude: Scalar) -> tuple[Vec3, Scalar]:
         """Colour (r, g, b) and extinction of a value and a magnitude of the gradient."""

@@ -18,14 +18,14 @@ from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.platform import is_traced
-from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by, trilinear
+from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, trilinear
 
 
 class Field(eqx.Module):
-    """A user-defined scalar field that replaces the interpolation of voxels, for example a formula.
+    """A user-defined scalar field in place of interpolated voxels: `Volume(data, field=...)`.
 
-    Pass it as `Volume(data, field=...)`. Its arrays are differentiable; of voxels, those that it reads by
-    `volume.interpolated`. `SpaceLeaping` leaps over no part of it, since its range is unknown.
+    Its arrays are differentiable; of voxels, those that it reads by `volume.interpolated`. `SpaceLeaping`
+    leaps over no part of it, since its range is unknown.
     """
 
     @abstractmethod
@@ -40,32 +40,27 @@ class Volume(eqx.Module):
     **Arguments:**
 
     - `data`: (nx, ny, nz) voxels, at least 2 along each axis: an array of any library and memory layout, or
-      nested sequences. uint8, int8, uint16, int16, float16, bfloat16 and float32 keep their type on the
-      device; a voxel is converted after it is fetched. float64 is kept if JAX's 64-bit types are enabled,
-      and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
-      int8, uint16, int16 and float32 that holds every value exactly.
+      nested sequences. 8- and 16-bit integers and floats of up to 32 bits keep their type on the device.
+      float64 is kept if JAX's 64-bit types are enabled, and becomes float32 otherwise. Booleans and wider
+      integers become the first of uint8, int8, uint16, int16 and float32 that holds every value exactly.
       Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
       evenly spaced, give spacing and origin. Of an image stack [plane, row, column], pass `stack.T`.
-    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT). By default
-      that of the data's coordinates, or 1.
-    - `origin`: world position of node (0, 0, 0). By default that of the data's coordinates, or 0.
+    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT), by default 1.
+    - `origin`: world position of node (0, 0, 0), by default 0.
     - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
-      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
-      and for the identity, the data's axes are the world's, and the field is None.
-    - `labels`: optional integer label of every node (a segmentation), of the same shape. 64-bit labels
-      become 32-bit.
-    - `field`: optional `Field` that supplies the values instead of the voxels; the voxel grid then only sets
-      the volume's extent.
+      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. None, the
+      default, and the identity, which becomes None: the data's axes are the world's. Its gradient is exact
+      along changes that keep it orthonormal.
+    - `labels`: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
+    - `field`: optional `Field` that supplies the values instead of the voxels, which then only set the
+      volume's extent.
 
-    bfloat16 keeps 8 significant bits, float16 11: values around 1000 are rounded to multiples of 4 and of 0.5
-    (`experiments/stability.py`, "voxels of 16-bit floats").
+    bfloat16 rounds values around 1000 to multiples of 4, float16 to 0.5 (`experiments/stability.py`,
+    "voxels of 16-bit floats").
 
-    The gradient by `direction` is exact along changes that keep it orthonormal.
-
-    **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
-    unsupported type, or hold NaN or infinity, also after conversion to float32; for integers that no type
-    holds exactly; for spacing that is not positive; for a direction whose columns are not of length 1 and
-    orthogonal to 1e-4; and for labels of another shape or type, or beyond int32.
+    **Raises:** `ValueError` for data that are not 3-D, have an axis of one voxel or an unsupported type, or
+    hold NaN, infinity or integers that no type holds exactly; for spacing that is not positive; for a
+    direction that is not orthonormal to 1e-4; and for labels of another shape or type, or beyond int32.
     """
 
     data: Shaped[Array, "nx ny nz"]
@@ -170,25 +165,28 @@ class Volume(eqx.Module):
         """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one.
 
         **Raises:** `ValueError` for a volume without labels."""
-        if self.labels is None:
-            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
+        labels = self._labels()
         i, j, k = (
             jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)
             for c, n in zip(coordinate, self.shape, strict=True)
         )
         _, ny, nz = self.shape
-        return fetched(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
+        return fetched(labels, (i * ny + j) * nz + k).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
         """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others.
 
         **Raises:** `ValueError` for a volume without labels."""
-        if self.labels is None:
-            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
+        labels = self._labels()
         share = jnp.zeros_like(coordinate[0])
         for index, weight in corners(coordinate, self.shape):
-            share = share + weight * (fetched(self.labels, index) == label).astype(share.dtype)
+            share = share + weight * (fetched(labels, index) == label).astype(share.dtype)
         return share
+
+    def _labels(self) -> Integer[Array, "nx ny nz"]:
+        if self.labels is None:
+            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
+        return self.labels
 
     def _field_slopes(self, coordinate: Vec3) -> Vec3:
         def slope(axis: int) -> Scalar:
@@ -247,18 +245,18 @@ def with_voxels(volume: Volume, data: Array) -> Volume:
 def part_of(
     volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
-    """The volume as a part of a grid of `whole` nodes that begins at the node `first`. Spacing, origin and
-    direction are those of the whole; beyond the part, its faces are read.
-
-    `axes`: of the array, which is data[z, y, x] for (2, 1, 0); by default as before."""
+    """The volume as a part of a grid of `whole` nodes that begins at the node `first`; beyond it, its faces
+    are read. Spacing, origin and direction are those of the whole. `axes`: of the array, as in `Window`."""
     window = Window(first, whole, volume.fetch.axes if axes is None else axes)
-    fetch = eqx.tree_at(lambda f: f.window, volume.fetch, window, is_leaf=lambda leaf: leaf is None)
-    return with_fetch(volume, fetch)
+    return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=lambda leaf: leaf is None)
 
 
 def read_as(volume: Volume, fetch: Fetch) -> Volume:
-    """The volume with another way to read its voxels, which are the same."""
-    return with_fetch(volume, read_by(volume.fetch, fetch))
+    """The volume with another way to read its voxels, which are the same, and the same window."""
+    window = volume.fetch.window
+    return with_fetch(
+        volume, eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=lambda leaf: leaf is None)
+    )
 
 
 def with_fetch(volume: Volume, fetch: Fetch) -> Volume:

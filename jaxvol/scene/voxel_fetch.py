@@ -29,15 +29,14 @@ SLOPE_BITS = 10
 
 
 class Window(eqx.Module):
-    """The box of a grid that is in memory. Beyond it, its faces are read.
-
-    - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both along x, y, z.
-    - `axes`: of the array in memory, which is data[z, y, x] for (2, 1, 0). All else is along x, y, z.
-    """
+    """The box of a grid that is in memory. Beyond it, its faces are read."""
 
     first: Int[Array, "3"]
+    """Node at which the box begins, along x, y, z."""
     whole: tuple[int, int, int] = eqx.field(static=True)
+    """Number of nodes of the grid along x, y, z."""
     axes: Axes = eqx.field(static=True)
+    """Of the array in memory, which is data[z, y, x] for (2, 1, 0)."""
 
 
 class Fetch(eqx.Module):
@@ -84,13 +83,11 @@ class Fetch(eqx.Module):
         return flat_index(self.split(data, coordinate)[0], data.shape)
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
-        """The same for `slopes` at one coordinate, whose node has this index into the flattened array. XLA
-        would compute it on one thread, unless it lies in memory."""
+        """The same for `slopes` at one node, whose index XLA computes on all threads if it lies in memory."""
         return self
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
-        """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
-        the nodes, which are central differences, one-sided at the border. Fetches six cubes."""
+        """Slopes along x, y and z at a grid coordinate, in value units per node (`Volume.gradient`)."""
         node, fraction = self.split(data, coordinate)
         slopes = [self._slopes_of_nodes(data, node, axis, coordinate[0].dtype) for axis in range(3)]
         return self._interpolated_slopes(slopes, fraction)
@@ -121,11 +118,6 @@ class Fetch(eqx.Module):
         )
         lower, upper = jax.tree.map(partial(slope, first), a, c), jax.tree.map(partial(slope, last), b, d)
         return _with_first(axis, [lower, upper])
-
-
-def read_by(fetch: Fetch, how: Fetch) -> Fetch:
-    """`how`, with the window of `fetch`."""
-    return eqx.tree_at(lambda fetch: fetch.window, how, fetch.window, is_leaf=lambda leaf: leaf is None)
 
 
 def transposed(cube: Cube, axes: Axes) -> Cube:
@@ -162,15 +154,11 @@ class OneByOne(Fetch):
 
 
 class Packed(Fetch):
-    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
-
-    - `nodes`: of 8-bit voxels, if stored, the slopes of each node. Doubled, they are integers of 10 bits:
-      along x in the highest bits of a word, along y from bit 12 on, along z in the lowest.
-    - `begin`: see `of_slopes_at`.
-    """
+    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches."""
 
     words: UInt32[Array, " voxels"]
     nodes: UInt32[Array, " voxels"] | None = None
+    """Of 8-bit voxels, doubled slopes of each node in 10 bits each: x in the highest, y from bit 12 on."""
     begin: Int[Array, ""] | None = None
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
@@ -215,33 +203,26 @@ class Packed(Fetch):
 
         words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
 
-        def slopes(bits: int) -> Cube:
-            """The slopes from so many bits below the highest one on, times a power of two."""
+        def slope(bits: int, word: Int[Array, ""]) -> Scalar:
+            """The slope from so many bits below the highest one on, times a power of two."""
+            return ((word << bits) & -(1 << shift)).astype(dtype)
 
-            def top(word: Int[Array, ""]) -> Scalar:
-                return ((word << bits) & -(1 << shift)).astype(dtype)
-
-            return jax.tree.map(top, words)
-
-        x, y, z = self._interpolated_slopes([slopes(bits) for bits in (0, 10, shift)], fraction)
+        slopes = [jax.tree.map(partial(slope, bits), words) for bits in (0, SLOPE_BITS, shift)]
+        x, y, z = self._interpolated_slopes(slopes, fraction)
         factor = 2.0 ** -(shift + 1)
         return x * factor, y * factor, z * factor
 
     def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
-        word = gather(self.words, flat)
-        # converted, or XLA repeats the fetch for each use
-        return word.astype(jnp.int32)
+        return gather(self.words, flat).astype(jnp.int32)  # or XLA repeats the fetch for each use
 
 
 class Recording(Fetch):
-    """Records every fetch, so that its VJP returns one cotangent per fetch.
-
-    - `perturbations`: are added to the voxels, in the order of the fetches; if empty, nothing is.
-    - `bases`: first voxel of each cube, as an index into the flattened array, filled while tracing.
-    """
+    """Records every fetch, so that its VJP returns one cotangent per fetch."""
 
     perturbations: list[Cube]
+    """Are added to the voxels, in the order of the fetches; if empty, nothing is."""
     bases: list[Int[Array, "..."]] = eqx.field(static=True)
+    """Flat index of the first voxel of each cube, filled while tracing."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         number = len(self.bases)
@@ -253,7 +234,7 @@ class Recording(Fetch):
 
 
 def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
-    """Perturbations for the cubes at these `bases`, of which the shapes count."""
+    """Perturbations of 0 for the cubes at these `bases`."""
     zeros = (jnp.zeros(base.shape, dtype) for base in bases)
     return [[[[zero, zero], [zero, zero]], [[zero, zero], [zero, zero]]] for zero in zeros]
 

@@ -27,28 +27,21 @@ BISECTIONS = 14
 class AlphaCorrection(Transform):
     """Cut the cells of a ray at the faces that they cross.
 
-    The cell of a ray's last sample reaches past the exit, by a different fraction of a step in every pixel,
-    which makes back faces bumpy. With this transform, that sample stands only for the width e up to the exit:
-    its opacity is `1 - exp(-extinction e)`, which is the paper's `1 - (1 - α)^(e/d)`. A volume of constant
-    extinction is rendered exactly at any step.
+    A ray's last sample then stands only for the width e up to the exit, and not for a different fraction of a
+    step past it in every pixel, which makes back faces bumpy: its opacity is `1 - exp(-extinction e)`, the
+    paper's `1 - (1 - α)^(e/d)`. A volume of constant extinction is rendered exactly at any step. Cells are
+    also cut at the ends of a ray's gaps, as under `ToroidalMap` or `Clip`; of several gaps in one cell, at
+    the first and the last end.
 
-    Where a ray leaves the volume and re-enters it, as under `ToroidalMap` or `Clip`, cells are cut at both
-    ends of such a gap, too. Of a cell that holds several gaps, only the first and the last end are cut.
-
-    With this transform, the image is continuous in the camera and in all else that moves the exit, and its
-    gradient is complete. Without it, the image jumps when a sample crosses the exit, and the gradient misses
-    these jumps.
+    With this transform, the image is continuous in all that moves the exit, and its gradient complete.
+    Without it, the image jumps when a sample crosses the exit, and the gradient misses these jumps.
 
     **Arguments:**
 
-    - `labels`: also cut cells where the volume's label changes between two samples; the face, and the ends
-      of gaps, are found by bisection. The part before it is classified at the sample, the part behind it at
-      the face: each by its own label, so that the faces of a segmentation stay smooth under jitter. A label
-      that lasts less than a quarter of a cell may be missed. Costs a label fetch per bisection, and two more
-      samples per cell.
-
-    Gradients take the faces of labels, and with `labels=True` the ends of gaps, as fixed in space: they miss
-    how these move along a ray. The motion of the exit is included.
+    - `labels`: also cut cells where the volume's label changes, found by bisection, so that the faces of a
+      segmentation stay smooth under jitter. A label that lasts less than a quarter of a cell may be missed.
+      Costs a label fetch per bisection, and two more samples per cell. Gradients then take the faces of
+      labels and the ends of gaps as fixed in space; the motion of the exit is included.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".

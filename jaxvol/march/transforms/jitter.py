@@ -1,8 +1,7 @@
 """Where are samples placed, so that steps do not show as rings? Jittered sampling, and empty-space jittering.
 
 Samples at the same depths in all pixels show rings around surfaces: wood grain. Both transforms shift the
-samples of each pixel by a random fraction ξ of a step, which turns the rings into noise. Neither makes the
-image more accurate: the energy of its error stays the same.
+samples of each pixel by a random fraction ξ of a step, which turns the rings into noise of the same energy.
 """
 
 from typing import Any, ClassVar, Literal
@@ -55,8 +54,7 @@ class Noise(eqx.Module):
 class Jitter(Transform):
     """Start each ray a random fraction ξ of a step past its entry.
 
-    Turns wood grain into noise. Where the volume's bounds cut through material it adds noise, since each
-    ray leaves out the first ξ d of it.
+    Where the volume's bounds cut through material it adds noise: each ray leaves out the first ξ d of it.
 
     **Arguments:**
 
@@ -100,13 +98,10 @@ class Jitter(Transform):
 
 
 class EmptySpaceJitter(Transform):
-    """At a ray's first transparent sample, advance by a random fraction ξ of a step instead of a whole one.
+    """At a ray's first transparent sample, of extinction 0, advance by a random fraction ξ of a step.
 
-    A ray starts at its entry, so that faces where the volume's bounds cut material stay smooth; samples
-    behind empty space are jittered, so that wood grain still turns into noise. This happens once per ray.
-    Transparent means an extinction of exactly 0.
-
-    The image jumps where a ray's first transparent sample changes; gradients do not include these jumps.
+    So wood grain turns into noise, while faces where the volume's bounds cut material stay smooth. The image
+    jumps where a ray's first transparent sample changes; gradients do not include these jumps.
 
     **Arguments:** `seed`, `pattern`: as in `Jitter`; the random numbers are independent of `Jitter`'s.
 

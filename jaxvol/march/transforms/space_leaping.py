@@ -27,8 +27,7 @@ LEAPS = 4
 class SpaceLeaping(Transform):
     """Leap over regions in which the transfer function shows nothing.
 
-    Leaps are whole steps, so that every sample is also one of the march without leaps: the image stays the
-    same, except under `"min_distance"`. `EmptySpaceJitter` treats what is leapt over as transparent.
+    Leaps are whole steps: the image stays the same, except under `"min_distance"`.
 
     **Arguments:**
 
@@ -43,10 +42,9 @@ class SpaceLeaping(Transform):
         - `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
     - `cell`: side of the square of pixels of the last two methods; at least 2.
 
-    Visible blocks are determined for every image, from its transfer function. What is leapt over has
-    extinction 0, which changes no image, but has a gradient: `adjoint="direct"`, which does not leap,
-    includes it; `"forward"` takes it as 0 where rays leap, `"replay"` also in front of and behind everything
-    that a ray sees. A fit that should make invisible regions visible must start above 0, or not leap.
+    What is leapt over has extinction 0, whose gradient only `adjoint="direct"` includes: `"forward"` takes it
+    as 0 where rays leap, `"replay"` also in front of and behind everything that a ray sees. A fit that should
+    make invisible regions visible must start above 0, or not leap.
 
     Where it fails: `experiments/stability.py`, "sheets thinner than a cell of rays",
     "occupancy under steep transfer functions", "gradients of what is leapt over".

@@ -36,10 +36,9 @@ class ToroidalMap(Transform):
     """Interpret `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, evenly spaced over the ranges.
 
     The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
-    coordinates are the probe's, with the origin on the motor axis. The world is empty outside the swept
-    sector. A ray may leave the sector and re-enter it, as through its hollow near side: two such gaps are
-    found. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside, and so may
-    one that runs along a face at less than 1e-5 of it.
+    coordinates are the probe's, with the origin on the motor axis. Of the gaps in which a ray is outside the
+    sector, as in its hollow near side, the first two are found. A ray less than 2e-6 of the probe's size
+    outside counts as inside, and so may one that runs along a face at less than 1e-5 of it.
 
     **Arguments:**
 
@@ -51,17 +50,15 @@ class ToroidalMap(Transform):
     - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
       b + first > 0.
 
-    All are differentiable, once: second derivatives miss how entries, exits and gaps curve. The gradient of
-    an angle is taken as 0 on the motor axis (y = z = 0) and at the apex (x = R = 0), and so is that of an
-    entry or exit whose ray meets its face at less than 0.06 degrees.
+    All are differentiable, once. The gradient of an angle is taken as 0 on the motor axis (y = z = 0) and at
+    the apex (x = R = 0), and so is that of an entry or exit where a ray grazes a face by less than 0.06°.
 
     Where it fails: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".
 
     **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
 
-    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), with `atan2` for `atan`, which differs only
-    outside every sector, γ for τ in (2.4), and ρ for R + a.
+    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), with `atan2` for `atan`.
     """
 
     a: Float[Array, ""]
@@ -100,7 +97,7 @@ class ToroidalMap(Transform):
         return jnp.vectorize(lambda p: jnp.stack(self._forward(apart(p))), signature="(k)->(k)")(points)
 
     def to_world(self, toroidal: Arrayable) -> Float[Array, "*points 3"]:
-        """World points of (β, σ, γ), (*points, 3): the inverse of `to_toroidal` where γ > -b and ρ > 0."""
+        """World points (*points, 3) of (β, σ, γ): the inverse of `to_toroidal` where γ > -b and ρ > 0."""
         beta, sigma, gamma = _components("toroidal", toroidal)
         depth = gamma + self.b
         rho = self.a + depth * jnp.sin(sigma)  # sin σ = cos(σ - π/2)
@@ -110,16 +107,14 @@ class ToroidalMap(Transform):
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Lowest and highest world coordinates of the swept sector; tight."""
-        half = math.pi / 2
+        # depth and angles are separable: extremes lie at the ends of the ranges, or in the middle of angles
+        angles = (ends - math.pi / 2 for ends in (self.sigma_range, self.beta_range))
+        fan, turn = (jnp.append(ends, jnp.clip(0.0, *ends)) for ends in angles)
         depth = self.b + self.gamma_range
-        # depth and angles are separable: extremes lie at the ends of the ranges, or where a cosine peaks
-        fan, turn = self.sigma_range - half, self.beta_range - half
-        middle_fan, middle_turn = (jnp.clip(0.0, angles[0], angles[1]) for angles in (fan, turn))
         x = jnp.outer(depth, jnp.sin(fan))
-        rho = self.a + jnp.outer(depth, jnp.cos(jnp.append(fan, middle_fan)))
+        rho = self.a + jnp.outer(depth, jnp.cos(fan))
         rho = jnp.maximum(jnp.stack([rho.min(), rho.max()]), 0)
-        y = jnp.outer(rho, jnp.sin(turn))
-        z = jnp.outer(rho, jnp.cos(jnp.append(turn, middle_turn)))
+        y, z = jnp.outer(rho, jnp.sin(turn)), jnp.outer(rho, jnp.cos(turn))
         return jnp.stack([x.min(), y.min(), z.min()]), jnp.stack([x.max(), y.max(), z.max()])
 
     @property
@@ -214,18 +209,15 @@ class _Sector(Space):
             return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
 
         changes, ranges = (angle(rho), angle(off), radius), self.probe.ranges
-        begin, end, reached = [], [], jnp.ones(rho.shape, bool)
+        begin, stop, reached = [], [], jnp.ones(rho.shape, bool)
         coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
-        if first is not None:
-            coordinate = tuple(c - corner for c, corner in zip(coordinate, first, strict=True))
-        for c, change, ends, n, blocks in zip(
-            coordinate, changes, ranges, self.shape, visible.shape, strict=True
-        ):
+        for axis, (change, ends, n) in enumerate(zip(changes, ranges, self.shape, strict=True)):
+            blocks, c = visible.shape[axis], coordinate[axis] - (0 if first is None else first[axis])
             nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
             reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, BLOCK * blocks))
-            begin.append(jnp.clip(jnp.floor((c - nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
-            end.append(jnp.clip(jnp.floor((c + nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
-        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (end[0], end[1], end[2]))
+            for end, found in ((c - nodes, begin), (c + nodes, stop)):
+                found.append(jnp.clip(jnp.floor(end / BLOCK).astype(jnp.int32), 0, blocks - 1))
+        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
         return Occupancy(reached & seen, low, (x, y, z))
 
     def path(self, entry: Vec3, direction: Vec3) -> "_Curved":
