@@ -19,10 +19,6 @@ from .space import Line
 from .volume import Volume, corners_of
 
 
-ALONG = 1e-3
-"""Sine of the angle up to which `looking_at` treats directions as parallel."""
-
-
 class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
@@ -69,9 +65,8 @@ class Camera(eqx.Module):
     ):
         self.size = width, height = _image_size(size)
         self.focal_point = finite_array("focal_point", focal_point, (3,))
-        position = finite_array("position", position, (3,))
         self.position = require(
-            position,
+            finite_array("position", position, (3,)),
             lambda here, there: (here != there).any(),
             "position must differ from focal_point; got {got} for both.",
             self.focal_point,
@@ -84,9 +79,9 @@ class Camera(eqx.Module):
             self.focal_point,
         )
         self.view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
-        self.parallel_scale = (
-            None if parallel_scale is None else number("parallel_scale", parallel_scale, above=0)
-        )
+        self.parallel_scale = None
+        if parallel_scale is not None:
+            self.parallel_scale = number("parallel_scale", parallel_scale, above=0)
         whole = (-width / height, width / height, -1.0, 1.0)
         self.window = finite_array("window", whole if window is None else window, (4,))
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
@@ -124,10 +119,8 @@ class Camera(eqx.Module):
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
         width, height = _image_size(size)
         cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
-        place = volume.origin, volume.spacing, volume.direction, cells
-        position, center, up, scale = _fitted_view(
-            place, direction, view_up, view_angle, min(1.0, width / height)
-        )
+        place, aspect = (volume.origin, volume.spacing, volume.direction, cells), min(1.0, width / height)
+        position, center, up, scale = _fitted_view(place, direction, view_up, view_angle, aspect)
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
@@ -249,22 +242,15 @@ def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
 
 
 @jax.jit  # or the first image would wait for a program per operation
-def _fitted_view(
-    place: tuple[Any, Any, Any, Any],
-    direction: Float[Array, "3"],
-    view_up: Float[Array, "3"],
-    view_angle: Float[Array, ""],
-    aspect: Any,
-) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere.
-    `place`: arguments of `corners_of`. `aspect`: width over height, at most 1."""
+def _fitted_view(place: Any, direction: Array, up: Array, angle: Array, aspect: Any) -> tuple[Array, ...]:
+    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere."""
     low, high = corners_of(*place)
     center, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
-    half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
+    half = jnp.arctan(jnp.tan(jnp.deg2rad(angle) / 2) * aspect)
     position = center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
     y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
-    other = jnp.where(_sine(y, direction) > ALONG, y, minus_z)
-    up = jnp.where(_sine(view_up, direction) > ALONG, view_up, other)
+    other = jnp.where(_sine(y, direction) > 1e-3, y, minus_z)
+    up = jnp.where(_sine(up, direction) > 1e-3, up, other)
     return position, center, up, radius / aspect
 
 
@@ -284,11 +270,12 @@ def _sine(a: Any, b: Any) -> Any:
     return (across / (lengths + (lengths == 0).astype(lengths.dtype))) ** 0.5
 
 
-def _image_size(size: tuple[int, int] | Any) -> tuple[int, int]:
+def _image_size(size: Any) -> tuple[int, int]:
     try:
         width, height = (int(n) for n in size)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(f"size must be (width, height) in pixels; got {size!r}.") from fault
-    if (width, height) != tuple(size) or width < 1 or height < 1:
-        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size}.")
+        whole = (width, height) == tuple(size)
+    except (TypeError, ValueError):
+        width = height = whole = 0
+    if not whole or width < 1 or height < 1:
+        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size!r}.")
     return width, height

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
-from .._util.checks import described, finite_array, integer, require
+from .._util.checks import described, finite_array, flag, integer, require
 from .._util.piecewise_linear import (
     clip_below,
     interpolate_row,
@@ -60,10 +60,8 @@ class LabelTransferFunction(Transfer):
         seen = [function for function in given if function is not None]
         if not seen:
             raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
-        points = max(function.values.shape[0] for function in seen)
-        hidden = jax.tree.map(lambda leaf: 0 * leaf, seen[0])
-        hidden = eqx.tree_at(lambda function: function.values, hidden, seen[0].values)
-        each = [_continued(hidden if function is None else function, points) for function in [*given, None]]
+        hidden = TransferFunction(seen[0].values, 0 * seen[0].colors, 0 * seen[0].extinction)
+        each = [hidden if function is None else function for function in [*given, None]]
         self.stacked = _stacked(each)
         self.opacity = jnp.asarray(np.ones(len(each)), self.stacked.extinction.dtype)
         self.shown = jnp.asarray(np.ones(len(each)), bool)
@@ -74,9 +72,7 @@ class LabelTransferFunction(Transfer):
         **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
         found = self.shown
         for label, shown in self._changes("visible", visible):
-            if jnp.shape(shown) != () or not jnp.issubdtype(jnp.result_type(shown), bool):
-                raise ValueError(f"visible[{label}] must be True or False; got {described(shown)}.")
-            found = found.at[label].set(shown)
+            found = found.at[label].set(flag(f"visible[{label}]", shown))
         return eqx.tree_at(lambda transfer: transfer.shown, self, found)
 
     def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
@@ -172,39 +168,30 @@ class LabelTransferFunction(Transfer):
 def _by_label(functions: Any) -> list[TransferFunction | None]:
     """Those of label 0, 1, 2, …"""
     if isinstance(functions, Mapping):
-        labels = [integer("functions' label", label, 0, 255) for label in functions]
-        named = dict(zip(labels, functions.values(), strict=True))
-        functions = [named.get(label) for label in range(max(labels, default=-1) + 1)]
-    if not isinstance(functions, list | tuple):
-        raise ValueError(
-            "functions must be {label: TransferFunction}, or a sequence of them from label 0 on; "
-            f"got {described(functions)}."
-        )
-    for label, function in enumerate(functions):
-        if not isinstance(function, TransferFunction | None):
+        named = {integer("functions' label", label, 0, 255): each for label, each in functions.items()}
+        functions = [named.get(label) for label in range(max(named, default=-1) + 1)]
+    if not isinstance(functions, list | tuple) or len(functions) > 256:
+        expected = "{label: TransferFunction}, or a sequence of those of labels 0 to 255"
+        raise ValueError(f"functions must be {expected}; got {described(functions)}.")
+    for label, each in enumerate(functions):
+        if not isinstance(each, TransferFunction | None):
             raise ValueError(
-                f"functions[{label}] must be a TransferFunction, or None; got {described(function)}."
+                f"functions[{label}] must be a TransferFunction, or None; got {described(each)}."
             )
-    if len(functions) > 256:
-        raise ValueError(f"functions must be those of labels 0 to 255; got {len(functions)} of them.")
     return list(functions)
-
-
-def _continued(function: TransferFunction, points: int) -> TransferFunction:
-    """The same function by so many points."""
-    values, missing = function.values, points - function.values.shape[0]
-    if missing == 0:
-        return function
-    # far enough apart to differ in the float type
-    gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
-    beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
-    return TransferFunction(
-        jnp.concatenate([values, beyond]),
-        jnp.concatenate([function.colors, jnp.repeat(function.colors[-1:], missing, axis=0)]),
-        jnp.concatenate([function.extinction, jnp.repeat(function.extinction[-1:], missing)]),
-    )
 
 
 @jax.jit
 def _stacked(functions: list[TransferFunction]) -> TransferFunction:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *functions)
+    """All functions along a leading axis; those with fewer points get copies of their last one beyond it."""
+    points = max(function.values.shape[0] for function in functions)
+
+    def continued(function: TransferFunction) -> TransferFunction:
+        values, missing = function.values, points - function.values.shape[0]
+        # far enough apart to differ in the float type
+        gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
+        beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
+        padded = jax.tree.map(lambda of: jnp.concatenate([of, *[of[-1:]] * missing]), function)
+        return eqx.tree_at(lambda of: of.values, padded, jnp.concatenate([values, beyond]))
+
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(continued, functions))
