@@ -6,13 +6,11 @@ gradients.
 """
 
 from collections.abc import Callable
-from functools import reduce
-from typing import Any, TypeVar
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
 from .._util.axes import XYZ, inverse
@@ -35,8 +33,6 @@ FARTHEST = 255
 
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 """By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
-
-Nodes = TypeVar("Nodes", Array, np.ndarray)
 
 Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 
@@ -128,7 +124,8 @@ class Sums(eqx.Module):
                 table = jnp.cumsum(table, axis=axis, dtype=jnp.int32)
                 continue
             # sums along the first axis, and moves it to the end; XLA's own cumulative sums are slow on CPU
-            _, sums = jax.lax.scan(_add, varying(jnp.zeros_like(table[0]), table), table)
+            start = varying(jnp.zeros_like(table[0]), table)
+            _, sums = jax.lax.scan(lambda total, layer: (total + layer,) * 2, start, table)
             table = jnp.moveaxis(sums, 0, 2)
         nx, ny, nz = occupied.shape
         return cls(table.reshape(-1), (nx, ny, nz))
@@ -188,9 +185,7 @@ class Occupancy(eqx.Module):
         return direction if self.frame is None else self.frame.components(direction)
 
 
-def with_neighbours(
-    grid: Shaped[Array, "cx cy cz"], combine: Callable[[Array, Array], Array]
-) -> Shaped[Array, "cx cy cz"]:
+def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Array:
     """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
     for axis in range(3):
         padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
@@ -200,20 +195,16 @@ def with_neighbours(
     return grid
 
 
-def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:
-    return total + layer, total + layer
-
-
 @jax.jit
-def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     return widened(*extremes(data))
 
 
 @jax.jit
-def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"], Shaped[Array, "bx by bz"]]:
+def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     """Least and greatest node of each block; NaN where a node is."""
 
-    def of(nodes: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
+    def of(nodes: Array) -> tuple[Array, Array]:
         return over_blocks(nodes, jnp.minimum), over_blocks(nodes, jnp.maximum)
 
     whole = (data.shape[0] - 1) // BLOCK
@@ -231,9 +222,7 @@ def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"]
 
 
 @jax.jit
-def widened(
-    low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]
-) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+def widened(low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]) -> tuple[Array, Array]:
     """Ranges of the values interpolated between nodes, from those of the nodes."""
     low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     slack = ROUNDING * jnp.maximum(abs(low), abs(high))
@@ -241,9 +230,7 @@ def widened(
 
 
 @jax.jit
-def _slope_ranges(
-    data: Shaped[Array, "nx ny nz"],
-) -> tuple[Float[Array, "3 bx by bz"], Float[Array, "3 bx by bz"], Float[Array, "bx by bz"]]:
+def _slope_ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array, Array]:
     """The fields of `SlopeRanges`, one layer of blocks after the other: all slopes would take several times
     the volume's memory."""
     last = data.shape[0] - 1
@@ -255,33 +242,19 @@ def _slope_ranges(
         before, here, after = (data[jnp.clip(node + side, 0, last)].astype(dtype) for side in (-1, 0, 1))
         border = ((node == 0) | (node == last))[:, None, None]
         along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)
-        slopes = jnp.stack([along_x, _central(here, 1), _central(here, 2)]).astype(jnp.float32)
-        square = jnp.max(jnp.sum(slopes**2, axis=0), axis=0)
-        low, high, square = (
-            jax.vmap(lambda part, of=of: over_blocks(part, of))(part)
-            for part, of in (
-                (jnp.min(slopes, axis=1), jnp.minimum),
-                (jnp.max(slopes, axis=1), jnp.maximum),
-                (square[None], jnp.maximum),
-            )
-        )
+        slopes = jnp.stack([along_x, *jnp.gradient(here, axis=(1, 2))]).astype(jnp.float32)
+        square = over_blocks(jnp.max(jnp.sum(slopes**2, axis=0), axis=0), jnp.maximum)
+        low = jax.vmap(lambda part: over_blocks(part, jnp.minimum))(jnp.min(slopes, axis=1))
+        high = jax.vmap(lambda part: over_blocks(part, jnp.maximum))(jnp.max(slopes, axis=1))
         # inside loops on CPU, XLA's minima and maxima lose NaN
         lost = over_blocks(jnp.any(jnp.isnan(slopes), axis=(0, 1)), jnp.logical_or)
         slack = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
-        steepest = jnp.sqrt(square[0]) * (1 + ROUNDING)
-        return jnp.where(lost, jnp.nan, low - slack), jnp.where(lost, jnp.nan, high + slack), steepest
+        steepest = jnp.sqrt(square) * (1 + ROUNDING)
+        low, high = (jnp.where(lost, jnp.nan, end) for end in (low - slack, high + slack))
+        return low, high, steepest
 
     low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
     return jnp.moveaxis(low, 0, 1), jnp.moveaxis(high, 0, 1), steepest
-
-
-def _central(values: Float[Array, "nx ny nz"], axis: int) -> Float[Array, "nx ny nz"]:
-    """Slopes of nodes along an axis, as `voxel_fetch.Fetch.slopes` has them."""
-    rise = jnp.diff(values, axis=axis)
-    n = values.shape[axis] - 1
-    first, last = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 1, n)))
-    before, after = (jax.lax.slice_in_dim(values, *part, axis=axis) for part in ((0, n - 1), (2, n + 1)))
-    return jnp.concatenate([first, (after - before) / 2, last], axis)
 
 
 @jax.jit
@@ -290,28 +263,22 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
     return over_blocks(bits, jnp.bitwise_or)
 
 
-def over_blocks(data: Nodes, combine: Callable[[Nodes, Nodes], Nodes], margin: int = 0) -> Nodes:
+def over_blocks(values: Array, combine: Callable[[Array, Array], Array], margin: int = 0) -> Array:
     """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
-    xp: Any = jnp if isinstance(data, jax.Array) else np
-    values: Any = data
-
-    def along(axis: int, begin: int, end: int, step: int = 1) -> Any:
-        return values[(slice(None),) * axis + (slice(begin, end, step),)]
-
     for axis in range(values.ndim):
         cells = values.shape[axis] - 1
         if margin:
             missing = -cells % BLOCK
             around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
-            values, cells = xp.pad(values, around, mode="edge"), cells + missing
+            values, cells = jnp.pad(values, around, mode="edge"), cells + missing
+        along = partial(jax.lax.slice_in_dim, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, BLOCK)
         found = []
         if whole:
-            last, parts = (whole - 1) * BLOCK, range(BLOCK + 1 + 2 * margin)
-            found.append(reduce(combine, [along(axis, i, i + last + 1, BLOCK) for i in parts]))
+            length, parts = (whole - 1) * BLOCK + 1, range(BLOCK + 1 + 2 * margin)
+            found.append(reduce(combine, [along(i, i + length, BLOCK) for i in parts]))
         if rest:
-            nodes = range(whole * BLOCK, cells + 1)
-            found.append(reduce(combine, [along(axis, i, i + 1) for i in nodes]))
-        values = xp.concatenate(found, axis) if len(found) > 1 else found[0]
+            found.append(reduce(combine, [along(i, i + 1) for i in range(whole * BLOCK, cells + 1)]))
+        values = jnp.concatenate(found, axis)
     return values

@@ -125,9 +125,8 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
 }
 
 
-SHADED = frozenset({"ct_bone", "ct_skin_bone", "ct_airway", "ct_chest", "engine", "bonsai", "head"})
-"""Presets that show surfaces, which the command line shades. Gradients of magnetic resonance images are
-mostly noise."""
+SHADED = PRESETS.keys() - {"mr_head"}
+"""Presets that the command line shades: not those of magnetic resonance, whose gradients are mostly noise."""
 
 
 def preset(

@@ -5,13 +5,13 @@ origin and direction, so that rays are straight in the grid. A space with curved
 """
 
 from abc import abstractmethod
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Frame, Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
@@ -223,23 +223,17 @@ class Affine(Space):
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:
     """Distances at which a line enters and leaves a box; on a miss, the first exceeds the second."""
-    (near_x, far_x), (near_y, far_y), (near_z, far_z) = (
-        _slab(*ends) for ends in zip(origin, direction, low, high, strict=True)
-    )
-    near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
-    far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
-    return near, far
+    nears, fars = zip(*map(_slab, origin, direction, low, high), strict=True)
+    return reduce(jnp.maximum, nears), reduce(jnp.minimum, fars)
 
 
-def node_distance(
-    space: Space, shape: tuple[int, ...], first: Int[Array, "3"] | None = None
-) -> Float[Array, "bx by bz"]:
+def node_distance(space: Space, shape: tuple[int, ...], first: Array | None = None) -> Array:
     """The least world distance between neighbouring nodes in the middle of each block, from `first` on."""
-    first = jnp.zeros(3, jnp.int32) if first is None else first
-    dtype = space.middle[0].dtype
-    middle = [
-        BLOCK * ((jnp.arange(n) + begin).astype(dtype) + 0.5) for n, begin in zip(shape, first, strict=True)
+    begins = jnp.zeros(3, jnp.int32) if first is None else first
+    blocks = [
+        (jnp.arange(n) + begin).astype(space.middle[0].dtype) for n, begin in zip(shape, begins, strict=True)
     ]
+    middle = [BLOCK * (block + 0.5) for block in blocks]
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))

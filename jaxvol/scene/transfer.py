@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.checks import Arrayable, finite_array, increasing, number, require, unit_interval
 from .._util.piecewise_linear import (
     FEW,
+    Row,
     clip_below,
     interpolate_row,
     points_below,
@@ -149,17 +150,13 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
     """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
-        raise ValueError(
-            'quadrature="preintegrated" needs a transfer function with an integral over the value; '
-            f'{type(transfer).__name__} has no integrator. Use "midpoint".'
-        )
-
-    def attributes(coordinate: Vec3) -> Measured:
-        return transfer.attributes(volume, coordinate)
+        name = type(transfer).__name__
+        raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
-        return (volume.value(coordinate), *attributes(coordinate))
+        return (volume.value(coordinate), *transfer.attributes(volume, coordinate))
 
+    attributes = partial(transfer.attributes, volume)
     return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)
 
 
@@ -197,9 +194,7 @@ class TransferFunction(Transfer):
 
     @classmethod
     def from_points(
-        cls,
-        points: Sequence[tuple[float, Sequence[float], float]] | Any,
-        unit_distance: Arrayable = 1.0,
+        cls, points: Sequence[tuple[float, Sequence[float], float]] | Any, unit_distance: Arrayable = 1.0
     ) -> "TransferFunction":
         """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
 
@@ -216,9 +211,7 @@ class TransferFunction(Transfer):
         try:
             values, colors, opacities = zip(*points, strict=True)
         except (TypeError, ValueError) as fault:
-            raise ValueError(
-                f"points must be triples (value, (r, g, b), opacity); got {points!r}."
-            ) from fault
+            raise ValueError(f"points must be (value, (r, g, b), opacity); got {points!r}.") from fault
         return cls(values, colors, extinction_of(opacities, unit_distance))
 
     def __call__(self, value: Scalar) -> tuple[Vec3, Scalar]:
@@ -294,7 +287,16 @@ class TransferFunction(Transfer):
     ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         if integrated:
-            return self._integrated_vjp(measured, color, extinction)
+            _, front, back = measured
+            rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
+            (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
+            _, pull = jax.vjp(partial(mean_by_rows, same=i == j), a, b, front[0], back[0])
+            of_a, of_b, of_front, of_back = pull((color, extinction))
+            fronts, backs = (
+                row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
+            )
+            (transfer,) = pull_rows(fronts + backs)
+            return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
         if self.values.shape[0] <= FEW:
             interval = jnp.maximum(points_below(self.values, value) - 1, 0)
@@ -313,26 +315,10 @@ class TransferFunction(Transfer):
         of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
         return transfer, (jnp.where(value < self.values[0], 0, of_value),)
 
-    def _integrated_vjp(
-        self, measured: Measured, color: Vec3, extinction: Scalar
-    ) -> tuple[Transfer, Measured]:
-        _, front, back = measured
-        rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
-        (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
-        means = partial(mean_by_rows, same=i == j)
-        _, pull = jax.vjp(means, a, b, front[0], back[0])
-        of_a, of_b, of_front, of_back = pull((color, extinction))
-        fronts, backs = (
-            row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
-        )
-        (transfer,) = pull_rows(fronts + backs)
-        return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
-
     def rows(self) -> Float[Array, "points 10"]:
-        """A table with one row for each point, so that a value between this point and the next finds all it
-        needs side by side: value, colour and extinction of the point, the slopes of colour and extinction,
-        and 1 over the gap to the next point. Slopes are 0 beyond the last point, and between two equal
-        ones."""
+        """By point, what values between it and the next need: value, colour and extinction of the point, the
+        slopes of colour and extinction, and 1 over the gap; 0 beyond the last point and between equal ones.
+        """
         values = jax.lax.stop_gradient(self.values)
         gap = (values[1:] - values[:-1])[:, None]
         inverse = jnp.where(gap > 0, 1 / jnp.where(gap > 0, gap, 1), 0)
@@ -341,11 +327,8 @@ class TransferFunction(Transfer):
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
 
 
-def _span_of(
-    rows: Float[Array, "spans 26"], measured: Measured
-) -> tuple[tuple[Scalar, ...], Int[Array, "..."]]:
-    """The row of the span in which a value lies, and its index. `measured`: the value, and what
-    `TransferFunction.search` finds for it."""
+def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[Row, Int[Array, "..."]]:
+    """The row of the span in which a value lies, and its index, from the value and what `search` finds."""
     value, *found = measured
     index = jnp.where(value < rows[0, 0], 0, found[0] + 1) if found else span_index(rows, value)
     return table_row(rows, index), index

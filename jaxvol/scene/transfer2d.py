@@ -16,13 +16,13 @@ from .._util.bilinear import (
     interpolate_corners,
     slope_between_lines,
 )
-from .._util.checks import Arrayable, described, finite_array, increasing, number, require, unit_interval
+from .._util.checks import Arrayable, finite_array, increasing, require
 from .._util.piecewise_linear import ROUNDING, Range, points_around, table_row
 from .._util.vec3 import Scalar, Vec3, length
 from ..xla.memory import row_sums
 from ..xla.platform import is_traced
 from .occupancy import Blocks
-from .transfer import Classify, Measured, Transfer, TransferFunction, extinction_of
+from .transfer import Classify, Measured, Transfer, extinction_of
 from .volume import Volume
 
 
@@ -65,36 +65,6 @@ class TransferFunction2D(Transfer):
         self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
 
     @classmethod
-    def from_transfer(
-        cls, transfer: TransferFunction | Any, magnitudes: Arrayable, inside: Arrayable = 0.0
-    ) -> "TransferFunction2D":
-        """A transfer function, its extinction times a factor that grows with the gradient's magnitude.
-
-        **Arguments:**
-
-        - `magnitudes`: (low, high), in value units per world length. The factor is `inside` up to `low`,
-          1 from `high` on, and linear in between.
-        - `inside`: the factor within homogeneous materials, in [0, 1].
-
-        A boundary of a width w between materials whose values differ by d has a magnitude of about d / w.
-
-        **Raises:** `ValueError` for what is no `TransferFunction`, magnitudes that are not two increasing
-        numbers, and a factor outside [0, 1].
-
-        Source: Levoy 1988, who weights opacities."""
-        if not isinstance(transfer, TransferFunction):
-            raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
-        magnitudes = require(
-            finite_array("magnitudes", magnitudes, (2,)),
-            lambda ends: ends[0] < ends[1],
-            "magnitudes must be (low, high) with low < high; got {got}.",
-        )
-        inside = unit_interval("inside", inside, ())
-        factor = jnp.stack([inside, jnp.ones_like(inside)])
-        colors = jnp.stack([transfer.colors, transfer.colors], axis=1)
-        return cls(transfer.values, magnitudes, colors, transfer.extinction[:, None] * factor[None])
-
-    @classmethod
     def from_points(
         cls,
         points: Sequence[tuple[float, float, Sequence[float], float, tuple[float, float]]] | Any,
@@ -124,8 +94,8 @@ class TransferFunction2D(Transfer):
         if is_traced(values, magnitudes, reaches):
             raise ValueError("values, magnitudes and reaches of points must be numbers; some are traced.")
         count = len(values)
-        places = _numbers("values", values, (count,)), _numbers("magnitudes", magnitudes, (count,))
-        reach = _numbers("reaches", reaches, (count, 2))
+        places = finite_array("values", values, (count,)), finite_array("magnitudes", magnitudes, (count,))
+        reach = finite_array("reaches", reaches, (count, 2))
         reach = require(reach, lambda reach: reach > 0, "reaches must be positive; got {got}.")
 
         def axis(place: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -135,7 +105,7 @@ class TransferFunction2D(Transfer):
             tents = np.stack([np.interp(lines, end, (0, 1, 0)) for end in ends])  # exactly 0 on the sides
             return lines, tents, np.abs(lines - place[:, None]) / reach[:, None]
 
-        (lines, along, far), (others, across, away) = map(axis, places, reach.T)
+        (lines, along, far), (others, across, away) = map(axis, map(np.asarray, places), np.asarray(reach).T)
         tents = along[:, :, None] * across[:, None]  # (points, values, magnitudes)
         each = extinction_of(opacities, unit_distance)[:, None, None] * tents
         extinction = jnp.sum(each, axis=0)
@@ -149,10 +119,6 @@ class TransferFunction2D(Transfer):
         """Colour (r, g, b) and extinction of a value and a magnitude of the gradient."""
         return self.classifier()((value, magnitude, *self.search()((value, magnitude))))
 
-    def opacity(self, unit_distance: float = 1.0) -> Float[Array, "n m"]:
-        """Opacity on the lines, of a layer of thickness `unit_distance`."""
-        return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
-
     @property
     def reads_gradient(self) -> bool:
         return True
@@ -163,10 +129,9 @@ class TransferFunction2D(Transfer):
 
     def search(self) -> Callable[[Measured], Measured]:
         def search(measured: Measured) -> Measured:
-            (i, along), (j, across) = (
-                between_lines(lines, read)
-                for lines, read in zip((self.values, self.magnitudes), measured, strict=True)
-            )
+            value, magnitude = measured
+            i, along = between_lines(self.values, value)
+            j, across = between_lines(self.magnitudes, magnitude)
             return i * (self.magnitudes.shape[0] - 1) + j, along, across
 
         return search
@@ -213,7 +178,3 @@ class TransferFunction2D(Transfer):
         """The values and magnitudes of the table on which blocks depend."""
         values, magnitudes = jax.lax.stop_gradient((self.values, self.magnitudes))
         return points_around(values, blocks.low, blocks.high), points_around(magnitudes, *blocks.magnitudes)
-
-
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    return np.asarray(finite_array(name, value, shape))
