@@ -17,8 +17,9 @@ from .._util.checks import Arrayable, described, finite_array, require
 from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
+from ..xla.memory import gather
 from ..xla.platform import is_traced
-from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, trilinear
+from .voxel_fetch import Fetch, OneByOne, Window, corners, flat_index, trilinear
 
 
 class Field(eqx.Module):
@@ -165,22 +166,20 @@ class Volume(eqx.Module):
         """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one.
 
         **Raises:** `ValueError` for a volume without labels."""
-        labels = self._labels()
-        i, j, k = (
-            jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)
-            for c, n in zip(coordinate, self.shape, strict=True)
+        labels, nearest = (
+            self._labels().reshape(-1),
+            [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate],
         )
-        _, ny, nz = self.shape
-        return fetched(labels, (i * ny + j) * nz + k).astype(jnp.int32)
+        i, j, k = (jnp.clip(index, 0, n - 1) for index, n in zip(nearest, self.shape, strict=True))
+        return gather(labels, flat_index((i, j, k), self.shape)).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
         """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others.
 
         **Raises:** `ValueError` for a volume without labels."""
-        labels = self._labels()
-        share = jnp.zeros_like(coordinate[0])
+        labels, share = self._labels().reshape(-1), jnp.zeros_like(coordinate[0])
         for index, weight in corners(coordinate, self.shape):
-            share = share + weight * (fetched(labels, index) == label).astype(share.dtype)
+            share = share + weight * (gather(labels, index) == label).astype(share.dtype)
         return share
 
     def _labels(self) -> Integer[Array, "nx ny nz"]:

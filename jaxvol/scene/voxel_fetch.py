@@ -150,7 +150,7 @@ class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        return cube_of(lambda flat: fetched(data, flat), data.shape, node, dtype)
+        return cube_of(partial(gather, data.reshape(-1)), data.shape, node, dtype)
 
 
 class Packed(Fetch):
@@ -176,11 +176,11 @@ class Packed(Fetch):
             return (word >> (bits * number) & (2**bits - 1)).astype(dtype)
 
         def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
-            if bits == 8:
-                word = self._word(flat)
-                return [[voxel(word, 0), voxel(word, 1)], [voxel(word, 2), voxel(word, 3)]]
-            words = self._word(flat), self._word(flat + nz)
-            return [[voxel(word, 0), voxel(word, 1)] for word in words]
+            fetched = [flat] if bits == 8 else [flat, flat + nz]
+            # converted, or XLA repeats the fetch for each use
+            words = [gather(self.words, index).astype(jnp.int32) for index in fetched]
+            a, b, c, d = (voxel(word, number) for word in words for number in range(32 // bits))
+            return [[a, b], [c, d]]
 
         return [row(base), row(base + ny * nz)]
 
@@ -212,9 +212,6 @@ class Packed(Fetch):
         factor = 2.0 ** -(shift + 1)
         return x * factor, y * factor, z * factor
 
-    def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
-        return gather(self.words, flat).astype(jnp.int32)  # or XLA repeats the fetch for each use
-
 
 class Recording(Fetch):
     """Records every fetch, so that its VJP returns one cotangent per fetch."""
@@ -226,7 +223,7 @@ class Recording(Fetch):
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         number = len(self.bases)
-        cube = cube_of(lambda flat: jax.lax.stop_gradient(fetched(data, flat)), data.shape, node, dtype)
+        cube = cube_of(partial(gather, jax.lax.stop_gradient(data).reshape(-1)), data.shape, node, dtype)
         self.bases.append(flat_index(node, data.shape))
         if self.perturbations:
             cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
@@ -281,14 +278,12 @@ def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
 
 
 def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
-    """The eight nodes around a coordinate: the index of each into the flattened array, and its trilinear
-    weight."""
-    (i, j, k), fraction = split(coordinate, shape)
-    _, ny, nz = shape
-    found = []
+    """The eight nodes around a coordinate: the index of each into the flattened array, and its weight."""
+    node, fraction = split(coordinate, shape)
+    base, (_, ny, nz), found = flat_index(node, shape), shape, []
     for x, y, z in itertools.product((0, 1), repeat=3):
         sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
-        found.append((((i + x) * ny + j + y) * nz + k + z, math.prod(sides)))
+        found.append((base + (x * ny + y) * nz + z, math.prod(sides)))
     return found
 
 
@@ -298,8 +293,3 @@ def split(coordinate: Vec3, shape: tuple[int, ...]) -> tuple[Node, Vec3]:
     # the second clip also keeps the index of a NaN inside the array
     i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
     return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
-
-
-def fetched(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
-    """The entry at index `flat` of the flattened array."""
-    return gather(array.reshape(-1), flat)
