@@ -29,7 +29,7 @@ from ..lighting.shading import Lighting
 from ..march.march import March
 from ..ray import check_arguments
 from ..render import Adjoint, render
-from ..scene.camera import Camera, rows_of
+from ..scene.camera import Camera
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
 from ..xla.trees import PyTree
@@ -207,7 +207,7 @@ class ImageResidual(Residual):
             view, first = item
             volume, transfer, camera, march, lighting = self._scene(parameters, group, view)
             if pieces > 1:
-                camera = rows_of(camera, first, rows)
+                camera = camera.part(0, first, (camera.size[0], rows))
             rendering = render(
                 *(volume, transfer, camera, march),
                 compositing=self.compositing,

@@ -81,7 +81,8 @@ class Box(eqx.Module):
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
         near = jnp.where(jnp.isfinite(near), near, 0)
         far = jnp.max(jnp.where(hit, rays.t_in + rays.length, -jnp.inf), axis=-1)
-        entry, direction = occupancy.own_point(rays.entry), occupancy.own_direction(rays.direction)
+        entry = occupancy.frame.coordinates(rays.entry)
+        direction = occupancy.frame.components(rays.direction)
         start = along(entry, direction, near[..., None] - rays.t_in)
         return cls._of(occupancy, start, direction, near, far, hit, jnp.zeros_like(near))
 
@@ -89,7 +90,7 @@ class Box(eqx.Module):
     def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
         """The box of all camera rays between a beam's corner rays, by beam and corner."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
-        origin, direction = occupancy.own_point(origin), occupancy.own_direction(direction)
+        origin, direction = occupancy.frame.coordinates(origin), occupancy.frame.components(direction)
         spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
         x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)

@@ -133,16 +133,18 @@ class Camera(eqx.Module):
         """
         left, top = integer("left", left, 0), integer("top", top, 0)
         width, height = integer("width", width, 1), integer("height", height, 1)
-        full_width, full_height = self.size
-        if left + width > full_width or top + height > full_height:
-            raise ValueError(
-                f"crop must be a rectangle inside the {full_width} x {full_height} image; "
-                f"got left={left}, top={top}, width={width}, height={height}."
-            )
-        x = [self._column(edge) for edge in (left, left + width)]
-        y = [self._row(edge) for edge in (top + height, top)]
-        corner = self.corner + np.array([left, top], self.corner.dtype)
-        return self._showing(jnp.stack([*x, *y]), (width, height), corner)
+        if left + width > self.size[0] or top + height > self.size[1]:
+            got = f"got left={left}, top={top}, width={width}, height={height}"
+            raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
+        return self.part(left, top, (width, height))
+
+    def part(self, left: Any, top: Any, size: tuple[int, int]) -> "Camera":
+        """`crop` without checks: from a row and column, which may be traced, also beyond the image."""
+        x = [self._column(edge) for edge in (left, left + size[0])]
+        y = [self._row(edge) for edge in (top + size[1], top)]
+        camera = replace(self, window=jnp.stack([*x, *y]), size=size, corner=None)
+        corner = self.corner + jnp.asarray([left, top], self.corner.dtype)
+        return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
         """A camera that shows 1/`factor` of the image at the same image size, in the same perspective.
@@ -181,10 +183,6 @@ class Camera(eqx.Module):
         """`corner`, as integers."""
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
-
-    def _showing(self, window: Scalar, size: tuple[int, int], corner: Scalar) -> "Camera":
-        camera = replace(self, window=window, size=size, corner=None)
-        return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
     def _column(self, column: Scalar | int) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
@@ -231,14 +229,6 @@ def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float
     right = jnp.cross(forward, camera.view_up)
     right = right / jnp.linalg.norm(right)
     return right, jnp.cross(right, forward), forward
-
-
-def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
-    """`Camera.crop` to `count` whole rows from a traced row `first` on; they may reach past the image."""
-    left, right, _, _ = camera.window
-    below, above = (camera._row(row.astype(camera.window.dtype)) for row in (first + count, first))
-    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
-    return camera._showing(jnp.stack([left, right, below, above]), (camera.size[0], count), corner)
 
 
 @jax.jit  # or the first image would wait for a program per operation

@@ -53,9 +53,7 @@ class LabelTransferFunction(Transfer):
     shown: Bool[Array, " labels"]
     """Of each label, whether it is seen: see `with_visibility`."""
 
-    def __init__(
-        self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
-    ):
+    def __init__(self, functions: Mapping[int, Any] | Sequence[TransferFunction | None] | Any):
         given = _by_label(functions)
         seen = [function for function in given if function is not None]
         if not seen:
@@ -87,9 +85,9 @@ class LabelTransferFunction(Transfer):
         found = self.opacity
         for label, factor in self._changes("opacity", opacity):
             name = f"opacity[{label}]"
-            message = f"{name} must be at least 0; got {{got}}."
-            checked = require(finite_array(name, factor, ()), lambda factor: factor >= 0, message)
-            found = found.at[label].set(checked.astype(found.dtype))
+            factor = finite_array(name, factor, ())
+            factor = require(factor, lambda f: f >= 0, f"{name} must be at least 0; got {{got}}.")
+            found = found.at[label].set(factor.astype(found.dtype))
         return eqx.tree_at(lambda transfer: transfer.opacity, self, found)
 
     def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
@@ -107,11 +105,9 @@ class LabelTransferFunction(Transfer):
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """The label at a grid coordinate."""
         return (volume.label(coordinate),)
 
     def classifier(self) -> Classify:
-        """Look-up of colour and extinction, by label and value."""
         functions = self._tables(TransferFunction.rows)
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
@@ -123,7 +119,6 @@ class LabelTransferFunction(Transfer):
         return classify
 
     def integrator(self) -> Classify:
-        """The means for the label in the middle of a cell."""
         functions = self._tables(TransferFunction.span_rows)
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:

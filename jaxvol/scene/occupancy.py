@@ -148,10 +148,10 @@ class Occupancy(eqx.Module):
 
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
-    """Corner of the grid, along the axes of `frame` or the world."""
+    """Corner of the grid, along the axes of `frame`."""
     size: Vec3
     """Side lengths of a cell."""
-    frame: Frame | None = None
+    frame: Frame = Frame()
 
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
@@ -172,17 +172,9 @@ class Occupancy(eqx.Module):
 
     def cell(self, point: Vec3) -> Vec3:
         """Coordinate of a world point in the grid, in cells."""
-        point = self.own_point(point)
+        point = self.frame.coordinates(point)
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
-
-    def own_point(self, point: Vec3) -> Vec3:
-        """A world point along the grid's axes."""
-        return point if self.frame is None else self.frame.coordinates(point)
-
-    def own_direction(self, direction: Vec3) -> Vec3:
-        """A world direction along the grid's axes."""
-        return direction if self.frame is None else self.frame.components(direction)
 
 
 def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Array:

@@ -16,29 +16,26 @@ T = TypeVar("T")
 
 
 class BrickReport(NamedTuple):
-    """What an image by `render_bricks` took.
-
-    - `counts`: bricks along x, y and z. `needed`: how many of them may hold anything visible.
-    - `loads`: how often a brick was read. `reloads`: of these, all but the first of each brick.
-    - `bytes_read`: of voxels, with what is read around each brick.
-    - `stored`: voxels along x, y and z that are held at a time. `bytes_held`: memory that these take, with
-      what is made of them and with the next ones.
-    """
+    """What an image by `render_bricks` took."""
 
     counts: tuple[int, int, int]
+    """Bricks along x, y and z."""
     needed: int
+    """How many of them may hold anything visible."""
     loads: int
+    """How often a brick was read."""
     reloads: int
+    """Of these, all but the first of each brick."""
     bytes_read: int
+    """Of voxels, with what is read around each brick."""
     stored: tuple[int, int, int]
+    """Voxels along x, y and z that are held at a time."""
     bytes_held: int
+    """Memory that these take, with what is made of them and with the next ones."""
 
 
 class Details(NamedTuple):
-    """Outputs that cost time, each None where it was not asked for. See `Rendering`.
-
-    `selected`: the final state of a `Selection`, for `ray.resolve`; None in an image.
-    """
+    """Outputs that cost time, each None where it was not asked for. See `Rendering`."""
 
     depth: Float[Array, "*rays"] | None = None
     samples: Int[Array, "*rays"] | None = None
@@ -46,7 +43,8 @@ class Details(NamedTuple):
     aligned: Bool[Array, "*rays"] | None = None
     normal: Float[Array, "*rays 3"] | None = None
     selected: PyTree = None
-    bricks: "BrickReport | None" = None
+    """The final state of a `Selection`, for `ray.resolve`; None in an image."""
+    bricks: BrickReport | None = None
 
 
 class Rendering(eqx.Module):
@@ -101,8 +99,7 @@ class Rendering(eqx.Module):
 
     def _detail(self, name: str, value: T | None, more: str = "") -> T:
         if value is None:
-            how = f'{more}pass outputs="all" to compute it'
-            raise AttributeError(f"{name} is not part of this rendering: {how}.")
+            raise AttributeError(f'{name} is not part of this rendering: {more}pass outputs="all".')
         return value
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
@@ -112,11 +109,9 @@ class Rendering(eqx.Module):
         if not is_traced(background):  # a traced one may be NaN, which then shows in the image
             background = finite_array("background", background, (..., 3))
         background = jnp.asarray(background, self.rgba.dtype)
-        if background.shape not in ((3,), (*self.rgba.shape[:-1], 3)):
-            raise ValueError(
-                f"background must be one colour (3,) or an image {(*self.rgba.shape[:-1], 3)}; "
-                f"got shape {background.shape}."
-            )
+        if background.shape not in ((3,), shape := (*self.rgba.shape[:-1], 3)):
+            expected = f"one colour (3,) or an image {shape}"
+            raise ValueError(f"background must be {expected}; got shape {background.shape}.")
         return _over(self.rgba, background)
 
 

@@ -159,16 +159,15 @@ class Affine(Space):
     """A grid given by spacing, origin and direction."""
 
     low: Vec3
-    """The first node, along the axes of `frame`, or, without one, the world's; `high`: the last one."""
+    """The first node, along the axes of `frame`; `high`: the last one."""
     high: Vec3
     spacing: Vec3
-    frame: Frame | None
+    frame: Frame
 
     def __init__(self, volume: Volume):
-        self.spacing = apart(volume.spacing)
+        self.spacing, self.frame = apart(volume.spacing), Frame()
         if volume.direction is None:
             self.low, self.high = (apart(end) for end in volume.corners)
-            self.frame = None
         else:
             # from the first node, where the numbers are small: many origins are far away
             self.frame = Frame.of(volume.origin, volume.direction)
@@ -182,23 +181,20 @@ class Affine(Space):
     @property
     def middle(self) -> Vec3:
         x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
-        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
+        return self.frame.point((x, y, z))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        if self.frame is not None:
-            origin = self.frame.coordinates(origin)
-        return slab_interval(origin, self.own(direction), self.low, self.high)
+        origin, direction = self.frame.coordinates(origin), self.frame.components(direction)
+        return slab_interval(origin, direction, self.low, self.high)
 
     def coordinate(self, point: Vec3) -> Vec3:
-        if self.frame is not None:
-            point = self.frame.coordinates(point)
+        point = self.frame.coordinates(point)
         # times the reciprocal: XLA stores quotients that are used more than once
         x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
 
     def point(self, coordinate: Vec3) -> Vec3:
-        x, y, z = self._own_point(coordinate)
-        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
+        return self.frame.point(self._own_point(coordinate))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
         return self.spacing
@@ -209,12 +205,9 @@ class Affine(Space):
         return Occupancy(visible, low, (x, y, z), self.frame)
 
     def path(self, entry: Vec3, direction: Vec3) -> Straight:
-        dx, dy, dz = (d / step for d, step in zip(self.own(direction), self.spacing, strict=True))
+        direction = self.frame.components(direction)
+        dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
         return Straight(self.coordinate(entry), (dx, dy, dz))
-
-    def own(self, direction: Vec3) -> Vec3:
-        """Components of a world direction along the grid's axes, in world length."""
-        return direction if self.frame is None else self.frame.components(direction)
 
     def _own_point(self, coordinate: Vec3) -> Vec3:
         x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))

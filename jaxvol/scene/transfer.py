@@ -81,16 +81,13 @@ class Classification(NamedTuple):
 
 class Transfer(eqx.Module):
     """The interface of all transfer functions. A subclass overrides `classifier`; `attributes` if more than
-    the value counts; and `majorant`, so that rays leap over what is transparent.
-
-    `integrator` and `variation` are for `quadrature="preintegrated"` and `AdaptiveSampling`; `search`,
-    `visible` and `vjp` make programs faster.
+    the value counts; `majorant`, so that rays leap over what is transparent; `integrator` and `variation` for
+    `quadrature="preintegrated"` and `AdaptiveSampling`. `search`, `visible` and `vjp` only save time.
     """
 
     @abstractmethod
     def classifier(self) -> Classify:
-        """The function from `Measured` to colour and extinction. Tables that it needs are computed here,
-        once, outside the march's loop."""
+        """The function from `Measured` to colour and extinction; its tables are computed here, once."""
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """What is read from the volume at a grid coordinate besides the value; by default nothing."""
@@ -98,31 +95,27 @@ class Transfer(eqx.Module):
 
     @property
     def reads_gradient(self) -> bool:
-        """Whether `attributes` reads the volume's gradient, so that slopes and their ranges in blocks
-        (`Blocks.slopes`) are stored. By default not."""
+        """Whether `attributes` reads the volume's gradient, so that slopes are stored. By default not."""
         return False
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
-        block's range. 0 only where the extinction is proven to be 0, and in blocks that hold NaN
-        (`Blocks.unordered`). It carries no gradient. By default infinite: nothing is proven."""
+        """An upper bound of the extinction (1/length) in each block, without a gradient; 0 only where that is
+        proven to be 0, and in blocks that hold NaN (`Blocks.unordered`). By default infinite."""
         return jnp.full(blocks.low.shape, jnp.inf)
 
     def integrator(self) -> Classify | None:
-        """The function from what is measured over a cell (`Measured`) to its colour and extinction: the means
-        over all values between its ends, that of the colour weighted by the extinction. None, the default:
-        unknown, so that `quadrature="preintegrated"` is refused."""
+        """The function from what is measured of a cell (`Measured`) to the means over all values between its
+        ends; None, the default, where they are unknown: `quadrature="preintegrated"` is refused."""
         return None
 
     def variation(self, windows: Windows) -> Variation:
-        """How much extinction and emission change within the range of each window. It carries no gradient. By
-        default nothing is known."""
+        """How much extinction and emission change within the range of each window, without a gradient."""
         return Variation.unknown(windows)
 
     def search(self) -> Callable[[Measured], Measured] | None:
         """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
-        classifier gets after it. By default there is none. With an `integrator` it depends on the value
-        alone. Overridden together with `vjp`."""
+        classifier gets after it. With an `integrator` it depends on the value alone. Overridden with `vjp`.
+        """
         return None
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
@@ -132,9 +125,9 @@ class Transfer(eqx.Module):
     def vjp(
         self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
     ) -> tuple["Transfer", Measured]:
-        """Vector–Jacobian product of classifying many samples, or many cells that are `integrated`, in arrays
-        of one shape: the cotangents of the transfer function and of what was measured, from those of colour
-        and extinction. None where there is no derivative. `measured` includes what `search` found."""
+        """Vector–Jacobian product of classifying many samples, or `integrated` cells: the cotangents of the
+        transfer function and of what was measured, including what `search` found; None without a derivative.
+        """
 
         def classified(transfer: Any, measured: Measured) -> tuple[Vec3, Scalar]:
             classify = transfer.integrator() if integrated else transfer.classifier()
@@ -201,9 +194,8 @@ class TransferFunction(Transfer):
         **Arguments:**
 
         - `points`: in increasing order of value; two of one value make a step. `opacity` in [0, 1] is that
-          of a layer of thickness `unit_distance`, and becomes the extinction
-          `-ln(1 - opacity) / unit_distance` exactly.
-          An opacity of 1, whose extinction would be infinite, is taken as 1 - 2⁻²⁴.
+          of a layer of thickness `unit_distance`; the extinction is `-ln(1 - opacity) / unit_distance`, 1
+          being taken as 1 - 2⁻²⁴.
         - `unit_distance`: world length. VTK's `ScalarOpacityUnitDistance`.
 
         **Raises:** `ValueError` as the class does, and for an opacity outside [0, 1].
@@ -248,7 +240,6 @@ class TransferFunction(Transfer):
         return search
 
     def classifier(self) -> Classify:
-        """Look-up of colour and extinction."""
         rows, values = self.rows(), jax.lax.stop_gradient(self.values)
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
@@ -265,7 +256,6 @@ class TransferFunction(Transfer):
         return chosen if values.shape[0] <= FEW else looked_up
 
     def integrator(self) -> Classify:
-        """The exact means, but for rounding."""
         rows, few = self.span_rows(), self.values.shape[0] <= FEW
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
@@ -335,14 +325,10 @@ def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[Row, I
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:
-    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity.
-
-    Inverse of `1 - exp(-extinction unit_distance)`; an opacity above 1 - 2⁻²⁴ counts as that, the
-    largest float32 below 1. **Raises** `ValueError` for an opacity outside [0, 1].
-    """
+    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity, of which
+    more than 1 - 2⁻²⁴, the largest float32 below 1, counts as that."""
     unit_distance = number("unit_distance", unit_distance, above=0)
-    opacity = unit_interval("opacity", opacity, (None,))
-    return _extinction(opacity, unit_distance)
+    return _extinction(unit_interval("opacity", opacity, (None,)), unit_distance)
 
 
 @jax.jit  # one program, rather than one for each operation

@@ -27,11 +27,8 @@ from .volume import Volume
 
 
 class TransferFunction2D(Transfer):
-    """Colour and extinction by the value and the magnitude of its gradient: a table, bilinear between its
-    lines and constant beyond them.
-
-    In a plot of magnitude against value, each boundary between two materials is an arc, which is told from a
-    material that has its values.
+    """Colour and extinction by the value and the magnitude of its gradient, which tells boundaries from
+    materials: a table, bilinear between its lines and constant beyond them.
 
     **Arguments:**
 
@@ -124,7 +121,6 @@ class TransferFunction2D(Transfer):
         return True
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """The magnitude of the gradient at a grid coordinate."""
         return (length(volume.gradient(coordinate)),)
 
     def search(self) -> Callable[[Measured], Measured]:
@@ -137,7 +133,6 @@ class TransferFunction2D(Transfer):
         return search
 
     def classifier(self) -> Classify:
-        """Look-up of colour and extinction."""
         rows = self.rows()
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:

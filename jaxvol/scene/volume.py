@@ -119,13 +119,11 @@ class Volume(eqx.Module):
     @property
     def bounds(self) -> Float[Array, "6"]:
         """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes."""
-        low, high = self.corners
-        if self.direction is not None:
-            # how far each axis of the data reaches along the world's, up or down
-            reach = self.direction * (self._steps * self.spacing)[None, :]
-            low = self.origin + jnp.sum(jnp.minimum(reach, 0), axis=1)
-            high = self.origin + jnp.sum(jnp.maximum(reach, 0), axis=1)
-        return jnp.stack([low, high], axis=-1).reshape(-1)
+        turn = np.eye(3, dtype=self.spacing.dtype) if self.direction is None else self.direction
+        # how far each axis of the data reaches along the world's, down or up
+        reach = turn * (self._steps * self.spacing)[None, :]
+        ends = (self.origin + jnp.sum(end(reach, 0), axis=1) for end in (jnp.minimum, jnp.maximum))
+        return jnp.stack(list(ends), axis=-1).reshape(-1)
 
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, flag, require, shortened
-from ..._util.vec3 import Frame, Scalar, Vec3, apart, dot
+from ..._util.vec3 import Scalar, Vec3, apart, dot
 from ...scene.occupancy import Occupancy
 from ...scene.space import Gap, Path, Space
 from ..march import Transform
@@ -120,14 +120,14 @@ class HalfSpace(NamedTuple):
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
             for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
         )
-        a, b, c = map(jnp.abs, grid.own_direction(self.normal))
+        a, b, c = map(jnp.abs, grid.frame.components(self.normal))
         # the greatest coordinate, which rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
-        if isinstance(grid.frame, Frame):
-            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.origin))
+        if grid.frame.placed is not None:
+            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.placed[0]))
         reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
         middle = x[:, None, None], y[None, :, None], z[None, None]
-        return self.height(middle if grid.frame is None else grid.frame.point(middle)), reach
+        return self.height(grid.frame.point(middle)), reach
 
 
 class _Clipped(Space):

@@ -153,7 +153,7 @@ class _Distances(EmptySpaceIndex):
         self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
     ) -> Float[Array, " rays"]:
         start = self.occupancy.cell(rays.entry)
-        direction = self.occupancy.own_direction(rays.direction)
+        direction = self.occupancy.frame.components(rays.direction)
         rate = [r / size for r, size in zip(direction, self.occupancy.size, strict=True)]
         if self.starts is not None:
             assert self.corner is not None
