@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Int, Shaped, UInt32
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.vec3 import Scalar, Vec3
@@ -120,14 +120,15 @@ class Fetch(eqx.Module):
         return _with_first(axis, [lower, upper])
 
 
+def cube_of(voxel: Callable[[int, int, int], Any]) -> Cube:
+    """A cube from each of its voxels, by their places along x, y and z, 0 or 1."""
+    return [[[voxel(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+
+
 def transposed(cube: Cube, axes: Axes) -> Cube:
     """A cube along x, y, z, from one whose own axes run along these."""
-
-    def corner(*index: int) -> Scalar:
-        i, j, k = permuted(index, axes)
-        return cube[i][j][k]
-
-    return [[[corner(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+    a, b, c = axes
+    return cube_of(lambda *at: cube[at[a]][at[b]][at[c]])
 
 
 def _with_first(axis: int, cube: Cube) -> Cube:
@@ -150,7 +151,7 @@ class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        return cube_of(partial(gather, data.reshape(-1)), data.shape, node, dtype)
+        return voxels_from(data, node, dtype)
 
 
 class Packed(Fetch):
@@ -201,7 +202,7 @@ class Packed(Fetch):
         def word(offset: int) -> Int[Array, ""]:
             return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
 
-        words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+        words = cube_of(lambda x, y, z: word((x * ny + y) * nz + z))
 
         def slope(bits: int, word: Int[Array, ""]) -> Scalar:
             """The slope from so many bits below the highest one on, times a power of two."""
@@ -223,7 +224,7 @@ class Recording(Fetch):
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         number = len(self.bases)
-        cube = cube_of(partial(gather, jax.lax.stop_gradient(data).reshape(-1)), data.shape, node, dtype)
+        cube = voxels_from(jax.lax.stop_gradient(data), node, dtype)
         self.bases.append(flat_index(node, data.shape))
         if self.perturbations:
             cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
@@ -232,8 +233,7 @@ class Recording(Fetch):
 
 def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
     """Perturbations of 0 for the cubes at these `bases`."""
-    zeros = (jnp.zeros(base.shape, dtype) for base in bases)
-    return [[[[zero, zero], [zero, zero]], [[zero, zero], [zero, zero]]] for zero in zeros]
+    return [cube_of(lambda *at, base=base: jnp.zeros(base.shape, dtype)) for base in bases]
 
 
 _PAIRS = jax.lax.ScatterDimensionNumbers(
@@ -241,12 +241,7 @@ _PAIRS = jax.lax.ScatterDimensionNumbers(
 )
 
 
-def scatter_add(
-    voxels: Float[Array, " voxels"],
-    shape: tuple[int, ...],
-    bases: list[Int[Array, "..."]],
-    cubes: list[Cube],
-) -> Float[Array, " voxels"]:
+def scatter_add(voxels: Array, shape: tuple[int, ...], bases: list[Any], cubes: list[Cube]) -> Array:
     """Adds the cotangents of the cubes at these `bases` to the flattened voxels of an array of this shape."""
     _, ny, nz = shape
     for base, cube in zip(bases, cubes, strict=True):
@@ -260,14 +255,10 @@ def scatter_add(
     return voxels
 
 
-def cube_of(
-    voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], node: Node, dtype: Any
-) -> Cube:
-    """The eight voxels from a node on. `voxel`: by its index into the flattened array."""
-    (_, ny, nz), base = shape, flat_index(node, shape)
-    return [
-        [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
-    ]
+def voxels_from(data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+    """The eight voxels from a node on, each fetched by itself."""
+    (_, ny, nz), base, flat = data.shape, flat_index(node, data.shape), data.reshape(-1)
+    return cube_of(lambda x, y, z: gather(flat, base + (x * ny + y) * nz + z).astype(dtype))
 
 
 def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
