@@ -9,15 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
+from .._util import piecewise_linear as linear
 from .._util.checks import described, finite_array, flag, integer, require
-from .._util.piecewise_linear import (
-    clip_below,
-    interpolate_row,
-    points_below,
-    positive_between,
-    table_row,
-    upper_bound_between,
-)
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
@@ -113,8 +106,8 @@ class LabelTransferFunction(Transfer):
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             value, label = measured
             values, row_at = functions(label)
-            row = row_at(jnp.maximum(points_below(values, value) - 1, 0))
-            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
+            row = row_at(jnp.maximum(linear.points_below(values, value) - 1, 0))
+            return linear.interpolate_row(row, linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return classify
 
@@ -124,7 +117,7 @@ class LabelTransferFunction(Transfer):
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, label, (front,), (back,) = measured
             values, row_at = functions(label)
-            i, j = (points_below(values, end) for end in (front, back))
+            i, j = (linear.points_below(values, end) for end in (front, back))
             return mean_by_rows(row_at(i), row_at(j), front, back, i == j)
 
         return integrate
@@ -136,17 +129,17 @@ class LabelTransferFunction(Transfer):
 
         def of(label: Any) -> tuple[Array, Any]:
             label = jnp.where((label < 0) | (label > hidden), hidden, label)
-            return gather(self.stacked.values, label), lambda row: table_row(rows, label * count + row)
+            return gather(self.stacked.values, label), lambda row: linear.table_row(rows, label * count + row)
 
         return of
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         return jnp.where(
-            self.visible(blocks), self._greatest(upper_bound_between, blocks, blocks.low.dtype), 0
+            self.visible(blocks), self._greatest(linear.upper_bound_between, blocks, blocks.low.dtype), 0
         )
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        return self._greatest(positive_between, blocks, bool)
+        return self._greatest(linear.positive_between, blocks, bool)
 
     def _greatest(
         self, between: Callable[..., Array], blocks: Blocks, dtype: Any

@@ -14,18 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._util import piecewise_linear as linear
 from .._util.checks import Arrayable, finite_array, increasing, number, require, unit_interval
-from .._util.piecewise_linear import (
-    FEW,
-    Row,
-    clip_below,
-    interpolate_row,
-    points_below,
-    positive_between,
-    table_row,
-    upper_bound_between,
-    variation_between,
-)
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, row_sums
@@ -217,25 +207,26 @@ class TransferFunction(Transfer):
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
-        bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
+        bound = linear.upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def variation(self, windows: Windows) -> Variation:
         points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
-        return Variation(*variation_between(*points, windows.low, windows.high))
+        return Variation(*linear.variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
-        return positive_between(values, extinction, blocks.low, blocks.high)
+        return linear.positive_between(values, extinction, blocks.low, blocks.high)
 
     def search(self) -> Callable[[Measured], Measured] | None:
         values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
-        if last < FEW:
+        if last < linear.FEW:
             return None
 
         def search(measured: Measured) -> Measured:
-            interval = jnp.clip(points_below(values, measured[0]) - 1, 0, last)
-            return interval, clip_below(measured[0] - gather(values, interval), jnp.zeros_like(values[0]))
+            interval = jnp.clip(linear.points_below(values, measured[0]) - 1, 0, last)
+            past = measured[0] - gather(values, interval)
+            return interval, linear.clip_below(past, jnp.zeros_like(values[0]))
 
         return search
 
@@ -244,19 +235,19 @@ class TransferFunction(Transfer):
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
-            return interpolate_row(table_row(rows, interval), past)
+            return linear.interpolate_row(linear.table_row(rows, interval), past)
 
         def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
             row = tuple(rows[0])
             for start, following in zip(values[1:], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
-            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
+            return linear.interpolate_row(row, linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
 
-        return chosen if values.shape[0] <= FEW else looked_up
+        return chosen if values.shape[0] <= linear.FEW else looked_up
 
     def integrator(self) -> Classify:
-        rows, few = self.span_rows(), self.values.shape[0] <= FEW
+        rows, few = self.span_rows(), self.values.shape[0] <= linear.FEW
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, front, back = measured
@@ -288,12 +279,12 @@ class TransferFunction(Transfer):
             (transfer,) = pull_rows(fronts + backs)
             return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
-        if self.values.shape[0] <= FEW:
-            interval = jnp.maximum(points_below(self.values, value) - 1, 0)
-            past = clip_below(value - table_row(rows, interval)[0], jnp.zeros_like(value))
+        if self.values.shape[0] <= linear.FEW:
+            interval = jnp.maximum(linear.points_below(self.values, value) - 1, 0)
+            past = linear.clip_below(value - linear.table_row(rows, interval)[0], jnp.zeros_like(value))
         else:
             _, interval, past = measured
-        *_, r, g, b, slope, inverse = table_row(rows, interval)
+        *_, r, g, b, slope, inverse = linear.table_row(rows, interval)
         part = past * inverse
         parts = jnp.stack([*color, extinction], axis=-1)
         shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
@@ -317,11 +308,11 @@ class TransferFunction(Transfer):
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
 
 
-def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[Row, Int[Array, "..."]]:
+def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[linear.Row, Int[Array, "..."]]:
     """The row of the span in which a value lies, and its index, from the value and what `search` finds."""
     value, *found = measured
     index = jnp.where(value < rows[0, 0], 0, found[0] + 1) if found else span_index(rows, value)
-    return table_row(rows, index), index
+    return linear.table_row(rows, index), index
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:

@@ -8,14 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._util.bilinear import (
-    any_between,
-    between_lines,
-    corner_rows,
-    greatest_between,
-    interpolate_corners,
-    slope_between_lines,
-)
+from .._util import bilinear
 from .._util.checks import Arrayable, finite_array, increasing, require
 from .._util.piecewise_linear import ROUNDING, Range, points_around, table_row
 from .._util.vec3 import Scalar, Vec3, length
@@ -126,8 +119,8 @@ class TransferFunction2D(Transfer):
     def search(self) -> Callable[[Measured], Measured]:
         def search(measured: Measured) -> Measured:
             value, magnitude = measured
-            i, along = between_lines(self.values, value)
-            j, across = between_lines(self.magnitudes, magnitude)
+            i, along = bilinear.between_lines(self.values, value)
+            j, across = bilinear.between_lines(self.magnitudes, magnitude)
             return i * (self.magnitudes.shape[0] - 1) + j, along, across
 
         return search
@@ -137,7 +130,7 @@ class TransferFunction2D(Transfer):
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             _, _, cell, along, across = measured
-            r, g, b, extinction = interpolate_corners(table_row(rows, cell), along, across)
+            r, g, b, extinction = bilinear.interpolate_corners(table_row(rows, cell), along, across)
             return (r, g, b), extinction
 
         return classify
@@ -148,26 +141,27 @@ class TransferFunction2D(Transfer):
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         value, magnitude, cell, along, across = measured
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
-        _, pull = jax.vjp(interpolate_corners, table_row(jax.lax.stop_gradient(rows), cell), along, across)
+        row = table_row(jax.lax.stop_gradient(rows), cell)
+        _, pull = jax.vjp(bilinear.interpolate_corners, row, along, across)
         of_row, of_along, of_across = pull((*color, extinction))
         (transfer,) = pull_rows(row_sums(len(rows), cell, jnp.stack(of_row, axis=-1)))
         i, j = jnp.divmod(cell, self.magnitudes.shape[0] - 1)
-        of_value = of_along * slope_between_lines(self.values, value, i)
-        return transfer, (of_value, of_across * slope_between_lines(self.magnitudes, magnitude, j))
+        of_value = of_along * bilinear.slope_between_lines(self.values, value, i)
+        return transfer, (of_value, of_across * bilinear.slope_between_lines(self.magnitudes, magnitude, j))
 
     def rows(self) -> Float[Array, "cells 16"]:
         """A table with one row for each cell between lines: colour and extinction of its four corners."""
-        return corner_rows(jnp.concatenate([self.colors, self.extinction[..., None]], axis=-1))
+        return bilinear.corner_rows(jnp.concatenate([self.colors, self.extinction[..., None]], axis=-1))
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         extinction = jax.lax.stop_gradient(self.extinction)
         values, magnitudes = self._lines(blocks)
-        bound = greatest_between(extinction, values, magnitudes) * (1 + ROUNDING)
+        bound = bilinear.greatest_between(extinction, values, magnitudes) * (1 + ROUNDING)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         values, magnitudes = self._lines(blocks)
-        return any_between(self.extinction > 0, values, magnitudes)
+        return bilinear.any_between(self.extinction > 0, values, magnitudes)
 
     def _lines(self, blocks: Blocks) -> tuple[Range, Range]:
         """The values and magnitudes of the table on which blocks depend."""

@@ -87,11 +87,9 @@ class Volume(eqx.Module):
         spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
         origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin
         spacing = finite_array("spacing", spacing, (3,))
-        self.spacing = require(
-            spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}."
-        )
+        self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive; got {got}.")
         self.origin = finite_array("origin", origin, (3,))
-        self.direction = None if direction is None else _turn(direction)
+        self.direction = None if direction is None else _checked_direction(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape)
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
@@ -147,7 +145,7 @@ class Volume(eqx.Module):
 
     def interpolated(self, coordinate: Vec3) -> Scalar:
         """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type."""
-        return trilinear(*self.fetch.cube(self.data, coordinate), _mix)
+        return trilinear(*self.fetch.cube(self.data, coordinate))
 
     def gradient(self, coordinate: Vec3) -> Vec3:
         """Gradient of the value along the grid axes, in value units per world length.
@@ -207,26 +205,19 @@ def corners_of(
     return origin, origin + along
 
 
-def _turn(direction: Arrayable) -> Float[Array, "3 3"] | None:
-    """A checked direction; None for one that is known to be the identity."""
+def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
+    """None for a direction that is known to be the identity."""
     turn = require(
         finite_array("direction", direction, (3, 3)),
         lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
-        "direction must be a 3 x 3 matrix whose columns have length 1 and are orthogonal to each other; got "
-        "{got}.",
+        "direction must be a 3 x 3 matrix of orthogonal columns of length 1; got {got}.",
     )
-    known = not is_traced(turn) and np.array_equal(np.asarray(turn), np.eye(3))
-    return None if known else turn
+    return None if not is_traced(turn) and np.array_equal(turn, np.eye(3)) else turn
 
 
 def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
     x, y, z = (component if i == axis else c for i, c in enumerate(coordinate))
     return x, y, z
-
-
-def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    # exactly a and b at the ends; a + f (b - a) would round at f = 1
-    return a * (1 - fraction) + b * fraction
 
 
 def without_voxels(volume: Volume) -> Volume:

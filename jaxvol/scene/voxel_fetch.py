@@ -136,12 +136,12 @@ def _with_first(axis: int, cube: Cube) -> Cube:
     return transposed(cube, ((0, 1, 2), (1, 0, 2), (2, 1, 0))[axis])
 
 
-def _lerp(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    return a + f * (b - a)
-
-
-def trilinear(cube: Cube, fraction: Vec3, mix: Callable[[Scalar, Scalar, Scalar], Scalar] = _lerp) -> Scalar:
+def trilinear(cube: Cube, fraction: Vec3) -> Scalar:
     """Trilinear interpolation."""
+
+    def mix(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
+        return a * (1 - f) + b * f  # exactly a and b at the ends
+
     fx, fy, fz = fraction
     (y0, y1), (y2, y3) = ((mix(fz, *row) for row in plane) for plane in cube)
     return mix(fx, mix(fy, y0, y1), mix(fy, y2, y3))
