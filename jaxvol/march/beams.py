@@ -31,17 +31,14 @@ class EmptySpaceIndex(eqx.Module):
 
     @abstractmethod
     def prepare(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Any:
-        """What the other methods need to know about beams, from the boxes around them. `stretch`: length of
-        the shortest leap that is of use."""
+        """What the other methods need, from the boxes around beams. `stretch`: the shortest useful leap."""
 
     @abstractmethod
     def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
         """Whether anything may be visible along each beam."""
 
     @abstractmethod
-    def skip_to(
-        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
+    def skip_to(self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
 
     def within_ranges(self) -> "EmptySpaceIndex":
@@ -109,14 +106,7 @@ class Box(eqx.Module):
 
     @classmethod
     def _of(
-        cls,
-        occupancy: Occupancy,
-        start: Vec3,
-        direction: Vec3,
-        near: Scalar,
-        far: Scalar,
-        counts: Bool[Array, "*beams rays"],
-        bulge: Scalar,
+        cls, occupancy: Occupancy, start: Vec3, direction: Vec3, near: Any, far: Any, counts: Any, bulge: Any
     ) -> "Box":
         """`start`, `direction`: along the axes of the occupancy."""
 
@@ -128,9 +118,8 @@ class Box(eqx.Module):
             # allows for rounding a ray's start to float32 when the camera is far away
             slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
             s, d, bulges = (s - corner) / size, d / size, bulge / size
-            sides.append(
-                (least(s, 1) - slack, least(s, -1) + slack, least(d, 1) - bulges, least(d, -1) + bulges)
-            )
+            ends = least(s, 1) - slack, least(s, -1) + slack
+            sides.append((*ends, least(d, 1) - bulges, least(d, -1) + bulges))
         low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
         return cls(near, far, low, high, low_rate, high_rate)
 
@@ -142,14 +131,12 @@ class Box(eqx.Module):
 
 
 class Stretches(eqx.Module):
-    """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on.
-
-    `following`: for each stretch, the first one from there on that is not empty, or their number.
-    """
+    """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on."""
 
     near: Float[Array, " beams"]
     length: Scalar
     following: Int[Array, "stretches beams"]
+    """For each stretch, the first one from there on that is not empty, or their number."""
 
 
 def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
@@ -169,10 +156,8 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
 
         def cells(corner: Vec3) -> Index:
             """Cell indices of a corner, arbitrary for boxes outside the grid."""
-            x, y, z = (
-                jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
-                for c, n in zip(corner, shape, strict=True)
-            )
+            at = [jnp.floor(jnp.where(inside, c, 0)) for c in corner]
+            x, y, z = (jnp.clip(i, 0, n - 1).astype(jnp.int32) for i, n in zip(at, shape, strict=True))
             return x, y, z
 
         return inside & sums.any_between(cells(low), cells(high))

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, flag, require, shortened
@@ -64,11 +63,11 @@ class Clip(Transform):
     ):
         self.box = None
         if box is not None:
-            message = (
-                "box must be (x_min, x_max, y_min, y_max, z_min, z_max), each minimum below its maximum; got "
-                "{got}."
+            expected = "(x_min, x_max, y_min, y_max, z_min, z_max), minima below maxima"
+            box = finite_array("box", box, (6,))
+            self.box = require(
+                box, lambda ends: ends[0::2] < ends[1::2], f"box must be {expected}; got {{got}}."
             )
-            self.box = require(finite_array("box", box, (6,)), lambda ends: ends[0::2] < ends[1::2], message)
         self.origins, self.normals = _planes(planes)
         if box is None and not len(self.origins):
             raise ValueError("Clip must be given a box, planes, or both; got neither.")
@@ -216,19 +215,17 @@ def _earlier(a: Scalar, b: Scalar) -> Scalar:
     return jnp.where(b <= a, b, a)
 
 
-def _is_sequence(value: Any) -> bool:
-    return isinstance(value, Sequence) or (isinstance(value, np.ndarray | jax.Array) and value.ndim > 0)
-
-
 def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes 3"]]:
-    if not _is_sequence(planes) or any(not _is_sequence(pair) or len(pair) != 2 for pair in planes):
-        raise ValueError(f"planes must be pairs [(origin, normal), ...]; got {shortened(planes)}.")
+    try:
+        pairs = [(origin, normal) for origin, normal in planes]
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"planes must be pairs [(origin, normal), ...]; got {shortened(planes)}.") from fault
     origins, normals = [], []
-    for i, (origin, normal) in enumerate(planes):
+    for i, (origin, normal) in enumerate(pairs):
         name = f"the normal of planes[{i}]"
         normal, message = finite_array(name, normal, (3,)), f"{name} must not be 0; got {{got}}."
         origins.append(finite_array(f"the origin of planes[{i}]", origin, (3,)))
         normals.append(require(normal, lambda normal: abs(normal).max() > 0, message))
-    if not origins:
+    if not pairs:
         return jnp.zeros((0, 3)), jnp.zeros((0, 3))
     return jnp.stack(origins), jnp.stack(normals)

@@ -74,10 +74,8 @@ class SpaceLeaping(Transform):
         if self.method == "distance":
             return distances
         if view is None:
-            raise ValueError(
-                f'SpaceLeaping("{self.method}") needs the neighbouring pixels of a camera; for rays of your '
-                'own use "hierarchy" or "distance".'
-            )
+            name = f'SpaceLeaping("{self.method}")'
+            raise ValueError(f'{name} needs neighbouring pixels; for rays use "hierarchy" or "distance".')
         columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in view.size)
         if self.method == "beam":
             starts = self._beam_starts(occupancy, view, *jnp.meshgrid(columns[:-1], rows[:-1]))
@@ -87,9 +85,7 @@ class SpaceLeaping(Transform):
             starts = jnp.minimum(across[1:], across[:-1])
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
-    def _beam_starts(
-        self, occupancy: Occupancy, view: View, column: Int[Array, "rows cols"], row: Int[Array, "rows cols"]
-    ) -> Float[Array, "rows cols"]:
+    def _beam_starts(self, occupancy: Occupancy, view: View, column: Array, row: Array) -> Array:
         """Up to which distances the beams of the cells that begin at these pixels meet nothing visible."""
         last = self.cell - 1
         column = jnp.stack([column, column + last, column, column + last], axis=-1)
@@ -116,15 +112,12 @@ class _Beams(EmptySpaceIndex):
     def any_visible(self, prepared: Stretches) -> Bool[Array, " beams"]:
         return prepared.following[0] < prepared.following.shape[0]
 
-    def skip_to(
-        self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
+    def skip_to(self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         count, beams = prepared.following.shape
         near = gather(prepared.near, beam)
         position = (rays.t_in + depth - near) / prepared.length
         stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
-        entry = stretch * beams + beam
-        following = gather(prepared.following.reshape(-1), entry)
+        following = gather(prepared.following.reshape(-1), stretch * beams + beam)
         begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in
         return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
@@ -149,9 +142,7 @@ class _Distances(EmptySpaceIndex):
     def within_ranges(self) -> EmptySpaceIndex:
         return replace(self, starts=None, corner=None)
 
-    def skip_to(
-        self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
+    def skip_to(self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         start = self.occupancy.cell(rays.entry)
         direction = self.occupancy.frame.components(rays.direction)
         rate = [r / size for r, size in zip(direction, self.occupancy.size, strict=True)]
