@@ -38,7 +38,6 @@ class Run(NamedTuple):
 
     @property
     def middle(self) -> Scalar:
-        """Depth of the middle of the run."""
         return self.front + RUN * self.stride / 2 * self.step
 
     def ends_before(self, depth: Scalar) -> Bool[Array, ""]:
@@ -48,23 +47,20 @@ class Run(NamedTuple):
 
 class StrideControl(Transform):
     """A transform that says how long cells may be. Rays take the longest runs whose error, times the
-    transmittance in front of them, is at most `tolerance`, or else of stride 1.
-
-    `longest`: the longest stride, a power of two up to 64.
-    """
+    transmittance in front of them, is at most `tolerance`, or else of stride 1."""
 
     tolerance: eqx.AbstractVar[Float[Array, ""]]
     longest: eqx.AbstractVar[int]
+    """The longest stride, a power of two up to 64."""
 
     @abstractmethod
     def prepared(self, march: March, space: Space, windows: Windows, variation: Variation) -> "StrideControl":
-        """With what `error` needs to know of the scene, in arrays of integers, which have no gradient.
-        `windows`, `variation`: how values, and what is composited, vary in each block."""
+        """With what `error` needs of the scene, in arrays of integers, which have no gradient. `windows`,
+        `variation`: how values, and what is composited, vary in each block."""
 
     @abstractmethod
     def error(self, ray: Ray, run: Run) -> Scalar:
-        """Predicted error of the image due to these cells if nothing lies in front of them. It depends on the
-        ray and the run alone."""
+        """Predicted error of the image due to these cells, by ray and run alone, if nothing is in front."""
 
 
 class Strides(eqx.Module):
@@ -81,12 +77,12 @@ class Strides(eqx.Module):
         self,
         march: March,
         ray: Ray,
-        index: Int[Array, ""],
-        ahead: Int[Array, ""] | int,
+        index: Array,
+        ahead: Any,
         transmittance: Scalar,
         *,
-        leaves: Bool[Array, ""],
-        finished: Bool[Array, ""],
+        leaves: Any,
+        finished: Any,
     ) -> tuple["Strides", Int[Array, ""]]:
         """The state in the run that holds the step `ahead` of `index`, up to which all is transparent, and
         the steps from `index` to that run. `leaves`: whether the ray has left the volume there."""
@@ -119,13 +115,10 @@ class Strides(eqx.Module):
                 fits &= run.ends_before(ray.length)
                 for near, far in ray.gaps:  # a shift may still move the run, by a step at most
                     fits &= run.ends_before(near) | (run.front - run.step >= far)
-            chosen = jax.tree.map(
-                partial(jnp.where, fits), (first, jnp.full_like(index, run.stride), error), chosen
-            )
-        going = target < end
-        begin, steps, error = jax.tree.map(
-            partial(jnp.where, going), (here, self.steps, jnp.zeros_like(error)), chosen
-        )
+            longer = first, jnp.full_like(index, run.stride), error
+            chosen = jax.tree.map(partial(jnp.where, fits), longer, chosen)
+        current = here, self.steps, jnp.zeros_like(error)
+        begin, steps, error = jax.tree.map(partial(jnp.where, target < end), current, chosen)
         begin, steps = jnp.where(leaves, target, begin), jnp.where(leaves, 1, steps)
         known = jnp.where(leaves | finished, 0, error)
         total = None if self.error is None else self.error + known**2
@@ -156,9 +149,7 @@ def begin(march: March, ray: Ray, *, estimate: bool) -> Strides | None:
     return Strides(one, _phase(march, ray, control), jnp.zeros_like(ray.length) if estimate else None)
 
 
-def predicted(
-    march: March, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
-) -> March:
+def predicted(march: March, space: Space, windows: Windows | None, variation: Callable[..., Any]) -> March:
     """The march, whose `StrideControl`, if it has one, knows the scene."""
     control = stride_control(march)
     if control is None:

@@ -1,4 +1,4 @@
-"""Where are samples placed, so that steps do not show as rings? Jittered sampling, and empty-space jittering.
+"""Jittered sampling, and empty-space jittering: how are steps kept from showing as rings?
 
 Samples at the same depths in all pixels show rings around surfaces: wood grain. Both transforms shift the
 samples of each pixel by a random fraction ξ of a step, which turns the rings into noise of the same energy.
@@ -22,11 +22,8 @@ Pattern = Literal["white", "blue"]
 
 
 class Noise(eqx.Module):
-    """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel.
-
-    `pattern`: `"white"`: independent from pixel to pixel. `"blue"`: a tile of 128 x 128 numbers without low
-    frequencies, repeated over the image from an origin that the seed chooses.
-    """
+    """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel: `"white"`,
+    independent of its neighbours, or `"blue"`, from a repeated tile of 128 x 128 without low frequencies."""
 
     seed: UInt32[Array, ""]
     tile: Float[Array, "side side"] | None
@@ -52,14 +49,12 @@ class Noise(eqx.Module):
 
 
 class Jitter(Transform):
-    """Start each ray a random fraction ξ of a step past its entry.
-
-    Where the volume's bounds cut through material it adds noise: each ray leaves out the first ξ d of it.
+    """Start each ray a random fraction ξ of a step past its entry: it leaves out the first ξ d, which adds
+    noise where the volume's bounds cut through material.
 
     **Arguments:**
 
-    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over. The random
-      number of a pixel depends only on seed and pixel.
+    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over.
     - `pattern`: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
     - `front_residual`: give the part that is left out a narrow cell of its own, from the entry to ξ d,
       sampled at the entry. The noise on cut faces then falls to that of the sample's value.

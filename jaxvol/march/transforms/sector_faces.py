@@ -6,7 +6,7 @@ crossing is approached by steps that cannot pass it (sphere tracing), which beco
 
 import math
 from functools import partial, reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -100,11 +100,11 @@ class SectorFaces(eqx.Module):
             outside = _farthest(to_faces).distance
             return outside <= tolerance if inside else outside > tolerance
 
-        def cond(state: tuple[Scalar, list[ToFace], Scalar]) -> Bool[Array, ""]:
+        def cond(state: Any) -> Bool[Array, ""]:
             gone, to_faces, steps = state
             return goes_on(to_faces) & (gone <= reach) & (steps < STEPS)
 
-        def body(state: tuple[Scalar, list[ToFace], Scalar]) -> tuple[Scalar, list[ToFace], Scalar]:
+        def body(state: Any) -> Any:
             gone, to_faces, steps = state
             here = along(origin, direction, begin + sign * gone)
             ahead = [ToFace(distance, sign * slope) for distance, slope in to_faces]
@@ -139,10 +139,8 @@ class SectorFaces(eqx.Module):
             else:
                 bend = 8 * away / jnp.maximum(near, jnp.maximum(away, self._tolerance))
                 root = jnp.sqrt(fall * fall + bend)
-                # the root of the quadratic, without differences
-                newton = jnp.where(
-                    falls, 2 * away / jnp.where(falls, root + fall, 1), (root - fall) * near / 4
-                )
+                quotient = 2 * away / jnp.where(falls, root + fall, 1)  # without differences
+                newton = jnp.where(falls, quotient, (root - fall) * near / 4)
                 safe = jnp.maximum(away, jnp.minimum(newton, near / 2))
             return safe if inside else jnp.where(face.distance > 0, safe, 0)
 
@@ -168,10 +166,8 @@ class SectorFaces(eqx.Module):
         off = hypot(y, z) - self.a
         depth = hypot(x, off) - self.b
         outside = [self.gamma_range[0] - depth, depth - self.gamma_range[1]]
-        for (first, last), across, ahead in (
-            (self.sigma_range - half, x, off),
-            (self.beta_range - half, y, z),
-        ):
+        angles = (self.sigma_range - half, x, off), (self.beta_range - half, y, z)
+        for (first, last), across, ahead in angles:
             outside.append(ahead * jnp.sin(first) - across * jnp.cos(first))
             outside.append(across * jnp.cos(last) - ahead * jnp.sin(last))
         return outside

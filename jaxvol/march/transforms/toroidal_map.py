@@ -136,9 +136,7 @@ class ToroidalMap(Transform):
 
     def locate(self, space: Space, volume: Volume) -> Space:
         if volume.direction is not None:
-            raise ValueError(
-                "volume has a direction, and ToroidalMap places its voxels by the probe: pass one without."
-            )
+            raise ValueError("volume must have no direction: ToroidalMap places its voxels by the probe.")
         return _Sector(self, volume.shape)
 
     def _forward(self, point: Vec3) -> Vec3:
@@ -169,25 +167,20 @@ class _Sector(Space):
 
     def coordinate(self, point: Vec3) -> Vec3:
         toroidal, ranges = self.probe._forward(point), self.probe.ranges
-        beta, sigma, gamma = (
-            (value - ends[0]) / (ends[1] - ends[0]) * (n - 1)
-            for value, ends, n in zip(toroidal, ranges, self.shape, strict=True)
-        )
+        parts = [(value - low) / (high - low) for value, (low, high) in zip(toroidal, ranges, strict=True)]
+        beta, sigma, gamma = (part * (n - 1) for part, n in zip(parts, self.shape, strict=True))
         return beta, sigma, gamma
 
     def point(self, coordinate: Vec3) -> Vec3:
-        toroidal = [
-            ends[0] + c / (n - 1) * (ends[1] - ends[0])
-            for c, ends, n in zip(coordinate, self.probe.ranges, self.shape, strict=True)
-        ]
-        return apart(self.probe.to_world(jnp.stack(toroidal)))
+        parts = [c / (n - 1) for c, n in zip(coordinate, self.shape, strict=True)]
+        ranges = zip(parts, self.probe.ranges, strict=True)
+        return apart(self.probe.to_world(jnp.stack([low + c * (high - low) for c, (low, high) in ranges])))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
         # ρ = a + (b + γ) sin σ is concave in σ and linear in γ, so that it is least in a corner
         probe = self.probe
-        beta, sigma, gamma = (
-            (ends[1] - ends[0]) / (n - 1) for ends, n in zip(probe.ranges, self.shape, strict=True)
-        )
+        ranges = zip(probe.ranges, self.shape, strict=True)
+        beta, sigma, gamma = ((last - first) / (n - 1) for (first, last), n in ranges)
         depth = [jnp.maximum(probe.b + probe.gamma_range[0] + end[2] * gamma, 0) for end in (low, high)]
         angle = [jnp.clip(probe.sigma_range[0] + end[1] * sigma, 0, math.pi) for end in (low, high)]
         rho = [probe.a + d * jnp.sin(s) for d in depth for s in angle]
