@@ -5,16 +5,6 @@ depths 0, d, 2d, … past the entry, each of which stands for the cell of width 
 transform is one idea of one paper: it overrides one or two of these methods, the seams. At each seam the
 answers of all transforms are combined, so that they compose.
 
-| seam | question | default answer |
-|---|---|---|
-| `locate` | which grid coordinate is this world point? | spacing and origin |
-| `clip` | which part of the volume is seen? | all of it |
-| `start` | how many steps past the entry is the first cell? | 0 |
-| `shift` | by what part of a step do samples after the first transparent one move? | 0 |
-| `empty_space` | where is nothing visible? | unknown |
-| `cut` | which part of its cell does a sample stand for? | all of it |
-| `stop` | is this ray finished? | not before the exit |
-
 How many steps long each cell is, one by default, is decided in `strides.py`.
 """
 

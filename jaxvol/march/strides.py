@@ -74,15 +74,7 @@ class Strides(eqx.Module):
     """Sum of the squared predicted errors of all runs so far; None where nobody asks for it."""
 
     def next(
-        self,
-        march: March,
-        ray: Ray,
-        index: Array,
-        ahead: Any,
-        transmittance: Scalar,
-        *,
-        leaves: Any,
-        finished: Any,
+        self, march: March, ray: Ray, index: Any, ahead: Any, transmittance: Any, leaves: Any, finished: Any
     ) -> tuple["Strides", Int[Array, ""]]:
         """The state in the run that holds the step `ahead` of `index`, up to which all is transparent, and
         the steps from `index` to that run. `leaves`: whether the ray has left the volume there."""

@@ -19,11 +19,10 @@ from ..strides import RUN, Run, StrideControl
 
 
 SHARE = 1 / 20
-"""Error of the image by predicted error of a block: errors of a ray's cells have either sign, and most are
-much smaller than predicted. Measured: `experiments.adaptive_error`."""
+"""Error of the image by predicted error of a block, measured (`experiments.adaptive_error`)."""
 
 HIDDEN = 1 / 4
-"""The same of what the front of a cell hides of its back: more, since that has one sign along a ray."""
+"""The same of what the front of a cell hides of its back, which has one sign along a ray."""
 
 FARTHEST = 8
 """Blocks around its own that a run may touch."""
@@ -32,13 +31,11 @@ FARTHEST = 8
 class AdaptiveSampling(StrideControl):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
-    A long cell is as good as several short ones where the value is nearly linear, or the transfer function
-    nearly constant, or little is seen of it. Take a block of 4³ voxels, of side ℓ, whose values, with those
-    up to two nodes around it, range over R, with second differences of at most H (per length²). Between the
-    ends of a cell of width w the value leaves the straight line by about δ = H w² / 8. While the value passes
-    through R once, extinction and emission change by V in total, C of it by the colour, and their slopes by
-    K; C times the extinction is D (`variation.Variation`). Then the optical depth along the block is wrong by
-    about
+    Take a block of 4³ voxels, of side ℓ, whose values, with those up to two nodes around it, range over R,
+    with second differences of at most H (per length²). Between the ends of a cell of width w the value leaves
+    the straight line by about δ = H w² / 8. While the value passes through R once, extinction and emission
+    change by V in total, C of it by the colour, and their slopes by K; C times the extinction is D
+    (`variation.Variation`). Then the optical depth along the block is wrong by about
 
         e = ℓ V min(1, δ / R) + q
 

@@ -23,25 +23,20 @@ class Clip(Transform):
 
     A ray enters and leaves the volume at the cuts: its first sample lies on the cut face, and
     `AlphaCorrection` cuts its last cell there. With `inside_out`, what is cut away is a gap of the ray, at
-    whose ends `AlphaCorrection` cuts cells, by three samples of each cell; without it, faces behind a gap are
-    noisy under jitter. Values and light stay those of the whole volume. Box and planes are in world
-    coordinates, also under a `ToroidalMap`.
+    whose ends `AlphaCorrection` cuts cells, too. Values and light stay those of the whole volume.
 
     **Arguments:**
 
     - `box`: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
     - `planes`: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
-      that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane`. (PyVista's `clip` keeps
-      the other side by default.)
+      that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane` (not PyVista's `clip`).
     - `inside_out`: cut away what is inside all of these, and show the rest.
 
     `box`, `origins` and `normals` are differentiable; where a face of the box coincides with one of the
     volume, the derivative is that of moving it inwards. Without `AlphaCorrection`, gradients miss the jumps
     of the image when a sample crosses a cut; `AlphaCorrection(labels=True)` takes the ends of gaps as fixed.
-    The image also jumps, by the error of the step, where a gap comes to reach the ray's entry.
-
     A ray within a plane is inside. Inside out, a film of less than 2e-6 of the volume's diagonal between its
-    face and the cut is not seen: it is taken for rounding.
+    face and the cut is taken for rounding, and not seen.
 
     Where it fails: `experiments/stability.py`, "jitter behind cuts".
 

@@ -68,7 +68,6 @@ class SectorFaces(eqx.Module):
         return jnp.where(hit, first, jnp.inf), jnp.where(hit, last, -jnp.inf)
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
-        """As `Space.gaps`."""
         faces, start, rate, length = jax.lax.stop_gradient((self, entry, direction, length))
 
         def next_gap(depth: Scalar, _: None) -> tuple[Scalar, Gap]:

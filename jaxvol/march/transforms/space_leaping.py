@@ -52,9 +52,8 @@ class SpaceLeaping(Transform):
     **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
     rendering rays of one's own (`render_rays`).
 
-    Source: Chae and Shin for `"distance"` and `"min_distance"`; they have distances of voxels, not of blocks,
-    and do not march the corner rays again. `"hierarchy"` stands for the octree of the KISTI report 2005;
-    `"beam"` is unpublished.
+    Source: Chae and Shin for `"distance"` and `"min_distance"`, of voxels; `"hierarchy"` stands for the
+    octree of the KISTI report 2005; `"beam"` is unpublished.
     """
 
     method: Method = eqx.field(static=True)

@@ -67,16 +67,8 @@ class ToroidalMap(Transform):
     sigma_range: Float[Array, "2"]
     gamma_range: Float[Array, "2"]
 
-    def __init__(
-        self,
-        a: Arrayable,
-        b: Arrayable,
-        beta_range: Arrayable,
-        sigma_range: Arrayable,
-        gamma_range: Arrayable,
-    ):
-        self.a = number("a", a)
-        self.b = number("b", b)
+    def __init__(self, a: Any, b: Any, beta_range: Any, sigma_range: Any, gamma_range: Any):
+        self.a, self.b = number("a", a), number("b", b)
         self.beta_range = _angles("beta_range", beta_range)
         self.sigma_range = _angles("sigma_range", sigma_range)
         self.gamma_range = require(
@@ -88,7 +80,6 @@ class ToroidalMap(Transform):
 
     @property
     def ranges(self) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"]]:
-        """Those of β, σ and γ."""
         return self.beta_range, self.sigma_range, self.gamma_range
 
     def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
@@ -124,7 +115,6 @@ class ToroidalMap(Transform):
 
     @property
     def center(self) -> Float[Array, "3"]:
-        """Center of the bounds."""
         low, high = self.corners
         return (low + high) / 2
 
