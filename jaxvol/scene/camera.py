@@ -203,11 +203,6 @@ class GivenRays(eqx.Module):
     pixels: Int[Array, "*rays 2"] | None = None
     first: Int[Array, ""] | int = 0
 
-    @classmethod
-    def of(cls, lines: Line) -> "GivenRays":
-        """These rays; their pixels are not kept."""
-        return cls(jnp.stack(lines.origin, axis=-1), jnp.stack(lines.direction, axis=-1))
-
     def pixel(self, index: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
         """The pixels of the rays at these indices."""
         if self.pixels is None:

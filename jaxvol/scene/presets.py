@@ -164,9 +164,8 @@ def colormap(
 
     **Arguments:**
 
-    - `cmap`: a matplotlib colormap or its name; or one colour, such as `"tomato"`, `"#ff6347"` or
-      (1, 0.39, 0.28); or several, a list or an (m, 3) array, evenly spaced over the range and interpolated
-      in sRGB. All are sRGB and are converted to linear. Their alpha is ignored.
+    - `cmap`: a matplotlib colormap or its name; or one colour, such as `"tomato"` or (1, 0.39, 0.28); or
+      several, evenly spaced and interpolated in sRGB. All are sRGB; their alpha is ignored.
     - `clim`: (low, high), the volume's values at which the colormap begins and ends.
     - `opacity`: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
       10; or an array of evenly spaced ones, in [0, 1].

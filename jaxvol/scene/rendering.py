@@ -52,18 +52,16 @@ class Rendering(eqx.Module):
     camera.
 
     - `rgba`: linear colour, premultiplied by opacity, and opacity; not composited over a background.
-    - `exhausted`: whether the ray took `March.max_samples` before it was finished: what lies behind is
-      missing.
+    - `exhausted`: whether the ray took `March.max_samples` before it was finished.
     - `depth`: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
       opacity, world length; infinite where nothing is visible.
     - `samples`: number of samples evaluated, one for each piece of a cell.
     - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
       (Kye 2013, Fig. 13).
-    - `error`: under `AdaptiveSampling`, a cautious estimate of how far a pixel's colour is wrong because of
-      the distance of its samples, without a gradient; infinite where nothing can be predicted. It is mostly
-      several times the true error (`experiments.adaptive_error`).
-    - `normal`: of a mode that shows surfaces (`Isosurface`), the unit normal in the world; 0 where nothing is
-      visible.
+    - `error`: under `AdaptiveSampling`, a cautious estimate of the error of a pixel's colour, mostly several
+      times the true one (`experiments.adaptive_error`); without a gradient, infinite where unknown.
+    - `normal`: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
+    - `bricks`: the `BrickReport` of `render_bricks`.
 
     All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
     other than `"over"` say what their depth is.

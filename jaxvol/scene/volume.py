@@ -40,24 +40,20 @@ class Volume(eqx.Module):
 
     **Arguments:**
 
-    - `data`: (nx, ny, nz) voxels, at least 2 along each axis: an array of any library and memory layout, or
-      nested sequences. 8- and 16-bit integers and floats of up to 32 bits keep their type on the device.
-      float64 is kept if JAX's 64-bit types are enabled, and becomes float32 otherwise. Booleans and wider
-      integers become the first of uint8, int8, uint16, int16 and float32 that holds every value exactly.
+    - `data`: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library. 8- and 16-bit
+      integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are enabled.
+      Others become the first of uint8, int8, uint16, int16 and float32 that holds every value exactly.
       Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
       evenly spaced, give spacing and origin. Of an image stack [plane, row, column], pass `stack.T`.
     - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT), by default 1.
     - `origin`: world position of node (0, 0, 0), by default 0.
     - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
-      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. None, the
-      default, and the identity, which becomes None: the data's axes are the world's. Its gradient is exact
-      along changes that keep it orthonormal.
+      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
+      the data's axes are the world's. Its gradient is exact along changes that keep it orthonormal.
     - `labels`: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
-    - `field`: optional `Field` that supplies the values instead of the voxels, which then only set the
-      volume's extent.
+    - `field`: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
-    bfloat16 rounds values around 1000 to multiples of 4, float16 to 0.5 (`experiments/stability.py`,
-    "voxels of 16-bit floats").
+    Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
 
     **Raises:** `ValueError` for data that are not 3-D, have an axis of one voxel or an unsupported type, or
     hold NaN, infinity or integers that no type holds exactly; for spacing that is not positive; for a
@@ -148,20 +144,15 @@ class Volume(eqx.Module):
         return trilinear(*self.fetch.cube(self.data, coordinate))
 
     def gradient(self, coordinate: Vec3) -> Vec3:
-        """Gradient of the value along the grid axes, in value units per world length.
-
-        Trilinear interpolation of central differences at the nodes, which at the border of the grid are
-        one-sided: continuous, with an error of O(spacing²). Of a `field`, the difference of its values one
-        node to either side, over the part inside the grid.
-        """
+        """Gradient of the value along the grid axes, in value units per world length: interpolated central
+        differences of the nodes, one-sided at the border, with an error of O(spacing²); of a `field`, the
+        difference of its values one node to either side, inside the grid."""
         central = self.field is None
         sx, sy, sz = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
-        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one.
-
-        **Raises:** `ValueError` for a volume without labels."""
+        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one."""
         labels, nearest = (
             self._labels().reshape(-1),
             [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate],
@@ -170,9 +161,7 @@ class Volume(eqx.Module):
         return gather(labels, flat_index((i, j, k), self.shape)).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
-        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others.
-
-        **Raises:** `ValueError` for a volume without labels."""
+        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
         labels, share = self._labels().reshape(-1), jnp.zeros_like(coordinate[0])
         for index, weight in corners(coordinate, self.shape):
             share = share + weight * (gather(labels, index) == label).astype(share.dtype)
@@ -221,12 +210,10 @@ def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
 
 
 def without_voxels(volume: Volume) -> Volume:
-    """The volume without `data`."""
     return eqx.tree_at(lambda v: v.data, volume, None)
 
 
 def with_voxels(volume: Volume, data: Array) -> Volume:
-    """The volume with `data` as its voxels."""
     return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
 
 
@@ -248,5 +235,4 @@ def read_as(volume: Volume, fetch: Fetch) -> Volume:
 
 
 def with_fetch(volume: Volume, fetch: Fetch) -> Volume:
-    """The volume with `fetch` as the way to read its voxels."""
     return eqx.tree_at(lambda v: v.fetch, volume, fetch, is_leaf=lambda leaf: isinstance(leaf, Fetch))

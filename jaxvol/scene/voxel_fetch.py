@@ -72,10 +72,8 @@ class Fetch(eqx.Module):
         if self.window is None:
             return node, fraction
         # of integers, so that the fractions are those of the whole grid
-        i, j, k = (
-            jnp.clip(node[axis] - self.window.first[axis], 0, n - 2)
-            for axis, n in zip(self.axes, data.shape, strict=True)
-        )
+        past = [node[axis] - self.window.first[axis] for axis in self.axes]
+        i, j, k = (jnp.clip(index, 0, n - 2) for index, n in zip(past, data.shape, strict=True))
         return (i, j, k), fraction
 
     def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
@@ -101,10 +99,9 @@ class Fetch(eqx.Module):
         """Slopes along an axis of the array of the eight nodes from this one on."""
 
         def neighbours(offset: int) -> Cube:
-            i, j, k = (
-                jnp.clip(n + offset, 0, data.shape[a] - 2) if a == axis else n for a, n in enumerate(node)
-            )
-            return _with_first(axis, self.cube_at(data, (i, j, k), dtype))
+            at = list(node)
+            at[axis] = jnp.clip(node[axis] + offset, 0, data.shape[axis] - 2)
+            return _with_first(axis, self.cube_at(data, (at[0], at[1], at[2]), dtype))
 
         def slope(whole: Bool[Array, ""], before: Scalar, after: Scalar) -> Scalar:
             return (after - before) * jnp.where(whole, 1, 0.5).astype(dtype)
@@ -112,10 +109,8 @@ class Fetch(eqx.Module):
         # A cube does not reach past the border. There it begins with the first node, or ends with the last.
         first, last = node[axis] == 0, node[axis] == data.shape[axis] - 2
         (a, b), (c, d) = neighbours(-1), neighbours(1)
-        b, c = (
-            jax.tree.map(partial(jnp.where, border), outer, inner)
-            for border, outer, inner in ((first, a, b), (last, d, c))
-        )
+        b = jax.tree.map(partial(jnp.where, first), a, b)
+        c = jax.tree.map(partial(jnp.where, last), d, c)
         lower, upper = jax.tree.map(partial(slope, first), a, c), jax.tree.map(partial(slope, last), b, d)
         return _with_first(axis, [lower, upper])
 
