@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
-from .._util.axes import XYZ, inverse
+from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
 from ..xla.memory import gather
@@ -44,8 +44,8 @@ class Blocks(eqx.Module):
     high: Float[Array, "bx by bz"]
     labels: UInt32[Array, "bx by bz"] | None
     """Bit `label % 32` is set for each label of the block's nodes."""
-    slopes: "SlopeRanges | None" = None
-    """None where they are unknown."""
+    slopes: tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]] | None = None
+    """Least and greatest magnitude of the gradient (`Volume.gradient`); None where they are unknown."""
 
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
@@ -55,59 +55,27 @@ class Blocks(eqx.Module):
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
-        return cls(low, high, labels, SlopeRanges.of(volume) if known else None)
+        return cls(low, high, labels, _magnitudes(volume) if known else None)
 
     @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
         """Blocks that hold NaN, also as a slope."""
         unordered = ~(self.low <= self.high)
-        if self.slopes is not None:
-            for low, high in zip(self.slopes.low, self.slopes.high, strict=True):
-                unordered |= ~(low <= high)
-        return unordered
+        least, most = self.magnitudes
+        return unordered | ~(least <= most)
 
     @property
     def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-        """Least and greatest magnitude of the gradient (`Volume.gradient`)."""
+        """`slopes`, or what is known without them: from 0 to infinity."""
         if self.slopes is None:
             return jnp.zeros_like(self.low), jnp.full_like(self.high, jnp.inf)
-        return self.slopes.magnitudes
+        return self.slopes
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
         """Which blocks may hold this label."""
         if self.labels is None:
             return jnp.ones(self.low.shape, bool)
         return (self.labels >> (label % 32)) & 1 == 1
-
-
-class SlopeRanges(eqx.Module):
-    """Ranges of slopes along x, y, z, in value units per node, in each block, including its faces."""
-
-    low: Float[Array, "3 bx by bz"]
-    high: Float[Array, "3 bx by bz"]
-    steepest: Float[Array, "bx by bz"]
-    """Greatest length of a node's three slopes."""
-    spacing: Float[Array, "3"]
-
-    @classmethod
-    def of(cls, volume: Volume) -> "SlopeRanges":
-        """Those of a volume's voxels, computed once for each array of them."""
-        low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
-        if (axes := volume.fetch.axes) != XYZ:
-            low, high = (jnp.stack([part[axis] for axis in inverse(axes)]) for part in (low, high))
-        return cls(low, high, steepest, jax.lax.stop_gradient(volume.spacing))
-
-    @property
-    def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-        """Least and greatest magnitude of the gradient, in value units per world length."""
-        spacing = self.spacing.astype(self.low.dtype)
-        least = most = jnp.zeros_like(self.steepest)
-        for axis in range(3):  # XLA's sum over a leading axis is slow on CPU
-            low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]
-            least += jnp.maximum(jnp.maximum(low, -high), 0) ** 2  # 0 where slopes change sign
-            most += jnp.maximum(-low, high) ** 2
-        most = jnp.minimum(jnp.sqrt(most), self.steepest / jnp.min(spacing))
-        return jnp.sqrt(least) * (1 - ROUNDING), most * (1 + ROUNDING)
 
 
 class Sums(eqx.Module):
@@ -223,8 +191,9 @@ def widened(low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]) -> 
 
 @jax.jit
 def _slope_ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array, Array]:
-    """The fields of `SlopeRanges`, one layer of blocks after the other: all slopes would take several times
-    the volume's memory."""
+    """Least and greatest slopes along the array's axes in each block, in value units per node, and the
+    greatest length of a node's three; layer by layer, since all would take several times the volume's memory.
+    """
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
@@ -247,6 +216,24 @@ def _slope_ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array, Array]
 
     low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
     return jnp.moveaxis(low, 0, 1), jnp.moveaxis(high, 0, 1), steepest
+
+
+def _magnitudes(volume: Volume) -> tuple[Array, Array]:
+    """Least and greatest magnitude of the gradient in each block, in value units per world length."""
+    low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
+    low, high = (jnp.stack([part[axis] for axis in inverse(volume.fetch.axes)]) for part in (low, high))
+    return _lengths(low, high, steepest, jax.lax.stop_gradient(volume.spacing).astype(low.dtype))
+
+
+@jax.jit
+def _lengths(low: Array, high: Array, steepest: Array, spacing: Array) -> tuple[Array, Array]:
+    least = most = jnp.zeros_like(steepest)
+    for begin, end, step in zip(low, high, spacing, strict=True):  # XLA's sum over axis 0 is slow on CPU
+        begin, end = begin / step, end / step
+        least += jnp.maximum(jnp.maximum(begin, -end), 0) ** 2  # 0 where slopes change sign
+        most += jnp.maximum(-begin, end) ** 2
+    most = jnp.minimum(jnp.sqrt(most), steepest / jnp.min(spacing)) * (1 + ROUNDING)
+    return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
 
 
 @jax.jit
