@@ -16,7 +16,8 @@ def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     Axes named x, y and z, in any order, are put in this one; others are taken as they come. Coordinates that
     fall are reversed, with the data. Axes without coordinates have spacing 1 from 0 on.
 
-    **Raises:** `ValueError` for coordinates that are not evenly spaced numbers.
+    Raises:
+        ValueError: for coordinates that are not evenly spaced numbers.
     """
     if sorted(map(str, value.dims)) == ["x", "y", "z"]:
         value = value.transpose("x", "y", "z")

@@ -77,28 +77,29 @@ class Transform(eqx.Module):
 class March(eqx.Module):
     """How rays step through a volume. Its methods combine the answers of all transforms at a seam.
 
-    **Arguments:**
-
-    - `step`: distance d between samples, world length, > 0.
-    - `transforms`: applied in this order at every seam; none may be given twice.
-    - `quadrature`: how a cell's colour and extinction follow from the values along it.
-      `"left"`: those at its front, as in the papers; the error falls with d.
-      `"midpoint"`: those in its middle; the error falls with d².
-      `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
-      along it, the colour weighted by the extinction. The error falls with d², too, and narrow peaks of the
-      transfer function are not missed; where there are none, `"midpoint"` may be more accurate, in half to
-      two thirds of the time. What a cell's front hides of its back is neglected: for an opacity α and optical
-      depth τ, at most α τ / 8 times the difference of its colours. Extinction times the range of values must
-      stay below 3e38 in float32. A cell has the label and the light of its middle.
-    - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
-      2²⁴, by default 131 072. Rays that need more are marked in `Rendering.exhausted`.
+    Args:
+        step: distance d between samples, world length, > 0.
+        transforms: applied in this order at every seam; none may be given twice.
+        quadrature: how a cell's colour and extinction follow from the values along it.
+            `"left"`: those at its front, as in the papers; the error falls with d.
+            `"midpoint"`: those in its middle; the error falls with d².
+            `"preintegrated"`: the means over all values between those at its two ends, as if the value were
+            linear along it, the colour weighted by the extinction. The error falls with d², too, and narrow
+            peaks of the transfer function are not missed; where there are none, `"midpoint"` may be more
+            accurate, in half to two thirds of the time. What a cell's front hides of its back is neglected:
+            for an opacity α and optical depth τ, at most α τ / 8 times the difference of its colours.
+            Extinction times the range of values must stay below 3e38 in float32. A cell has the label and
+            the light of its middle.
+        max_samples: a ray's cells begin less than so many steps after its first one; an integer from 1 to
+            2²⁴, by default 131 072. Rays that need more are marked in `Rendering.exhausted`.
 
     What is thinner than a step is missed by a part of the rays. Where a march fails:
     `experiments/stability.py`, "sheets thinner than a step", "rays of very many samples",
     "rays that run out of samples".
 
-    **Raises:** `ValueError` for a step that is not a positive number, for something that is no transform, for
-    a transform given twice, and for another `quadrature` or `max_samples`.
+    Raises:
+        ValueError: for a step that is not a positive number, for something that is no transform, for a
+            transform given twice, and for another `quadrature` or `max_samples`.
     """
 
     step: Float[Array, ""]

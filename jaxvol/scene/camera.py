@@ -22,23 +22,22 @@ from .volume import Volume, corners_of
 class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
-    **Arguments:**
+    Args:
+        position: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
+        focal_point: world point at the center of the image.
+        view_up: direction that points up in the image; not parallel to the view direction.
+        view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).
+        parallel_scale: half the height of the view, in world length. Makes the camera orthographic, with ray
+            origins in the plane through `position`.
+        size: (width, height) of the image in pixels.
+        window: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
+            half heights of the whole view; by default all of it. Set by `crop` and `zoom`.
+        corner: (column, row) of the first pixel in the image that this one was cropped from, which keys
+            random numbers; by default (0, 0). Set by `crop`.
 
-    - `position`: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
-    - `focal_point`: world point at the center of the image.
-    - `view_up`: direction that points up in the image; not parallel to the view direction.
-    - `view_angle`: angle between the lower and the upper edge of the image, degrees, in (0, 180).
-    - `parallel_scale`: half the height of the view, in world length. Makes the camera orthographic, with
-      ray origins in the plane through `position`.
-    - `size`: (width, height) of the image in pixels.
-    - `window`: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
-      half heights of the whole view; by default that, (-width/height, width/height, -1, 1). Set by `crop` and
-      `zoom`.
-    - `corner`: (column, row) of the first pixel in the image that this one was cropped from, by default
-      (0, 0); keys random numbers. Set by `crop`.
-
-    **Raises:** `ValueError` for a camera at its focal point, a `view_up` along the view direction, and an
-    angle, scale or size out of range.
+    Raises:
+        ValueError: for a camera at its focal point, a `view_up` along the view direction, and an angle,
+            scale or size out of range.
     """
 
     position: Float[Array, "3"]
@@ -100,15 +99,17 @@ class Camera(eqx.Module):
         """A camera that sees the whole volume from the side that `direction` points to: as by VTK's
         `ResetCamera`, its bounding sphere just fits into the view.
 
-        **Arguments:**
+        Args:
+            volume: what is seen.
+            direction: from the center of the volume to the camera, of any length.
+            view_up: as in `Camera`. Within 0.06° of `direction`, y is used instead, or else -z.
+            view_angle: degrees. For an orthographic camera, it only sets the distance.
+            parallel: whether the camera is orthographic.
+            size: (width, height) of the image in pixels.
 
-        - `direction`: from the center of the volume to the camera, of any length.
-        - `view_up`: as in `Camera`. Within 0.06° of `direction`, y is used instead, or else -z.
-        - `view_angle`: degrees. For an orthographic camera, it only sets the distance.
-        - `parallel`: whether the camera is orthographic.
-
-        **Raises:** `ValueError` as `Camera` does, for a `direction` or `view_up` of 0, and if `volume` is not
-        a `Volume`.
+        Raises:
+            ValueError: as `Camera` does, for a `direction` or `view_up` of 0, and if `volume` is not a
+                `Volume`.
         """
         if not isinstance(volume, Volume):
             raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
@@ -127,9 +128,14 @@ class Camera(eqx.Module):
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """A camera that renders only this rectangle of the image: the same pixels, jitter included.
 
-        `left`, `top`: column and row of the rectangle's first pixel.
+        Args:
+            left: column of the rectangle's first pixel.
+            top: its row.
+            width: number of columns.
+            height: number of rows.
 
-        **Raises:** `ValueError` for a rectangle that is empty or extends beyond the image.
+        Raises:
+            ValueError: for a rectangle that is empty or extends beyond the image.
         """
         left, top = integer("left", left, 0), integer("top", top, 0)
         width, height = integer("width", width, 1), integer("height", height, 1)
@@ -149,7 +155,9 @@ class Camera(eqx.Module):
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
         """A camera that shows 1/`factor` of the image at the same image size, in the same perspective.
 
-        `center`: in fractions of width and height from the top left.
+        Args:
+            factor: by which the image is magnified, > 0.
+            center: what becomes the image's center, in fractions of width and height from the top left.
         """
         factor = number("zoom factor", factor, above=0)
         window = _zoomed(self.window, factor, finite_array("center", center, (2,)))

@@ -22,11 +22,10 @@ from .volume import Volume
 class LabelTransferFunction(Transfer):
     """A transfer function for each label of a segmented volume.
 
-    **Arguments:**
-
-    - `functions`: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
-      label that is not seen, as others without a function are not. Labels are 0 to 255; renumber others, as
-      by `np.unique(labels, return_inverse=True)`.
+    Args:
+        functions: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
+            label that is not seen, as others without a function are not. Labels are 0 to 255; renumber
+            others, as by `np.unique(labels, return_inverse=True)`.
 
     The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
     `AlphaCorrection(labels=True)` cuts cells there, where `"preintegrated"` otherwise takes the label in the
@@ -35,8 +34,9 @@ class LabelTransferFunction(Transfer):
     What `with_visibility` hides is leapt over. Other factors, or labels hidden and shown, compile nothing
     again.
 
-    **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
-    rendering a volume without labels.
+    Raises:
+        ValueError: for no function at all, something that is none, and labels out of range; and when
+            rendering a volume without labels.
     """
 
     stacked: TransferFunction
@@ -60,7 +60,9 @@ class LabelTransferFunction(Transfer):
     def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
         """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
 
-        **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
+        Raises:
+            ValueError: for labels beyond the last one, and for what is not true or false.
+        """
         found = self.shown
         for label, shown in self._changes("visible", visible):
             found = found.at[label].set(flag(f"visible[{label}]", shown))
@@ -73,8 +75,9 @@ class LabelTransferFunction(Transfer):
         f is a factor of the extinction: what has the opacity α at f = 1 has 1 - (1 - α)^f. It may exceed 1,
         and is differentiable; where it is 0, its derivative misses what is leapt over (`SpaceLeaping`).
 
-        **Raises:** `ValueError` for labels beyond the last one, and for factors that are negative or not
-        finite."""
+        Raises:
+            ValueError: for labels beyond the last one, and for factors that are negative or not finite.
+        """
         found = self.opacity
         for label, factor in self._changes("opacity", opacity):
             name = f"opacity[{label}]"

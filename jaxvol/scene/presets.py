@@ -134,16 +134,17 @@ def preset(
 ) -> TransferFunction:
     """A transfer function by name.
 
-    **Arguments:**
+    Args:
+        name: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values.
+        clim: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
+            Hounsfield units + 1000 needs (0, 4000).
+        unit_distance: world length to which the opacities refer; they are designed for 1 mm.
 
-    - `name`: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values.
-    - `clim`: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
-      Hounsfield units + 1000 needs (0, 4000).
-    - `unit_distance`: world length to which the opacities refer; they are designed for 1 mm.
+    Returns:
+        The `TransferFunction`, its colours linear.
 
-    **Returns:** the `TransferFunction`, its colours linear.
-
-    **Raises:** `ValueError` for an unknown name, and a `clim` that does not increase.
+    Raises:
+        ValueError: for an unknown name, and a `clim` that does not increase.
     """
     if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
@@ -162,20 +163,21 @@ def colormap(
 ) -> TransferFunction:
     """A transfer function from a matplotlib colormap and an opacity ramp, as in PyVista's `add_volume`.
 
-    **Arguments:**
+    Args:
+        cmap: a matplotlib colormap or its name; or one colour, such as `"tomato"` or (1, 0.39, 0.28); or
+            several, evenly spaced and interpolated in sRGB. All are sRGB; their alpha is ignored.
+        clim: (low, high), the volume's values at which the colormap begins and ends.
+        opacity: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
+            10; or an array of evenly spaced ones, in [0, 1].
+        unit_distance: thickness, in world length, of a layer that has these opacities.
+        n_colors: number of control points, at least 2.
 
-    - `cmap`: a matplotlib colormap or its name; or one colour, such as `"tomato"` or (1, 0.39, 0.28); or
-      several, evenly spaced and interpolated in sRGB. All are sRGB; their alpha is ignored.
-    - `clim`: (low, high), the volume's values at which the colormap begins and ends.
-    - `opacity`: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
-      10; or an array of evenly spaced ones, in [0, 1].
-    - `unit_distance`: thickness, in world length, of a layer that has these opacities.
-    - `n_colors`: number of control points, at least 2.
+    Returns:
+        The `TransferFunction`, its colours linear.
 
-    **Returns:** the `TransferFunction`, its colours linear.
-
-    **Raises:** `ValueError` for an unknown colormap, colour or opacity, opacities outside [0, 1], and a
-    `clim` that does not increase.
+    Raises:
+        ValueError: for an unknown colormap, colour or opacity, opacities outside [0, 1], and a `clim` that
+            does not increase.
     """
     n_colors = integer("n_colors", n_colors, 2)
     colors = _display_colors(cmap, np.linspace(0, 1, n_colors))

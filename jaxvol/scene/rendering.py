@@ -51,17 +51,17 @@ class Rendering(eqx.Module):
     """The image of rays, and what they met. The leading shape is that of the rays: (height, width) from a
     camera.
 
-    - `rgba`: linear colour, premultiplied by opacity, and opacity; not composited over a background.
-    - `exhausted`: whether the ray took `March.max_samples` before it was finished.
-    - `depth`: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
-      opacity, world length; infinite where nothing is visible.
-    - `samples`: number of samples evaluated, one for each piece of a cell.
-    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
-      (Kye 2013, Fig. 13).
-    - `error`: under `AdaptiveSampling`, a cautious estimate of the error of a pixel's colour, mostly several
-      times the true one (`experiments.adaptive_error`); without a gradient, infinite where unknown.
-    - `normal`: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
-    - `bricks`: the `BrickReport` of `render_bricks`.
+    Attributes:
+        rgba: linear colour, premultiplied by opacity, and opacity; not composited over a background.
+        exhausted: whether the ray took `March.max_samples` before it was finished.
+        depth: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
+            opacity, world length; infinite where nothing is visible.
+        samples: number of samples evaluated, one for each piece of a cell.
+        aligned: whether a last cell that is not transparent was cut at the exit (Kye 2013, Fig. 13).
+        error: under `AdaptiveSampling`, a cautious estimate of the error of a pixel's colour, mostly several
+            times the true one (`experiments.adaptive_error`); without a gradient, infinite where unknown.
+        normal: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
+        bricks: the `BrickReport` of `render_bricks`.
 
     All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
     other than `"over"` say what their depth is.
@@ -103,7 +103,9 @@ class Rendering(eqx.Module):
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
         """Linear RGB over a background: one colour (3,), or an image of the same shape.
 
-        **Raises:** `ValueError` for a background of another shape, or that is not finite."""
+        Raises:
+            ValueError: for a background of another shape, or that is not finite.
+        """
         if not is_traced(background):  # a traced one may be NaN, which then shows in the image
             background = finite_array("background", background, (..., 3))
         background = jnp.asarray(background, self.rgba.dtype)

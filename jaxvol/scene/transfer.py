@@ -146,22 +146,21 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
 class TransferFunction(Transfer):
     """Colour and extinction, piecewise linear in the volume's value and constant beyond the ends.
 
-    **Arguments:**
-
-    - `values`: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
-      step: what lies below takes the first one's colour and extinction, what lies there or above the
-      second's. They carry no gradient.
-    - `colors`: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
-    - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
-      `1 - exp(-extinction w)`.
+    Args:
+        values: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
+            step: what lies below takes the first one's colour and extinction, what lies there or above the
+            second's. They carry no gradient.
+        colors: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
+        extinction: (n,) at the points, in 1/length, ≥ 0; a width w has opacity `1 - exp(-extinction w)`.
 
     VTK interpolates opacity instead; the two differ between points where opacities are high. Put a step
     between values of the data: interpolation may round a value to either side.
 
     Where it fails, and where not: `experiments/stability.py`, "extinction without bound".
 
-    **Raises:** `ValueError` for fewer than two points, points that do not increase or of which three are
-    equal, negative extinction, NaN or infinity, or lengths that differ.
+    Raises:
+        ValueError: for fewer than two points, points that do not increase or of which three are equal,
+            negative extinction, NaN or infinity, or lengths that differ.
     """
 
     values: Float[Array, " n"]
@@ -181,14 +180,13 @@ class TransferFunction(Transfer):
     ) -> "TransferFunction":
         """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
 
-        **Arguments:**
+        Args:
+            points: in increasing order of value; two of one value make a step.
+            unit_distance: thickness of a layer that has these opacities, world length (VTK's
+                `ScalarOpacityUnitDistance`); extinctions are `-ln(1 - opacity) / unit_distance`.
 
-        - `points`: in increasing order of value; two of one value make a step. `opacity` in [0, 1] is that
-          of a layer of thickness `unit_distance`; the extinction is `-ln(1 - opacity) / unit_distance`, 1
-          being taken as 1 - 2⁻²⁴.
-        - `unit_distance`: world length. VTK's `ScalarOpacityUnitDistance`.
-
-        **Raises:** `ValueError` as the class does, and for an opacity outside [0, 1].
+        Raises:
+            ValueError: as the class does, and for an opacity outside [0, 1].
         """
         try:
             values, colors, opacities = zip(*points, strict=True)

@@ -23,19 +23,20 @@ class TransferFunction2D(Transfer):
     """Colour and extinction by the value and the magnitude of its gradient, which tells boundaries from
     materials: a table, bilinear between its lines and constant beyond them.
 
-    **Arguments:**
-
-    - `values`: (n,) increasing, in value units; n ≥ 2. `magnitudes`: (m,) increasing, in value units per
-      world length; m ≥ 2. Two neighbours may be equal, and make a step. They carry no gradient.
-    - `colors`: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
-    - `extinction`: (n, m), in 1/length, ≥ 0.
+    Args:
+        values: (n,) increasing, in value units; n ≥ 2.
+        magnitudes: (m,) increasing, in value units per world length; m ≥ 2. Two neighbours may be equal, and
+            make a step. They carry no gradient.
+        colors: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
+        extinction: (n, m), in 1/length, ≥ 0.
 
     The magnitude is that of `volume.gradient`, also under a `ToroidalMap`, which bends the grid: choose a
     spacing for which that has a meaning. Where the gradient is 0, the derivative of its magnitude is taken as
     0. `quadrature="preintegrated"` and `"average"` are refused; `AdaptiveSampling` takes its shortest steps.
 
-    **Raises:** `ValueError` for fewer than two lines, lines that do not increase or of which three are equal,
-    negative extinction, NaN or infinity, or shapes that do not fit together.
+    Raises:
+        ValueError: for fewer than two lines, lines that do not increase or of which three are equal,
+            negative extinction, NaN or infinity, or shapes that do not fit together.
 
     Sources: Levoy, "Display of Surfaces from Volume Data", 1988; Kniss et al., "Multidimensional Transfer
     Functions for Interactive Volume Rendering", 2002.
@@ -62,20 +63,20 @@ class TransferFunction2D(Transfer):
     ) -> "TransferFunction2D":
         """From places in the plot of magnitude against value, each with the material seen there.
 
-        **Arguments:**
-
-        - `points`: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`, in any order. The
-          extinction of each is that of this `opacity`, times (1 - |value - that of the point| / reach), and
-          the same of the magnitude.
-        - `unit_distance`: thickness of a layer that has these opacities, world length.
+        Args:
+            points: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`. The extinction of each
+                is that of this opacity, times 1 - |value - the point's| / reach, and so by the magnitude.
+            unit_distance: thickness of a layer that has these opacities, world length.
 
         Where points overlap, extinctions are added; colours are means weighted by them on the lines through
         points and sides, and bilinear between.
 
-        **Raises:** `ValueError` for no points or what is none, an opacity outside [0, 1], reaches that are
-        not positive, and places that are traced: lines carry no gradient.
+        Raises:
+            ValueError: for no points or what is none, an opacity outside [0, 1], reaches that are not
+                positive, and places that are traced: lines carry no gradient.
 
-        Source: Kniss et al. 2002, whose widgets are such tents."""
+        Source: Kniss et al. 2002, whose widgets are such tents.
+        """
         try:
             values, magnitudes, colors, opacities, reaches = zip(*points, strict=True)
         except (TypeError, ValueError) as fault:

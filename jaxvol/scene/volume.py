@@ -38,26 +38,27 @@ class Field(eqx.Module):
 class Volume(eqx.Module):
     """A scalar field sampled on a regular grid, `data[x, y, z]`.
 
-    **Arguments:**
-
-    - `data`: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library. 8- and 16-bit
-      integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are enabled.
-      Others become the first of uint8, int8, uint16, int16 and float32 that holds every value exactly.
-      Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
-      evenly spaced, give spacing and origin. Of an image stack [plane, row, column], pass `stack.T`.
-    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT), by default 1.
-    - `origin`: world position of node (0, 0, 0), by default 0.
-    - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
-      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
-      the data's axes are the world's. Its gradient is exact along changes that keep it orthonormal.
-    - `labels`: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
-    - `field`: optional `Field` that supplies the values; voxels then only set the volume's extent.
+    Args:
+        data: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library. 8- and 16-bit
+            integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are
+            enabled. Others become the first of uint8, int8, uint16, int16 and float32 that holds every value
+            exactly. Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates,
+            which must be evenly spaced, give spacing and origin. Of an image stack [plane, row, column],
+            pass `stack.T`.
+        spacing: distance between neighbouring nodes along x, y, z, world length (mm for CT); by default 1.
+        origin: world position of node (0, 0, 0), by default 0.
+        direction: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
+            ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`; by
+            default the world's axes. Its gradient is exact along changes that keep it orthonormal.
+        labels: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
+        field: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
     Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
 
-    **Raises:** `ValueError` for data that are not 3-D, have an axis of one voxel or an unsupported type, or
-    hold NaN, infinity or integers that no type holds exactly; for spacing that is not positive; for a
-    direction that is not orthonormal to 1e-4; and for labels of another shape or type, or beyond int32.
+    Raises:
+        ValueError: for data that are not 3-D, have an axis of one voxel or an unsupported type, or hold NaN,
+            infinity or integers that no type holds exactly; for spacing that is not positive; for a
+            direction that is not orthonormal to 1e-4; and for labels of another shape, or beyond int32.
     """
 
     data: Shaped[Array, "nx ny nz"]

@@ -54,10 +54,9 @@ class AdaptiveSampling(StrideControl):
     All cells are one step long, and `Rendering.error` is infinite, for modes other than "over", and for
     transfer functions that do not say how they vary, such as `LabelTransferFunction`.
 
-    **Arguments:**
-
-    - `tolerance`: of the image's RMSE, > 0. It may be traced.
-    - `longest`: the most steps of the march that a cell is long, a power of two up to 64.
+    Args:
+        tolerance: of the image's RMSE, > 0. It may be traced.
+        longest: the most steps of the march that a cell is long, a power of two up to 64.
 
     Under jitter, each ray's runs begin at a random depth, too. Strides, and `Rendering.error`, are constants
     to derivatives, and the image jumps where a stride changes: compare gradients with finite differences
@@ -66,7 +65,8 @@ class AdaptiveSampling(StrideControl):
     Where it fails: `experiments/stability.py`, "tolerances finer than the finest cell",
     "adaptive strides under light".
 
-    **Raises:** `ValueError` for another tolerance or `longest`.
+    Raises:
+        ValueError: for another tolerance or `longest`.
 
     Source: unpublished.
     """

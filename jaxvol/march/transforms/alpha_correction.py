@@ -32,18 +32,18 @@ class AlphaCorrection(Transform):
     With this transform, the image is continuous in all that moves the exit, and its gradient complete.
     Without it, the image jumps when a sample crosses the exit, and the gradient misses these jumps.
 
-    **Arguments:**
-
-    - `labels`: also cut cells where the volume's label changes, found by bisection, so that the faces of a
-      segmentation stay smooth under jitter. A label that lasts less than a quarter of a cell may be missed.
-      Costs a label fetch per bisection, and two more samples per cell. Gradients then take the faces of
-      labels and the ends of gaps as fixed in space; the motion of the exit is included.
+    Args:
+        labels: also cut cells where the volume's label changes, found by bisection, so that the faces of a
+            segmentation stay smooth under jitter. A label that lasts less than a quarter of a cell may be
+            missed. Costs a label fetch per bisection, and two more samples per cell. Gradients then take the
+            faces of labels and the ends of gaps as fixed in space; the motion of the exit is included.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
 
-    **Raises:** `ValueError` for `labels` that are not true or false, and when a volume without labels is
-    rendered with `labels=True`.
+    Raises:
+        ValueError: for `labels` that are not true or false, and when a volume without labels is rendered
+            with `labels=True`.
 
     Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit; labels are its
     future work.

@@ -25,12 +25,12 @@ class Clip(Transform):
     `AlphaCorrection` cuts its last cell there. With `inside_out`, what is cut away is a gap of the ray, at
     whose ends `AlphaCorrection` cuts cells, too. Values and light stay those of the whole volume.
 
-    **Arguments:**
-
-    - `box`: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
-    - `planes`: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
-      that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane` (not PyVista's `clip`).
-    - `inside_out`: cut away what is inside all of these, and show the rest.
+    Args:
+        box: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
+        planes: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
+            that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane` (not PyVista's
+            `clip`).
+        inside_out: cut away what is inside all of these, and show the rest.
 
     `box`, `origins` and `normals` are differentiable; where a face of the box coincides with one of the
     volume, the derivative is that of moving it inwards. Without `AlphaCorrection`, gradients miss the jumps
@@ -40,8 +40,9 @@ class Clip(Transform):
 
     Where it fails: `experiments/stability.py`, "jitter behind cuts".
 
-    **Raises:** `ValueError` without a box or a plane, for numbers that are not finite, a box whose ends do
-    not increase, and a normal of length 0.
+    Raises:
+        ValueError: without a box or a plane, for numbers that are not finite, a box whose ends do not
+            increase, and a normal of length 0.
     """
 
     box: Float[Array, "6"] | None

@@ -18,13 +18,13 @@ class EarlyTermination(Transform):
     **Gradients are less exact than the image**: in README's first scene, the derivative of the sum of all
     pixels by a factor of all extinctions is wrong by 55 % at 1/255 and 2 % at 0.0001. For fits take 0.0001.
 
-    **Arguments:**
-
-    - `opacity_left`: in (0, 1); 1/255 is one level of an 8-bit image.
+    Args:
+        opacity_left: in (0, 1); 1/255 is one level of an 8-bit image.
 
     Where it fails: `experiments/stability.py`, "early termination in gradients".
 
-    **Raises:** `ValueError` outside that range.
+    Raises:
+        ValueError: outside that range.
 
     Source: KISTI report 2005, which tests once per 16 slices. Here every cell is tested.
     """

@@ -52,16 +52,16 @@ class Jitter(Transform):
     """Start each ray a random fraction ξ of a step past its entry: it leaves out the first ξ d, which adds
     noise where the volume's bounds cut through material.
 
-    **Arguments:**
-
-    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over.
-    - `pattern`: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
-    - `front_residual`: give the part that is left out a narrow cell of its own, from the entry to ξ d,
-      sampled at the entry. The noise on cut faces then falls to that of the sample's value.
+    Args:
+        seed: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over.
+        pattern: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
+        front_residual: give the part that is left out a narrow cell of its own, from the entry to ξ d,
+            sampled at the entry. The noise on cut faces then falls to that of the sample's value.
 
     Where it fails: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
 
-    **Raises:** `ValueError` for an invalid seed, pattern or `front_residual`.
+    Raises:
+        ValueError: for an invalid seed, pattern or `front_residual`.
 
     Source: jittered sampling as in Kye 2013, section 2.2.
     """
@@ -98,11 +98,14 @@ class EmptySpaceJitter(Transform):
     So wood grain turns into noise, while faces where the volume's bounds cut material stay smooth. The image
     jumps where a ray's first transparent sample changes; gradients do not include these jumps.
 
-    **Arguments:** `seed`, `pattern`: as in `Jitter`; the random numbers are independent of `Jitter`'s.
+    Args:
+        seed: as in `Jitter`; the random numbers are independent of `Jitter`'s.
+        pattern: as in `Jitter`.
 
     Where it fails: `experiments/stability.py`, "wood grain without empty samples".
 
-    **Raises:** `ValueError` for an invalid seed or pattern.
+    Raises:
+        ValueError: for an invalid seed or pattern.
 
     Source: Kye 2013, section 3.1.
     """

@@ -29,18 +29,17 @@ class SpaceLeaping(Transform):
 
     Leaps are whole steps: the image stays the same, except under `"min_distance"`.
 
-    **Arguments:**
-
-    - `method`:
-        - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
-          bounding box holds no visible block of 4³ voxels.
-        - `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
-          proves empty. Leaps are short where a ray runs along a surface.
-        - `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
-          the first hits of their four corner rays. **It is not a bound**: what is thinner than these pixels,
-          and nearer than what their corners hit, is leapt over, and missing in the image.
-        - `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
-    - `cell`: side of the square of pixels of the last two methods; at least 2.
+    Args:
+        method: how what is empty is found.
+            `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
+            bounding box holds no visible block of 4³ voxels.
+            `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
+            proves empty. Leaps are short where a ray runs along a surface.
+            `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
+            the first hits of their four corner rays. **It is not a bound**: what is thinner than these
+            pixels, and nearer than what their corners hit, is missing in the image.
+            `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
+        cell: side of the square of pixels of the last two methods; at least 2.
 
     What is leapt over has extinction 0, whose gradient only `adjoint="direct"` includes: `"forward"` takes it
     as 0 where rays leap, `"replay"` also in front of and behind everything that a ray sees. A fit that should
@@ -49,8 +48,9 @@ class SpaceLeaping(Transform):
     Where it fails: `experiments/stability.py`, "sheets thinner than a cell of rays",
     "occupancy under steep transfer functions", "gradients of what is leapt over".
 
-    **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
-    rendering rays of one's own (`render_rays`).
+    Raises:
+        ValueError: for another method or a smaller cell, and, with the last two methods, when rendering rays
+            of one's own (`render_rays`).
 
     Source: Chae and Shin for `"distance"` and `"min_distance"`, of voxels; `"hierarchy"` stands for the
     octree of the KISTI report 2005; `"beam"` is unpublished.

@@ -40,15 +40,13 @@ class ToroidalMap(Transform):
     sector, as in its hollow near side, the first two are found. A ray less than 2e-6 of the probe's size
     outside counts as inside, and so may one that runs along a face at less than 1e-5 of it.
 
-    **Arguments:**
-
-    - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
-      behind the axis. Samples behind the axis, where ρ would be negative (`nearest_to_axis`), are not shown.
-    - `b`: distance from the apex to depth γ = 0, world length.
-    - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
-      [0, π], increasing.
-    - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
-      b + first > 0.
+    Args:
+        a: distance from the motor axis to the fan's apex, world length; negative if the apex lies behind the
+            axis. Samples behind it, where ρ would be negative (`nearest_to_axis`), are not shown.
+        b: distance from the apex to depth γ = 0, world length.
+        beta_range: (first, last) angle of the nodes along data axis 0, radians, within [0, π], increasing.
+        sigma_range: the same along data axis 1.
+        gamma_range: (first, last) depth of the nodes along data axis 2, increasing, with b + first > 0.
 
     All are differentiable, once. The gradient of an angle is taken as 0 on the motor axis (y = z = 0) and at
     the apex (x = R = 0), and so is that of an entry or exit where a ray grazes a face by less than 0.06°.
@@ -56,7 +54,8 @@ class ToroidalMap(Transform):
     Where it fails: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".
 
-    **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
+    Raises:
+        ValueError: for ranges that do not increase or lie outside their limits.
 
     Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), with `atan2` for `atan`.
     """
