@@ -1,6 +1,6 @@
 """What does a render return?"""
 
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,9 +10,6 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.checks import finite_array
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree
-
-
-T = TypeVar("T")
 
 
 class BrickReport(NamedTuple):
@@ -73,30 +70,30 @@ class Rendering(eqx.Module):
 
     @property
     def depth(self) -> Float[Array, "*rays"]:
-        return self._detail("depth", self.details.depth)
+        return self._detail("depth")
 
     @property
     def samples(self) -> Int[Array, "*rays"]:
-        return self._detail("samples", self.details.samples)
+        return self._detail("samples")
 
     @property
     def aligned(self) -> Bool[Array, "*rays"]:
-        return self._detail("aligned", self.details.aligned)
+        return self._detail("aligned")
 
     @property
     def error(self) -> Float[Array, "*rays"]:
-        return self._detail("error", self.details.error, "give the march AdaptiveSampling, and ")
+        return self._detail("error", "give the march AdaptiveSampling, and ")
 
     @property
     def normal(self) -> Float[Array, "*rays 3"]:
-        return self._detail("normal", self.details.normal, "composite by an Isosurface, and ")
+        return self._detail("normal", "composite by an Isosurface, and ")
 
     @property
     def bricks(self) -> BrickReport:
-        return self._detail("bricks", self.details.bricks, "render it by render_bricks, and ")
+        return self._detail("bricks", "render it by render_bricks, and ")
 
-    def _detail(self, name: str, value: T | None, more: str = "") -> T:
-        if value is None:
+    def _detail(self, name: str, more: str = "") -> Any:
+        if (value := getattr(self.details, name)) is None:
             raise AttributeError(f'{name} is not part of this rendering: {more}pass outputs="all".')
         return value
 

@@ -80,9 +80,9 @@ class Space(eqx.Module):
         faces = [jax.lax.index_in_dim(visible, end, axis) for axis in range(3) for end in (0, -1)]
         return tuple(jnp.any(face) for face in faces)
 
-    @abstractmethod
     def path(self, entry: Vec3, direction: Vec3) -> Path:
         """The straight world ray from `entry`, in grid coordinates."""
+        return Curved(self, entry, direction)
 
 
 class Line(NamedTuple):
@@ -143,6 +143,17 @@ def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
     """Where `fault` is true, a ray that is never marched, which might not end, and renders as NaN."""
     t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
     return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
+
+
+class Curved(Path):
+    """A straight world ray in any grid."""
+
+    space: Space
+    entry: Vec3
+    direction: Vec3
+
+    def __call__(self, s: Scalar) -> Vec3:
+        return self.space.coordinate(along(self.entry, self.direction, s))
 
 
 class Straight(Path):

@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, number, require
-from ..._util.vec3 import Scalar, Vec3, along, apart
+from ..._util.vec3 import Scalar, Vec3, apart
 from ...scene.occupancy import BLOCK, Occupancy, Sums
-from ...scene.space import Gap, Path, Space
+from ...scene.space import Gap, Space
 from ...scene.volume import Volume
 from ..march import Transform
 from .sector_faces import SectorFaces, hypot
@@ -202,9 +202,6 @@ class _Sector(Space):
         seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
         return Occupancy(reached & seen, low, (x, y, z))
 
-    def path(self, entry: Vec3, direction: Vec3) -> "_Curved":
-        return _Curved(self, entry, direction)
-
     @property
     def _faces(self) -> SectorFaces:
         return SectorFaces(self.probe.a, self.probe.b, *self.probe.ranges, *map(apart, self.probe.corners))
@@ -214,17 +211,6 @@ class _Sector(Space):
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
         return self._faces.gaps(entry, direction, length)
-
-
-class _Curved(Path):
-    """A straight world ray in the grid of a sector."""
-
-    sector: _Sector
-    entry: Vec3
-    direction: Vec3
-
-    def __call__(self, s: Scalar) -> Vec3:
-        return self.sector.coordinate(along(self.entry, self.direction, s))
 
 
 def _atan2(a: Scalar, b: Scalar) -> Scalar:
