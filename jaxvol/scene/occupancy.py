@@ -5,6 +5,7 @@ the transfer function, too, and is computed in each image. What is called empty 
 gradients.
 """
 
+import itertools
 from collections.abc import Callable
 from functools import partial, reduce
 
@@ -103,11 +104,8 @@ class Sums(eqx.Module):
         _, ny, nz = (n + 1 for n in self.shape)
         x, y, z = (((low, -1), (high + 1, 1)) for low, high in zip(first, last, strict=True))
         count = jnp.zeros((), jnp.int32)
-        for i, sign_i in x:
-            for j, sign_j in y:
-                for k, sign_k in z:
-                    entry = gather(self.table, (i * ny + j) * nz + k)
-                    count = count + sign_i * sign_j * sign_k * entry
+        for (i, sign_i), (j, sign_j), (k, sign_k) in itertools.product(x, y, z):
+            count = count + sign_i * sign_j * sign_k * gather(self.table, (i * ny + j) * nz + k)
         return count > 0
 
 
@@ -124,10 +122,6 @@ class Occupancy(eqx.Module):
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
 
-        def go_on(state: tuple[Array, Array, Array]) -> Array:
-            reached, _, rounds = state
-            return ~jnp.all(reached) & (rounds < FARTHEST - 1)
-
         def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             reached, distance, rounds = state
             distance += (~reached).astype(distance.dtype)
@@ -135,7 +129,9 @@ class Occupancy(eqx.Module):
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
-        _, distance, _ = while_loop(go_on, grow, varying(start))
+        _, distance, _ = while_loop(
+            lambda state: ~jnp.all(state[0]) & (state[2] < FARTHEST - 1), grow, varying(start)
+        )
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:

@@ -80,18 +80,6 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
             (235, (1.0, 0.85, 0.45), 0.9),
         ],
     ),
-    "mr_head": (
-        "MR of a head, T1, 8 bit: skin, with the brain showing through",
-        (0, 255),
-        [
-            (25, (0.05, 0.03, 0.03), 0.0),
-            (45, (0.20, 0.10, 0.08), 0.02),
-            (80, (0.60, 0.35, 0.28), 0.05),
-            (120, (0.75, 0.50, 0.42), 0.12),
-            (170, (0.95, 0.80, 0.68), 0.3),
-            (255, (1.0, 0.97, 0.92), 0.6),
-        ],
-    ),
     "head": (
         "the head phantom, 8 bit: skull under translucent skin and muscle",
         (0, 255),
@@ -125,13 +113,7 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
 }
 
 
-SHADED = PRESETS.keys() - {"mr_head"}
-"""Presets that the command line shades: not those of magnetic resonance, whose gradients are mostly noise."""
-
-
-def preset(
-    name: str | Any, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0
-) -> TransferFunction:
+def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1.0) -> TransferFunction:
     """A transfer function by name.
 
     Args:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...compositing.modes import MODES
-from ...scene.presets import PRESETS, SHADED
+from ...scene.presets import PRESETS
 from .parsing import Parser
 
 
@@ -118,7 +118,7 @@ def _add_appearance(parser: Parser) -> None:
     group.add_argument("--isovalue", type=float, metavar="VALUE", help=text)
     text = (
         "shade by the gradient of the values, under a light at the camera; by default isosurfaces, the "
-        f"automatic transfer function, and the presets {', '.join(sorted(SHADED))}"
+        "automatic transfer function, and the presets"
     )
     group.add_argument("--shade", action=SWITCH, help=text)
 

@@ -17,7 +17,7 @@ from ...lighting import Lighting, Phong
 from ...march.march import Transform
 from ...march.transforms.clip import Clip
 from ...scene.camera import Camera
-from ...scene.presets import SHADED, colormap, preset
+from ...scene.presets import colormap, preset
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
 from ..automatic import FRONT, automatic_transfer, framed, labels_shown, transfer_by_copy, visible_points
@@ -99,7 +99,7 @@ def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting |
     if shade and isinstance(mode, Average):
         raise ValueError("--shade needs a place that is shaded; leave it out with --compositing average.")
     if shade is None:
-        shows_surfaces = options.preset in SHADED or is_automatic(options)
+        shows_surfaces = options.preset is not None or is_automatic(options)
         shade = (shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
     return Phong() if shade else None
 

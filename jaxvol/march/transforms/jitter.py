@@ -72,7 +72,7 @@ class Jitter(Transform):
     front_residual: bool = eqx.field(static=True)
 
     def __init__(
-        self, seed: int | Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool | Any = False
+        self, seed: Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool | Any = False
     ):
         self.noise = Noise(seed, pattern, stream=0)
         self.front_residual = flag("front_residual", front_residual)
