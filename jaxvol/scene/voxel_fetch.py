@@ -5,7 +5,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,6 +17,8 @@ from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, without_zeros
 from ..xla.platform import on_gpu
 
+
+T = TypeVar("T")
 
 Cube: TypeAlias = list[list[list[Scalar]]]
 """Eight voxels, [x][y][z]."""
@@ -115,7 +117,7 @@ class Fetch(eqx.Module):
         return _with_first(axis, [lower, upper])
 
 
-def cube_of(voxel: Callable[[int, int, int], Any]) -> Cube:
+def cube_of(voxel: Callable[[int, int, int], T]) -> list[list[list[T]]]:
     """A cube from each of its voxels, by their places along x, y and z, 0 or 1."""
     return [[[voxel(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
 
