@@ -186,11 +186,11 @@ class March(eqx.Module):
         pieces = (cell,)
         for transform in self.transforms:
             divided = [transform.cut(piece, ray, volume) for piece in pieces]
-            for parts in divided:
-                _check_kind(transform, "cut", parts, tuple)
-                for part in parts or (None,):
-                    _check_kind(transform, "cut", part, Cell)
-            pieces = tuple(part for parts in divided for part in parts)
+            for cells in divided:
+                _check_kind(transform, "cut", cells, tuple)
+                for each in cells or (None,):
+                    _check_kind(transform, "cut", each, Cell)
+            pieces = tuple(each for cells in divided for each in cells)
         return pieces
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:

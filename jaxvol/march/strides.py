@@ -60,7 +60,7 @@ class StrideControl(Transform):
 
     @abstractmethod
     def error(self, ray: Ray, run: Run) -> Scalar:
-        """Predicted error of the image due to these cells, by ray and run alone, if nothing is in front."""
+        """Predicted error of the image due to these cells if nothing is in front, from ray and run only."""
 
 
 class Strides(eqx.Module):

@@ -1,6 +1,6 @@
 """Where may anything be visible? Ranges of values of a volume's blocks, and grids of occupied cells.
 
-Ranges depend on the voxels alone, and are kept as long as their array. Which blocks are visible depends on
+Ranges depend only on the voxels, and are kept as long as their array. Which blocks are visible depends on
 the transfer function, too, and is computed in each image. What is called empty is proven to be. There are no
 gradients.
 """
@@ -170,10 +170,10 @@ def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     layers = jax.lax.map(
         lambda x: of(jax.lax.dynamic_slice_in_dim(data, x, BLOCK + 1)), begins, batch_size=LAYERS
     )
-    parts = [jax.tree.map(lambda layer: layer[:, 0], layers)]
+    found = [jax.tree.map(lambda layer: layer[:, 0], layers)]
     if whole * BLOCK < data.shape[0] - 1:
-        parts.append(of(data[whole * BLOCK :]))
-    low, high = (jnp.concatenate(part) for part in zip(*parts, strict=True))
+        found.append(of(data[whole * BLOCK :]))
+    low, high = (jnp.concatenate(ends) for ends in zip(*found, strict=True))
     return low, high
 
 
@@ -251,8 +251,8 @@ def over_blocks(values: Array, combine: Callable[[Array, Array], Array], margin:
         whole, rest = divmod(cells, BLOCK)
         found = []
         if whole:
-            length, parts = (whole - 1) * BLOCK + 1, range(BLOCK + 1 + 2 * margin)
-            found.append(reduce(combine, [along(i, i + length, BLOCK) for i in parts]))
+            length, nodes = (whole - 1) * BLOCK + 1, range(BLOCK + 1 + 2 * margin)
+            found.append(reduce(combine, [along(i, i + length, BLOCK) for i in nodes]))
         if rest:
             found.append(reduce(combine, [along(i, i + 1) for i in range(whole * BLOCK, cells + 1)]))
         values = jnp.concatenate(found, axis)

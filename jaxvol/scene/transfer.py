@@ -104,7 +104,7 @@ class Transfer(eqx.Module):
 
     def search(self) -> Callable[[Measured], Measured] | None:
         """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
-        classifier gets after it. With an `integrator` it depends on the value alone. Overridden with `vjp`.
+        classifier gets after it. With an `integrator` it depends only on the value. Overridden with `vjp`.
         """
         return None
 
@@ -284,8 +284,8 @@ class TransferFunction(Transfer):
             _, interval, past = measured
         *_, r, g, b, slope, inverse = linear.table_row(rows, interval)
         part = past * inverse
-        parts = jnp.stack([*color, extinction], axis=-1)
-        shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
+        each = jnp.stack([*color, extinction], axis=-1)
+        shared = jnp.concatenate([each * (1 - part)[..., None], each * part[..., None]], axis=-1)
         sums = row_sums(len(rows), interval, shared)
         at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))
         leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]

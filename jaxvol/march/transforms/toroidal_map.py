@@ -156,13 +156,15 @@ class _Sector(Space):
 
     def coordinate(self, point: Vec3) -> Vec3:
         toroidal, ranges = self.probe._forward(point), self.probe.ranges
-        parts = [(value - low) / (high - low) for value, (low, high) in zip(toroidal, ranges, strict=True)]
-        beta, sigma, gamma = (part * (n - 1) for part, n in zip(parts, self.shape, strict=True))
+        fractions = [
+            (value - low) / (high - low) for value, (low, high) in zip(toroidal, ranges, strict=True)
+        ]
+        beta, sigma, gamma = (fraction * (n - 1) for fraction, n in zip(fractions, self.shape, strict=True))
         return beta, sigma, gamma
 
     def point(self, coordinate: Vec3) -> Vec3:
-        parts = [c / (n - 1) for c, n in zip(coordinate, self.shape, strict=True)]
-        ranges = zip(parts, self.probe.ranges, strict=True)
+        fractions = [c / (n - 1) for c, n in zip(coordinate, self.shape, strict=True)]
+        ranges = zip(fractions, self.probe.ranges, strict=True)
         return apart(self.probe.to_world(jnp.stack([low + c * (high - low) for c, (low, high) in ranges])))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
