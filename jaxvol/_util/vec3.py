@@ -92,29 +92,35 @@ def golden_spiral(n: int) -> Float[np.ndarray, "n 3"]:
 
 
 class Frame(eqx.Module):
-    """A Cartesian frame: the world point that has coordinates 0, and its orthonormal axes in the world."""
+    """A Cartesian frame of coordinates in world length; by default the world itself."""
 
-    origin: Vec3
-    axes: tuple[Vec3, Vec3, Vec3]
+    placed: tuple[Vec3, tuple[Vec3, Vec3, Vec3]] | None = None
+    """The world point that has coordinates 0, and the axes, orthogonal unit vectors of the world."""
 
     @classmethod
     def of(cls, origin: Float[Array, "3"], direction: Float[Array, "3 3"]) -> "Frame":
         """`direction`: its columns are the axes."""
         x, y, z = (apart(direction[:, axis]) for axis in range(3))
-        return cls(apart(origin), (x, y, z))
+        return cls((apart(origin), (x, y, z)))
 
     def coordinates(self, point: Vec3) -> Vec3:
         """Coordinates of a world point."""
-        (x, y, z), (ox, oy, oz) = point, self.origin
+        if self.placed is None:
+            return point
+        (x, y, z), ((ox, oy, oz), _) = point, self.placed
         return self.components((x - ox, y - oy, z - oz))
 
     def components(self, direction: Vec3) -> Vec3:
         """Components of a world direction along the axes."""
-        x, y, z = (dot(axis, direction) for axis in self.axes)
+        if self.placed is None:
+            return direction
+        x, y, z = (dot(axis, direction) for axis in self.placed[1])
         return x, y, z
 
     def point(self, coordinates: Vec3) -> Vec3:
         """World point of coordinates."""
-        a, b, c = coordinates
-        x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(self.origin, *self.axes, strict=True))
+        if self.placed is None:
+            return coordinates
+        (a, b, c), (origin, axes) = coordinates, self.placed
+        x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(origin, *axes, strict=True))
         return x, y, z

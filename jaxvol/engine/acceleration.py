@@ -103,7 +103,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
                 "lies before. Use another method."
             )
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
-        own = GivenRays.of(lines(scene.source, columns.reshape(1, -1), rows.reshape(1, -1), no_fault))
+        seen_by = lines(scene.source, columns.reshape(1, -1), rows.reshape(1, -1), no_fault)
+        own = GivenRays(jnp.stack(seen_by.origin, axis=-1), jnp.stack(seen_by.direction, axis=-1))
         one_tile = tiling._replace(tile=columns.size, devices=None)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
         seen = Scene(volume, transfer, own, plain, FirstVisible()).prepared()

@@ -26,7 +26,7 @@ from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..ray import check_arguments
 from ..render import Adjoint, render
-from ..scene.camera import Camera, rows_of
+from ..scene.camera import Camera
 from ..scene.transfer import Transfer
 from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
@@ -162,7 +162,7 @@ class ImageResidual(eqx.Module):
                     f"scene must return a camera of its view's size {of_view.size}; got {camera.size}."
                 )
             if pieces > 1:
-                camera = rows_of(camera, first, rows)
+                camera = camera.part(0, first, (camera.size[0], rows))
             how: Any = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
             rendered = rendering.rgba if channels == 4 else rendering.image(self.background)

@@ -1,7 +1,7 @@
 """Where is nothing visible? What marches ask, and which stretches of a beam of neighbouring rays are empty.
 
-A beam is a group of rays that share one query. At each distance from their origins, the rays lie in a
-bounding box whose faces move linearly with the distance.
+A beam is a group of rays that share one query: at each distance from their origins, they lie in a bounding
+box whose faces move linearly with the distance.
 """
 
 from abc import abstractmethod
@@ -31,17 +31,14 @@ class EmptySpaceIndex(eqx.Module):
 
     @abstractmethod
     def prepare(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Any:
-        """What the other methods need to know about beams, from the boxes around them. `stretch`: length of
-        the shortest leap that is of use."""
+        """What the other methods need, from the boxes around beams. `stretch`: the shortest useful leap."""
 
     @abstractmethod
     def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
         """Whether anything may be visible along each beam."""
 
     @abstractmethod
-    def skip_to(
-        self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
+    def skip_to(self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
 
     def within_ranges(self) -> "EmptySpaceIndex":
@@ -50,19 +47,16 @@ class EmptySpaceIndex(eqx.Module):
 
 
 class View(NamedTuple):
-    """The camera's rays, as `Transform.empty_space` may ask for them.
-
-    - `ray`: origin and unit direction of the ray through a column and a row.
-    - `size`: (width, height).
-    - `corner`: (column, row) of the image's first pixel, which keys random numbers.
-    - `first_hit`: marches the rays of these columns and rows, with leaps by an index, and returns the
-      distances to their first visible samples, infinite where there are none.
-    """
+    """The camera's rays, as `Transform.empty_space` may ask for them."""
 
     ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
+    """Origin and unit direction of the ray through a column and a row."""
     size: tuple[int, int]
+    """(width, height)."""
     corner: tuple[Int[Array, ""], Int[Array, ""]]
+    """(column, row) of the image's first pixel, which keys random numbers."""
     first_hit: Callable[[EmptySpaceIndex, Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
+    """From an index to leap by, and columns and rows, to the distances of the first visible samples."""
 
 
 class Box(eqx.Module):
@@ -84,7 +78,8 @@ class Box(eqx.Module):
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
         near = jnp.where(jnp.isfinite(near), near, 0)
         far = jnp.max(jnp.where(hit, rays.t_in + rays.length, -jnp.inf), axis=-1)
-        entry, direction = occupancy.own_point(rays.entry), occupancy.own_direction(rays.direction)
+        entry = occupancy.frame.coordinates(rays.entry)
+        direction = occupancy.frame.components(rays.direction)
         start = along(entry, direction, near[..., None] - rays.t_in)
         return cls._of(occupancy, start, direction, near, far, hit, jnp.zeros_like(near))
 
@@ -92,7 +87,7 @@ class Box(eqx.Module):
     def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
         """The box of all camera rays between a beam's corner rays, by beam and corner."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
-        origin, direction = occupancy.own_point(origin), occupancy.own_direction(direction)
+        origin, direction = occupancy.frame.coordinates(origin), occupancy.frame.components(direction)
         spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
         x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
@@ -111,14 +106,7 @@ class Box(eqx.Module):
 
     @classmethod
     def _of(
-        cls,
-        occupancy: Occupancy,
-        start: Vec3,
-        direction: Vec3,
-        near: Scalar,
-        far: Scalar,
-        counts: Bool[Array, "*beams rays"],
-        bulge: Scalar,
+        cls, occupancy: Occupancy, start: Vec3, direction: Vec3, near: Any, far: Any, counts: Any, bulge: Any
     ) -> "Box":
         """`start`, `direction`: along the axes of the occupancy."""
 
@@ -130,9 +118,8 @@ class Box(eqx.Module):
             # allows for rounding a ray's start to float32 when the camera is far away
             slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
             s, d, bulges = (s - corner) / size, d / size, bulge / size
-            sides.append(
-                (least(s, 1) - slack, least(s, -1) + slack, least(d, 1) - bulges, least(d, -1) + bulges)
-            )
+            ends = least(s, 1) - slack, least(s, -1) + slack
+            sides.append((*ends, least(d, 1) - bulges, least(d, -1) + bulges))
         low, high, low_rate, high_rate = (tuple(side) for side in zip(*sides, strict=True))
         return cls(near, far, low, high, low_rate, high_rate)
 
@@ -144,14 +131,12 @@ class Box(eqx.Module):
 
 
 class Stretches(eqx.Module):
-    """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on.
-
-    `following`: for each stretch, the first one from there on that is not empty, or their number.
-    """
+    """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on."""
 
     near: Float[Array, " beams"]
     length: Scalar
     following: Int[Array, "stretches beams"]
+    """For each stretch, the first one from there on that is not empty, or their number."""
 
 
 def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
@@ -171,10 +156,8 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
 
         def cells(corner: Vec3) -> Index:
             """Cell indices of a corner, arbitrary for boxes outside the grid."""
-            x, y, z = (
-                jnp.clip(jnp.floor(jnp.where(inside, c, 0)), 0, n - 1).astype(jnp.int32)
-                for c, n in zip(corner, shape, strict=True)
-            )
+            at = [jnp.floor(jnp.where(inside, c, 0)) for c in corner]
+            x, y, z = (jnp.clip(i, 0, n - 1).astype(jnp.int32) for i, n in zip(at, shape, strict=True))
             return x, y, z
 
         return inside & sums.any_between(cells(low), cells(high))

@@ -5,16 +5,6 @@ depths 0, d, 2d, … past the entry, each of which stands for the cell of width 
 transform is one idea of one paper: it overrides one or two of these methods, the seams. At each seam the
 answers of all transforms are combined, so that they compose.
 
-| seam | question | default answer |
-|---|---|---|
-| `locate` | which grid coordinate is this world point? | spacing and origin |
-| `clip` | which part of the volume is seen? | all of it |
-| `start` | how many steps past the entry is the first cell? | 0 |
-| `shift` | by what part of a step do samples after the first transparent one move? | 0 |
-| `empty_space` | where is nothing visible? | unknown |
-| `cut` | which part of its cell does a sample stand for? | all of it |
-| `stop` | is this ray finished? | not before the exit |
-
 How many steps long each cell is, one by default, is decided in `strides.py`.
 """
 
@@ -51,8 +41,7 @@ class Transform(eqx.Module):
         return space
 
     def clip(self, space: Space) -> Space:
-        """The same space without a part of it: rays are shorter, or have more gaps. Called after the
-        `locate` of all transforms."""
+        """The same space without a part of it: rays are shorter, or have more gaps. Called after `locate`."""
         return space
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
@@ -60,19 +49,17 @@ class Transform(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps all samples behind the ray's first cell of opacity 0 move, in [-1, 0].
-
-        Otherwise rays advance by whole steps. The shifts of all transforms are summed and clipped."""
+        """By how many steps all samples behind the ray's first cell of opacity 0 move, in [-1, 0]; those of
+        all transforms are summed and clipped. Otherwise rays advance by whole steps."""
         return jnp.zeros_like(ray.length)
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
-        """Where nothing is visible; None if that is unknown. Called once for each image. `view`: None for
-        `render_rays`."""
+        """Where nothing is visible, asked once an image; None: unknown. `view`: None for `render_rays`."""
         return None
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        """The pieces, front to back, into which the cell is divided. Each is sampled by itself. Their number
-        is static; of several, some may have width 0."""
+        """The pieces, front to back, into which the cell is divided and each of which is sampled: a static
+        number, of which some may have width 0."""
         return (cell,)
 
     joins: ClassVar[bool] = False
@@ -88,33 +75,31 @@ class Transform(eqx.Module):
 
 
 class March(eqx.Module):
-    """How rays step through a volume.
+    """How rays step through a volume. Its methods combine the answers of all transforms at a seam.
 
-    **Arguments:**
-
-    - `step`: distance d between samples, world length, > 0.
-    - `transforms`: applied in this order at every seam; none may be given twice.
-    - `quadrature`: how a cell's colour and extinction follow from the values along it.
-      `"left"`: those at its front, as in the papers; the error falls with d.
-      `"midpoint"`: those in its middle; the error falls with d².
-      `"preintegrated"`: the means over all values between those at its two ends, as if the value were linear
-      along it, the colour weighted by the extinction. The error falls with d², too, and narrow peaks of the
-      transfer function are not missed. Where there are none, `"midpoint"` may be more accurate, in half to
-      two thirds of the time. What the front of a cell hides of its back is neglected: for a cell of opacity α
-      and optical depth τ, this errs by at most α τ / 8 times the difference of its colours. Extinction times
-      the range of values must stay below 3e38 in float32, or the image is NaN. Between two control points of
-      extinction 0, the gradient is exact for their sum, and for each off by some 1e-4 of it.
-      A cell has the label, and the light, of its middle, which is also what a `Selection` compares.
-    - `max_samples`: a ray's cells begin less than so many steps after its first one; an integer from 1 to
-      2²⁴, up to which float32 counts exactly. Rays that need more are marked in `Rendering.exhausted`. By
-      default 131 072, so that every march ends.
+    Args:
+        step: distance d between samples, world length, > 0.
+        transforms: applied in this order at every seam; none may be given twice.
+        quadrature: how a cell's colour and extinction follow from the values along it.
+            `"left"`: those at its front, as in the papers; the error falls with d.
+            `"midpoint"`: those in its middle; the error falls with d².
+            `"preintegrated"`: the means over all values between those at its two ends, as if the value were
+            linear along it, the colour weighted by the extinction. The error falls with d², too, and narrow
+            peaks of the transfer function are not missed; where there are none, `"midpoint"` may be more
+            accurate, in half to two thirds of the time. What a cell's front hides of its back is neglected:
+            for an opacity α and optical depth τ, at most α τ / 8 times the difference of its colours.
+            Extinction times the range of values must stay below 3e38 in float32. A cell has the label and
+            the light of its middle.
+        max_samples: a ray's cells begin less than so many steps after its first one; an integer from 1 to
+            2²⁴, by default 131 072. Rays that need more are marked in `Rendering.exhausted`.
 
     What is thinner than a step is missed by a part of the rays. Where a march fails:
     `experiments/stability.py`, "sheets thinner than a step", "rays of very many samples",
     "rays that run out of samples".
 
-    **Raises:** `ValueError` for a step that is not a positive finite number, for something that is no
-    transform, for a transform given twice, and for a `max_samples` that is no such integer.
+    Raises:
+        ValueError: for a step that is not a positive number, for something that is no transform, for a
+            transform given twice, and for another `quadrature` or `max_samples`.
     """
 
     step: Float[Array, ""]
@@ -132,17 +117,15 @@ class March(eqx.Module):
     ):
         self.step = number("step", step, above=0)
         if not isinstance(transforms, tuple | list):
-            raise ValueError(
-                f"transforms must be a tuple, such as (AlphaCorrection(),); got {described(transforms)}."
-            )
+            raise ValueError(f"transforms must be a tuple (AlphaCorrection(),); got {described(transforms)}.")
         self.transforms = tuple(transforms)
-        kinds = [type(transform) for transform in transforms]
+        kinds = list(map(type, transforms))
         for transform in transforms:
             if not isinstance(transform, Transform):
                 raise ValueError(f"transforms must hold jaxvol transforms; got {described(transform)}.")
-            kind = type(transform)
-            if (count := kinds.count(kind)) > 1:
-                raise ValueError(f"transforms must each be given once; got {kind.__name__} {count} times.")
+            if (count := kinds.count(type(transform))) > 1:
+                name = type(transform).__name__
+                raise ValueError(f"transforms must each be given once; got {name} {count} times.")
         if quadrature not in get_args(Quadrature):
             names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
@@ -156,10 +139,12 @@ class March(eqx.Module):
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """The index of the first transform that has one."""
-        indices = [transform.empty_space(occupancy, view) for transform in self.transforms]
-        for transform, index in zip(self.transforms, indices, strict=True):
+        for transform in self.overriding("empty_space"):
+            index = transform.empty_space(occupancy, view)
             _check_kind(transform, "empty_space", index, EmptySpaceIndex | None)
-        return next((index for index in indices if index is not None), None)
+            if index is not None:
+                return index
+        return None
 
     def overriding(self, seam: str) -> list[Transform]:
         """The transforms that override a seam."""
@@ -168,16 +153,13 @@ class March(eqx.Module):
 
     @property
     def leaps(self) -> bool:
-        """Whether any transform overrides `empty_space`."""
         return bool(self.overriding("empty_space"))
 
     @property
     def may_shift(self) -> bool:
-        """Whether any transform overrides `shift`."""
         return bool(self.overriding("shift"))
 
     def locate(self, volume: Volume) -> Space:
-        """The space in which rays meet the volume."""
         space: Space = Affine(volume)
         for transform in self.transforms:
             space = transform.locate(space, volume)
@@ -188,14 +170,12 @@ class March(eqx.Module):
         return space
 
     def start(self, ray: Ray) -> Scalar:
-        """Steps from the entry to the first cell."""
         steps = jnp.zeros_like(ray.length)
         for transform in self.transforms:
             steps = _checked(transform, "start", transform.start(steps, ray), steps)
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps samples behind a ray's first transparent cell move, in [-1, 0]."""
         shift = jnp.zeros_like(ray.length)
         for transform in self.transforms:
             shift = shift + _checked(transform, "shift", transform.shift(ray), shift)
@@ -203,10 +183,14 @@ class March(eqx.Module):
         return jnp.clip(shift, -1, 0)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        """The pieces of a cell, front to back."""
         pieces = (cell,)
         for transform in self.transforms:
-            pieces = tuple(part for piece in pieces for part in _cut(transform, piece, ray, volume))
+            divided = [transform.cut(piece, ray, volume) for piece in pieces]
+            for cells in divided:
+                _check_kind(transform, "cut", cells, tuple)
+                for each in cells or (None,):
+                    _check_kind(transform, "cut", each, Cell)
+            pieces = tuple(each for cells in divided for each in cells)
         return pieces
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
@@ -223,12 +207,10 @@ class March(eqx.Module):
 
     @property
     def joins(self) -> bool:
-        """Whether each piece of a cell begins where the one in front of it ends."""
         return all(transform.joins for transform in self.overriding("cut"))
 
     @property
     def ends_at_exit(self) -> bool:
-        """Whether a transform cuts cells that reach past the exit; otherwise they count as a whole."""
         return any(transform.ends_at_exit for transform in self.transforms)
 
     def sample(self, cell: Cell) -> Scalar:
@@ -248,24 +230,11 @@ def within(ray: Ray, depth: Scalar) -> Scalar:
 
 
 def _checked(transform: Transform, seam: str, answer: Any, expected: Array) -> Array:
-    """A transform's answer, if it is an array like the one expected."""
     check_answer(transform, seam, answer, expected)
     return answer
 
 
 def _check_kind(transform: Transform, seam: str, answer: Any, kind: Any) -> None:
     if not isinstance(answer, kind):
-        wanted = getattr(kind, "__name__", str(kind))
-        raise ValueError(
-            f"{type(transform).__name__}.{seam} must return a {wanted}; got {described(answer)}."
-        )
-
-
-def _cut(transform: Transform, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-    pieces = transform.cut(cell, ray, volume)
-    _check_kind(transform, "cut", pieces, tuple)
-    if not pieces:
-        raise ValueError(f"{type(transform).__name__}.cut must return at least one cell; got ().")
-    for piece in pieces:
-        _check_kind(transform, "cut", piece, Cell)
-    return pieces
+        name, wanted = f"{type(transform).__name__}.{seam}", getattr(kind, "__name__", kind)
+        raise ValueError(f"{name} must return a {wanted}; got {described(answer)}.")

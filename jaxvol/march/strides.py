@@ -5,8 +5,7 @@ steps, counted from `Strides.phase` steps before the ray's first cell: of two ru
 other, so that leaps do not change which runs are taken.
 
 Both engines make three calls: `predicted` prepares the march, once for each image, `begin` makes a ray's
-state, and `Strides.next` chooses the next run. Gradients take strides as given; the image jumps where one
-changes.
+state, and `Strides.next` chooses the next run. Gradients take strides as given.
 """
 
 from abc import abstractmethod
@@ -31,8 +30,7 @@ RUN = 4
 
 
 class Run(NamedTuple):
-    """RUN cells in a row from depth `front` on, without `Transform.shift`; each `stride` steps long, a static
-    power of two."""
+    """RUN cells from depth `front` on, without `Transform.shift`, of `stride` steps each, a power of two."""
 
     front: Scalar
     stride: int
@@ -40,7 +38,6 @@ class Run(NamedTuple):
 
     @property
     def middle(self) -> Scalar:
-        """Depth of the middle of the run."""
         return self.front + RUN * self.stride / 2 * self.step
 
     def ends_before(self, depth: Scalar) -> Bool[Array, ""]:
@@ -50,52 +47,37 @@ class Run(NamedTuple):
 
 class StrideControl(Transform):
     """A transform that says how long cells may be. Rays take the longest runs whose error, times the
-    transmittance in front of them, is at most `tolerance`, or else of stride 1.
-
-    `longest`: the longest stride, a power of two up to 64.
-    """
+    transmittance in front of them, is at most `tolerance`, or else of stride 1."""
 
     tolerance: eqx.AbstractVar[Float[Array, ""]]
     longest: eqx.AbstractVar[int]
+    """The longest stride, a power of two up to 64."""
 
     @abstractmethod
     def prepared(self, march: March, space: Space, windows: Windows, variation: Variation) -> "StrideControl":
-        """With what `error` needs to know of the scene, in arrays of integers, which have no gradient.
-        `windows`, `variation`: how values, and what is composited, vary in each block."""
+        """With what `error` needs of the scene, in arrays of integers, which have no gradient. `windows`,
+        `variation`: how values, and what is composited, vary in each block."""
 
     @abstractmethod
     def error(self, ray: Ray, run: Run) -> Scalar:
-        """Predicted error of the image due to these cells if nothing lies in front of them. It depends on the
-        ray and the run alone."""
+        """Predicted error of the image due to these cells if nothing is in front, from ray and run only."""
 
 
 class Strides(eqx.Module):
-    """How long the cells of a ray are.
-
-    - `steps`: length of each cell of the current run, in steps.
-    - `phase`: steps from where the first of all runs begins to the ray's first cell; None if 0 for all rays.
-    - `error`: sum of the squared errors that are predicted of all runs so far; None where nobody asks for it.
-    """
+    """How long the cells of a ray are."""
 
     steps: Int[Array, ""]
+    """Length of each cell of the current run, in steps."""
     phase: Int[Array, ""] | None
+    """Steps from where the first of all runs begins to the ray's first cell; None if 0 for all rays."""
     error: Scalar | None
+    """Sum of the squared predicted errors of all runs so far; None where nobody asks for it."""
 
     def next(
-        self,
-        march: March,
-        ray: Ray,
-        index: Int[Array, ""],
-        ahead: Int[Array, ""] | int,
-        transmittance: Scalar,
-        *,
-        leaves: Bool[Array, ""],
-        finished: Bool[Array, ""],
+        self, march: March, ray: Ray, index: Any, ahead: Any, transmittance: Any, leaves: Any, finished: Any
     ) -> tuple["Strides", Int[Array, ""]]:
-        """Chooses the run that holds the step `ahead` of `index`, up to which all is transparent. Returns the
-        state, and the steps from `index` to that run, 0 if it is the current one.
-
-        `leaves`: whether the ray has left the volume there. `finished`: whether it takes no more cells."""
+        """The state in the run that holds the step `ahead` of `index`, up to which all is transparent, and
+        the steps from `index` to that run. `leaves`: whether the ray has left the volume there."""
         control = stride_control(march)
         assert control is not None
         march, control, ray, transmittance = jax.lax.stop_gradient((march, control, ray, transmittance))
@@ -125,13 +107,10 @@ class Strides(eqx.Module):
                 fits &= run.ends_before(ray.length)
                 for near, far in ray.gaps:  # a shift may still move the run, by a step at most
                     fits &= run.ends_before(near) | (run.front - run.step >= far)
-            chosen = jax.tree.map(
-                partial(jnp.where, fits), (first, jnp.full_like(index, run.stride), error), chosen
-            )
-        going = target < end
-        begin, steps, error = jax.tree.map(
-            partial(jnp.where, going), (here, self.steps, jnp.zeros_like(error)), chosen
-        )
+            longer = first, jnp.full_like(index, run.stride), error
+            chosen = jax.tree.map(partial(jnp.where, fits), longer, chosen)
+        current = here, self.steps, jnp.zeros_like(error)
+        begin, steps, error = jax.tree.map(partial(jnp.where, target < end), current, chosen)
         begin, steps = jnp.where(leaves, target, begin), jnp.where(leaves, 1, steps)
         known = jnp.where(leaves | finished, 0, error)
         total = None if self.error is None else self.error + known**2
@@ -162,9 +141,7 @@ def begin(march: March, ray: Ray, *, estimate: bool) -> Strides | None:
     return Strides(one, _phase(march, ray, control), jnp.zeros_like(ray.length) if estimate else None)
 
 
-def predicted(
-    march: March, space: Space, windows: Windows | None, variation: Callable[[Windows], Variation]
-) -> March:
+def predicted(march: March, space: Space, windows: Windows | None, variation: Callable[..., Any]) -> March:
     """The march, whose `StrideControl`, if it has one, knows the scene."""
     control = stride_control(march)
     if control is None:
@@ -177,9 +154,7 @@ def predicted(
 
 
 def stride_control(march: March) -> StrideControl | None:
-    """The transform that chooses strides, if there is one.
-
-    **Raises:** `ValueError` if there are several."""
+    """The transform that chooses strides, if there is one; several are an error."""
     found = [transform for transform in march.transforms if isinstance(transform, StrideControl)]
     if len(found) > 1:
         raise ValueError(f"transforms must have one StrideControl at most; got {len(found)}.")
@@ -196,8 +171,7 @@ def _phase(march: March, ray: Ray, control: StrideControl) -> Int[Array, ""] | N
     """Random where `start` or `shift` are, which move samples too little to break the wood grain of runs."""
     if not march.overriding("start") and not march.may_shift:
         return None
-    part = jax.lax.stop_gradient(march.start(ray) - march.shift(ray))
-    # its lower digits, of which the part of a step is nearly independent; all of it is exact
-    part = 32 * part
+    # the lower digits of a part of a step, which are nearly independent of it; all of this is exact
+    part = 32 * jax.lax.stop_gradient(march.start(ray) - march.shift(ray))
     run = RUN * control.longest
     return jnp.floor((part - jnp.floor(part)) * run).astype(jnp.int32) & (run - 1)

@@ -100,7 +100,8 @@ class WalkScene(NamedTuple):
 
     def flight(self, start: Vec3, direction: Vec3, end: Scalar) -> Flight:
         """Flight from a grid coordinate in a world direction, at most to the depth `end`."""
-        return Flight.to(self.medium.majorants, start, self.space.own(direction), self.space.spacing, end)
+        space = self.space
+        return Flight.to(self.medium.majorants, start, space.frame.components(direction), space.spacing, end)
 
     def light(self, coordinate: Vec3, direction: Vec3, uniform: Scalar) -> Arriving:
         """Light at a grid coordinate of a walk in this direction, from one located light, chosen at random,

@@ -4,6 +4,7 @@ Names and conventions are those of VTK and PyVista: `view_angle` and `parallel_s
 the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -18,30 +19,25 @@ from .space import Line
 from .volume import Volume, corners_of
 
 
-ALONG = 1e-3
-"""`looking_at` treats directions as parallel up to this sine of the angle between them."""
-
-
 class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
-    **Arguments:**
+    Args:
+        position: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
+        focal_point: world point at the center of the image.
+        view_up: direction that points up in the image; not parallel to the view direction.
+        view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).
+        parallel_scale: half the height of the view, in world length. Makes the camera orthographic, with ray
+            origins in the plane through `position`.
+        size: (width, height) of the image in pixels.
+        window: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
+            half heights of the whole view; by default all of it. Set by `crop` and `zoom`.
+        corner: (column, row) of the first pixel in the image that this one was cropped from, which keys
+            random numbers; by default (0, 0). Set by `crop`.
 
-    - `position`: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
-    - `focal_point`: world point at the center of the image.
-    - `view_up`: direction that points up in the image; not parallel to the view direction.
-    - `view_angle`: angle between the lower and the upper edge of the image, degrees, in (0, 180).
-    - `parallel_scale`: half the height of the view, in world length. Makes the camera orthographic, with
-      ray origins in the plane through `position`.
-    - `size`: (width, height) of the image in pixels.
-    - `window`: the part of the image plane that is shown, (left, right, bottom, top) relative to its
-      center, in units of half the height of the whole view. By default the whole view,
-      (-width/height, width/height, -1, 1). Set by `crop` and `zoom`.
-    - `corner`: column and row of the first pixel in the image that this one was cropped from, by default
-      (0, 0), which key random numbers. Set by `crop`.
-
-    **Raises:** `ValueError` for a camera at its focal point, a `view_up` along the view direction, and an
-    angle, scale or size out of range.
+    Raises:
+        ValueError: for a camera at its focal point, a `view_up` along the view direction, and an angle,
+            scale or size out of range.
     """
 
     position: Float[Array, "3"]
@@ -68,9 +64,8 @@ class Camera(eqx.Module):
     ):
         self.size = width, height = _image_size(size)
         self.focal_point = finite_array("focal_point", focal_point, (3,))
-        position = finite_array("position", position, (3,))
         self.position = require(
-            position,
+            finite_array("position", position, (3,)),
             lambda here, there: (here != there).any(),
             "position must differ from focal_point; got {got} for both.",
             self.focal_point,
@@ -83,9 +78,9 @@ class Camera(eqx.Module):
             self.focal_point,
         )
         self.view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
-        self.parallel_scale = (
-            None if parallel_scale is None else number("parallel_scale", parallel_scale, above=0)
-        )
+        self.parallel_scale = None
+        if parallel_scale is not None:
+            self.parallel_scale = number("parallel_scale", parallel_scale, above=0)
         whole = (-width / height, width / height, -1.0, 1.0)
         self.window = finite_array("window", whole if window is None else window, (4,))
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
@@ -101,66 +96,72 @@ class Camera(eqx.Module):
         parallel: bool | Any = False,
         size: tuple[int, int] | Any = (512, 512),
     ) -> "Camera":
-        """A camera that sees the whole volume from the side that `direction` points to.
+        """A camera that sees the whole volume from the side that `direction` points to: as by VTK's
+        `ResetCamera`, its bounding sphere just fits into the view.
 
-        Like VTK's `ResetCamera`: the bounding sphere of the volume just fits into the view.
+        Args:
+            volume: what is seen.
+            direction: from the center of the volume to the camera, of any length.
+            view_up: as in `Camera`. Within 0.06° of `direction`, y is used instead, or else -z.
+            view_angle: degrees. For an orthographic camera, it only sets the distance.
+            parallel: whether the camera is orthographic.
+            size: (width, height) of the image in pixels.
 
-        **Arguments:**
-
-        - `direction`: from the center of the volume to the camera, of any length.
-        - `view_up`: as in `Camera`. Within 0.06° of `direction`, y is used instead, or else -z.
-        - `view_angle`: degrees. For an orthographic camera, it only sets the distance.
-        - `parallel`: whether the camera is orthographic.
-
-        **Raises:** `ValueError` as `Camera` does, for a `direction` or `view_up` of 0, and if `volume` is not
-        a `Volume`.
+        Raises:
+            ValueError: as `Camera` does, for a `direction` or `view_up` of 0, and if `volume` is not a
+                `Volume`.
         """
         if not isinstance(volume, Volume):
-            raise ValueError(
-                f"volume must be a jaxvol Volume; got {described(volume)}. "
-                "Pass jv.Volume(data, spacing=...) for an array."
-            )
-        direction = finite_array("direction", direction, (3,))
-        direction = require(direction, lambda d: (d != 0).any(), "direction must not be zero.")
+            raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
+        direction, view_up = (
+            require(finite_array(name, vector, (3,)), lambda v: (v != 0).any(), f"{name} must not be zero.")
+            for name, vector in (("direction", direction), ("view_up", view_up))
+        )
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
-        view_up = finite_array("view_up", view_up, (3,))
-        view_up = require(view_up, lambda up: (up != 0).any(), "view_up must not be zero.")
         width, height = _image_size(size)
         cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
-        place = volume.origin, volume.spacing, volume.direction, cells
-        position, center, up, scale = _fitted_view(
-            place, direction, view_up, view_angle, min(1.0, width / height)
-        )
+        place, aspect = (volume.origin, volume.spacing, volume.direction, cells), min(1.0, width / height)
+        position, center, up, scale = _fitted_view(place, direction, view_up, view_angle, aspect)
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """A camera that renders only this rectangle of the image: the same pixels, jitter included.
 
-        `left`, `top`: column and row of the rectangle's first pixel.
+        Args:
+            left: column of the rectangle's first pixel.
+            top: its row.
+            width: number of columns.
+            height: number of rows.
 
-        **Raises:** `ValueError` for a rectangle that is empty or extends beyond the image.
+        Raises:
+            ValueError: for a rectangle that is empty or extends beyond the image.
         """
         left, top = integer("left", left, 0), integer("top", top, 0)
         width, height = integer("width", width, 1), integer("height", height, 1)
-        full_width, full_height = self.size
-        if left + width > full_width or top + height > full_height:
-            raise ValueError(
-                f"crop must be a rectangle inside the {full_width} x {full_height} image; "
-                f"got left={left}, top={top}, width={width}, height={height}."
-            )
-        x = [self._column(edge) for edge in (left, left + width)]
-        y = [self._row(edge) for edge in (top + height, top)]
-        corner = self.corner + np.array([left, top], self.corner.dtype)
-        return self._showing(jnp.stack([*x, *y]), (width, height), corner)
+        if left + width > self.size[0] or top + height > self.size[1]:
+            got = f"got left={left}, top={top}, width={width}, height={height}"
+            raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
+        return self.part(left, top, (width, height))
+
+    def part(self, left: Any, top: Any, size: tuple[int, int]) -> "Camera":
+        """`crop` without checks: from a row and column, which may be traced, also beyond the image."""
+        x = [self._column(edge) for edge in (left, left + size[0])]
+        y = [self._row(edge) for edge in (top + size[1], top)]
+        camera = replace(self, window=jnp.stack([*x, *y]), size=size, corner=None)
+        corner = self.corner + jnp.asarray([left, top], self.corner.dtype)
+        return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
         """A camera that shows 1/`factor` of the image at the same image size, in the same perspective.
 
-        `center`: in fractions of width and height from the top left.
+        Args:
+            factor: by which the image is magnified, > 0.
+            center: what becomes the image's center, in fractions of width and height from the top left.
         """
         factor = number("zoom factor", factor, above=0)
-        return self._showing(_zoomed(self.window, factor, finite_array("center", center, (2,))), self.size)
+        window = _zoomed(self.window, factor, finite_array("center", center, (2,)))
+        return replace(self, window=window, corner=None)
 
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
@@ -191,45 +192,24 @@ class Camera(eqx.Module):
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
-    def _showing(
-        self, window: Float[Array, "4"], size: tuple[int, int], corner: Float[Array, "2"] | None = None
-    ) -> "Camera":
-        camera = Camera(
-            self.position,
-            self.focal_point,
-            self.view_up,
-            self.view_angle,
-            size=size,
-            parallel_scale=self.parallel_scale,
-            window=window,
-        )
-        return camera if corner is None else eqx.tree_at(lambda camera: camera.corner, camera, corner)
-
     def _column(self, column: Scalar | int) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
-        left, right = self.window[0], self.window[1]
+        left, right, _, _ = self.window
         return left + (right - left) * (column / self.size[0])
 
     def _row(self, row: Scalar | int) -> Scalar:
-        bottom, top = self.window[2], self.window[3]
+        _, _, bottom, top = self.window
         return top - (top - bottom) * (row / self.size[1])
 
 
 class GivenRays(eqx.Module):
-    """Rays given by world origins and unit directions.
-
-    Random numbers along a ray are keyed by its pixel, (column, row); without `pixels` that is
-    (`first` + index in the flattened array, 0)."""
+    """World origins and unit directions. A ray's pixel, (column, row), keys its random numbers; without
+    `pixels` it is (`first` + index in the flattened array, 0)."""
 
     origins: Float[Array, "*rays 3"]
     directions: Float[Array, "*rays 3"]
     pixels: Int[Array, "*rays 2"] | None = None
     first: Int[Array, ""] | int = 0
-
-    @classmethod
-    def of(cls, lines: Line) -> "GivenRays":
-        """These rays; their pixels are not kept."""
-        return cls(jnp.stack(lines.origin, axis=-1), jnp.stack(lines.direction, axis=-1))
 
     def pixel(self, index: Int[Array, "*batch"]) -> tuple[Int[Array, "*batch"], Int[Array, "*batch"]]:
         """The pixels of the rays at these indices."""
@@ -254,38 +234,21 @@ def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float
     return right, jnp.cross(right, forward), forward
 
 
-def rows_of(camera: Camera, first: Int[Array, ""], count: int) -> Camera:
-    """`Camera.crop` to `count` whole rows from a traced row `first` on; they may reach past the image."""
-    left, right = camera.window[0], camera.window[1]
-    below, above = (camera._row(row.astype(camera.window.dtype)) for row in (first + count, first))
-    corner = camera.corner + jnp.stack([jnp.zeros_like(first), first]).astype(camera.corner.dtype)
-    return camera._showing(jnp.stack([left, right, below, above]), (camera.size[0], count), corner)
-
-
 @jax.jit  # or the first image would wait for a program per operation
-def _fitted_view(
-    place: tuple[Any, Any, Any, Any],
-    direction: Float[Array, "3"],
-    view_up: Float[Array, "3"],
-    view_angle: Float[Array, ""],
-    aspect: Any,
-) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere.
-    `place`: arguments of `corners_of`. `aspect`: width over height, at most 1."""
+def _fitted_view(place: Any, direction: Array, up: Array, angle: Array, aspect: Any) -> tuple[Array, ...]:
+    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere."""
     low, high = corners_of(*place)
     center, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
-    half = jnp.arctan(jnp.tan(jnp.deg2rad(view_angle) / 2) * aspect)
+    half = jnp.arctan(jnp.tan(jnp.deg2rad(angle) / 2) * aspect)
     position = center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
     y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
-    other = jnp.where(_sine(y, direction) > ALONG, y, minus_z)
-    up = jnp.where(_sine(view_up, direction) > ALONG, view_up, other)
+    other = jnp.where(_sine(y, direction) > 1e-3, y, minus_z)
+    up = jnp.where(_sine(up, direction) > 1e-3, up, other)
     return position, center, up, radius / aspect
 
 
 @jax.jit
-def _zoomed(
-    window: Float[Array, "4"], factor: Float[Array, ""], center: Float[Array, "2"]
-) -> Float[Array, "4"]:
+def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     """1/`factor` of a window."""
     left, right, bottom, top = window
     x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
@@ -300,11 +263,12 @@ def _sine(a: Any, b: Any) -> Any:
     return (across / (lengths + (lengths == 0).astype(lengths.dtype))) ** 0.5
 
 
-def _image_size(size: tuple[int, int] | Any) -> tuple[int, int]:
+def _image_size(size: Any) -> tuple[int, int]:
     try:
         width, height = (int(n) for n in size)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(f"size must be (width, height) in pixels; got {size!r}.") from fault
-    if (width, height) != tuple(size) or width < 1 or height < 1:
-        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size}.")
+        whole = (width, height) == tuple(size)
+    except (TypeError, ValueError):
+        width = height = whole = 0
+    if not whole or width < 1 or height < 1:
+        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size!r}.")
     return width, height

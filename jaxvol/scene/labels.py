@@ -1,23 +1,16 @@
 """Transfer functions of segmented volumes: one for each label."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
-from .._util.checks import described, finite_array, integer, require
-from .._util.piecewise_linear import (
-    clip_below,
-    interpolate_row,
-    points_below,
-    positive_between,
-    table_row,
-    upper_bound_between,
-)
+from .._util import piecewise_linear as linear
+from .._util.checks import described, finite_array, flag, integer, require
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
@@ -29,22 +22,21 @@ from .volume import Volume
 class LabelTransferFunction(Transfer):
     """A transfer function for each label of a segmented volume.
 
-    **Arguments:**
-
-    - `functions`: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
-      label that is not seen. A label that is not named, or lies beyond the last, is not seen either. Labels
-      are 0 to 255 here; renumber others, as by `np.unique(labels, return_inverse=True)`.
-
-    A function with fewer control points than another is padded with copies of its last point beyond it.
+    Args:
+        functions: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
+            label that is not seen, as others without a function are not. Labels are 0 to 255; renumber
+            others, as by `np.unique(labels, return_inverse=True)`.
 
     The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
-    `AlphaCorrection(labels=True)` cuts cells there.
+    `AlphaCorrection(labels=True)` cuts cells there, where `"preintegrated"` otherwise takes the label in the
+    middle of a cell.
 
-    `with_visibility` and `with_opacity` hide labels, and make them fainter or denser. What is hidden is leapt
-    over, as all that is transparent. Other factors, or labels hidden and shown, compile nothing again.
+    What `with_visibility` hides is leapt over. Other factors, or labels hidden and shown, compile nothing
+    again.
 
-    **Raises:** `ValueError` for no function at all, something that is none, and labels out of range; and when
-    rendering a volume without labels.
+    Raises:
+        ValueError: for no function at all, something that is none, and labels out of range; and when
+            rendering a volume without labels.
     """
 
     stacked: TransferFunction
@@ -54,50 +46,44 @@ class LabelTransferFunction(Transfer):
     shown: Bool[Array, " labels"]
     """Of each label, whether it is seen: see `with_visibility`."""
 
-    def __init__(
-        self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None] | Any
-    ):
+    def __init__(self, functions: Mapping[int, Any] | Sequence[TransferFunction | None] | Any):
         given = _by_label(functions)
         seen = [function for function in given if function is not None]
         if not seen:
             raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
-        points = max(function.values.shape[0] for function in seen)
-        first = _continued(seen[0], points)
-        hidden = TransferFunction(first.values, 0 * first.colors, 0 * first.extinction)
-        each = [hidden if function is None else _continued(function, points) for function in [*given, None]]
+        hidden = TransferFunction(seen[0].values, 0 * seen[0].colors, 0 * seen[0].extinction)
+        each = [hidden if function is None else function for function in [*given, None]]
         self.stacked = _stacked(each)
         self.opacity = jnp.asarray(np.ones(len(each)), self.stacked.extinction.dtype)
         self.shown = jnp.asarray(np.ones(len(each)), bool)
 
     def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
-        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again, with
-        the opacity that it had. Other labels stay as they are.
+        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
 
-        **Raises:** `ValueError` for labels beyond the last one, and for what is not true or false."""
+        Raises:
+            ValueError: for labels beyond the last one, and for what is not true or false.
+        """
         found = self.shown
         for label, shown in self._changes("visible", visible):
-            if jnp.shape(shown) != () or not jnp.issubdtype(jnp.result_type(shown), bool):
-                raise ValueError(f"visible[{label}] must be True or False; got {described(shown)}.")
-            found = found.at[label].set(shown)
+            found = found.at[label].set(flag(f"visible[{label}]", shown))
         return eqx.tree_at(lambda transfer: transfer.shown, self, found)
 
     def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
         """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
         keep theirs, which are 1 at first.
 
-        f is a factor of the extinction, at all values alike: what has the opacity α at f = 1 has
-        1 - (1 - α)^f, so that f = 0.5 makes 0.68 of 0.9, and 0.05 of 0.1. The image does not depend on the
-        step, and f may exceed 1. f is differentiable. Where it is 0, as where an extinction is, its
-        derivative misses what is leapt over (`SpaceLeaping`).
+        f is a factor of the extinction: what has the opacity α at f = 1 has 1 - (1 - α)^f. It may exceed 1,
+        and is differentiable; where it is 0, its derivative misses what is leapt over (`SpaceLeaping`).
 
-        **Raises:** `ValueError` for labels beyond the last one, and for factors that are negative or not
-        finite."""
+        Raises:
+            ValueError: for labels beyond the last one, and for factors that are negative or not finite.
+        """
         found = self.opacity
         for label, factor in self._changes("opacity", opacity):
             name = f"opacity[{label}]"
-            message = f"{name} must be at least 0; got {{got}}."
-            checked = require(finite_array(name, factor, ()), lambda factor: factor >= 0, message)
-            found = found.at[label].set(checked.astype(found.dtype))
+            factor = finite_array(name, factor, ())
+            factor = require(factor, lambda f: f >= 0, f"{name} must be at least 0; got {{got}}.")
+            found = found.at[label].set(factor.astype(found.dtype))
         return eqx.tree_at(lambda transfer: transfer.opacity, self, found)
 
     def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
@@ -115,98 +101,88 @@ class LabelTransferFunction(Transfer):
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """The label at a grid coordinate."""
         return (volume.label(coordinate),)
 
     def classifier(self) -> Classify:
-        """Look-up of colour and extinction, by label and value."""
-        tables = jax.vmap(TransferFunction.rows)(self._seen)
-        hidden, points = tables.shape[0] - 1, tables.shape[1]
-        rows = tables.reshape(-1, tables.shape[2])
+        functions = self._tables(TransferFunction.rows)
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             value, label = measured
-            label = jnp.where((label < 0) | (label > hidden), hidden, label)
-            values = gather(self.stacked.values, label)
-            row = table_row(rows, label * points + jnp.maximum(points_below(values, value) - 1, 0))
-            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
+            values, row_at = functions(label)
+            row = row_at(jnp.maximum(linear.points_below(values, value) - 1, 0))
+            return linear.interpolate_row(row, linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return classify
 
     def integrator(self) -> Classify:
-        """The means for the label in the middle of a cell: where it changes along one, `AlphaCorrection(
-        labels=True)` cuts it."""
-        stacked = jax.lax.stop_gradient(self.stacked.values)
-        tables = jax.vmap(TransferFunction.span_rows)(self._seen)
-        hidden, spans = tables.shape[0] - 1, tables.shape[1]
-        rows = tables.reshape(-1, tables.shape[2])
+        functions = self._tables(TransferFunction.span_rows)
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, label, (front,), (back,) = measured
-            label = jnp.where((label < 0) | (label > hidden), hidden, label)
-            values = gather(stacked, label)
-            i, j = (points_below(values, end) for end in (front, back))
-            a, b = (table_row(rows, label * spans + span) for span in (i, j))
-            return mean_by_rows(a, b, front, back, i == j)
+            values, row_at = functions(label)
+            i, j = (linear.points_below(values, end) for end in (front, back))
+            return mean_by_rows(row_at(i), row_at(j), front, back, i == j)
 
         return integrate
 
+    def _tables(self, table_of: Callable[[TransferFunction], Array]) -> Callable[[Any], tuple[Array, Any]]:
+        """From a label to the control points of its function, and the look-up of its table's rows."""
+        tables = jax.vmap(table_of)(self._seen)
+        hidden, count, rows = tables.shape[0] - 1, tables.shape[1], tables.reshape(-1, tables.shape[2])
+
+        def of(label: Any) -> tuple[Array, Any]:
+            label = jnp.where((label < 0) | (label > hidden), hidden, label)
+            return gather(self.stacked.values, label), lambda row: linear.table_row(rows, label * count + row)
+
+        return of
+
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        bound = jnp.zeros_like(blocks.low)
-        for label, values, extinction in self._functions():
-            own = upper_bound_between(values, extinction, blocks.low, blocks.high)
-            bound = jnp.where(blocks.may_hold(label), jnp.maximum(bound, own), bound)
-        return jnp.where(self.visible(blocks), bound, 0)
+        return jnp.where(
+            self.visible(blocks), self._greatest(linear.upper_bound_between, blocks, blocks.low.dtype), 0
+        )
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        seen = jnp.zeros(blocks.low.shape, bool)
-        for label, values, extinction in self._functions():
-            seen |= positive_between(values, extinction, blocks.low, blocks.high) & blocks.may_hold(label)
-        return seen
+        return self._greatest(linear.positive_between, blocks, bool)
 
-    def _functions(self) -> Iterator[tuple[int, Float[Array, " n"], Float[Array, " n"]]]:
-        """Each label, with the control points and extinctions of its function, without their gradients."""
+    def _greatest(
+        self, between: Callable[..., Array], blocks: Blocks, dtype: Any
+    ) -> Shaped[Array, "bx by bz"]:
+        """The greatest answer of the functions whose labels a block may hold, without a gradient."""
         functions = jax.lax.stop_gradient(self._seen)
-        for label in range(functions.values.shape[0] - 1):
-            yield label, functions.values[label], functions.extinction[label]
+        greatest = jnp.zeros(blocks.low.shape, dtype)
+        for label, points in enumerate(zip(functions.values[:-1], functions.extinction[:-1], strict=True)):
+            found = jnp.maximum(greatest, between(*points, blocks.low, blocks.high))
+            greatest = jnp.where(blocks.may_hold(label), found, greatest)
+        return greatest
 
 
 def _by_label(functions: Any) -> list[TransferFunction | None]:
     """Those of label 0, 1, 2, …"""
     if isinstance(functions, Mapping):
-        labels = [integer("functions' label", label, 0, 255) for label in functions]
-        named = dict(zip(labels, functions.values(), strict=True))
-        functions = [named.get(label) for label in range(max(labels, default=-1) + 1)]
-    if not isinstance(functions, list | tuple):
-        raise ValueError(
-            "functions must be {label: TransferFunction}, or a sequence of them from label 0 on; "
-            f"got {described(functions)}."
-        )
-    for label, function in enumerate(functions):
-        if not isinstance(function, TransferFunction | None):
+        named = {integer("functions' label", label, 0, 255): each for label, each in functions.items()}
+        functions = [named.get(label) for label in range(max(named, default=-1) + 1)]
+    if not isinstance(functions, list | tuple) or len(functions) > 256:
+        expected = "{label: TransferFunction}, or a sequence of those of labels 0 to 255"
+        raise ValueError(f"functions must be {expected}; got {described(functions)}.")
+    for label, each in enumerate(functions):
+        if not isinstance(each, TransferFunction | None):
             raise ValueError(
-                f"functions[{label}] must be a TransferFunction, or None; got {described(function)}."
+                f"functions[{label}] must be a TransferFunction, or None; got {described(each)}."
             )
-    if len(functions) > 256:
-        raise ValueError(f"functions must be those of labels 0 to 255; got {len(functions)} of them.")
     return list(functions)
-
-
-def _continued(function: TransferFunction, points: int) -> TransferFunction:
-    """The same function by so many points."""
-    values, missing = function.values, points - function.values.shape[0]
-    if missing == 0:
-        return function
-    # far enough apart to differ in the float type
-    gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
-    beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
-    return TransferFunction(
-        jnp.concatenate([values, beyond]),
-        jnp.concatenate([function.colors, jnp.repeat(function.colors[-1:], missing, axis=0)]),
-        jnp.concatenate([function.extinction, jnp.repeat(function.extinction[-1:], missing)]),
-    )
 
 
 @jax.jit
 def _stacked(functions: list[TransferFunction]) -> TransferFunction:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *functions)
+    """All functions along a leading axis; those with fewer points get copies of their last one beyond it."""
+    points = max(function.values.shape[0] for function in functions)
+
+    def continued(function: TransferFunction) -> TransferFunction:
+        values, missing = function.values, points - function.values.shape[0]
+        # far enough apart to differ in the float type
+        gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
+        beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
+        padded = jax.tree.map(lambda of: jnp.concatenate([of, *[of[-1:]] * missing]), function)
+        return eqx.tree_at(lambda of: of.values, padded, jnp.concatenate([values, beyond]))
+
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(continued, functions))

@@ -1,21 +1,20 @@
 """Where may anything be visible? Ranges of values of a volume's blocks, and grids of occupied cells.
 
-Ranges depend on the voxels alone, and are kept as long as their array. Which blocks are visible depends on
+Ranges depend only on the voxels, and are kept as long as their array. Which blocks are visible depends on
 the transfer function, too, and is computed in each image. What is called empty is proven to be. There are no
 gradients.
 """
 
+import itertools
 from collections.abc import Callable
-from functools import reduce
-from typing import Any, TypeVar
+from functools import partial, reduce
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
 
-from .._util.axes import XYZ, inverse
+from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
 from ..xla.memory import gather
@@ -36,8 +35,6 @@ FARTHEST = 255
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
 """By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
 
-Nodes = TypeVar("Nodes", Array, np.ndarray)
-
 Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 
 
@@ -48,75 +45,38 @@ class Blocks(eqx.Module):
     high: Float[Array, "bx by bz"]
     labels: UInt32[Array, "bx by bz"] | None
     """Bit `label % 32` is set for each label of the block's nodes."""
-    slopes: "SlopeRanges | None" = None
-    """None where they are unknown."""
+    slopes: tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]] | None = None
+    """Least and greatest magnitude of the gradient (`Volume.gradient`); None where they are unknown."""
 
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
-        """The blocks of a volume, computed once for each array of voxels and of labels. `slopes`: whether
-        their ranges are needed."""
+        """The blocks of a volume, computed once for each array; ranges of `slopes` only where asked for."""
         labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
         low, high = map(volume.in_grid_order, memoized(volume.data, _ranges))
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
-        return cls(low, high, labels, SlopeRanges.of(volume) if known else None)
+        return cls(low, high, labels, _magnitudes(volume) if known else None)
 
     @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
         """Blocks that hold NaN, also as a slope."""
         unordered = ~(self.low <= self.high)
-        if self.slopes is not None:
-            for low, high in zip(self.slopes.low, self.slopes.high, strict=True):
-                unordered |= ~(low <= high)
-        return unordered
+        least, most = self.magnitudes
+        return unordered | ~(least <= most)
 
     @property
     def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-        """Least and greatest magnitude of the gradient (`Volume.gradient`)."""
+        """`slopes`, or what is known without them: from 0 to infinity."""
         if self.slopes is None:
             return jnp.zeros_like(self.low), jnp.full_like(self.high, jnp.inf)
-        return self.slopes.magnitudes
+        return self.slopes
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
         """Which blocks may hold this label."""
         if self.labels is None:
             return jnp.ones(self.low.shape, bool)
         return (self.labels >> (label % 32)) & 1 == 1
-
-
-class SlopeRanges(eqx.Module):
-    """Ranges of slopes in each block, including the nodes on its faces.
-
-    - `low`, `high`: least and greatest slope along x, y, z, in value units per node.
-    - `steepest`: greatest length of a node's three slopes, per node.
-    - `spacing`: of the volume.
-    """
-
-    low: Float[Array, "3 bx by bz"]
-    high: Float[Array, "3 bx by bz"]
-    steepest: Float[Array, "bx by bz"]
-    spacing: Float[Array, "3"]
-
-    @classmethod
-    def of(cls, volume: Volume) -> "SlopeRanges":
-        """Those of a volume's voxels, computed once for each array of them."""
-        low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
-        if (axes := volume.fetch.axes) != XYZ:
-            low, high = (jnp.stack([part[axis] for axis in inverse(axes)]) for part in (low, high))
-        return cls(low, high, steepest, jax.lax.stop_gradient(volume.spacing))
-
-    @property
-    def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-        """Least and greatest magnitude of the gradient, in value units per world length."""
-        spacing = self.spacing.astype(self.low.dtype)
-        least = most = jnp.zeros_like(self.steepest)
-        for axis in range(3):  # XLA's sum over a leading axis is slow on CPU
-            low, high = self.low[axis] / spacing[axis], self.high[axis] / spacing[axis]
-            least += jnp.maximum(jnp.maximum(low, -high), 0) ** 2  # 0 where slopes change sign
-            most += jnp.maximum(-low, high) ** 2
-        most = jnp.minimum(jnp.sqrt(most), self.steepest / jnp.min(spacing))
-        return jnp.sqrt(least) * (1 - ROUNDING), most * (1 + ROUNDING)
 
 
 class Sums(eqx.Module):
@@ -133,7 +93,8 @@ class Sums(eqx.Module):
                 table = jnp.cumsum(table, axis=axis, dtype=jnp.int32)
                 continue
             # sums along the first axis, and moves it to the end; XLA's own cumulative sums are slow on CPU
-            _, sums = jax.lax.scan(_add, varying(jnp.zeros_like(table[0]), table), table)
+            start = varying(jnp.zeros_like(table[0]), table)
+            _, sums = jax.lax.scan(lambda total, layer: (total + layer,) * 2, start, table)
             table = jnp.moveaxis(sums, 0, 2)
         nx, ny, nz = occupied.shape
         return cls(table.reshape(-1), (nx, ny, nz))
@@ -143,63 +104,44 @@ class Sums(eqx.Module):
         _, ny, nz = (n + 1 for n in self.shape)
         x, y, z = (((low, -1), (high + 1, 1)) for low, high in zip(first, last, strict=True))
         count = jnp.zeros((), jnp.int32)
-        for i, sign_i in x:
-            for j, sign_j in y:
-                for k, sign_k in z:
-                    entry = gather(self.table, (i * ny + j) * nz + k)
-                    count = count + sign_i * sign_j * sign_k * entry
+        for (i, sign_i), (j, sign_j), (k, sign_k) in itertools.product(x, y, z):
+            count = count + sign_i * sign_j * sign_k * gather(self.table, (i * ny + j) * nz + k)
         return count > 0
 
 
 class Occupancy(eqx.Module):
-    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it.
-
-    - `origin`, `size`: corner of the grid and side lengths of a cell, along the axes of `frame` or the world.
-    """
+    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it."""
 
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
+    """Corner of the grid, along the axes of `frame`."""
     size: Vec3
-    frame: Frame | None = None
+    """Side lengths of a cell."""
+    frame: Frame = Frame()
 
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
 
-        def go_on(state: tuple[Array, Array, Array]) -> Array:
-            reached, _, rounds = state
-            return ~jnp.all(reached) & (rounds < FARTHEST - 1)
-
         def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             reached, distance, rounds = state
-            return (
-                with_neighbours(reached, jnp.logical_or),
-                distance + (~reached).astype(distance.dtype),
-                rounds + 1,
-            )
+            distance += (~reached).astype(distance.dtype)
+            return with_neighbours(reached, jnp.logical_or), distance, rounds + 1
 
         anything = jnp.any(self.occupied)
         start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
-        _, distance, _ = while_loop(go_on, grow, varying(start))
+        _, distance, _ = while_loop(
+            lambda state: ~jnp.all(state[0]) & (state[2] < FARTHEST - 1), grow, varying(start)
+        )
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:
         """Coordinate of a world point in the grid, in cells."""
-        point = self.own_point(point)
+        point = self.frame.coordinates(point)
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
 
-    def own_point(self, point: Vec3) -> Vec3:
-        """A world point along the grid's axes."""
-        return point if self.frame is None else self.frame.coordinates(point)
 
-    def own_direction(self, direction: Vec3) -> Vec3:
-        """A world direction along the grid's axes."""
-        return direction if self.frame is None else self.frame.components(direction)
-
-
-def with_neighbours(
-    grid: Shaped[Array, "cx cy cz"], combine: Callable[[Array, Array], Array]
-) -> Shaped[Array, "cx cy cz"]:
+def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Array:
     """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
     for axis in range(3):
         padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
@@ -209,41 +151,34 @@ def with_neighbours(
     return grid
 
 
-def _add(total: Int[Array, "ny nz"], layer: Int[Array, "ny nz"]) -> tuple[Array, Array]:
-    return total + layer, total + layer
-
-
 @jax.jit
-def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     return widened(*extremes(data))
 
 
 @jax.jit
-def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Shaped[Array, "bx by bz"], Shaped[Array, "bx by bz"]]:
+def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     """Least and greatest node of each block; NaN where a node is."""
 
-    def of(nodes: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
+    def of(nodes: Array) -> tuple[Array, Array]:
         return over_blocks(nodes, jnp.minimum), over_blocks(nodes, jnp.maximum)
 
     whole = (data.shape[0] - 1) // BLOCK
     if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
         return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
-    low, high = jax.lax.map(
-        lambda first: of(jax.lax.dynamic_slice_in_dim(data, first, BLOCK + 1)),
-        BLOCK * jnp.arange(whole),
-        batch_size=LAYERS,
+    begins = BLOCK * jnp.arange(whole)
+    layers = jax.lax.map(
+        lambda x: of(jax.lax.dynamic_slice_in_dim(data, x, BLOCK + 1)), begins, batch_size=LAYERS
     )
-    low, high = low[:, 0], high[:, 0]
+    found = [jax.tree.map(lambda layer: layer[:, 0], layers)]
     if whole * BLOCK < data.shape[0] - 1:
-        last_low, last_high = of(data[whole * BLOCK :])
-        low, high = jnp.concatenate([low, last_low]), jnp.concatenate([high, last_high])
+        found.append(of(data[whole * BLOCK :]))
+    low, high = (jnp.concatenate(ends) for ends in zip(*found, strict=True))
     return low, high
 
 
 @jax.jit
-def widened(
-    low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]
-) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
+def widened(low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]) -> tuple[Array, Array]:
     """Ranges of the values interpolated between nodes, from those of the nodes."""
     low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     slack = ROUNDING * jnp.maximum(abs(low), abs(high))
@@ -251,11 +186,10 @@ def widened(
 
 
 @jax.jit
-def _slope_ranges(
-    data: Shaped[Array, "nx ny nz"],
-) -> tuple[Float[Array, "3 bx by bz"], Float[Array, "3 bx by bz"], Float[Array, "bx by bz"]]:
-    """The fields of `SlopeRanges`, one layer of blocks after the other: all slopes would take several times
-    the volume's memory."""
+def _slope_ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array, Array]:
+    """Least and greatest slopes along the array's axes in each block, in value units per node, and the
+    greatest length of a node's three; layer by layer, since all would take several times the volume's memory.
+    """
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
@@ -265,33 +199,37 @@ def _slope_ranges(
         before, here, after = (data[jnp.clip(node + side, 0, last)].astype(dtype) for side in (-1, 0, 1))
         border = ((node == 0) | (node == last))[:, None, None]
         along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)
-        slopes = jnp.stack([along_x, _central(here, 1), _central(here, 2)]).astype(jnp.float32)
-        square = jnp.max(jnp.sum(slopes**2, axis=0), axis=0)
-        low, high, square = (
-            jax.vmap(lambda part, of=of: over_blocks(part, of))(part)
-            for part, of in (
-                (jnp.min(slopes, axis=1), jnp.minimum),
-                (jnp.max(slopes, axis=1), jnp.maximum),
-                (square[None], jnp.maximum),
-            )
-        )
+        slopes = jnp.stack([along_x, *jnp.gradient(here, axis=(1, 2))]).astype(jnp.float32)
+        square = over_blocks(jnp.max(jnp.sum(slopes**2, axis=0), axis=0), jnp.maximum)
+        low = jax.vmap(lambda part: over_blocks(part, jnp.minimum))(jnp.min(slopes, axis=1))
+        high = jax.vmap(lambda part: over_blocks(part, jnp.maximum))(jnp.max(slopes, axis=1))
         # inside loops on CPU, XLA's minima and maxima lose NaN
         lost = over_blocks(jnp.any(jnp.isnan(slopes), axis=(0, 1)), jnp.logical_or)
         slack = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
-        steepest = jnp.sqrt(square[0]) * (1 + ROUNDING)
-        return jnp.where(lost, jnp.nan, low - slack), jnp.where(lost, jnp.nan, high + slack), steepest
+        steepest = jnp.sqrt(square) * (1 + ROUNDING)
+        low, high = (jnp.where(lost, jnp.nan, end) for end in (low - slack, high + slack))
+        return low, high, steepest
 
     low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
     return jnp.moveaxis(low, 0, 1), jnp.moveaxis(high, 0, 1), steepest
 
 
-def _central(values: Float[Array, "nx ny nz"], axis: int) -> Float[Array, "nx ny nz"]:
-    """Slopes of nodes along an axis, as `voxel_fetch.Fetch.slopes` has them."""
-    rise = jnp.diff(values, axis=axis)
-    n = values.shape[axis] - 1
-    first, last = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 1, n)))
-    before, after = (jax.lax.slice_in_dim(values, *part, axis=axis) for part in ((0, n - 1), (2, n + 1)))
-    return jnp.concatenate([first, (after - before) / 2, last], axis)
+def _magnitudes(volume: Volume) -> tuple[Array, Array]:
+    """Least and greatest magnitude of the gradient in each block, in value units per world length."""
+    low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
+    low, high = (jnp.stack([part[axis] for axis in inverse(volume.fetch.axes)]) for part in (low, high))
+    return _lengths(low, high, steepest, jax.lax.stop_gradient(volume.spacing).astype(low.dtype))
+
+
+@jax.jit
+def _lengths(low: Array, high: Array, steepest: Array, spacing: Array) -> tuple[Array, Array]:
+    least = most = jnp.zeros_like(steepest)
+    for begin, end, step in zip(low, high, spacing, strict=True):  # XLA's sum over axis 0 is slow on CPU
+        begin, end = begin / step, end / step
+        least += jnp.maximum(jnp.maximum(begin, -end), 0) ** 2  # 0 where slopes change sign
+        most += jnp.maximum(-begin, end) ** 2
+    most = jnp.minimum(jnp.sqrt(most), steepest / jnp.min(spacing)) * (1 + ROUNDING)
+    return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
 
 
 @jax.jit
@@ -300,28 +238,22 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
     return over_blocks(bits, jnp.bitwise_or)
 
 
-def over_blocks(data: Nodes, combine: Callable[[Nodes, Nodes], Nodes], margin: int = 0) -> Nodes:
+def over_blocks(values: Array, combine: Callable[[Array, Array], Array], margin: int = 0) -> Array:
     """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
-    xp: Any = jnp if isinstance(data, jax.Array) else np
-    values: Any = data
-
-    def along(axis: int, begin: int, end: int, step: int = 1) -> Any:
-        return values[(slice(None),) * axis + (slice(begin, end, step),)]
-
     for axis in range(values.ndim):
         cells = values.shape[axis] - 1
         if margin:
             missing = -cells % BLOCK
             around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
-            values, cells = xp.pad(values, around, mode="edge"), cells + missing
+            values, cells = jnp.pad(values, around, mode="edge"), cells + missing
+        along = partial(jax.lax.slice_in_dim, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, BLOCK)
         found = []
         if whole:
-            last, parts = (whole - 1) * BLOCK, range(BLOCK + 1 + 2 * margin)
-            found.append(reduce(combine, [along(axis, i, i + last + 1, BLOCK) for i in parts]))
+            length, nodes = (whole - 1) * BLOCK + 1, range(BLOCK + 1 + 2 * margin)
+            found.append(reduce(combine, [along(i, i + length, BLOCK) for i in nodes]))
         if rest:
-            nodes = range(whole * BLOCK, cells + 1)
-            found.append(reduce(combine, [along(axis, i, i + 1) for i in nodes]))
-        values = xp.concatenate(found, axis) if len(found) > 1 else found[0]
+            found.append(reduce(combine, [along(i, i + 1) for i in range(whole * BLOCK, cells + 1)]))
+        values = jnp.concatenate(found, axis)
     return values

@@ -125,36 +125,31 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
     ),
 }
 
-
-SHADED = frozenset({"ct_bone", "ct_skin_bone", "ct_airway", "ct_chest", "engine", "bonsai", "head"})
-"""Presets that show surfaces, which the command line shades. Gradients of magnetic resonance images are
-mostly noise."""
+SHADED = frozenset(PRESETS) - {"mr_head"}
+"""Presets that the command line shades: gradients of magnetic resonance images are mostly noise."""
 
 
-def preset(
-    name: str | Any, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0
-) -> TransferFunction:
+def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1.0) -> TransferFunction:
     """A transfer function by name.
 
-    **Arguments:**
+    Args:
+        name: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values.
+        clim: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
+            Hounsfield units + 1000 needs (0, 4000).
+        unit_distance: world length to which the opacities refer; they are designed for 1 mm.
 
-    - `name`: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values:
-      Hounsfield units for `ct_…`, 0 to 255 for the others.
-    - `clim`: (low, high) in the volume's values; the preset's own range is stretched linearly to it.
-      For example, CT stored as Hounsfield units + 1000 needs `clim=(0, 4000)`.
-    - `unit_distance`: world length to which the preset's opacities refer; they are designed for 1 mm.
+    Returns:
+        The `TransferFunction`, its colours linear.
 
-    **Returns:** the `TransferFunction`, its colours linear.
-
-    **Raises:** `ValueError` for an unknown name, and a `clim` that does not increase.
+    Raises:
+        ValueError: for an unknown name, and a `clim` that does not increase.
     """
     if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
-    _, (own_low, own_high), points = PRESETS[name]
-    low, high = _range((own_low, own_high) if clim is None else clim)
+    _, own_range, points = PRESETS[name]
     values, colors, opacities = zip(*points, strict=True)
-    fraction = (np.array(values) - own_low) / (own_high - own_low)
-    return TransferFunction(low + fraction * (high - low), colors, extinction_of(opacities, unit_distance))
+    stretched = np.interp(values, own_range, _range(own_range if clim is None else clim))
+    return TransferFunction(stretched, colors, extinction_of(opacities, unit_distance))
 
 
 def colormap(
@@ -166,22 +161,21 @@ def colormap(
 ) -> TransferFunction:
     """A transfer function from a matplotlib colormap and an opacity ramp, as in PyVista's `add_volume`.
 
-    **Arguments:**
+    Args:
+        cmap: a matplotlib colormap or its name; or one colour, such as `"tomato"` or (1, 0.39, 0.28); or
+            several, evenly spaced and interpolated in sRGB. All are sRGB; their alpha is ignored.
+        clim: (low, high), the volume's values at which the colormap begins and ends.
+        opacity: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
+            10; or an array of evenly spaced ones, in [0, 1].
+        unit_distance: thickness, in world length, of a layer that has these opacities.
+        n_colors: number of control points, at least 2.
 
-    - `cmap`: a matplotlib colormap or its name; or one colour for the whole range, such as `"tomato"`,
-      `"#ff6347"` or (1, 0.39, 0.28); or several colours, a list or an (m, 3) array, evenly spaced over the
-      range and interpolated linearly in sRGB, as in matplotlib. All colours are sRGB and are converted to
-      linear. Their alpha is ignored; `opacity` applies.
-    - `clim`: (low, high), the volume's values at which the colormap begins and ends.
-    - `opacity`: `"linear"`: from 0 to 1 over the range. `"sigmoid"`: `1/(1 + exp(-x))` for x from -10
-      to 10 over the range. An array in [0, 1]: opacities evenly spaced over the range.
-    - `unit_distance`: thickness, in world length, of a layer that has these opacities.
-    - `n_colors`: number of control points, at least 2.
+    Returns:
+        The `TransferFunction`, its colours linear.
 
-    **Returns:** the `TransferFunction`, its colours linear.
-
-    **Raises:** `ValueError` for an unknown colormap, colour or opacity, opacities outside [0, 1], and a
-    `clim` that does not increase.
+    Raises:
+        ValueError: for an unknown colormap, colour or opacity, opacities outside [0, 1], and a `clim` that
+            does not increase.
     """
     n_colors = integer("n_colors", n_colors, 2)
     colors = _display_colors(cmap, np.linspace(0, 1, n_colors))
@@ -209,11 +203,9 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
         hint = f" Did you mean {' or '.join(near)}?" if near else ""
         got = repr(cmap) if isinstance(cmap, list | tuple) else described(cmap)
         raise ValueError(
-            "cmap must be a matplotlib colormap or its name, or one or several colours, by name or sRGB in "
-            f"[0, 1]; got {got}.{hint}"
+            f"cmap must be a matplotlib colormap, or colours by name or sRGB in [0, 1]; got {got}.{hint}"
         ) from fault
-    positions = np.linspace(0, 1, len(rgb))
-    return np.stack([np.interp(at, positions, channel) for channel in rgb.T], axis=-1)
+    return np.stack([np.interp(at, np.linspace(0, 1, len(rgb)), channel) for channel in rgb.T], axis=-1)
 
 
 def _ramp(opacity: Any, n: int) -> Float[Array, " n"]:

@@ -1,47 +1,38 @@
 """What does a render return?"""
 
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import finite
+from .._util.checks import finite_array
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 
 
-T = TypeVar("T")
-
-
 class BrickReport(NamedTuple):
-    """What an image by `render_bricks` took.
-
-    - `counts`: bricks along x, y and z. `needed`: how many of them may hold anything visible.
-    - `loads`: how often a brick was read: less than `needed` where bricks lie outside of the view, or behind
-      what is opaque. `reloads`: how many of these were not the first of their brick (`method="reload"`).
-    - `bytes_read`: of voxels, with what is read around each brick.
-    - `stored`: voxels along x, y and z that are held at a time, for which programs are compiled.
-      `bytes_held`: memory that these take, with what is made of them and with the next ones.
-    """
+    """What an image by `render_bricks` took."""
 
     counts: tuple[int, int, int]
+    """Bricks along x, y and z."""
     needed: int
+    """How many of them may hold anything visible."""
     loads: int
+    """How often a brick was read."""
     reloads: int
+    """Of these, all but the first of each brick."""
     bytes_read: int
+    """Of voxels, with what is read around each brick."""
     stored: tuple[int, int, int]
+    """Voxels along x, y and z that are held at a time."""
     bytes_held: int
+    """Memory that these take, with what is made of them and with the next ones."""
 
 
 class Details(NamedTuple):
-    """Outputs that cost time, each None where it was not asked for. See `Rendering`.
-
-    `selected`: the state of a `Selection` after the march, which `ray.resolve` makes pixels from; None
-    in an image.
-    """
+    """Outputs that cost time, each None where it was not asked for. See `Rendering`."""
 
     depth: Float[Array, "*rays"] | None = None
     samples: Int[Array, "*rays"] | None = None
@@ -49,32 +40,28 @@ class Details(NamedTuple):
     aligned: Bool[Array, "*rays"] | None = None
     normal: Float[Array, "*rays 3"] | None = None
     selected: PyTree = None
-    bricks: "BrickReport | None" = None
+    """The final state of a `Selection`, for `ray.resolve`; None in an image."""
+    bricks: BrickReport | None = None
 
 
 class Rendering(eqx.Module):
     """The image of rays, and what they met. The leading shape is that of the rays: (height, width) from a
     camera.
 
-    - `rgba`: linear colour, premultiplied by opacity, and opacity; not composited over a background.
-    - `exhausted`: whether the ray took `March.max_samples` before it was finished: what lies behind is
-      missing.
-    - `depth`: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
-      opacity, world length; infinite where nothing is visible.
-    - `samples`: number of samples evaluated, one for each piece of a cell.
-    - `aligned`: whether the ray reached a non-transparent last cell that was cut at the exit
-      (Kye 2013, Fig. 13).
-    - `error`: under `AdaptiveSampling`, a cautious estimate of how far a pixel's colour is wrong because of
-      the distance of its samples, without a gradient; infinite where nothing can be predicted. In the scenes
-      of `experiments.adaptive_error`, it is several times the true error, and less in at most 3 % of the
-      pixels. It may be somewhat smaller where rays leap.
-    - `normal`: of a mode that shows surfaces (`Isosurface`), the unit normal in the world; 0 where nothing is
-      visible.
+    Attributes:
+        rgba: linear colour, premultiplied by opacity, and opacity; not composited over a background.
+        exhausted: whether the ray took `March.max_samples` before it was finished.
+        depth: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
+            opacity, world length; infinite where nothing is visible.
+        samples: number of samples evaluated, one for each piece of a cell.
+        aligned: whether a last cell that is not transparent was cut at the exit (Kye 2013, Fig. 13).
+        error: under `AdaptiveSampling`, a cautious estimate of the error of a pixel's colour, mostly several
+            times the true one (`experiments.adaptive_error`); without a gradient, infinite where unknown.
+        normal: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
+        bricks: the `BrickReport` of `render_bricks`.
 
-    The last five raise `AttributeError` where they were not asked for (`outputs="rgba"`), `error` without
-    `AdaptiveSampling`, and `normal` under other modes.
-
-    Modes other than `"over"` say what their depth is.
+    All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
+    other than `"over"` say what their depth is.
     """
 
     rgba: Float[Array, "*rays 4"]
@@ -83,57 +70,46 @@ class Rendering(eqx.Module):
 
     @property
     def depth(self) -> Float[Array, "*rays"]:
-        return self._detail("depth", self.details.depth)
+        return self._detail("depth")
 
     @property
     def samples(self) -> Int[Array, "*rays"]:
-        return self._detail("samples", self.details.samples)
+        return self._detail("samples")
 
     @property
     def aligned(self) -> Bool[Array, "*rays"]:
-        return self._detail("aligned", self.details.aligned)
+        return self._detail("aligned")
 
     @property
     def error(self) -> Float[Array, "*rays"]:
-        return self._detail("error", self.details.error, "give the march AdaptiveSampling, and ")
+        return self._detail("error", "give the march AdaptiveSampling, and ")
 
     @property
     def normal(self) -> Float[Array, "*rays 3"]:
-        return self._detail("normal", self.details.normal, "composite by an Isosurface, and ")
+        return self._detail("normal", "composite by an Isosurface, and ")
 
     @property
     def bricks(self) -> BrickReport:
-        return self._detail("bricks", self.details.bricks, "render it by render_bricks, and ")
+        return self._detail("bricks", "render it by render_bricks, and ")
 
-    def _detail(self, name: str, value: T | None, more: str = "") -> T:
-        if value is None:
-            how = f'{more}pass outputs="all" to compute it'
-            raise AttributeError(f"{name} is not part of this rendering: {how}.")
+    def _detail(self, name: str, more: str = "") -> Any:
+        if (value := getattr(self.details, name)) is None:
+            raise AttributeError(f'{name} is not part of this rendering: {more}pass outputs="all".')
         return value
 
     def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
         """Linear RGB over a background: one colour (3,), or an image of the same shape.
 
-        **Raises:** `ValueError` for a background of another shape, or that is not finite."""
-        background = self._background(background)
-        if background.shape not in ((3,), (*self.rgba.shape[:-1], 3)):
-            raise ValueError(
-                f"background must be one colour (3,) or an image {(*self.rgba.shape[:-1], 3)}; "
-                f"got shape {background.shape}."
-            )
+        Raises:
+            ValueError: for a background of another shape, or that is not finite.
+        """
+        if not is_traced(background):  # a traced one may be NaN, which then shows in the image
+            background = finite_array("background", background, (..., 3))
+        background = jnp.asarray(background, self.rgba.dtype)
+        if background.shape not in ((3,), shape := (*self.rgba.shape[:-1], 3)):
+            expected = f"one colour (3,) or an image {shape}"
+            raise ValueError(f"background must be {expected}; got shape {background.shape}.")
         return _over(self.rgba, background)
-
-    def _background(self, background: Any) -> Float[Array, "..."]:
-        """The background as an array. A traced one may be NaN, which then shows in the image."""
-        if not is_traced(background):
-            given = background
-            try:
-                background = np.asarray(given, np.float32)
-            except (TypeError, ValueError) as fault:
-                raise ValueError(f"background must be linear RGB numbers; got {given!r}.") from fault
-            if not np.all(finite(background)):
-                raise ValueError("background must be finite; got NaN or infinity.")
-        return jnp.asarray(background, self.rgba.dtype)
 
 
 @jax.jit

@@ -5,13 +5,13 @@ origin and direction, so that rays are straight in the grid. A space with curved
 """
 
 from abc import abstractmethod
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Frame, Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
@@ -80,9 +80,9 @@ class Space(eqx.Module):
         faces = [jax.lax.index_in_dim(visible, end, axis) for axis in range(3) for end in (0, -1)]
         return tuple(jnp.any(face) for face in faces)
 
-    @abstractmethod
     def path(self, entry: Vec3, direction: Vec3) -> Path:
         """The straight world ray from `entry`, in grid coordinates."""
+        return Curved(self, entry, direction)
 
 
 class Line(NamedTuple):
@@ -94,23 +94,22 @@ class Line(NamedTuple):
 
 
 class Ray(eqx.Module):
-    """One ray, clipped to the volume.
-
-    - `entry`, `direction`: world point where the ray enters the volume, and its unit direction.
-    - `t_in`: distance from the ray's origin to the entry. `length`: from entry to exit; 0 on a miss.
-      Depths along a march are measured from the entry, so that float32 resolves them for far cameras, too.
-    - `path`: the ray in grid coordinates.
-    - `pixel`: (column, row); keys everything random along the ray.
-    - `gaps`: depths between entry and exit where the ray is outside the volume.
-    """
+    """One ray, clipped to the volume. Depths along it are measured from the entry, so that float32 resolves
+    them for far cameras, too."""
 
     entry: Vec3
+    """World point where the ray enters the volume."""
     direction: Vec3
+    """Unit direction in the world."""
     t_in: Scalar
+    """Distance from the ray's origin to the entry."""
     length: Scalar
+    """Distance from entry to exit; 0 on a miss."""
     path: Path
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
+    """(column, row); keys everything random along the ray."""
     gaps: tuple[Gap, ...] = ()
+    """Depths between entry and exit where the ray is outside the volume."""
 
     def contains(self, depth: Scalar) -> Bool[Array, "..."]:
         """Whether this depth is inside the volume: neither past the exit nor in a gap."""
@@ -124,8 +123,7 @@ class Ray(eqx.Module):
 
 
 def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
-    """Clip a ray to the volume and to what lies ahead of its origin, which may be inside. It is `invalid` if
-    a number of it, or of the space, is NaN or infinite."""
+    """Clip a ray to the volume and to what lies ahead of its origin; `invalid` if a number is not finite."""
     # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
@@ -142,10 +140,20 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
-    """Where `fault` is true, a ray that is never marched and renders as NaN: comparisons with NaN are false,
-    and a march might never end."""
+    """Where `fault` is true, a ray that is never marched, which might not end, and renders as NaN."""
     t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
     return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
+
+
+class Curved(Path):
+    """A straight world ray in any grid."""
+
+    space: Space
+    entry: Vec3
+    direction: Vec3
+
+    def __call__(self, s: Scalar) -> Vec3:
+        return self.space.coordinate(along(self.entry, self.direction, s))
 
 
 class Straight(Path):
@@ -159,21 +167,18 @@ class Straight(Path):
 
 
 class Affine(Space):
-    """A grid given by spacing, origin and direction.
-
-    `low`, `high`: its first and its last node, along the axes of `frame`, or, without one, the world's.
-    """
+    """A grid given by spacing, origin and direction."""
 
     low: Vec3
+    """The first node, along the axes of `frame`; `high`: the last one."""
     high: Vec3
     spacing: Vec3
-    frame: Frame | None
+    frame: Frame
 
     def __init__(self, volume: Volume):
-        self.spacing = apart(volume.spacing)
+        self.spacing, self.frame = apart(volume.spacing), Frame()
         if volume.direction is None:
             self.low, self.high = (apart(end) for end in volume.corners)
-            self.frame = None
         else:
             # from the first node, where the numbers are small: many origins are far away
             self.frame = Frame.of(volume.origin, volume.direction)
@@ -187,23 +192,20 @@ class Affine(Space):
     @property
     def middle(self) -> Vec3:
         x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
-        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
+        return self.frame.point((x, y, z))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        if self.frame is not None:
-            origin = self.frame.coordinates(origin)
-        return slab_interval(origin, self.own(direction), self.low, self.high)
+        origin, direction = self.frame.coordinates(origin), self.frame.components(direction)
+        return slab_interval(origin, direction, self.low, self.high)
 
     def coordinate(self, point: Vec3) -> Vec3:
-        if self.frame is not None:
-            point = self.frame.coordinates(point)
+        point = self.frame.coordinates(point)
         # times the reciprocal: XLA stores quotients that are used more than once
         x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
         return x, y, z
 
     def point(self, coordinate: Vec3) -> Vec3:
-        x, y, z = self._own_point(coordinate)
-        return (x, y, z) if self.frame is None else self.frame.point((x, y, z))
+        return self.frame.point(self._own_point(coordinate))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
         return self.spacing
@@ -214,12 +216,9 @@ class Affine(Space):
         return Occupancy(visible, low, (x, y, z), self.frame)
 
     def path(self, entry: Vec3, direction: Vec3) -> Straight:
-        dx, dy, dz = (d / step for d, step in zip(self.own(direction), self.spacing, strict=True))
+        direction = self.frame.components(direction)
+        dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
         return Straight(self.coordinate(entry), (dx, dy, dz))
-
-    def own(self, direction: Vec3) -> Vec3:
-        """Components of a world direction along the grid's axes, in world length."""
-        return direction if self.frame is None else self.frame.components(direction)
 
     def _own_point(self, coordinate: Vec3) -> Vec3:
         x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
@@ -228,24 +227,17 @@ class Affine(Space):
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:
     """Distances at which a line enters and leaves a box; on a miss, the first exceeds the second."""
-    (near_x, far_x), (near_y, far_y), (near_z, far_z) = (
-        _slab(*ends) for ends in zip(origin, direction, low, high, strict=True)
-    )
-    near = jnp.maximum(jnp.maximum(near_x, near_y), near_z)
-    far = jnp.minimum(jnp.minimum(far_x, far_y), far_z)
-    return near, far
+    nears, fars = zip(*map(_slab, origin, direction, low, high), strict=True)
+    return reduce(jnp.maximum, nears), reduce(jnp.minimum, fars)
 
 
-def node_distance(
-    space: Space, shape: tuple[int, ...], first: Int[Array, "3"] | None = None
-) -> Float[Array, "bx by bz"]:
-    """By block, the least world distance between neighbouring nodes, in its middle. `first`: index of the
-    first block."""
-    first = jnp.zeros(3, jnp.int32) if first is None else first
-    dtype = space.middle[0].dtype
-    middle = [
-        BLOCK * ((jnp.arange(n) + begin).astype(dtype) + 0.5) for n, begin in zip(shape, first, strict=True)
+def node_distance(space: Space, shape: tuple[int, ...], first: Array | None = None) -> Array:
+    """The least world distance between neighbouring nodes in the middle of each block, from `first` on."""
+    begins = jnp.zeros(3, jnp.int32) if first is None else first
+    blocks = [
+        (jnp.arange(n) + begin).astype(space.middle[0].dtype) for n, begin in zip(shape, begins, strict=True)
     ]
+    middle = [BLOCK * (block + 0.5) for block in blocks]
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
@@ -254,15 +246,14 @@ def node_distance(
     return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))
 
 
-@partial(jax.jit, static_argnums=1)  # operation by operation, it takes seconds to compile
+@partial(jax.jit, static_argnums=1)  # operations by themselves take seconds to compile
 def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
     """The median of `node_distance` over all blocks: the size of a voxel."""
     return jnp.median(node_distance(space, shape))
 
 
 def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:
-    """Gradient of the value by a world point, in value units per world length: `Volume.gradient` times the
-    transposed Jacobian of `space.coordinate`."""
+    """`Volume.gradient`, by a world point: times the transposed Jacobian of `space.coordinate`."""
     coordinate, transpose = jax.vjp(space.coordinate, point)
     slopes = volume.gradient(coordinate)
     per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))

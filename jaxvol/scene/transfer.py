@@ -1,8 +1,7 @@
 """Which colour and extinction has this value?
 
-A transfer function answers three questions: what it reads at a place besides the value (`attributes`), how
-that becomes colour and extinction (`classifier`), and how great the extinction can be in a block of the
-volume (`majorant`). Only the second has no default.
+A transfer function says what it reads at a place besides the value (`attributes`), how that becomes colour
+and extinction (`classifier`), and how great the extinction can be in a block of the volume (`majorant`).
 """
 
 from abc import abstractmethod
@@ -15,17 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._util import piecewise_linear as linear
 from .._util.checks import Arrayable, finite_array, increasing, number, require, unit_interval
-from .._util.piecewise_linear import (
-    FEW,
-    clip_below,
-    interpolate_row,
-    points_below,
-    positive_between,
-    table_row,
-    upper_bound_between,
-    variation_between,
-)
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, row_sums
@@ -44,11 +34,8 @@ Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 
 
 class Classification(NamedTuple):
-    """A transfer function applied to one volume, in two stages: `measure` at a grid coordinate, then
-    `classify`.
-
-    The stages are separate because measuring fetches from memory, and an engine keeps what was fetched.
-    """
+    """A transfer function applied to one volume: `measure` at a grid coordinate fetches from memory; what it
+    found, `classify` turns into colour and extinction."""
 
     measure: Callable[[Vec3], Measured]
     attributes: Callable[[Vec3], Measured]
@@ -69,8 +56,7 @@ class Classification(NamedTuple):
 
     @staticmethod
     def spanned(attributes: Measured, front: Measured, back: Measured) -> Measured:
-        """What `integrate` needs of a cell: from what is measured at its ends, and the attributes in its
-        middle."""
+        """What `integrate` needs, from the attributes in a cell's middle and what is measured at its ends."""
         return ((front[0] + back[0]) / 2, *attributes, front, back)
 
     @property
@@ -85,16 +71,13 @@ class Classification(NamedTuple):
 
 class Transfer(eqx.Module):
     """The interface of all transfer functions. A subclass overrides `classifier`; `attributes` if more than
-    the value counts; and `majorant`, so that rays leap over what is transparent.
-
-    `integrator` and `variation` are for `quadrature="preintegrated"` and `AdaptiveSampling`; `search`,
-    `visible` and `vjp` make programs faster.
+    the value counts; `majorant`, so that rays leap over what is transparent; `integrator` and `variation` for
+    `quadrature="preintegrated"` and `AdaptiveSampling`. `search`, `visible` and `vjp` only save time.
     """
 
     @abstractmethod
     def classifier(self) -> Classify:
-        """The function from `Measured` to colour and extinction. Tables that it needs are computed here,
-        once, outside the march's loop."""
+        """The function from `Measured` to colour and extinction; its tables are computed here, once."""
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """What is read from the volume at a grid coordinate besides the value; by default nothing."""
@@ -102,31 +85,27 @@ class Transfer(eqx.Module):
 
     @property
     def reads_gradient(self) -> bool:
-        """Whether `attributes` reads the volume's gradient, so that it is worth storing slopes, and the
-        ranges of them in blocks (`Blocks.slopes`). By default not."""
+        """Whether `attributes` reads the volume's gradient, so that slopes are stored. By default not."""
         return False
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        """An upper bound of the extinction (1/length) in each block of a volume, for all values in the
-        block's range. 0 only where the extinction is proven to be 0, and in blocks that hold NaN
-        (`Blocks.unordered`). It carries no gradient. By default infinite: nothing is proven."""
+        """An upper bound of the extinction (1/length) in each block, without a gradient; 0 only where that is
+        proven to be 0, and in blocks that hold NaN (`Blocks.unordered`). By default infinite."""
         return jnp.full(blocks.low.shape, jnp.inf)
 
     def integrator(self) -> Classify | None:
-        """The function from what is measured over a cell (`Measured`) to its colour and extinction: the means
-        over all values between its ends, that of the colour weighted by the extinction. None, the default:
-        unknown, so that `quadrature="preintegrated"` is refused."""
+        """The function from what is measured of a cell (`Measured`) to the means over all values between its
+        ends; None, the default, where they are unknown: `quadrature="preintegrated"` is refused."""
         return None
 
     def variation(self, windows: Windows) -> Variation:
-        """How much extinction and emission change within the range of each window. It carries no gradient. By
-        default nothing is known."""
+        """How much extinction and emission change within the range of each window, without a gradient."""
         return Variation.unknown(windows)
 
     def search(self) -> Callable[[Measured], Measured] | None:
         """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
-        classifier gets after it. By default there is none. With an `integrator` it depends on the value
-        alone. Overridden together with `vjp`."""
+        classifier gets after it. With an `integrator` it depends only on the value. Overridden with `vjp`.
+        """
         return None
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
@@ -136,9 +115,9 @@ class Transfer(eqx.Module):
     def vjp(
         self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
     ) -> tuple["Transfer", Measured]:
-        """Vector–Jacobian product of classifying many samples, or many cells that are `integrated`, in arrays
-        of one shape: the cotangents of the transfer function and of what was measured, from those of colour
-        and extinction. None where there is no derivative. `measured` includes what `search` found."""
+        """Vector–Jacobian product of classifying many samples, or `integrated` cells: the cotangents of the
+        transfer function and of what was measured, including what `search` found; None without a derivative.
+        """
 
         def classified(transfer: Any, measured: Measured) -> tuple[Vec3, Scalar]:
             classify = transfer.integrator() if integrated else transfer.classifier()
@@ -151,47 +130,37 @@ class Transfer(eqx.Module):
 
 
 def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
-    """A transfer function applied to a volume: to its points, and where cells are `integrated`
-    (`quadrature="preintegrated"`), also to these.
-
-    **Raises:** `ValueError` for that, where the transfer function has no `integrator`."""
+    """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
-        raise ValueError(
-            'quadrature="preintegrated" needs a transfer function with an integral over the value; '
-            f'{type(transfer).__name__} has no integrator. Use "midpoint".'
-        )
-
-    def attributes(coordinate: Vec3) -> Measured:
-        return transfer.attributes(volume, coordinate)
+        name = type(transfer).__name__
+        raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
-        return (volume.value(coordinate), *attributes(coordinate))
+        return (volume.value(coordinate), *transfer.attributes(volume, coordinate))
 
+    attributes = partial(transfer.attributes, volume)
     return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)
 
 
 class TransferFunction(Transfer):
     """Colour and extinction, piecewise linear in the volume's value and constant beyond the ends.
 
-    **Arguments:**
+    Args:
+        values: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
+            step: what lies below takes the first one's colour and extinction, what lies there or above the
+            second's. They carry no gradient.
+        colors: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
+        extinction: (n,) at the points, in 1/length, ≥ 0; a width w has opacity `1 - exp(-extinction w)`.
 
-    - `values`: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
-      step: what lies below takes the first one's colour and extinction, what lies there or above the
-      second's. They carry no gradient.
-    - `colors`: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
-    - `extinction`: (n,) at the points, in 1/length, ≥ 0. A cell of width w has opacity
-      `1 - exp(-extinction w)`.
-
-    Extinction is interpolated. VTK interpolates opacity; the two agree at the points, and
-    differ between points where the opacity of a unit distance is high.
-
-    Put a step between values of the data rather than at one: interpolation may round a value to either side.
+    VTK interpolates opacity instead; the two differ between points where opacities are high. Put a step
+    between values of the data: interpolation may round a value to either side.
 
     Where it fails, and where not: `experiments/stability.py`, "extinction without bound".
 
-    **Raises:** `ValueError` for fewer than two points, points that do not increase or of which three are
-    equal, negative extinction, NaN or infinity, or lengths that differ.
+    Raises:
+        ValueError: for fewer than two points, points that do not increase or of which three are equal,
+            negative extinction, NaN or infinity, or lengths that differ.
     """
 
     values: Float[Array, " n"]
@@ -207,28 +176,22 @@ class TransferFunction(Transfer):
 
     @classmethod
     def from_points(
-        cls,
-        points: Sequence[tuple[float, Sequence[float], float]] | Any,
-        unit_distance: Arrayable = 1.0,
+        cls, points: Sequence[tuple[float, Sequence[float], float]] | Any, unit_distance: Arrayable = 1.0
     ) -> "TransferFunction":
         """From control points `(value, (r, g, b), opacity)`, as one draws them in a viewer.
 
-        **Arguments:**
+        Args:
+            points: in increasing order of value; two of one value make a step.
+            unit_distance: thickness of a layer that has these opacities, world length (VTK's
+                `ScalarOpacityUnitDistance`); extinctions are `-ln(1 - opacity) / unit_distance`.
 
-        - `points`: in increasing order of value; two of one value make a step. `opacity` in [0, 1] is that
-          of a layer of thickness `unit_distance`, and becomes the extinction
-          `-ln(1 - opacity) / unit_distance` exactly.
-          An opacity of 1, whose extinction would be infinite, is taken as 1 - 2⁻²⁴.
-        - `unit_distance`: world length. VTK's `ScalarOpacityUnitDistance`.
-
-        **Raises:** `ValueError` as the class does, and for an opacity outside [0, 1].
+        Raises:
+            ValueError: as the class does, and for an opacity outside [0, 1].
         """
         try:
             values, colors, opacities = zip(*points, strict=True)
         except (TypeError, ValueError) as fault:
-            raise ValueError(
-                f"points must be triples (value, (r, g, b), opacity); got {points!r}."
-            ) from fault
+            raise ValueError(f"points must be (value, (r, g, b), opacity); got {points!r}.") from fault
         return cls(values, colors, extinction_of(opacities, unit_distance))
 
     def __call__(self, value: Scalar) -> tuple[Vec3, Scalar]:
@@ -242,48 +205,47 @@ class TransferFunction(Transfer):
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
-        bound = upper_bound_between(values, extinction, blocks.low, blocks.high)
+        bound = linear.upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def variation(self, windows: Windows) -> Variation:
         points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
-        return Variation(*variation_between(*points, windows.low, windows.high))
+        return Variation(*linear.variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
-        return positive_between(values, extinction, blocks.low, blocks.high)
+        return linear.positive_between(values, extinction, blocks.low, blocks.high)
 
     def search(self) -> Callable[[Measured], Measured] | None:
         values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
-        if last < FEW:
+        if last < linear.FEW:
             return None
 
         def search(measured: Measured) -> Measured:
-            interval = jnp.clip(points_below(values, measured[0]) - 1, 0, last)
-            return interval, clip_below(measured[0] - gather(values, interval), jnp.zeros_like(values[0]))
+            interval = jnp.clip(linear.points_below(values, measured[0]) - 1, 0, last)
+            past = measured[0] - gather(values, interval)
+            return interval, linear.clip_below(past, jnp.zeros_like(values[0]))
 
         return search
 
     def classifier(self) -> Classify:
-        """Look-up of colour and extinction."""
         rows, values = self.rows(), jax.lax.stop_gradient(self.values)
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
-            return interpolate_row(table_row(rows, interval), past)
+            return linear.interpolate_row(linear.table_row(rows, interval), past)
 
         def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
             row = tuple(rows[0])
             for start, following in zip(values[1:], rows[1:], strict=True):
                 row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
-            return interpolate_row(row, clip_below(value - row[0], jnp.zeros_like(row[0])))
+            return linear.interpolate_row(row, linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
 
-        return chosen if values.shape[0] <= FEW else looked_up
+        return chosen if values.shape[0] <= linear.FEW else looked_up
 
     def integrator(self) -> Classify:
-        """The exact means, but for rounding."""
-        rows, few = self.span_rows(), self.values.shape[0] <= FEW
+        rows, few = self.span_rows(), self.values.shape[0] <= linear.FEW
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, front, back = measured
@@ -304,17 +266,26 @@ class TransferFunction(Transfer):
     ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         if integrated:
-            return self._integrated_vjp(measured, color, extinction)
+            _, front, back = measured
+            rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
+            (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
+            _, pull = jax.vjp(partial(mean_by_rows, same=i == j), a, b, front[0], back[0])
+            of_a, of_b, of_front, of_back = pull((color, extinction))
+            fronts, backs = (
+                row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
+            )
+            (transfer,) = pull_rows(fronts + backs)
+            return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
         rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
-        if self.values.shape[0] <= FEW:
-            interval = jnp.maximum(points_below(self.values, value) - 1, 0)
-            past = clip_below(value - table_row(rows, interval)[0], jnp.zeros_like(value))
+        if self.values.shape[0] <= linear.FEW:
+            interval = jnp.maximum(linear.points_below(self.values, value) - 1, 0)
+            past = linear.clip_below(value - linear.table_row(rows, interval)[0], jnp.zeros_like(value))
         else:
             _, interval, past = measured
-        *_, r, g, b, slope, inverse = table_row(rows, interval)
+        *_, r, g, b, slope, inverse = linear.table_row(rows, interval)
         part = past * inverse
-        parts = jnp.stack([*color, extinction], axis=-1)
-        shared = jnp.concatenate([parts * (1 - part)[..., None], parts * part[..., None]], axis=-1)
+        each = jnp.stack([*color, extinction], axis=-1)
+        shared = jnp.concatenate([each * (1 - part)[..., None], each * part[..., None]], axis=-1)
         sums = row_sums(len(rows), interval, shared)
         at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))
         leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
@@ -323,26 +294,10 @@ class TransferFunction(Transfer):
         of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
         return transfer, (jnp.where(value < self.values[0], 0, of_value),)
 
-    def _integrated_vjp(
-        self, measured: Measured, color: Vec3, extinction: Scalar
-    ) -> tuple[Transfer, Measured]:
-        _, front, back = measured
-        rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
-        (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
-        means = partial(mean_by_rows, same=i == j)
-        _, pull = jax.vjp(means, a, b, front[0], back[0])
-        of_a, of_b, of_front, of_back = pull((color, extinction))
-        fronts, backs = (
-            row_sums(len(rows), index, jnp.stack(part, axis=-1)) for index, part in ((i, of_a), (j, of_b))
-        )
-        (transfer,) = pull_rows(fronts + backs)
-        return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
-
     def rows(self) -> Float[Array, "points 10"]:
-        """A table with one row for each point, so that a value between this point and the next finds all it
-        needs side by side: value, colour and extinction of the point, the slopes of colour and extinction,
-        and 1 over the gap to the next point. Slopes are 0 beyond the last point, and between two equal
-        ones."""
+        """By point, what values between it and the next need: value, colour and extinction of the point, the
+        slopes of colour and extinction, and 1 over the gap; 0 beyond the last point and between equal ones.
+        """
         values = jax.lax.stop_gradient(self.values)
         gap = (values[1:] - values[:-1])[:, None]
         inverse = jnp.where(gap > 0, 1 / jnp.where(gap > 0, gap, 1), 0)
@@ -351,25 +306,18 @@ class TransferFunction(Transfer):
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
 
 
-def _span_of(
-    rows: Float[Array, "spans 26"], measured: Measured
-) -> tuple[tuple[Scalar, ...], Int[Array, "..."]]:
-    """The row of the span in which a value lies, and its index. `measured`: the value, and what
-    `TransferFunction.search` finds for it."""
+def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[linear.Row, Int[Array, "..."]]:
+    """The row of the span in which a value lies, and its index, from the value and what `search` finds."""
     value, *found = measured
     index = jnp.where(value < rows[0, 0], 0, found[0] + 1) if found else span_index(rows, value)
-    return table_row(rows, index), index
+    return linear.table_row(rows, index), index
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:
-    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity.
-
-    Inverse of `1 - exp(-extinction unit_distance)`; an opacity above 1 - 2⁻²⁴ counts as that, the
-    largest float32 below 1. **Raises** `ValueError` for an opacity outside [0, 1].
-    """
+    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity, of which
+    more than 1 - 2⁻²⁴, the largest float32 below 1, counts as that."""
     unit_distance = number("unit_distance", unit_distance, above=0)
-    opacity = unit_interval("opacity", opacity, (None,))
-    return _extinction(opacity, unit_distance)
+    return _extinction(unit_interval("opacity", opacity, (None,)), unit_distance)
 
 
 @jax.jit  # one program, rather than one for each operation

@@ -8,55 +8,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._util.bilinear import (
-    any_between,
-    between_lines,
-    corner_rows,
-    greatest_between,
-    interpolate_corners,
-    slope_between_lines,
-)
-from .._util.checks import Arrayable, described, finite_array, increasing, number, require, unit_interval
+from .._util import bilinear
+from .._util.checks import Arrayable, finite_array, increasing, require
 from .._util.piecewise_linear import ROUNDING, Range, points_around, table_row
 from .._util.vec3 import Scalar, Vec3, length
 from ..xla.memory import row_sums
 from ..xla.platform import is_traced
 from .occupancy import Blocks
-from .transfer import Classify, Measured, Transfer, TransferFunction, extinction_of
+from .transfer import Classify, Measured, Transfer, extinction_of
 from .volume import Volume
 
 
 class TransferFunction2D(Transfer):
-    """Colour and extinction by the value and the magnitude of its gradient: a table, bilinear between its
-    lines and constant beyond them.
+    """Colour and extinction by the value and the magnitude of its gradient, which tells boundaries from
+    materials: a table, bilinear between its lines and constant beyond them.
 
-    A boundary between two materials is where values change most, so that it is told from a material that has
-    its values. In a plot of magnitude against value, each boundary is an arc, whose top is its middle.
+    Args:
+        values: (n,) increasing, in value units; n ≥ 2.
+        magnitudes: (m,) increasing, in value units per world length; m ≥ 2. Two neighbours may be equal, and
+            make a step. They carry no gradient.
+        colors: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
+        extinction: (n, m), in 1/length, ≥ 0.
 
-    **Arguments:**
+    The magnitude is that of `volume.gradient`, also under a `ToroidalMap`, which bends the grid: choose a
+    spacing for which that has a meaning. Where the gradient is 0, the derivative of its magnitude is taken as
+    0. `quadrature="preintegrated"` and `"average"` are refused; `AdaptiveSampling` takes its shortest steps.
 
-    - `values`: (n,) increasing, in value units; n ≥ 2. Two of them may be equal, and make a step, as in a
-      `TransferFunction`. They carry no gradient.
-    - `magnitudes`: (m,) increasing, ≥ 0 where they matter, in value units per world length; m ≥ 2. Two may be
-      equal. They carry no gradient.
-    - `colors`: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
-    - `extinction`: (n, m), in 1/length, ≥ 0.
-
-    The magnitude is that of `volume.gradient`: of central differences at the nodes, interpolated, and divided
-    by the volume's spacing. The image depends on the spacing through the magnitude, too, and so does its
-    gradient. Under a `ToroidalMap`, which bends the grid, it is still that of the straight grid: choose a
-    spacing for which that has a meaning.
-
-    Look-up, `majorant` and leaping are exact. The extinction along a ray has a kink where the ray passes from
-    voxel to voxel or from cell to cell of the table, and where the gradient is 0, at which the derivative of
-    the magnitude is taken as 0.
-
-    Not known: the integral over a cell (`quadrature="preintegrated"` is refused, since value and magnitude do
-    not run along a straight line together), and how much it varies: `AdaptiveSampling` takes its shortest
-    steps wherever something is visible. `"average"` is refused.
-
-    **Raises:** `ValueError` for fewer than two lines, lines that do not increase or of which three are equal,
-    negative extinction, NaN or infinity, or shapes that do not fit together.
+    Raises:
+        ValueError: for fewer than two lines, lines that do not increase or of which three are equal,
+            negative extinction, NaN or infinity, or shapes that do not fit together.
 
     Sources: Levoy, "Display of Surfaces from Volume Data", 1988; Kniss et al., "Multidimensional Transfer
     Functions for Interactive Volume Rendering", 2002.
@@ -76,38 +56,6 @@ class TransferFunction2D(Transfer):
         self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
 
     @classmethod
-    def from_transfer(
-        cls, transfer: TransferFunction | Any, magnitudes: Arrayable, inside: Arrayable = 0.0
-    ) -> "TransferFunction2D":
-        """A transfer function whose boundaries are emphasised: its extinction times a factor, which grows
-        with the gradient's magnitude. Its colours are kept.
-
-        **Arguments:**
-
-        - `magnitudes`: (low, high), in value units per world length. The factor is `inside` up to `low`,
-          1 from `high` on, and linear in between.
-        - `inside`: the factor within homogeneous materials, in [0, 1].
-
-        A boundary of a width w between materials whose values differ by d has a magnitude of about d / w.
-
-        **Raises:** `ValueError` for what is no `TransferFunction`, magnitudes that are not two increasing
-        numbers, and a factor outside [0, 1].
-
-        Source: Levoy 1988, who weights opacities by the magnitude. Here extinctions are, so that the image
-        does not depend on the step."""
-        if not isinstance(transfer, TransferFunction):
-            raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
-        magnitudes = require(
-            finite_array("magnitudes", magnitudes, (2,)),
-            lambda ends: ends[0] < ends[1],
-            "magnitudes must be (low, high) with low < high; got {got}.",
-        )
-        inside = unit_interval("inside", inside, ())
-        factor = jnp.stack([inside, jnp.ones_like(inside)])
-        colors = jnp.stack([transfer.colors, transfer.colors], axis=1)
-        return cls(transfer.values, magnitudes, colors, transfer.extinction[:, None] * factor[None])
-
-    @classmethod
     def from_points(
         cls,
         points: Sequence[tuple[float, float, Sequence[float], float, tuple[float, float]]] | Any,
@@ -115,86 +63,75 @@ class TransferFunction2D(Transfer):
     ) -> "TransferFunction2D":
         """From places in the plot of magnitude against value, each with the material seen there.
 
-        **Arguments:**
+        Args:
+            points: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`. The extinction of each
+                is that of this opacity, times 1 - |value - the point's| / reach, and so by the magnitude.
+            unit_distance: thickness of a layer that has these opacities, world length.
 
-        - `points`: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`, in any order.
-          `opacity` in [0, 1] is that of a layer of thickness `unit_distance`, as for
-          `TransferFunction.from_points`. From there it falls to 0 on the sides of a rectangle, whose half
-          sides are the two reaches: the extinction is that of the point, times
-          (1 - |value - that of the point| / reach) and the same of the magnitude.
-        - `unit_distance`: world length.
+        Where points overlap, extinctions are added; colours are means weighted by them on the lines through
+        points and sides, and bilinear between.
 
-        Where points overlap, extinctions are added, exactly; colours are means weighted by them on the lines
-        through points and sides, and bilinear between.
+        Raises:
+            ValueError: for no points or what is none, an opacity outside [0, 1], reaches that are not
+                positive, and places that are traced: lines carry no gradient.
 
-        **Raises:** `ValueError` for no points or what is none, an opacity outside [0, 1], reaches that are
-        not positive, and places that are traced: lines carry no gradient.
-
-        Source: Kniss et al. 2002, whose widgets are such tents."""
+        Source: Kniss et al. 2002, whose widgets are such tents.
+        """
         try:
             values, magnitudes, colors, opacities, reaches = zip(*points, strict=True)
         except (TypeError, ValueError) as fault:
-            raise ValueError(
-                "points must be one or more of (value, magnitude, (r, g, b), opacity, "
-                f"(reach, magnitude_reach)); got {points!r}."
-            ) from fault
+            form = "(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))"
+            raise ValueError(f"points must be one or more of {form}; got {points!r}.") from fault
         if is_traced(values, magnitudes, reaches):
             raise ValueError("values, magnitudes and reaches of points must be numbers; some are traced.")
         count = len(values)
-        positive = "reaches must be positive; got {got}."
-        places = _numbers("values", values, (count,)), _numbers("magnitudes", magnitudes, (count,))
-        reach = require(_numbers("reaches", reaches, (count, 2)), lambda reach: reach > 0, positive)
-        lines, away, falls = [], [], []  # away: how far lines are from each point, in reaches
-        for place, far in zip(places, reach.T, strict=True):
-            low, high = (side[:, None] for side in (place - far, place + far))
-            lines.append(np.unique([place - far, place, place + far]))
-            away.append(np.abs(lines[-1] - place[:, None]) / far[:, None])
-            # exactly 0 on the sides, where the quotient may round to less than 1
-            falls.append(np.where((low < lines[-1]) & (lines[-1] < high), np.maximum(1 - away[-1], 0), 0))
-        # (points, values, magnitudes)
-        away, (along, across) = [away[0][:, :, None], away[1][:, None]], falls
-        tents = along[:, :, None] * across[:, None]
+        places = finite_array("values", values, (count,)), finite_array("magnitudes", magnitudes, (count,))
+        reach = finite_array("reaches", reaches, (count, 2))
+        reach = require(reach, lambda reach: reach > 0, "reaches must be positive; got {got}.")
+
+        def axis(place: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Lines, the tent of each point on them, and how far they are from it, in reaches."""
+            ends = np.stack([place - reach, place, place + reach], axis=1)
+            lines = np.unique(ends)
+            tents = np.stack([np.interp(lines, end, (0, 1, 0)) for end in ends])  # exactly 0 on the sides
+            return lines, tents, np.abs(lines - place[:, None]) / reach[:, None]
+
+        (lines, along, far), (others, across, away) = map(axis, map(np.asarray, places), np.asarray(reach).T)
+        tents = along[:, :, None] * across[:, None]  # (points, values, magnitudes)
         each = extinction_of(opacities, unit_distance)[:, None, None] * tents
         extinction = jnp.sum(each, axis=0)
         rgb = finite_array("colors", colors, (count, 3))
         mean = jnp.einsum("pnm,pc->nmc", each, rgb) / jnp.where(extinction > 0, extinction, 1)[..., None]
         # where nothing is seen, the colour of the nearest point, so that it reaches to its sides
-        nearest = rgb[np.argmin(np.maximum(*away), axis=0)]
-        return cls(lines[0], lines[1], jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
+        nearest = rgb[np.argmin(np.maximum(far[:, :, None], away[:, None]), axis=0)]
+        return cls(lines, others, jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
 
     def __call__(self, value: Scalar, magnitude: Scalar) -> tuple[Vec3, Scalar]:
         """Colour (r, g, b) and extinction of a value and a magnitude of the gradient."""
         return self.classifier()((value, magnitude, *self.search()((value, magnitude))))
-
-    def opacity(self, unit_distance: float = 1.0) -> Float[Array, "n m"]:
-        """Opacity on the lines, of a layer of thickness `unit_distance`."""
-        return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
 
     @property
     def reads_gradient(self) -> bool:
         return True
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
-        """The magnitude of the gradient at a grid coordinate."""
         return (length(volume.gradient(coordinate)),)
 
     def search(self) -> Callable[[Measured], Measured]:
         def search(measured: Measured) -> Measured:
-            (i, along), (j, across) = (
-                between_lines(lines, read)
-                for lines, read in zip((self.values, self.magnitudes), measured, strict=True)
-            )
+            value, magnitude = measured
+            i, along = bilinear.between_lines(self.values, value)
+            j, across = bilinear.between_lines(self.magnitudes, magnitude)
             return i * (self.magnitudes.shape[0] - 1) + j, along, across
 
         return search
 
     def classifier(self) -> Classify:
-        """Look-up of colour and extinction."""
         rows = self.rows()
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             _, _, cell, along, across = measured
-            r, g, b, extinction = interpolate_corners(table_row(rows, cell), along, across)
+            r, g, b, extinction = bilinear.interpolate_corners(table_row(rows, cell), along, across)
             return (r, g, b), extinction
 
         return classify
@@ -205,32 +142,29 @@ class TransferFunction2D(Transfer):
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         value, magnitude, cell, along, across = measured
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
-        _, pull = jax.vjp(interpolate_corners, table_row(jax.lax.stop_gradient(rows), cell), along, across)
+        row = table_row(jax.lax.stop_gradient(rows), cell)
+        _, pull = jax.vjp(bilinear.interpolate_corners, row, along, across)
         of_row, of_along, of_across = pull((*color, extinction))
         (transfer,) = pull_rows(row_sums(len(rows), cell, jnp.stack(of_row, axis=-1)))
         i, j = jnp.divmod(cell, self.magnitudes.shape[0] - 1)
-        of_value = of_along * slope_between_lines(self.values, value, i)
-        return transfer, (of_value, of_across * slope_between_lines(self.magnitudes, magnitude, j))
+        of_value = of_along * bilinear.slope_between_lines(self.values, value, i)
+        return transfer, (of_value, of_across * bilinear.slope_between_lines(self.magnitudes, magnitude, j))
 
     def rows(self) -> Float[Array, "cells 16"]:
         """A table with one row for each cell between lines: colour and extinction of its four corners."""
-        return corner_rows(jnp.concatenate([self.colors, self.extinction[..., None]], axis=-1))
+        return bilinear.corner_rows(jnp.concatenate([self.colors, self.extinction[..., None]], axis=-1))
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         extinction = jax.lax.stop_gradient(self.extinction)
         values, magnitudes = self._lines(blocks)
-        bound = greatest_between(extinction, values, magnitudes) * (1 + ROUNDING)
+        bound = bilinear.greatest_between(extinction, values, magnitudes) * (1 + ROUNDING)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         values, magnitudes = self._lines(blocks)
-        return any_between(self.extinction > 0, values, magnitudes)
+        return bilinear.any_between(self.extinction > 0, values, magnitudes)
 
     def _lines(self, blocks: Blocks) -> tuple[Range, Range]:
         """The values and magnitudes of the table on which blocks depend."""
         values, magnitudes = jax.lax.stop_gradient((self.values, self.magnitudes))
         return points_around(values, blocks.low, blocks.high), points_around(magnitudes, *blocks.magnitudes)
-
-
-def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
-    return np.asarray(finite_array(name, value, shape))

@@ -20,15 +20,12 @@ MARGIN = 2
 
 
 class Windows(eqx.Module):
-    """How values vary over the nodes of each block of a volume and those up to MARGIN beyond its faces.
-
-    - `low`, `high`: least and greatest value.
-    - `bend`: greatest second difference between nodes, along an axis or across two; NaN where a value is.
-    """
+    """Least and greatest value of the nodes of each block of a volume and those up to MARGIN beyond it."""
 
     low: Float[Array, "bx by bz"]
     high: Float[Array, "bx by bz"]
     bend: Float[Array, "bx by bz"]
+    """Greatest second difference between nodes, along an axis or across two; NaN where a value is."""
     first: Int[Array, "3"] | None = None
     """Index of the first block, where the volume is only a part of its grid; `whole`: blocks of that."""
     whole: tuple[int, int, int] | None = eqx.field(static=True, default=None)
@@ -49,17 +46,16 @@ class Windows(eqx.Module):
 
 class Variation(NamedTuple):
     """How much extinction and emission (extinction × colour) change within the range of values of each
-    window: of extinction and three channels, the one that changes most.
-
-    - `total`: while the value passes through the range once, 1/length.
-    - `turns`: the sum of all changes of slope, 1/length for each unit of the value; infinite at a step.
-    - `colored`: the part of `total` that is due to the colour, 1/length; `hidden`: that times the extinction.
-    """
+    window: of extinction and three channels, the one that changes most."""
 
     total: Float[Array, "bx by bz"]
+    """While the value passes through the range once, 1/length."""
     turns: Float[Array, "bx by bz"]
+    """Sum of all changes of slope, 1/length for each unit of the value; infinite at a step."""
     colored: Float[Array, "bx by bz"]
+    """The part of `total` that is due to the colour."""
     hidden: Float[Array, "bx by bz"]
+    """`colored` times the extinction."""
 
     @classmethod
     def unknown(cls, windows: Windows) -> "Variation":

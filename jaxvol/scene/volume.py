@@ -17,15 +17,16 @@ from .._util.checks import Arrayable, described, finite_array, require
 from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
+from ..xla.memory import gather
 from ..xla.platform import is_traced
-from .voxel_fetch import Fetch, OneByOne, Window, corners, fetched, read_by, trilinear
+from .voxel_fetch import Fetch, OneByOne, Window, corners, flat_index, trilinear
 
 
 class Field(eqx.Module):
-    """A user-defined scalar field that replaces the interpolation of voxels, for example a formula.
+    """A user-defined scalar field in place of interpolated voxels: `Volume(data, field=...)`.
 
-    Pass it as `Volume(data, field=...)`. Its arrays are differentiable; of voxels, those that it reads by
-    `volume.interpolated`. `SpaceLeaping` leaps over no part of it, since its range is unknown.
+    Its arrays are differentiable; of voxels, those that it reads by `volume.interpolated`. `SpaceLeaping`
+    leaps over no part of it, since its range is unknown.
     """
 
     @abstractmethod
@@ -37,35 +38,27 @@ class Field(eqx.Module):
 class Volume(eqx.Module):
     """A scalar field sampled on a regular grid, `data[x, y, z]`.
 
-    **Arguments:**
+    Args:
+        data: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library. 8- and 16-bit
+            integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are
+            enabled. Others become the first of uint8, int8, uint16, int16 and float32 that holds every value
+            exactly. Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates,
+            which must be evenly spaced, give spacing and origin. Of an image stack [plane, row, column],
+            pass `stack.T`.
+        spacing: distance between neighbouring nodes along x, y, z, world length (mm for CT); by default 1.
+        origin: world position of node (0, 0, 0), by default 0.
+        direction: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
+            ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`; by
+            default the world's axes. Its gradient is exact along changes that keep it orthonormal.
+        labels: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
+        field: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
-    - `data`: (nx, ny, nz) voxels, at least 2 along each axis: an array of any library and memory layout, or
-      nested sequences. uint8, int8, uint16, int16, float16, bfloat16 and float32 keep their type on the
-      device; a voxel is converted after it is fetched. float64 is kept if JAX's 64-bit types are enabled,
-      and becomes float32 otherwise. Booleans and 32- or 64-bit integers are converted to the first of uint8,
-      int8, uint16, int16 and float32 that holds every value exactly.
-      Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates, which must be
-      evenly spaced, give spacing and origin. Of an image stack [plane, row, column], pass `stack.T`.
-    - `spacing`: distance between neighbouring nodes along x, y, z, in world length (mm for CT). By default
-      that of the data's coordinates, or 1.
-    - `origin`: world position of node (0, 0, 0). By default that of the data's coordinates, or 0.
-    - `direction`: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
-      ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`. By default,
-      and for the identity, the data's axes are the world's, and the field is None.
-    - `labels`: optional integer label of every node (a segmentation), of the same shape. 64-bit labels
-      become 32-bit.
-    - `field`: optional `Field` that supplies the values instead of the voxels; the voxel grid then only sets
-      the volume's extent.
+    Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
 
-    bfloat16 keeps 8 significant bits, float16 11: values around 1000 are rounded to multiples of 4 and of 0.5
-    (`experiments/stability.py`, "voxels of 16-bit floats").
-
-    The gradient by `direction` is exact along changes that keep it orthonormal.
-
-    **Raises:** `ValueError`, naming the argument, for data that are not 3-D, have an axis of one voxel or an
-    unsupported type, or hold NaN or infinity, also after conversion to float32; for integers that no type
-    holds exactly; for spacing that is not positive; for a direction whose columns are not of length 1 and
-    orthogonal to 1e-4; and for labels of another shape or type, or beyond int32.
+    Raises:
+        ValueError: for data that are not 3-D, have an axis of one voxel or an unsupported type, or hold NaN,
+            infinity or integers that no type holds exactly; for spacing that is not positive; for a
+            direction that is not orthonormal to 1e-4; and for labels of another shape, or beyond int32.
     """
 
     data: Shaped[Array, "nx ny nz"]
@@ -91,11 +84,9 @@ class Volume(eqx.Module):
         spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
         origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin
         spacing = finite_array("spacing", spacing, (3,))
-        self.spacing = require(
-            spacing, lambda s: s > 0, "spacing must be positive along every axis; got {got}."
-        )
+        self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive; got {got}.")
         self.origin = finite_array("origin", origin, (3,))
-        self.direction = None if direction is None else _turn(direction)
+        self.direction = None if direction is None else _checked_direction(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape)
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
@@ -123,13 +114,11 @@ class Volume(eqx.Module):
     @property
     def bounds(self) -> Float[Array, "6"]:
         """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes."""
-        low, high = self.corners
-        if self.direction is not None:
-            # how far each axis of the data reaches along the world's, up or down
-            reach = self.direction * (self._steps * self.spacing)[None, :]
-            low = self.origin + jnp.sum(jnp.minimum(reach, 0), axis=1)
-            high = self.origin + jnp.sum(jnp.maximum(reach, 0), axis=1)
-        return jnp.stack([low, high], axis=-1).reshape(-1)
+        turn = np.eye(3, dtype=self.spacing.dtype) if self.direction is None else self.direction
+        # how far each axis of the data reaches along the world's, down or up
+        reach = turn * (self._steps * self.spacing)[None, :]
+        ends = (self.origin + jnp.sum(end(reach, 0), axis=1) for end in (jnp.minimum, jnp.maximum))
+        return jnp.stack(list(ends), axis=-1).reshape(-1)
 
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -153,42 +142,36 @@ class Volume(eqx.Module):
 
     def interpolated(self, coordinate: Vec3) -> Scalar:
         """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type."""
-        return trilinear(*self.fetch.cube(self.data, coordinate), _mix)
+        return trilinear(*self.fetch.cube(self.data, coordinate))
 
     def gradient(self, coordinate: Vec3) -> Vec3:
-        """Gradient of the value along the grid axes, in value units per world length.
-
-        Trilinear interpolation of central differences at the nodes, which at the border of the grid are
-        one-sided: continuous, with an error of O(spacing²). Of a `field`, the difference of its values one
-        node to either side, over the part inside the grid.
-        """
+        """Gradient of the value along the grid axes, in value units per world length: interpolated central
+        differences of the nodes, one-sided at the border, with an error of O(spacing²); of a `field`, the
+        difference of its values one node to either side, inside the grid."""
         central = self.field is None
         sx, sy, sz = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
-        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one.
-
-        **Raises:** `ValueError` for a volume without labels."""
-        if self.labels is None:
-            raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
-        i, j, k = (
-            jnp.clip(jnp.floor(c + 0.5).astype(jnp.int32), 0, n - 1)
-            for c, n in zip(coordinate, self.shape, strict=True)
+        """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one."""
+        labels, nearest = (
+            self._labels().reshape(-1),
+            [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate],
         )
-        _, ny, nz = self.shape
-        return fetched(self.labels, (i * ny + j) * nz + k).astype(jnp.int32)
+        i, j, k = (jnp.clip(index, 0, n - 1) for index, n in zip(nearest, self.shape, strict=True))
+        return gather(labels, flat_index((i, j, k), self.shape)).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
-        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others.
+        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
+        labels, share = self._labels().reshape(-1), jnp.zeros_like(coordinate[0])
+        for index, weight in corners(coordinate, self.shape):
+            share = share + weight * (gather(labels, index) == label).astype(share.dtype)
+        return share
 
-        **Raises:** `ValueError` for a volume without labels."""
+    def _labels(self) -> Integer[Array, "nx ny nz"]:
         if self.labels is None:
             raise ValueError("labels are needed here, but volume has none; pass Volume(..., labels=...).")
-        share = jnp.zeros_like(coordinate[0])
-        for index, weight in corners(coordinate, self.shape):
-            share = share + weight * (fetched(self.labels, index) == label).astype(share.dtype)
-        return share
+        return self.labels
 
     def _field_slopes(self, coordinate: Vec3) -> Vec3:
         def slope(axis: int) -> Scalar:
@@ -212,16 +195,14 @@ def corners_of(
     return origin, origin + along
 
 
-def _turn(direction: Arrayable) -> Float[Array, "3 3"] | None:
-    """A checked direction; None for one that is known to be the identity."""
+def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
+    """None for a direction that is known to be the identity."""
     turn = require(
         finite_array("direction", direction, (3, 3)),
         lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
-        "direction must be a 3 x 3 matrix whose columns have length 1 and are orthogonal to each other; got "
-        "{got}.",
+        "direction must be a 3 x 3 matrix of orthogonal columns of length 1; got {got}.",
     )
-    known = not is_traced(turn) and np.array_equal(np.asarray(turn), np.eye(3))
-    return None if known else turn
+    return None if not is_traced(turn) and np.array_equal(turn, np.eye(3)) else turn
 
 
 def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
@@ -229,38 +210,30 @@ def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
     return x, y, z
 
 
-def _mix(fraction: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    # exactly a and b at the ends; a + f (b - a) would round at f = 1
-    return a * (1 - fraction) + b * fraction
-
-
 def without_voxels(volume: Volume) -> Volume:
-    """The volume without `data`."""
     return eqx.tree_at(lambda v: v.data, volume, None)
 
 
 def with_voxels(volume: Volume, data: Array) -> Volume:
-    """The volume with `data` as its voxels."""
     return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
 
 
 def part_of(
     volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
-    """The volume as a part of a grid of `whole` nodes that begins at the node `first`. Spacing, origin and
-    direction are those of the whole; beyond the part, its faces are read.
-
-    `axes`: of the array, which is data[z, y, x] for (2, 1, 0); by default as before."""
+    """The volume as a part of a grid of `whole` nodes that begins at the node `first`; beyond it, its faces
+    are read. Spacing, origin and direction are those of the whole. `axes`: of the array, as in `Window`."""
     window = Window(first, whole, volume.fetch.axes if axes is None else axes)
-    fetch = eqx.tree_at(lambda f: f.window, volume.fetch, window, is_leaf=lambda leaf: leaf is None)
-    return with_fetch(volume, fetch)
+    return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=lambda leaf: leaf is None)
 
 
 def read_as(volume: Volume, fetch: Fetch) -> Volume:
-    """The volume with another way to read its voxels, which are the same."""
-    return with_fetch(volume, read_by(volume.fetch, fetch))
+    """The volume with another way to read its voxels, which are the same, and the same window."""
+    window = volume.fetch.window
+    return with_fetch(
+        volume, eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=lambda leaf: leaf is None)
+    )
 
 
 def with_fetch(volume: Volume, fetch: Fetch) -> Volume:
-    """The volume with `fetch` as the way to read its voxels."""
     return eqx.tree_at(lambda v: v.fetch, volume, fetch, is_leaf=lambda leaf: isinstance(leaf, Fetch))

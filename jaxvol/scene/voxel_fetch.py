@@ -5,18 +5,20 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Int, Shaped, UInt32
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, without_zeros
 from ..xla.platform import on_gpu
 
+
+T = TypeVar("T")
 
 Cube: TypeAlias = list[list[list[Scalar]]]
 """Eight voxels, [x][y][z]."""
@@ -29,15 +31,14 @@ SLOPE_BITS = 10
 
 
 class Window(eqx.Module):
-    """The box of a grid that is in memory. Beyond it, its faces are read.
-
-    - `first`: node at which the box begins. `whole`: number of nodes of the grid. Both along x, y, z.
-    - `axes`: of the array in memory, which is data[z, y, x] for (2, 1, 0). All else is along x, y, z.
-    """
+    """The box of a grid that is in memory. Beyond it, its faces are read."""
 
     first: Int[Array, "3"]
+    """Node at which the box begins, along x, y, z."""
     whole: tuple[int, int, int] = eqx.field(static=True)
+    """Number of nodes of the grid along x, y, z."""
     axes: Axes = eqx.field(static=True)
+    """Of the array in memory, which is data[z, y, x] for (2, 1, 0)."""
 
 
 class Fetch(eqx.Module):
@@ -73,10 +74,8 @@ class Fetch(eqx.Module):
         if self.window is None:
             return node, fraction
         # of integers, so that the fractions are those of the whole grid
-        i, j, k = (
-            jnp.clip(node[axis] - self.window.first[axis], 0, n - 2)
-            for axis, n in zip(self.axes, data.shape, strict=True)
-        )
+        past = [node[axis] - self.window.first[axis] for axis in self.axes]
+        i, j, k = (jnp.clip(index, 0, n - 2) for index, n in zip(past, data.shape, strict=True))
         return (i, j, k), fraction
 
     def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
@@ -84,13 +83,11 @@ class Fetch(eqx.Module):
         return flat_index(self.split(data, coordinate)[0], data.shape)
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
-        """The same for `slopes` at one coordinate, whose node has this index into the flattened array. XLA
-        would compute it on one thread, unless it lies in memory."""
+        """The same for `slopes` at one node, whose index XLA computes on all threads if it lies in memory."""
         return self
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
-        """Slopes along x, y and z at a grid coordinate, in value units per node: trilinear between those of
-        the nodes, which are central differences, one-sided at the border. Fetches six cubes."""
+        """Slopes along x, y and z at a grid coordinate, in value units per node (`Volume.gradient`)."""
         node, fraction = self.split(data, coordinate)
         slopes = [self._slopes_of_nodes(data, node, axis, coordinate[0].dtype) for axis in range(3)]
         return self._interpolated_slopes(slopes, fraction)
@@ -104,10 +101,9 @@ class Fetch(eqx.Module):
         """Slopes along an axis of the array of the eight nodes from this one on."""
 
         def neighbours(offset: int) -> Cube:
-            i, j, k = (
-                jnp.clip(n + offset, 0, data.shape[a] - 2) if a == axis else n for a, n in enumerate(node)
-            )
-            return _with_first(axis, self.cube_at(data, (i, j, k), dtype))
+            at = list(node)
+            at[axis] = jnp.clip(node[axis] + offset, 0, data.shape[axis] - 2)
+            return _with_first(axis, self.cube_at(data, (at[0], at[1], at[2]), dtype))
 
         def slope(whole: Bool[Array, ""], before: Scalar, after: Scalar) -> Scalar:
             return (after - before) * jnp.where(whole, 1, 0.5).astype(dtype)
@@ -115,27 +111,21 @@ class Fetch(eqx.Module):
         # A cube does not reach past the border. There it begins with the first node, or ends with the last.
         first, last = node[axis] == 0, node[axis] == data.shape[axis] - 2
         (a, b), (c, d) = neighbours(-1), neighbours(1)
-        b, c = (
-            jax.tree.map(partial(jnp.where, border), outer, inner)
-            for border, outer, inner in ((first, a, b), (last, d, c))
-        )
+        b = jax.tree.map(partial(jnp.where, first), a, b)
+        c = jax.tree.map(partial(jnp.where, last), d, c)
         lower, upper = jax.tree.map(partial(slope, first), a, c), jax.tree.map(partial(slope, last), b, d)
         return _with_first(axis, [lower, upper])
 
 
-def read_by(fetch: Fetch, how: Fetch) -> Fetch:
-    """`how`, with the window of `fetch`."""
-    return eqx.tree_at(lambda fetch: fetch.window, how, fetch.window, is_leaf=lambda leaf: leaf is None)
+def cube_of(voxel: Callable[[int, int, int], T]) -> list[list[list[T]]]:
+    """A cube from each of its voxels, by their places along x, y and z, 0 or 1."""
+    return [[[voxel(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
 
 
 def transposed(cube: Cube, axes: Axes) -> Cube:
     """A cube along x, y, z, from one whose own axes run along these."""
-
-    def corner(*index: int) -> Scalar:
-        i, j, k = permuted(index, axes)
-        return cube[i][j][k]
-
-    return [[[corner(x, y, z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+    a, b, c = axes
+    return cube_of(lambda *at: cube[at[a]][at[b]][at[c]])
 
 
 def _with_first(axis: int, cube: Cube) -> Cube:
@@ -143,12 +133,12 @@ def _with_first(axis: int, cube: Cube) -> Cube:
     return transposed(cube, ((0, 1, 2), (1, 0, 2), (2, 1, 0))[axis])
 
 
-def _lerp(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
-    return a + f * (b - a)
-
-
-def trilinear(cube: Cube, fraction: Vec3, mix: Callable[[Scalar, Scalar, Scalar], Scalar] = _lerp) -> Scalar:
+def trilinear(cube: Cube, fraction: Vec3) -> Scalar:
     """Trilinear interpolation."""
+
+    def mix(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
+        return a * (1 - f) + b * f  # exactly a and b at the ends
+
     fx, fy, fz = fraction
     (y0, y1), (y2, y3) = ((mix(fz, *row) for row in plane) for plane in cube)
     return mix(fx, mix(fy, y0, y1), mix(fy, y2, y3))
@@ -158,19 +148,15 @@ class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        return cube_of(lambda flat: fetched(data, flat), data.shape, node, dtype)
+        return voxels_from(data, node, dtype)
 
 
 class Packed(Fetch):
-    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
-
-    - `nodes`: of 8-bit voxels, if stored, the slopes of each node. Doubled, they are integers of 10 bits:
-      along x in the highest bits of a word, along y from bit 12 on, along z in the lowest.
-    - `begin`: see `of_slopes_at`.
-    """
+    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches."""
 
     words: UInt32[Array, " voxels"]
     nodes: UInt32[Array, " voxels"] | None = None
+    """Of 8-bit voxels, doubled slopes of each node in 10 bits each: x in the highest, y from bit 12 on."""
     begin: Int[Array, ""] | None = None
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
@@ -188,11 +174,11 @@ class Packed(Fetch):
             return (word >> (bits * number) & (2**bits - 1)).astype(dtype)
 
         def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
-            if bits == 8:
-                word = self._word(flat)
-                return [[voxel(word, 0), voxel(word, 1)], [voxel(word, 2), voxel(word, 3)]]
-            words = self._word(flat), self._word(flat + nz)
-            return [[voxel(word, 0), voxel(word, 1)] for word in words]
+            fetched = [flat] if bits == 8 else [flat, flat + nz]
+            # converted, or XLA repeats the fetch for each use
+            words = [gather(self.words, index).astype(jnp.int32) for index in fetched]
+            a, b, c, d = (voxel(word, number) for word in words for number in range(32 // bits))
+            return [[a, b], [c, d]]
 
         return [row(base), row(base + ny * nz)]
 
@@ -213,39 +199,29 @@ class Packed(Fetch):
         def word(offset: int) -> Int[Array, ""]:
             return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
 
-        words = [[[word((x * ny + y) * nz + z) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
+        words = cube_of(lambda x, y, z: word((x * ny + y) * nz + z))
 
-        def slopes(bits: int) -> Cube:
-            """The slopes from so many bits below the highest one on, times a power of two."""
+        def slope(bits: int, word: Int[Array, ""]) -> Scalar:
+            """The slope from so many bits below the highest one on, times a power of two."""
+            return ((word << bits) & -(1 << shift)).astype(dtype)
 
-            def top(word: Int[Array, ""]) -> Scalar:
-                return ((word << bits) & -(1 << shift)).astype(dtype)
-
-            return jax.tree.map(top, words)
-
-        x, y, z = self._interpolated_slopes([slopes(bits) for bits in (0, 10, shift)], fraction)
+        slopes = [jax.tree.map(partial(slope, bits), words) for bits in (0, SLOPE_BITS, shift)]
+        x, y, z = self._interpolated_slopes(slopes, fraction)
         factor = 2.0 ** -(shift + 1)
         return x * factor, y * factor, z * factor
 
-    def _word(self, flat: Int[Array, ""]) -> Int[Array, ""]:
-        word = gather(self.words, flat)
-        # converted, or XLA repeats the fetch for each use
-        return word.astype(jnp.int32)
-
 
 class Recording(Fetch):
-    """Records every fetch, so that its VJP returns one cotangent per fetch.
-
-    - `perturbations`: are added to the voxels, in the order of the fetches; if empty, nothing is.
-    - `bases`: first voxel of each cube, as an index into the flattened array, filled while tracing.
-    """
+    """Records every fetch, so that its VJP returns one cotangent per fetch."""
 
     perturbations: list[Cube]
+    """Are added to the voxels, in the order of the fetches; if empty, nothing is."""
     bases: list[Int[Array, "..."]] = eqx.field(static=True)
+    """Flat index of the first voxel of each cube, filled while tracing."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         number = len(self.bases)
-        cube = cube_of(lambda flat: jax.lax.stop_gradient(fetched(data, flat)), data.shape, node, dtype)
+        cube = voxels_from(jax.lax.stop_gradient(data), node, dtype)
         self.bases.append(flat_index(node, data.shape))
         if self.perturbations:
             cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
@@ -253,9 +229,8 @@ class Recording(Fetch):
 
 
 def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
-    """Perturbations for the cubes at these `bases`, of which the shapes count."""
-    zeros = (jnp.zeros(base.shape, dtype) for base in bases)
-    return [[[[zero, zero], [zero, zero]], [[zero, zero], [zero, zero]]] for zero in zeros]
+    """Perturbations of 0 for the cubes at these `bases`."""
+    return [cube_of(lambda *at, base=base: jnp.zeros(base.shape, dtype)) for base in bases]
 
 
 _PAIRS = jax.lax.ScatterDimensionNumbers(
@@ -263,12 +238,7 @@ _PAIRS = jax.lax.ScatterDimensionNumbers(
 )
 
 
-def scatter_add(
-    voxels: Float[Array, " voxels"],
-    shape: tuple[int, ...],
-    bases: list[Int[Array, "..."]],
-    cubes: list[Cube],
-) -> Float[Array, " voxels"]:
+def scatter_add(voxels: Array, shape: tuple[int, ...], bases: list[Any], cubes: list[Cube]) -> Array:
     """Adds the cotangents of the cubes at these `bases` to the flattened voxels of an array of this shape."""
     _, ny, nz = shape
     for base, cube in zip(bases, cubes, strict=True):
@@ -282,14 +252,10 @@ def scatter_add(
     return voxels
 
 
-def cube_of(
-    voxel: Callable[[Int[Array, ""]], Shaped[Array, ""]], shape: tuple[int, ...], node: Node, dtype: Any
-) -> Cube:
-    """The eight voxels from a node on. `voxel`: by its index into the flattened array."""
-    (_, ny, nz), base = shape, flat_index(node, shape)
-    return [
-        [[voxel(base + (x * ny + y) * nz + z).astype(dtype) for z in (0, 1)] for y in (0, 1)] for x in (0, 1)
-    ]
+def voxels_from(data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+    """The eight voxels from a node on, each fetched by itself."""
+    (_, ny, nz), base, flat = data.shape, flat_index(node, data.shape), data.reshape(-1)
+    return cube_of(lambda x, y, z: gather(flat, base + (x * ny + y) * nz + z).astype(dtype))
 
 
 def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
@@ -300,14 +266,12 @@ def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
 
 
 def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
-    """The eight nodes around a coordinate: the index of each into the flattened array, and its trilinear
-    weight."""
-    (i, j, k), fraction = split(coordinate, shape)
-    _, ny, nz = shape
-    found = []
+    """The eight nodes around a coordinate: the index of each into the flattened array, and its weight."""
+    node, fraction = split(coordinate, shape)
+    base, (_, ny, nz), found = flat_index(node, shape), shape, []
     for x, y, z in itertools.product((0, 1), repeat=3):
         sides = (f if side else 1 - f for side, f in zip((x, y, z), fraction, strict=True))
-        found.append((((i + x) * ny + j + y) * nz + k + z, math.prod(sides)))
+        found.append((base + (x * ny + y) * nz + z, math.prod(sides)))
     return found
 
 
@@ -317,8 +281,3 @@ def split(coordinate: Vec3, shape: tuple[int, ...]) -> tuple[Node, Vec3]:
     # the second clip also keeps the index of a NaN inside the array
     i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
     return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))
-
-
-def fetched(array: Shaped[Array, "nx ny nz"], flat: Int[Array, ""]) -> Shaped[Array, ""]:
-    """The entry at index `flat` of the flattened array."""
-    return gather(array.reshape(-1), flat)

@@ -96,7 +96,7 @@ def test_image_over_a_background():
     np.testing.assert_allclose(over[1], [[0.45, 0.35, 0.25], [0.5, 0.5, 0.5], [1, 1, 1]])
     for wrong, message in (
         (np.zeros((5, 3)), "background must be one colour"),
-        ("white", "background must be linear RGB numbers; got 'white'"),
+        ("white", r"background must be numbers of shape \(\*rays, 3\); got 'white'"),
         ((1, np.nan, 1), "background must be finite"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -241,5 +241,5 @@ def test_a_swept_sector_takes_no_direction():
         lambda: jv.March(1.0, (probe,)).locate(volume),
         lambda: jv.scan_convert(volume, probe, shape=(4, 4, 4), spacing=5.0, origin=(0, 0, 0)),
     ):
-        with pytest.raises(ValueError, match="volume has a direction, and ToroidalMap places"):
+        with pytest.raises(ValueError, match="volume must have no direction: ToroidalMap places"):
             use()

@@ -141,7 +141,10 @@ ONE = plain(RED, 1.0)
 SINGLE = jv.LabelTransferFunction([ONE])
 BAD = {
     "a colour": (lambda: jv.LabelTransferFunction([ONE, "red"]), r"functions\[1\] must be .*got 'red'"),
-    "many labels": (lambda: jv.LabelTransferFunction([ONE] * 257), "of labels 0 to 255; got 257"),
+    "many labels": (
+        lambda: jv.LabelTransferFunction([ONE] * 257),
+        "of labels 0 to 255; got a list of length 257",
+    ),
     "a list to hide": (lambda: SINGLE.with_visibility([False]), "visible must be by label.*got a list"),
     "no function": (lambda: jv.LabelTransferFunction([None]), "functions must hold a TransferFunction"),
     "one bare": (lambda: jv.LabelTransferFunction(ONE), "{label: TransferFunction}.*got a TransferFunction"),

@@ -89,15 +89,6 @@ def soft() -> jv.TransferFunction:
     return scaled_transfer(255, soft_transfer(0.1))
 
 
-def test_emphasis_scales_the_extinction_by_the_magnitude():
-    transfer = jv.TransferFunction2D.from_transfer(soft(), (2.0, 6.0), inside=0.25)
-    np.testing.assert_array_equal(transfer.values, soft().values)
-    np.testing.assert_array_equal(transfer.magnitudes, [2, 6])
-    for line, factor in ((0, 0.25), (1, 1.0)):
-        np.testing.assert_allclose(transfer.extinction[:, line], factor * soft().extinction, rtol=1e-6)
-        np.testing.assert_array_equal(transfer.colors[:, line], soft().colors)
-
-
 POINTS = [
     (20.0, 6.0, (1.0, 0.0, 0.0), 0.5, (10.0, 4.0)),
     (60.0, 3.0, (0.0, 1.0, 0.0), 0.9, (20.0, 3.0)),
@@ -221,7 +212,11 @@ def test_slopes_of_large_doubles_are_not_lost():
 
 
 def emphasised() -> jv.TransferFunction2D:
-    return jv.TransferFunction2D.from_transfer(soft(), (50.0, 250.0), 0.0)
+    """Boundaries alone: extinction grows with the magnitude."""
+    transfer = soft()
+    colors = jnp.stack([transfer.colors, transfer.colors], axis=1)
+    extinction = jnp.stack([jnp.zeros_like(transfer.extinction), transfer.extinction], axis=1)
+    return jv.TransferFunction2D(transfer.values, (50.0, 250.0), colors, extinction)
 
 
 def shells(kind: str) -> jv.Volume:
@@ -331,8 +326,6 @@ WRONG: list[tuple[Callable[[], Any], str]] = [
     (lambda: make((1, 2), (0, 1), np.ones((2, 3)), ONES[1]), r"colors must have shape \(2, 2, 3\)"),
     (lambda: make((1, 2), (0, 1), ONES[0], np.ones((2, 3))), r"extinction must have shape \(2, 2\)"),
     (lambda: make((1, 2), (0, np.nan), *ONES), "magnitudes must be finite"),
-    (lambda: make.from_transfer(emphasised(), (0, 1)), "transfer must be a TransferFunction; got a T"),
-    (lambda: make.from_transfer(soft(), (0, 1), 1.5), r"inside must be in \[0, 1\]"),
     (lambda: points([(1, (1, 1, 1), 0.5)]), "points must be one or more of"),
     (lambda: points([(*POINT[:3], 1.5, (1, 1))]), r"opacity must be in \[0, 1\]"),
     (lambda: points([(*POINT[:4], (1, 0))]), "reaches must be positive"),
@@ -364,9 +357,3 @@ def test_what_needs_more_than_a_sample_is_refused():
 def test_a_fit_changes_colours_and_extinction_alone():
     free, start = Free.of(emphasised(), None, None)
     assert {name.split("[")[0] for name in free.names(start)} == {".colors", ".extinction"}
-
-
-def test_opacity_is_that_of_a_layer():
-    extinction = np.array([[0.0, 1.0], [2.0, 3.0]])
-    opacity = make((0, 1), (0, 1), ONES[0], extinction).opacity(2.0)
-    np.testing.assert_allclose(opacity, 1 - np.exp(-2 * extinction), rtol=1e-6)

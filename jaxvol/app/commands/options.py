@@ -187,7 +187,7 @@ def add_scene(parser: Parser) -> None:
     group.add_argument("--isovalue", type=float, metavar="VALUE", help=text)
     text = (
         "shade by the gradient of the values, under a light at the camera; by default isosurfaces, the "
-        f"automatic transfer function, and the presets {', '.join(sorted(SHADED))}"
+        "automatic transfer function, and presets but mr_head"
     )
     group.add_argument("--shade", action=SWITCH, help=text)
 

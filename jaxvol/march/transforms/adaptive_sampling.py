@@ -19,11 +19,10 @@ from ..strides import RUN, Run, StrideControl
 
 
 SHARE = 1 / 20
-"""Error of the image by predicted error of a block: errors of a ray's cells have either sign, and most are
-much smaller than predicted. Measured: `experiments.adaptive_error`."""
+"""Error of the image by predicted error of a block, measured (`experiments.adaptive_error`)."""
 
 HIDDEN = 1 / 4
-"""The same of what the front of a cell hides of its back: more, since that has one sign along a ray."""
+"""The same of what the front of a cell hides of its back, which has one sign along a ray."""
 
 FARTHEST = 8
 """Blocks around its own that a run may touch."""
@@ -32,13 +31,11 @@ FARTHEST = 8
 class AdaptiveSampling(StrideControl):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
-    A long cell is as good as several short ones where the value is nearly linear, or the transfer function
-    nearly constant, or little is seen of it. Take a block of 4³ voxels, of side ℓ, whose values, with those
-    up to two nodes around it, range over R, with second differences of at most H (per length²). Between the
-    ends of a cell of width w the value leaves the straight line by about δ = H w² / 8. While the value passes
-    through R once, extinction and emission change by V in total, C of it by the colour, and their slopes by
-    K; C times the extinction is D (`variation.Variation`). Then the optical depth along the block is wrong by
-    about
+    Take a block of 4³ voxels, of side ℓ, whose values, with those up to two nodes around it, range over R,
+    with second differences of at most H (per length²). Between the ends of a cell of width w the value leaves
+    the straight line by about δ = H w² / 8. While the value passes through R once, extinction and emission
+    change by V in total, C of it by the colour, and their slopes by K; C times the extinction is D
+    (`variation.Variation`). Then the optical depth along the block is wrong by about
 
         e = ℓ V min(1, δ / R) + q
 
@@ -47,35 +44,29 @@ class AdaptiveSampling(StrideControl):
     that is less. The front of a cell hides of its back, in colour, at most h = min(C, D w) w / 8. Cells come
     in runs of four that are equally long: as long as T max(e / 20, h / 4) is at most `tolerance`, with the
     largest e and h of the blocks that may hold a part of the run, and T the transmittance in front of it.
-    Without `AlphaCorrection`, only cells of one step reach past the exit.
 
     **It is an estimate, not a bound**, of the RMSE of the image's colours, calibrated on five scenes
-    (`experiments.adaptive_error`). It does not know how light varies along a cell. No cell is shorter than a
-    step: an eighth of a voxel suits tolerances of 0.001, a quarter larger ones; `quadrature="left"` may need
-    less. `Rendering.error` is the root of the summed squares of a ray's runs; where a step is too long, it is
-    greater than the tolerance.
+    (`experiments.adaptive_error`), without light. No cell is shorter than a step: an eighth of a voxel suits
+    tolerances of 0.001, a quarter larger ones; `quadrature="left"` may need less. `Rendering.error` is the
+    root of the summed squares of a ray's runs, and exceeds the tolerance where a step is too long. On CPU it
+    is faster only where rays take many samples (`experiments/results/README.md`).
 
-    What it saves is in `experiments/results/README.md`: on CPU it is faster only where rays take many
-    samples. Under light it was not measured.
+    All cells are one step long, and `Rendering.error` is infinite, for modes other than "over", and for
+    transfer functions that do not say how they vary, such as `LabelTransferFunction`.
 
-    All cells are one step long, and `Rendering.error` is infinite, where nothing is known: for modes other
-    than "over", and for transfer functions that do not say how they vary, such as `LabelTransferFunction`.
+    Args:
+        tolerance: of the image's RMSE, > 0. It may be traced.
+        longest: the most steps of the march that a cell is long, a power of two up to 64.
 
-    **Arguments:**
-
-    - `tolerance`: of the image's RMSE, > 0. It may be traced.
-    - `longest`: the most steps of the march that a cell is long, a power of two up to 64.
-
-    Where `Jitter` or `EmptySpaceJitter` move samples, each ray's runs begin at a random depth, too, or long
-    cells would leave a wood grain of their own.
-
-    Strides, and `Rendering.error`, are constants to derivatives, and the image jumps where a stride changes:
-    compare gradients with finite differences without this transform, and search along lines with care.
+    Under jitter, each ray's runs begin at a random depth, too. Strides, and `Rendering.error`, are constants
+    to derivatives, and the image jumps where a stride changes: compare gradients with finite differences
+    without this transform, and search along lines with care.
 
     Where it fails: `experiments/stability.py`, "tolerances finer than the finest cell",
     "adaptive strides under light".
 
-    **Raises:** `ValueError` for another tolerance or `longest`.
+    Raises:
+        ValueError: for another tolerance or `longest`.
 
     Source: unpublished.
     """
@@ -98,8 +89,7 @@ class AdaptiveSampling(StrideControl):
     ) -> "AdaptiveSampling":
         # in a branch of its own, so that it is rounded alike in every program, and strides are the same
         predict = partial(_errors, self.longest)
-        errors = in_memory(march.step > 0, predict, march, space, windows, variation)
-        found = errors, windows.first
+        found = in_memory(march.step > 0, predict, march, space, windows, variation), windows.first
         return eqx.tree_at(lambda of: (of.errors, of.first), self, found, is_leaf=lambda leaf: leaf is None)
 
     def error(self, ray: Ray, run: Run) -> Scalar:
@@ -113,18 +103,13 @@ class AdaptiveSampling(StrideControl):
         )
         level = run.stride.bit_length() - 1
         code = gather(self.errors.reshape(-1), ((level * nx + i) * ny + j) * nz + k)
-        return _decoded(code, ray.length.dtype)
+        return jax.lax.bitcast_convert_type(code, jnp.float32).astype(ray.length.dtype)
 
 
 def _coded(error: Float[Array, "*blocks"]) -> Int32[Array, "*blocks"]:
     """An error as the bits of a float32, which are in the same order. NaN is infinite."""
     known = jnp.where(error >= 0, error, jnp.inf).astype(jnp.float32)
     return jax.lax.bitcast_convert_type(known, jnp.int32)
-
-
-def _decoded(code: Int32[Array, "*blocks"], dtype: Any) -> Float[Array, "*blocks"]:
-    """The error of a code."""
-    return jax.lax.bitcast_convert_type(code, jnp.float32).astype(dtype)
 
 
 def _errors(

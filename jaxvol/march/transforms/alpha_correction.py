@@ -1,6 +1,6 @@
 """How wide is a cell that crosses a face? Sampling alignment, also called alpha correction (Kye 2013)."""
 
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -14,9 +14,6 @@ from ...scene.volume import Volume
 from ..march import Cell, Transform
 
 
-Bracket: TypeAlias = tuple[Scalar, Scalar, Bool[Array, ""]]
-"""Two depths, and whether the region at the second differs from that at the first."""
-
 PROBES = 4
 """Depths of a cell, besides its front, at which the region is looked up."""
 
@@ -27,34 +24,26 @@ BISECTIONS = 14
 class AlphaCorrection(Transform):
     """Cut the cells of a ray at the faces that they cross.
 
-    The cell of a ray's last sample reaches past the exit, by a different fraction of a step in every pixel,
-    which makes back faces bumpy. With this transform, that sample stands only for the width e up to the exit:
-    its opacity is `1 - exp(-extinction e)`, which is the paper's `1 - (1 - α)^(e/d)`. A volume of constant
-    extinction is rendered exactly at any step.
+    A ray's last sample then stands only for the width e up to the exit, and back faces are smooth: its
+    opacity is `1 - exp(-extinction e)`, the paper's `1 - (1 - α)^(e/d)`. A volume of constant extinction is
+    rendered exactly at any step. Cells are also cut at the ends of a ray's gaps, as under `ToroidalMap` or
+    `Clip`; of several gaps in one cell, at the first and the last end.
 
-    Where a ray leaves the volume and re-enters it, as under `ToroidalMap` or `Clip`, cells are cut at both
-    ends of such a gap, too. Of a cell that holds several gaps, only the first and the last end are cut.
+    With this transform, the image is continuous in all that moves the exit, and its gradient complete.
+    Without it, the image jumps when a sample crosses the exit, and the gradient misses these jumps.
 
-    With this transform, the image is continuous in the camera and in all else that moves the exit, and its
-    gradient is complete. Without it, the image jumps when a sample crosses the exit, and the gradient misses
-    these jumps.
-
-    **Arguments:**
-
-    - `labels`: also cut cells where the volume's label changes between two samples; the face, and the ends
-      of gaps, are found by bisection. The part before it is classified at the sample, the part behind it at
-      the face: each by its own label, so that the faces of a segmentation stay smooth under jitter. A label
-      that lasts less than a quarter of a cell may be missed. Costs a label fetch per bisection, and two more
-      samples per cell.
-
-    Gradients take the faces of labels, and with `labels=True` the ends of gaps, as fixed in space: they miss
-    how these move along a ray. The motion of the exit is included.
+    Args:
+        labels: also cut cells where the volume's label changes, found by bisection, so that the faces of a
+            segmentation stay smooth under jitter. A label that lasts less than a quarter of a cell may be
+            missed. Costs a label fetch per bisection, and two more samples per cell. Gradients then take the
+            faces of labels and the ends of gaps as fixed in space; the motion of the exit is included.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
 
-    **Raises:** `ValueError` for `labels` that are not true or false, and when a volume without labels is
-    rendered with `labels=True`.
+    Raises:
+        ValueError: for `labels` that are not true or false, and when a volume without labels is rendered
+            with `labels=True`.
 
     Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit; labels are its
     future work.
@@ -115,11 +104,12 @@ def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, 
     depths = [front + width * (i / PROBES) for i in range(PROBES + 1)]
     regions = [region(depth) for depth in depths]
 
-    def face(inner: Int[Array, ""], brackets: list[Bracket]) -> tuple[Scalar, Scalar]:
-        """Both sides of the face where the region stops being `inner`, in the first bracket that changes."""
-        near, far = brackets[0][0], brackets[0][0]
-        for start, stop, changed in reversed(brackets):
-            near, far = jnp.where(changed, start, near), jnp.where(changed, stop, far)
+    def face(depths: list[Scalar], regions: list[Array]) -> tuple[Scalar, Scalar]:
+        """Both sides of the face where the region first differs from that at the first depth."""
+        inner, near, far = regions[0], depths[0], depths[0]
+        for i in reversed(range(PROBES)):
+            changed = regions[i + 1] != inner
+            near, far = jnp.where(changed, depths[i], near), jnp.where(changed, depths[i + 1], far)
 
         def halve(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
             near, far = bracket
@@ -129,12 +119,7 @@ def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, 
 
         return jax.lax.fori_loop(0, BISECTIONS, halve, (near, far))
 
-    changed_to = [r != regions[0] for r in regions]
-    changed_from = [r != regions[-1] for r in regions]
-    forward = list(zip(depths, depths[1:], changed_to[1:], strict=False))
-    backward = list(zip(depths[:0:-1], depths[-2::-1], changed_from[-2::-1], strict=True))
-    changes = jnp.any(jnp.stack(changed_to))
     # each piece begins on its own side of the face, since it is sampled there
-    _, first = face(regions[0], forward)
-    last, _ = face(regions[-1], backward)
-    return first, last, changes
+    _, first = face(depths, regions)
+    last, _ = face(depths[::-1], regions[::-1])
+    return first, last, jnp.any(jnp.stack(regions) != regions[0])

@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..._util.checks import Arrayable, described, finite_array, flag, require
-from ..._util.vec3 import Frame, Scalar, Vec3, apart, dot
+from ..._util.checks import Arrayable, finite_array, flag, require, shortened
+from ..._util.vec3 import Scalar, Vec3, apart, dot
 from ...scene.occupancy import Occupancy
 from ...scene.space import Gap, Path, Space
 from ..march import Transform
@@ -23,35 +22,27 @@ class Clip(Transform):
     out, cut this away and show the rest.
 
     A ray enters and leaves the volume at the cuts: its first sample lies on the cut face, and
-    `AlphaCorrection` cuts its last cell there. With `inside_out`, a ray that passes through what is cut away
-    has a gap there, in which samples are transparent, and at whose ends `AlphaCorrection` cuts cells, for
-    which it takes three samples of each cell. Without `AlphaCorrection`, faces behind a gap are as noisy
-    under jitter as any surface in the volume.
+    `AlphaCorrection` cuts its last cell there. With `inside_out`, what is cut away is a gap of the ray, at
+    whose ends `AlphaCorrection` cuts cells, too. Values and light stay those of the whole volume.
 
-    Values and light stay those of the whole volume. The place among other transforms does not matter. Box and
-    planes are in world coordinates, also under a `ToroidalMap`.
+    Args:
+        box: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
+        planes: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
+            that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane` (not PyVista's
+            `clip`).
+        inside_out: cut away what is inside all of these, and show the rest.
 
-    **Arguments:**
-
-    - `box`: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.
-    - `planes`: any number of pairs (origin, normal): a world point of the plane, and a vector of any length
-      that points to what is inside, as in VTK's `vtkVolumeMapper.AddClippingPlane`. (PyVista's `clip` keeps
-      the other side by default.)
-    - `inside_out`: cut away what is inside all of these, and show the rest.
-
-    `box`, `origins` and `normals` are differentiable: gradients include how ends of rays and gaps move.
-    Where a face of the box coincides with one of the volume, the derivative is that of moving it inwards.
-    Without `AlphaCorrection` the image jumps when a sample crosses a cut, and gradients miss these jumps.
-    With `AlphaCorrection(labels=True)`, they take the ends of gaps as fixed. The image also jumps, by the
-    error of the step, where a gap comes to reach the ray's entry.
-
+    `box`, `origins` and `normals` are differentiable; where a face of the box coincides with one of the
+    volume, the derivative is that of moving it inwards. Without `AlphaCorrection`, gradients miss the jumps
+    of the image when a sample crosses a cut; `AlphaCorrection(labels=True)` takes the ends of gaps as fixed.
     A ray within a plane is inside. Inside out, a film of less than 2e-6 of the volume's diagonal between its
-    face and the cut is not seen: it is taken for rounding.
+    face and the cut is taken for rounding, and not seen.
 
     Where it fails: `experiments/stability.py`, "jitter behind cuts".
 
-    **Raises:** `ValueError` without a box or a plane, for numbers that are not finite, a box whose ends do
-    not increase, and a normal of length 0.
+    Raises:
+        ValueError: without a box or a plane, for numbers that are not finite, a box whose ends do not
+            increase, and a normal of length 0.
     """
 
     box: Float[Array, "6"] | None
@@ -66,16 +57,25 @@ class Clip(Transform):
         *,
         inside_out: bool | Any = False,
     ):
-        self.box = None if box is None else _box(box)
+        self.box = None
+        if box is not None:
+            expected = "(x_min, x_max, y_min, y_max, z_min, z_max), minima below maxima"
+            box = finite_array("box", box, (6,))
+            self.box = require(
+                box, lambda ends: ends[0::2] < ends[1::2], f"box must be {expected}; got {{got}}."
+            )
         self.origins, self.normals = _planes(planes)
         if box is None and not len(self.origins):
             raise ValueError("Clip must be given a box, planes, or both; got neither.")
         self.inside_out = flag("inside_out", inside_out)
 
     def clip(self, space: Space) -> Space:
-        sides = [] if self.box is None else _faces(self.box)
-        sides += map(HalfSpace.of, self.origins, self.normals)
-        return _Clipped(space, tuple(sides), self.inside_out)
+        origins, normals = [*self.origins], [*self.normals]
+        if self.box is not None:
+            axes = jnp.eye(3, dtype=self.box.dtype)
+            origins = [self.box[0::2]] * 3 + [self.box[1::2]] * 3 + origins
+            normals = [*axes, *-axes, *normals]
+        return _Clipped(space, tuple(map(HalfSpace.of, origins, normals)), self.inside_out)
 
 
 class HalfSpace(NamedTuple):
@@ -115,14 +115,14 @@ class HalfSpace(NamedTuple):
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
             for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
         )
-        a, b, c = map(jnp.abs, grid.own_direction(self.normal))
+        a, b, c = map(jnp.abs, grid.frame.components(self.normal))
         # the greatest coordinate, which rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
-        if isinstance(grid.frame, Frame):
-            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.origin))
+        if grid.frame.placed is not None:
+            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.placed[0]))
         reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
         middle = x[:, None, None], y[None, :, None], z[None, None]
-        return self.height(middle if grid.frame is None else grid.frame.point(middle)), reach
+        return self.height(grid.frame.point(middle)), reach
 
 
 class _Clipped(Space):
@@ -211,46 +211,17 @@ def _earlier(a: Scalar, b: Scalar) -> Scalar:
     return jnp.where(b <= a, b, a)
 
 
-def _faces(box: Float[Array, "6"]) -> list[HalfSpace]:
-    """The half-spaces inside the six faces of a box."""
-    low, high, zero = box[0::2], box[1::2], jnp.zeros_like(box[0])
-    found = []
-    for corner, sign in ((low, 1), (high, -1)):
-        for axis in range(3):
-            x, y, z = (zero + sign * (i == axis) for i in range(3))
-            found.append(HalfSpace(apart(corner), (x, y, z)))
-    return found
-
-
-def _box(box: Arrayable) -> Float[Array, "6"]:
-    return require(
-        finite_array("box", box, (6,)),
-        lambda ends: ends[0::2] < ends[1::2],
-        "box must be (x_min, x_max, y_min, y_max, z_min, z_max), each minimum below its maximum; got {got}.",
-    )
-
-
-def _is_sequence(value: Any) -> bool:
-    return isinstance(value, Sequence) or (isinstance(value, np.ndarray | jax.Array) and value.ndim > 0)
-
-
 def _planes(planes: Any) -> tuple[Float[Array, "planes 3"], Float[Array, "planes 3"]]:
-    if not _is_sequence(planes):
-        raise ValueError(f"planes must be a list of pairs (origin, normal); got {described(planes)}.")
+    try:
+        pairs = [(origin, normal) for origin, normal in planes]
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"planes must be pairs [(origin, normal), ...]; got {shortened(planes)}.") from fault
     origins, normals = [], []
-    for i, pair in enumerate(planes):
-        if not _is_sequence(pair) or len(pair) != 2:
-            bare = len(planes) == 2 and all(_is_sequence(part) and len(part) == 3 for part in planes)
-            remedy = " For a single plane, pass [(origin, normal)]." if bare else ""
-            raise ValueError(f"planes[{i}] must be a pair (origin, normal); got {described(pair)}.{remedy}")
-        origins.append(finite_array(f"the origin of planes[{i}]", pair[0], (3,)))
-        normals.append(
-            require(
-                finite_array(f"the normal of planes[{i}]", pair[1], (3,)),
-                lambda normal: abs(normal).max() > 0,
-                f"the normal of planes[{i}] must not be 0; got {{got}}.",
-            )
-        )
-    if not origins:
+    for i, (origin, normal) in enumerate(pairs):
+        name = f"the normal of planes[{i}]"
+        normal, message = finite_array(name, normal, (3,)), f"{name} must not be 0; got {{got}}."
+        origins.append(finite_array(f"the origin of planes[{i}]", origin, (3,)))
+        normals.append(require(normal, lambda normal: abs(normal).max() > 0, message))
+    if not pairs:
         return jnp.zeros((0, 3)), jnp.zeros((0, 3))
     return jnp.stack(origins), jnp.stack(normals)

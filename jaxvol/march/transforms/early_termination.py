@@ -12,22 +12,19 @@ from ..march import Transform
 class EarlyTermination(Transform):
     """End a ray once its transmittance is at most `opacity_left`.
 
-    Everything behind is left out: the error of a colour channel is at most `opacity_left` times the
-    brightest colour behind, that of the accumulated opacity at most `opacity_left`. If the sample at which
-    a ray ends changes, the image jumps by as much.
+    The error of the opacity is at most `opacity_left`, that of a colour channel at most this times the
+    brightest colour behind. The image jumps by as much where the sample at which a ray ends changes.
 
-    **Gradients are less exact than the image.** They include neither what is left out nor these jumps, and
-    what they miss has the same sign in all opaque pixels. In README's first scene, the derivative of the sum
-    of all pixels by a factor of all extinctions is wrong by 55 % at 1/255, 17 % at 0.001 and 2 % at 0.0001.
-    For fits take 0.0001, or none.
+    **Gradients are less exact than the image**: in README's first scene, the derivative of the sum of all
+    pixels by a factor of all extinctions is wrong by 55 % at 1/255 and 2 % at 0.0001. For fits take 0.0001.
 
-    **Arguments:**
-
-    - `opacity_left`: in (0, 1); 1/255 is one level of an 8-bit image.
+    Args:
+        opacity_left: in (0, 1); 1/255 is one level of an 8-bit image.
 
     Where it fails: `experiments/stability.py`, "early termination in gradients".
 
-    **Raises:** `ValueError` outside that range.
+    Raises:
+        ValueError: outside that range.
 
     Source: KISTI report 2005, which tests once per 16 slices. Here every cell is tested.
     """

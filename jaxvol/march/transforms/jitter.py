@@ -1,8 +1,7 @@
-"""Where are samples placed, so that steps do not show as rings? Jittered sampling, and empty-space jittering.
+"""Jittered sampling, and empty-space jittering: how are steps kept from showing as rings?
 
 Samples at the same depths in all pixels show rings around surfaces: wood grain. Both transforms shift the
-samples of each pixel by a random fraction ξ of a step, which turns the rings into noise. Neither makes the
-image more accurate: the energy of its error stays the same.
+samples of each pixel by a random fraction ξ of a step, which turns the rings into noise of the same energy.
 """
 
 from typing import Any, ClassVar, Literal
@@ -23,11 +22,8 @@ Pattern = Literal["white", "blue"]
 
 
 class Noise(eqx.Module):
-    """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel.
-
-    `pattern`: `"white"`: independent from pixel to pixel. `"blue"`: a tile of 128 x 128 numbers without low
-    frequencies, repeated over the image from an origin that the seed chooses.
-    """
+    """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel: `"white"`,
+    independent of its neighbours, or `"blue"`, from a repeated tile of 128 x 128 without low frequencies."""
 
     seed: UInt32[Array, ""]
     tile: Float[Array, "side side"] | None
@@ -53,22 +49,19 @@ class Noise(eqx.Module):
 
 
 class Jitter(Transform):
-    """Start each ray a random fraction ξ of a step past its entry.
+    """Start each ray a random fraction ξ of a step past its entry: it leaves out the first ξ d, which adds
+    noise where the volume's bounds cut through material.
 
-    Turns wood grain into noise. Where the volume's bounds cut through material it adds noise, since each
-    ray leaves out the first ξ d of it.
-
-    **Arguments:**
-
-    - `seed`: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over. The random
-      number of a pixel depends only on seed and pixel.
-    - `pattern`: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
-    - `front_residual`: give the part that is left out a narrow cell of its own, from the entry to ξ d,
-      sampled at the entry. The noise on cut faces then falls to that of the sample's value.
+    Args:
+        seed: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over.
+        pattern: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
+        front_residual: give the part that is left out a narrow cell of its own, from the entry to ξ d,
+            sampled at the entry. The noise on cut faces then falls to that of the sample's value.
 
     Where it fails: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
 
-    **Raises:** `ValueError` for an invalid seed, pattern or `front_residual`.
+    Raises:
+        ValueError: for an invalid seed, pattern or `front_residual`.
 
     Source: jittered sampling as in Kye 2013, section 2.2.
     """
@@ -79,7 +72,7 @@ class Jitter(Transform):
     front_residual: bool = eqx.field(static=True)
 
     def __init__(
-        self, seed: int | Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool | Any = False
+        self, seed: Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool | Any = False
     ):
         self.noise = Noise(seed, pattern, stream=0)
         self.front_residual = flag("front_residual", front_residual)
@@ -100,19 +93,19 @@ class Jitter(Transform):
 
 
 class EmptySpaceJitter(Transform):
-    """At a ray's first transparent sample, advance by a random fraction ξ of a step instead of a whole one.
+    """At a ray's first transparent sample, of extinction 0, advance by a random fraction ξ of a step.
 
-    A ray starts at its entry, so that faces where the volume's bounds cut material stay smooth; samples
-    behind empty space are jittered, so that wood grain still turns into noise. This happens once per ray.
-    Transparent means an extinction of exactly 0.
+    So wood grain turns into noise, while faces where the volume's bounds cut material stay smooth. The image
+    jumps where a ray's first transparent sample changes; gradients do not include these jumps.
 
-    The image jumps where a ray's first transparent sample changes; gradients do not include these jumps.
-
-    **Arguments:** `seed`, `pattern`: as in `Jitter`; the random numbers are independent of `Jitter`'s.
+    Args:
+        seed: as in `Jitter`; the random numbers are independent of `Jitter`'s.
+        pattern: as in `Jitter`.
 
     Where it fails: `experiments/stability.py`, "wood grain without empty samples".
 
-    **Raises:** `ValueError` for an invalid seed or pattern.
+    Raises:
+        ValueError: for an invalid seed or pattern.
 
     Source: Kye 2013, section 3.1.
     """

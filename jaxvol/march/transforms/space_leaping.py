@@ -27,36 +27,33 @@ LEAPS = 4
 class SpaceLeaping(Transform):
     """Leap over regions in which the transfer function shows nothing.
 
-    Leaps are whole steps, so that every sample is also one of the march without leaps: the image stays the
-    same, except under `"min_distance"`. `EmptySpaceJitter` treats what is leapt over as transparent.
+    Leaps are whole steps: the image stays the same, except under `"min_distance"`.
 
-    **Arguments:**
+    Args:
+        method: how what is empty is found.
+            `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
+            bounding box holds no visible block of 4³ voxels.
+            `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
+            proves empty. Leaps are short where a ray runs along a surface.
+            `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
+            the first hits of their four corner rays. **It is not a bound**: what is thinner than these
+            pixels, and nearer than what their corners hit, is missing in the image.
+            `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
+        cell: side of the square of pixels of the last two methods; at least 2.
 
-    - `method`:
-        - `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
-          bounding box holds no visible block of 4³ voxels.
-        - `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
-          proves empty. Leaps are short where a ray runs along a surface.
-        - `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
-          the first hits of their four corner rays. **It is not a bound**: what is thinner than these pixels,
-          and nearer than what their corners hit, is leapt over, and missing in the image.
-        - `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
-    - `cell`: side of the square of pixels of the last two methods; at least 2.
-
-    Visible blocks are determined for every image, from its transfer function. What is leapt over has
-    extinction 0, which changes no image, but has a gradient: `adjoint="direct"`, which does not leap,
-    includes it; `"forward"` takes it as 0 where rays leap, `"replay"` also in front of and behind everything
-    that a ray sees. A fit that should make invisible regions visible must start above 0, or not leap.
+    What is leapt over has extinction 0, whose gradient only `adjoint="direct"` includes: `"forward"` takes it
+    as 0 where rays leap, `"replay"` also in front of and behind everything that a ray sees. A fit that should
+    make invisible regions visible must start above 0, or not leap.
 
     Where it fails: `experiments/stability.py`, "sheets thinner than a cell of rays",
     "occupancy under steep transfer functions", "gradients of what is leapt over".
 
-    **Raises:** `ValueError` for another method or a smaller cell, and, with the last two methods, when
-    rendering rays of one's own (`render_rays`).
+    Raises:
+        ValueError: for another method or a smaller cell, and, with the last two methods, when rendering rays
+            of one's own (`render_rays`).
 
-    Source: Chae and Shin for `"distance"` and `"min_distance"`; they have distances of voxels, not of blocks,
-    and do not march the corner rays again. `"hierarchy"` stands for the octree of the KISTI report 2005;
-    `"beam"` is unpublished.
+    Source: Chae and Shin for `"distance"` and `"min_distance"`, of voxels; `"hierarchy"` stands for the
+    octree of the KISTI report 2005; `"beam"` is unpublished.
     """
 
     method: Method = eqx.field(static=True)
@@ -76,10 +73,8 @@ class SpaceLeaping(Transform):
         if self.method == "distance":
             return distances
         if view is None:
-            raise ValueError(
-                f'SpaceLeaping("{self.method}") needs the neighbouring pixels of a camera; for rays of your '
-                'own use "hierarchy" or "distance".'
-            )
+            name = f'SpaceLeaping("{self.method}")'
+            raise ValueError(f'{name} needs neighbouring pixels; for rays use "hierarchy" or "distance".')
         columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in view.size)
         if self.method == "beam":
             starts = self._beam_starts(occupancy, view, *jnp.meshgrid(columns[:-1], rows[:-1]))
@@ -89,9 +84,7 @@ class SpaceLeaping(Transform):
             starts = jnp.minimum(across[1:], across[:-1])
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
-    def _beam_starts(
-        self, occupancy: Occupancy, view: View, column: Int[Array, "rows cols"], row: Int[Array, "rows cols"]
-    ) -> Float[Array, "rows cols"]:
+    def _beam_starts(self, occupancy: Occupancy, view: View, column: Array, row: Array) -> Array:
         """Up to which distances the beams of the cells that begin at these pixels meet nothing visible."""
         last = self.cell - 1
         column = jnp.stack([column, column + last, column, column + last], axis=-1)
@@ -118,15 +111,12 @@ class _Beams(EmptySpaceIndex):
     def any_visible(self, prepared: Stretches) -> Bool[Array, " beams"]:
         return prepared.following[0] < prepared.following.shape[0]
 
-    def skip_to(
-        self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
+    def skip_to(self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         count, beams = prepared.following.shape
         near = gather(prepared.near, beam)
         position = (rays.t_in + depth - near) / prepared.length
         stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
-        entry = stretch * beams + beam
-        following = gather(prepared.following.reshape(-1), entry)
+        following = gather(prepared.following.reshape(-1), stretch * beams + beam)
         begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in
         return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
@@ -151,11 +141,9 @@ class _Distances(EmptySpaceIndex):
     def within_ranges(self) -> EmptySpaceIndex:
         return replace(self, starts=None, corner=None)
 
-    def skip_to(
-        self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Float[Array, " rays"]
-    ) -> Float[Array, " rays"]:
+    def skip_to(self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         start = self.occupancy.cell(rays.entry)
-        direction = self.occupancy.own_direction(rays.direction)
+        direction = self.occupancy.frame.components(rays.direction)
         rate = [r / size for r, size in zip(direction, self.occupancy.size, strict=True)]
         if self.starts is not None:
             assert self.corner is not None

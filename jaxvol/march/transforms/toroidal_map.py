@@ -20,9 +20,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, number, require
-from ..._util.vec3 import Scalar, Vec3, along, apart
+from ..._util.vec3 import Scalar, Vec3, apart
 from ...scene.occupancy import BLOCK, Occupancy, Sums
-from ...scene.space import Gap, Path, Space
+from ...scene.space import Gap, Space
 from ...scene.volume import Volume
 from ..march import Transform
 from .sector_faces import SectorFaces, hypot
@@ -36,32 +36,28 @@ class ToroidalMap(Transform):
     """Interpret `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, evenly spaced over the ranges.
 
     The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
-    coordinates are the probe's, with the origin on the motor axis. The world is empty outside the swept
-    sector. A ray may leave the sector and re-enter it, as through its hollow near side: two such gaps are
-    found. A ray that is nowhere farther outside than 2e-6 of the probe's size counts as inside, and so may
-    one that runs along a face at less than 1e-5 of it.
+    coordinates are the probe's, with the origin on the motor axis. Of the gaps in which a ray is outside the
+    sector, as in its hollow near side, the first two are found. A ray less than 2e-6 of the probe's size
+    outside counts as inside, and so may one that runs along a face at less than 1e-5 of it.
 
-    **Arguments:**
+    Args:
+        a: distance from the motor axis to the fan's apex, world length; negative if the apex lies behind the
+            axis. Samples behind it, where ρ would be negative (`nearest_to_axis`), are not shown.
+        b: distance from the apex to depth γ = 0, world length.
+        beta_range: (first, last) angle of the nodes along data axis 0, radians, within [0, π], increasing.
+        sigma_range: the same along data axis 1.
+        gamma_range: (first, last) depth of the nodes along data axis 2, increasing, with b + first > 0.
 
-    - `a`: distance from the motor axis to the fan's apex, world length (mm); negative if the apex lies
-      behind the axis. Samples behind the axis, where ρ would be negative (`nearest_to_axis`), are not shown.
-    - `b`: distance from the apex to depth γ = 0, world length.
-    - `beta_range`, `sigma_range`: (first, last) angle of the nodes along data axes 0 and 1, radians, within
-      [0, π], increasing.
-    - `gamma_range`: (first, last) depth of the nodes along data axis 2, world length, increasing, with
-      b + first > 0.
-
-    All are differentiable, once: second derivatives miss how entries, exits and gaps curve. The gradient of
-    an angle is taken as 0 on the motor axis (y = z = 0) and at the apex (x = R = 0), and so is that of an
-    entry or exit whose ray meets its face at less than 0.06 degrees.
+    All are differentiable, once. The gradient of an angle is taken as 0 on the motor axis (y = z = 0) and at
+    the apex (x = R = 0), and so is that of an entry or exit where a ray grazes a face by less than 0.06°.
 
     Where it fails: `experiments/stability.py`, "gaps of rays under a toroidal map",
     "rays near the motor axis".
 
-    **Raises:** `ValueError` for ranges that do not increase or lie outside their limits.
+    Raises:
+        ValueError: for ranges that do not increase or lie outside their limits.
 
-    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), with `atan2` for `atan`, which differs only
-    outside every sector, γ for τ in (2.4), and ρ for R + a.
+    Source: Kim, Kwon and Shin 2008, equations (2.1) to (2.4), with `atan2` for `atan`.
     """
 
     a: Float[Array, ""]
@@ -70,16 +66,8 @@ class ToroidalMap(Transform):
     sigma_range: Float[Array, "2"]
     gamma_range: Float[Array, "2"]
 
-    def __init__(
-        self,
-        a: Arrayable,
-        b: Arrayable,
-        beta_range: Arrayable,
-        sigma_range: Arrayable,
-        gamma_range: Arrayable,
-    ):
-        self.a = number("a", a)
-        self.b = number("b", b)
+    def __init__(self, a: Any, b: Any, beta_range: Any, sigma_range: Any, gamma_range: Any):
+        self.a, self.b = number("a", a), number("b", b)
         self.beta_range = _angles("beta_range", beta_range)
         self.sigma_range = _angles("sigma_range", sigma_range)
         self.gamma_range = require(
@@ -91,7 +79,6 @@ class ToroidalMap(Transform):
 
     @property
     def ranges(self) -> tuple[Float[Array, "2"], Float[Array, "2"], Float[Array, "2"]]:
-        """Those of β, σ and γ."""
         return self.beta_range, self.sigma_range, self.gamma_range
 
     def to_toroidal(self, points: Arrayable) -> Float[Array, "*points 3"]:
@@ -100,7 +87,7 @@ class ToroidalMap(Transform):
         return jnp.vectorize(lambda p: jnp.stack(self._forward(apart(p))), signature="(k)->(k)")(points)
 
     def to_world(self, toroidal: Arrayable) -> Float[Array, "*points 3"]:
-        """World points of (β, σ, γ), (*points, 3): the inverse of `to_toroidal` where γ > -b and ρ > 0."""
+        """World points (*points, 3) of (β, σ, γ): the inverse of `to_toroidal` where γ > -b and ρ > 0."""
         beta, sigma, gamma = _components("toroidal", toroidal)
         depth = gamma + self.b
         rho = self.a + depth * jnp.sin(sigma)  # sin σ = cos(σ - π/2)
@@ -110,16 +97,14 @@ class ToroidalMap(Transform):
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Lowest and highest world coordinates of the swept sector; tight."""
-        half = math.pi / 2
+        # depth and angles are separable: extremes lie at the ends of the ranges, or in the middle of angles
+        angles = (ends - math.pi / 2 for ends in (self.sigma_range, self.beta_range))
+        fan, turn = (jnp.append(ends, jnp.clip(0.0, *ends)) for ends in angles)
         depth = self.b + self.gamma_range
-        # depth and angles are separable: extremes lie at the ends of the ranges, or where a cosine peaks
-        fan, turn = self.sigma_range - half, self.beta_range - half
-        middle_fan, middle_turn = (jnp.clip(0.0, angles[0], angles[1]) for angles in (fan, turn))
         x = jnp.outer(depth, jnp.sin(fan))
-        rho = self.a + jnp.outer(depth, jnp.cos(jnp.append(fan, middle_fan)))
+        rho = self.a + jnp.outer(depth, jnp.cos(fan))
         rho = jnp.maximum(jnp.stack([rho.min(), rho.max()]), 0)
-        y = jnp.outer(rho, jnp.sin(turn))
-        z = jnp.outer(rho, jnp.cos(jnp.append(turn, middle_turn)))
+        y, z = jnp.outer(rho, jnp.sin(turn)), jnp.outer(rho, jnp.cos(turn))
         return jnp.stack([x.min(), y.min(), z.min()]), jnp.stack([x.max(), y.max(), z.max()])
 
     @property
@@ -129,7 +114,6 @@ class ToroidalMap(Transform):
 
     @property
     def center(self) -> Float[Array, "3"]:
-        """Center of the bounds."""
         low, high = self.corners
         return (low + high) / 2
 
@@ -141,9 +125,7 @@ class ToroidalMap(Transform):
 
     def locate(self, space: Space, volume: Volume) -> Space:
         if volume.direction is not None:
-            raise ValueError(
-                "volume has a direction, and ToroidalMap places its voxels by the probe: pass one without."
-            )
+            raise ValueError("volume must have no direction: ToroidalMap places its voxels by the probe.")
         return _Sector(self, volume.shape)
 
     def _forward(self, point: Vec3) -> Vec3:
@@ -174,25 +156,22 @@ class _Sector(Space):
 
     def coordinate(self, point: Vec3) -> Vec3:
         toroidal, ranges = self.probe._forward(point), self.probe.ranges
-        beta, sigma, gamma = (
-            (value - ends[0]) / (ends[1] - ends[0]) * (n - 1)
-            for value, ends, n in zip(toroidal, ranges, self.shape, strict=True)
-        )
+        fractions = [
+            (value - low) / (high - low) for value, (low, high) in zip(toroidal, ranges, strict=True)
+        ]
+        beta, sigma, gamma = (fraction * (n - 1) for fraction, n in zip(fractions, self.shape, strict=True))
         return beta, sigma, gamma
 
     def point(self, coordinate: Vec3) -> Vec3:
-        toroidal = [
-            ends[0] + c / (n - 1) * (ends[1] - ends[0])
-            for c, ends, n in zip(coordinate, self.probe.ranges, self.shape, strict=True)
-        ]
-        return apart(self.probe.to_world(jnp.stack(toroidal)))
+        fractions = [c / (n - 1) for c, n in zip(coordinate, self.shape, strict=True)]
+        ranges = zip(fractions, self.probe.ranges, strict=True)
+        return apart(self.probe.to_world(jnp.stack([low + c * (high - low) for c, (low, high) in ranges])))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
         # ρ = a + (b + γ) sin σ is concave in σ and linear in γ, so that it is least in a corner
         probe = self.probe
-        beta, sigma, gamma = (
-            (ends[1] - ends[0]) / (n - 1) for ends, n in zip(probe.ranges, self.shape, strict=True)
-        )
+        ranges = zip(probe.ranges, self.shape, strict=True)
+        beta, sigma, gamma = ((last - first) / (n - 1) for (first, last), n in ranges)
         depth = [jnp.maximum(probe.b + probe.gamma_range[0] + end[2] * gamma, 0) for end in (low, high)]
         angle = [jnp.clip(probe.sigma_range[0] + end[1] * sigma, 0, math.pi) for end in (low, high)]
         rho = [probe.a + d * jnp.sin(s) for d in depth for s in angle]
@@ -214,22 +193,16 @@ class _Sector(Space):
             return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
 
         changes, ranges = (angle(rho), angle(off), radius), self.probe.ranges
-        begin, end, reached = [], [], jnp.ones(rho.shape, bool)
+        begin, stop, reached = [], [], jnp.ones(rho.shape, bool)
         coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
-        if first is not None:
-            coordinate = tuple(c - corner for c, corner in zip(coordinate, first, strict=True))
-        for c, change, ends, n, blocks in zip(
-            coordinate, changes, ranges, self.shape, visible.shape, strict=True
-        ):
+        for axis, (change, ends, n) in enumerate(zip(changes, ranges, self.shape, strict=True)):
+            blocks, c = visible.shape[axis], coordinate[axis] - (0 if first is None else first[axis])
             nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
             reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, BLOCK * blocks))
-            begin.append(jnp.clip(jnp.floor((c - nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
-            end.append(jnp.clip(jnp.floor((c + nodes) / BLOCK).astype(jnp.int32), 0, blocks - 1))
-        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (end[0], end[1], end[2]))
+            for end, found in ((c - nodes, begin), (c + nodes, stop)):
+                found.append(jnp.clip(jnp.floor(end / BLOCK).astype(jnp.int32), 0, blocks - 1))
+        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
         return Occupancy(reached & seen, low, (x, y, z))
-
-    def path(self, entry: Vec3, direction: Vec3) -> "_Curved":
-        return _Curved(self, entry, direction)
 
     @property
     def _faces(self) -> SectorFaces:
@@ -240,17 +213,6 @@ class _Sector(Space):
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
         return self._faces.gaps(entry, direction, length)
-
-
-class _Curved(Path):
-    """A straight world ray in the grid of a sector."""
-
-    sector: _Sector
-    entry: Vec3
-    direction: Vec3
-
-    def __call__(self, s: Scalar) -> Vec3:
-        return self.sector.coordinate(along(self.entry, self.direction, s))
 
 
 def _atan2(a: Scalar, b: Scalar) -> Scalar:

@@ -278,7 +278,7 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
 
 
 def test_a_table_is_shown_and_not_edited(controlled):
-    given = jv.TransferFunction2D.from_transfer(LOOK, (2.0, 20.0), 0.5)
+    given = jv.TransferFunction2D.from_points([(0.5, 10.0, (1, 0, 0), 0.5, (0.5, 8.0))])
     model, controls = controlled(BALL, given)
     assert padded(model.state.transfer) is given
     assert not {"window", "level", "point"} & controls.keys()

@@ -336,27 +336,19 @@ BAD = {
     "corners": ((((0, 0, 0), (1, 1, 1)),), r"box must have shape \(6,\); got shape \(2, 3\)"),
     "corners in a row": (
         ((0, 0, 0, 1, 1, 1),),
-        r"box must be .* each minimum below its maximum; got \[0\. 0\. 0\. 1\.",
+        r"box must be .* minima below maxima; got \[0\. 0\. 0\. 1\.",
     ),
     "NaN": (((0, 1, 0, 1, 0, np.nan),), "box must be finite"),
     "infinite": (((0, 1, 0, 1, 0, np.inf),), "box must be finite"),
     "a bare plane": (
         (None, ((0, 0, 0), (0, 0, 1))),
-        r"planes\[0\] must be a pair \(origin, normal\); got a tuple of length 3\. "
-        r"For a single plane, pass \[\(origin, normal\)\]\.",
+        r"planes must be pairs \[\(origin, normal\), \.\.\.\]; got",
     ),
-    "a bare plane in arrays": (
-        (None, (np.zeros(3), np.ones(3))),
-        r"got a NumPy array of shape \(3,\) .*For a single plane, pass",
-    ),
-    "coefficients": (
-        (None, [(1, 0, 0, 5)]),
-        r"planes\[0\] must be a pair \(origin, normal\); got a tuple of length 4\.$",
-    ),
-    "None": ((None, None), r"planes must be a list of pairs \(origin, normal\); got None\.$"),
-    "a generator": ((None, (pair for pair in ())), r"planes must be a list of pairs .* got a generator\.$"),
-    "a name": ((None, "x"), r"planes\[0\] must be a pair"),
-    "a number": ((None, 3.0), r"planes must be a list of pairs .* got 3.0"),
+    "a bare plane in arrays": ((None, (np.zeros(3), np.ones(3))), "planes must be pairs"),
+    "coefficients": ((None, [(1, 0, 0, 5)]), r"planes must be pairs .* got \[\(1, 0, 0, 5\)\]"),
+    "None": ((None, None), "planes must be pairs .* got None"),
+    "a name": ((None, "x"), "planes must be pairs .* got 'x'"),
+    "a number": ((None, 3.0), "planes must be pairs .* got 3.0"),
     "no normal": ((None, [((0, 0, 0), (0, 0, 0))]), r"the normal of planes\[0\] must not be 0"),
     "a flat normal": ((None, [((0, 0, 0), (0, 1))]), r"the normal of planes\[0\] must have shape \(3,\)"),
     "NaN in a plane": (
