@@ -1,15 +1,17 @@
-"""Options of the subcommands of `jaxvol`, from the command line or from the picture that `--like` names."""
+"""Options of the subcommands of `jaxvol`: of the command line, or else of the file that `--config` names, or
+else of the picture that `--like` names."""
 
 import argparse
 import re
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ..._util.checks import shortened
 from ...compositing.modes import MODES
-from ...scene.presets import PRESETS, SHADED
-from .recorded import recorded_in, volume_of_picture
+from ...scene.presets import PRESETS
+from .recorded import recorded_in, volume_of_picture, words_of
 
 
 SWITCH = argparse.BooleanOptionalAction
@@ -53,17 +55,14 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     """The options of a command, their `defaults`, and the function that is to `execute` it."""
     found = parser.parse_known_args(words)[0]
     command: Parser = found.parser
-    settings = given = command.given(words[1:])
-    if "like" in given:
-        try:
-            recorded = _of_picture(command, given["like"], named="file" in given)
-        except ValueError as fault:
-            raise ValueError(f"--like: {str(fault)[:400]}") from fault
-        replacing = [name for name, value in given.items() if value is not False]
-        overridden = set().union(*(OVERRIDES.get(name, ()) for name in replacing))
-        if given.get("compositing", "isosurface") != "isosurface":
-            overridden.add("isovalue")
-        settings = {name: value for name, value in recorded.items() if name not in overridden} | given
+    settings = command.given(words[1:])
+    for name, read in (("config", _of_toml), ("like", _of_picture)):
+        if name in settings:
+            try:
+                weaker = read(command, settings[name], named="file" in settings)
+            except ValueError as fault:
+                raise ValueError(f"--{name}: {str(fault)[:400]}") from fault
+            settings = _over(settings, weaker)
     on = {name for name, value in settings.items() if value is not False}
     for name in sorted(on):
         for other in sorted(on & OVERRIDES.get(name, set())):
@@ -76,6 +75,29 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     if options.get("file", "") is None:
         command.error("the following arguments are required: FILE")
     return argparse.Namespace(execute=found.execute, defaults=defaults, **options)
+
+
+def _over(settings: dict[str, Any], weaker: dict[str, Any]) -> dict[str, Any]:
+    """The settings, above weaker ones, of which they override what they exclude."""
+    overridden = set().union(*(OVERRIDES.get(n, ()) for n, value in settings.items() if value is not False))
+    if settings.get("compositing", "isosurface") != "isosurface":
+        overridden.add("isovalue")
+    return {name: value for name, value in weaker.items() if name not in overridden} | settings
+
+
+def _of_toml(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
+    """The options in a TOML file, by their names."""
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as fault:
+        raise ValueError(f"{path} cannot be read as TOML: {fault}") from fault
+    words = [str(content.pop("file"))] if "file" in content else []
+    known = {action.dest.replace("_", "-") for action in command._actions} - {"config", "like", "help"}
+    for name, value in content.items():
+        if name not in known:
+            raise ValueError(f"{path}: {command.prog} has no option {name!r}.")
+        words += words_of(name, value)
+    return command.given(words)
 
 
 def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
@@ -171,6 +193,8 @@ def add_scene(parser: Parser) -> None:
     add_size(parser)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
+    text = "options by their names, such as size = [640, 480]; those of the command line override them"
+    parser.add_argument("--config", type=Path, metavar="TOML", help=text)
     text = "read the volume in bricks, with so much memory for them, such as 256M: .raw, .npy and Zarr"
     parser.add_argument("--memory", type=memory_size, metavar="BYTES", help=text)
     text = "RMSE of linear colours, by which step and transforms are chosen (default: 1/255; not with --step)"

@@ -18,21 +18,25 @@ from ...scene.transfer import Transfer, TransferFunction
 KEYWORD = "jaxvol"  # of the text in a PNG
 
 
+def words_of(name: str, value: Any) -> list[str]:
+    """An option as words of a command line."""
+    flag = name.replace("_", "-")
+    if isinstance(value, bool):
+        return [f"--{flag}" if value else f"--no-{flag}"]
+    if not isinstance(value, list | tuple):
+        return [f"--{flag}={value}"]
+    rows = value if value and isinstance(value[0], list) else [value]
+    return [word for row in rows for word in (f"--{flag}", *map(str, row))]
+
+
 def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
     """The text that a PNG carries, for `save_image`: the options that are not at their defaults, as words of
     a command line, and the transfer function if a file or a picture held it."""
     words: list[str] = []
     for name, default in options.defaults.items():
-        value, flag = getattr(options, name), name.replace("_", "-")
-        if value == default or isinstance(value, Path):
-            continue
-        if isinstance(value, bool):
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-        elif isinstance(value, list):
-            for row in value if isinstance(value[0], list) else [value]:
-                words += [f"--{flag}", *map(str, row)]
-        else:
-            words.append(f"--{flag}={value}")
+        value = getattr(options, name)
+        if value != default and not isinstance(value, Path):
+            words += words_of(name, value)
     file = {"name": str(options.file), "sha256": checksum(options.file)}
     content: dict[str, Any] = {"options": words, "file": file}
     from_file = options.transfer is not None or options.recorded_transfer is not None
