@@ -31,8 +31,8 @@ CHUNK = 8
 
 
 class Visit(eqx.Module):
-    """A brick; through which bricks rays go on from it, itself included, while it is in memory; and which are
-    `empty`, so that rays move through them to it. Of all bricks, and of what lies outside of the volume."""
+    """A brick; through which bricks rays go on from it, itself included; and which are `empty`, so that rays
+    move through them to it. The masks are of all bricks, and of what lies outside of the volume."""
 
     brick: Int[Array, ""]
     passable: Bool[Array, " bricks"]
@@ -40,8 +40,8 @@ class Visit(eqx.Module):
 
 
 class BrickCells(NamedTuple):
-    """Cells of rays that are marched while a brick is in memory; the index that each ray has then `reached`;
-    a box of grid coordinates that holds all points of these cells; and whether there are any."""
+    """Cells of rays that are marched in a brick; to which cell of each ray bricks have then been found; a box
+    of grid coordinates that holds all points of these cells; and whether there are any."""
 
     cells: CellRange
     reached: Int[Array, "*rays"]
@@ -110,29 +110,38 @@ def curved_cells(
 ) -> BrickCells:
     """The cells of any rays, of shape (groups, rays in a group), found one after the other.
 
-    - `at`: where the march has come to. `reached`: to which cell of each ray its bricks have been found.
-    - `beyond`: steps before and behind its cells that `low` and `high` are to hold, too."""
+    Args:
+        grid: The bricks.
+        march: How rays are marched.
+        rays: The rays.
+        at: Where the march has come to.
+        reached: To which cell of each ray bricks have been found.
+        visit: The brick.
+        beyond: Steps before and behind its cells that `low` and `high` are to hold, too.
+    """
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
     # A ray may come back into the volume and leave it before the next of these points: this counts, too.
-    returns = [_Return.of(grid, rays, back) for _, back in rays.gaps]
+    returns = [(back, _located(rays, back)) for _, back in rays.gaps]
     number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
+    def depths(index: Int[Array, "cells *rays"]) -> Float[Array, "points cells *rays"]:
+        return jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
+
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
-        depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
-        return jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        depth, end = depths(index), depths(index + 1)
+        found = jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        every = [found]
+        for back, located in returns:
+            within = (depth <= back) & (back < end)
+            every += [jax.tree.map(lambda a, b, within=within: jnp.where(within, a, b), located, found)]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *every)
 
     def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
         coordinate, inside = points(index)
-        found = jnp.where(inside, grid.brick_of(coordinate), grid.number)
-        more = [
-            jnp.where(back.within(index, offset, march.step), back.brick, grid.number)
-            for back in returns
-            for offset in fronts
-        ]
-        return jnp.concatenate([found, jnp.stack(more)]) if more else found
+        return jnp.where(inside, grid.brick_of(coordinate), grid.number)
 
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
         front = index.astype(rays.length.dtype) * march.step
@@ -158,20 +167,19 @@ def curved_cells(
 
     first, _ = while_in(visit.empty, reached, ~at.finished)
     here = jnp.any(bricks(first[None])[:, 0] == visit.brick, axis=0)
-    # where its points lie in several bricks, the first one that is visited takes the cell
+    # where its points lie in several bricks, the cell belongs to the first one that is visited
     enters = ~at.finished & here & ahead(first[None])[0]
-    _, until = while_in(visit.passable, first, enters)
+    _, until = while_in(visit.passable, first + 1, enters)
     until = jnp.maximum(until, first + 1)
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         start, low, high = state
         index = start[None] + number
         coordinate, inside = points(index)
-        counts = enters[None] & (index <= (until + beyond)[None]) & (index >= 0)
-        low, high = _around(low, high, coordinate, inside & counts[None])
-        for back in returns:
-            held = [back.within(index, offset, march.step) & counts for offset in fronts]
-            low, high = _around(low, high, back.coordinate, jnp.any(jnp.stack(held), axis=(0, 1)))
+        counts = inside & (enters[None] & (index <= (until + beyond)[None]) & (index >= 0))
+        point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
+        low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
+        high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
         return start + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)
@@ -187,36 +195,3 @@ def curved_cells(
 def _located(rays: Ray, depth: Float[Array, "*rays"]) -> tuple[Vec3, Bool[Array, "*rays"]]:
     """Grid coordinates of points on rays, and whether these lie in the volume."""
     return vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)
-
-
-class _Return(NamedTuple):
-    """Where rays come back into the volume: depth, grid coordinate and brick, and whether they do."""
-
-    depth: Float[Array, "*rays"]
-    coordinate: Vec3
-    brick: Int[Array, "*rays"]
-    there: Bool[Array, "*rays"]
-
-    @classmethod
-    def of(cls, grid: BrickGrid, rays: Ray, depth: Float[Array, "*rays"]) -> "_Return":
-        known = jnp.isfinite(depth)
-        depth = jnp.where(known, depth, 0)
-        coordinate, inside = _located(rays, depth)
-        return cls(depth, coordinate, grid.brick_of(coordinate), known & inside)
-
-    def within(
-        self, index: Int[Array, "cells *rays"], offset: Float[Array, "*rays"], step: Float[Array, ""]
-    ) -> Bool[Array, "cells *rays"]:
-        """Whether that is in cells that begin at `offset` + index."""
-        front, back = ((offset[None] + (index + more).astype(offset.dtype)) * step for more in (0, 1))
-        return self.there[None] & (front <= self.depth[None]) & (self.depth[None] < back)
-
-
-def _around(
-    low: Float[Array, "3"], high: Float[Array, "3"], coordinate: Vec3, counts: Bool[Array, "..."]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """A box, and the points that count."""
-    point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
-    low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
-    high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
-    return low, high

@@ -73,7 +73,9 @@ def levels_of(
     place = {name: value for name, value in place.items() if value is not None}
     if isinstance(thing, VoxelSource):
         if place or options:
-            raise ValueError(f"{', '.join(place | options)}: a VoxelSource takes no options; make another one.")
+            raise ValueError(
+                f"{', '.join(place | options)}: a VoxelSource takes no options; make another one."
+            )
         return (thing,)
     if isinstance(thing, Volume):
         if thing.labels is not None or thing.field is not None:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import Arrayable, described, integer, shortened
+from .._util.checks import Arrayable, integer, shortened
 from .._util.memory import memory_of_device
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
@@ -83,24 +83,28 @@ def render_bricks(
     function that rises within an eightieth of the values, 3e-5). `samples`, `error`, and `exhausted` where a
     `max_samples` is too small, may differ.
 
-    **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
-    but `SpaceLeaping("min_distance")`.
+    **Arguments:**
 
-    - `source`, and `options` for it (`shape`, `dtype`, `axes`, `index`, `missing`): see `bricks.levels_of`.
-      One pass over all voxels finds their ranges before the first image. A `bricks.VoxelSource` of a file
-      keeps them for the next: open it once, by `bricks.source_of`.
-    - `spacing`, `origin`: as in `Volume`; by default what the source says.
+    - `source`: see `bricks.levels_of`. One pass over all voxels finds their ranges before the first image. A
+      `bricks.VoxelSource` keeps them for the next: open it once, by `bricks.source_of`.
+    - `transfer`: as for `render`.
+    - `camera`: as for `render`.
+    - `march`: as for `render`; all transforms but `SpaceLeaping("min_distance")`.
+    - `spacing`: as in `Volume`; by default what the source says.
+    - `origin`: as in `Volume`; by default what the source says.
     - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
-      default a quarter of the device's. Beside them an image takes some 550 bytes for each pixel, compiled
+      default a quarter of the device's. In addition an image takes some 550 bytes for each pixel, compiled
       programs some 300 MiB, the ranges of values 2 / 16³ of the voxels, and Zarr 16 MiB for each level.
     - `bricks`: number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
       may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
       left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as `memory`
       goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
-      (`bricks.traversal.Schedule`).
+      (`bricks.traversal.Schedule`), which has no gradient.
+    - `compositing`: as for `render`.
     - `lighting`: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
       (`Lighting.farthest_read`).
+    - `outputs`: as for `render`.
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
       are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
     - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
@@ -111,23 +115,23 @@ def render_bricks(
       them, and the partial images are combined front to back: where reading takes longest, and for several
       processes. Rays must be straight in the grid, and what a ray shows must not depend on what lies in front
       but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by `"over"`). An
-      `EarlyTermination` sees what is in front on the same device alone: up to `opacity_left` of the colours
+      `EarlyTermination` sees only what is in front on the same device: up to `opacity_left` of the colours
       behind are added, and depth changes with them. Without it, depth agrees to 1e-5 of itself. Each device
       keeps some 300 bytes for each pixel. No gradients.
+    - `**options`: for the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
 
     **Returns:** as `render`, and in `Rendering.bricks` what it took.
 
+    **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
+    unknown, or whose file changed; for less memory than the smallest bricks take; for what needs the whole
+    volume at once (labels, baked or deferred light); and for what cannot be had with `own="bricks"`.
+
     Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
     spacing and origin: a second march reads the bricks again. Where the march leaps, the derivative by the
-    extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other parts
-    of it. There is no gradient to the voxels, none of modes that choose a sample or resolve (`"maximum"`,
+    extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other cells.
+    There is no gradient to the voxels, none of modes that choose a sample or resolve (`"maximum"`,
     `"average"`, `Isosurface`), none in forward mode (`jax.jvp`) or of second order, and none inside `jax.jit`
     or `jax.vmap`.
-
-    **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
-    unknown, or that changed after its ranges of values were found; for less memory than the smallest bricks
-    take; for what needs the whole volume at once (labels, baked or deferred light); and for what cannot be
-    had with `own="bricks"`. Nothing is written.
 
     Where it fails, and where not: `experiments/stability.py`, "wrong order".
 
@@ -137,7 +141,7 @@ def render_bricks(
     """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    _check(march, transfer, lighting, method, outputs, own, progress)
+    _check(march, transfer, lighting, method, outputs, own)
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
@@ -214,9 +218,9 @@ def _marched(scene: Scene) -> Scene:
     return scene._replace(transfer=transfer, march=march, lighting=None)
 
 
-_set_out, _march_part, _arrive = map(compiled, (begin_rays, march_brick, finish_image))
-_resolve_part, _resolve = map(compiled, (resolve_brick, resolve_image))
-_start_pull, _pull_part, _end_pull = map(compiled, (begin_vjp, vjp_of_brick, finish_vjp))
+_begin_rays, _march_brick, _finish_image = map(compiled, (begin_rays, march_brick, finish_image))
+_resolve_brick, _resolve_image = map(compiled, (resolve_brick, resolve_image))
+_begin_vjp, _vjp_of_brick, _finish_vjp = map(compiled, (begin_vjp, vjp_of_brick, finish_vjp))
 
 
 def _image(scene: Scene, request: Request) -> Rendering:
@@ -228,20 +232,20 @@ def _image(scene: Scene, request: Request) -> Rendering:
     if request.deals_bricks:
         assert request.mesh is not None
         return render_distributed(traversal, request.mesh)
-    underway, pixels = _set_out(marched, options), None
+    underway, pixels = _begin_rays(marched, options), None
     for brick, cells in traversal.bricks(underway.rays, underway.at):
         before, restart = underway.at, callable(request.method)
-        underway = _march_part(*_on(brick, marched, options), underway, cells, restart)
+        underway = _march_brick(*_on(brick, marched, options), underway, cells, restart)
         if selects:
-            pixels = _resolve_part(*_on(brick, scene, options), marched.march, before, underway, pixels)
+            pixels = _resolve_brick(*_on(brick, scene, options), marched.march, before, underway, pixels)
             jax.block_until_ready(pixels)
         traversal.at = underway.at
         del brick
-    rendering = _arrive(marched, options, underway)
+    rendering = _finish_image(marched, options, underway)
     if not mode.resolves:
         return rendering
     if not selects:
-        pixels = _resolve(scene, options, NO_ACCELERATION, (rendering.rgba, rendering.depth, None))
+        pixels = _resolve_image(scene, options, NO_ACCELERATION, (rendering.rgba, rendering.depth, None))
     elif pixels is None:  # no brick was read
         pixels = jnp.zeros((*rendering.rgba.shape[:-1], 5), rendering.rgba.dtype).at[..., 4].set(jnp.inf)
     details = Details()
@@ -282,12 +286,12 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, reques
     options, whole = traversal.options, of_all_outputs(rendering, cotangent)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
-    sums, replay = _start_pull(scene, perturbed, options, rendering, whole)
+    sums, replay = _begin_vjp(scene, perturbed, options, rendering, whole)
     for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
-        sums, replay = _pull_part(*_on(brick, scene, options), perturbed, sums, replay, cells)
+        sums, replay = _vjp_of_brick(*_on(brick, scene, options), perturbed, sums, replay, cells)
         traversal.at = replay.states.at
         del brick
-    found = _end_pull(scene, perturbed, options, sums, replay, rendering, whole)
+    found = _finish_vjp(scene, perturbed, options, sums, replay, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 
@@ -331,7 +335,6 @@ def _check(
     method: Any = "overlap",
     outputs: Any = "all",
     own: Any = "rays",
-    progress: Any = None,
 ) -> None:
     """Raises for arguments that are no such, and for what needs the whole volume."""
     words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, get_args(Own))]
@@ -339,8 +342,6 @@ def _check(
     for name, given, known in words:
         if not isinstance(given, str) or given not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
-    if progress is not None and not callable(progress):
-        raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     if isinstance(transfer, LabelTransferFunction):
         raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):

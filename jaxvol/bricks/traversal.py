@@ -1,4 +1,4 @@
-"""Takes an image's rays through all bricks, while the next brick is read."""
+"""Marches an image's rays through all bricks, while the next brick is read."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -26,7 +26,6 @@ from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
 from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
-from .conversion import range_of
 from .grid import BrickGrid, Node
 from .sources import READERS, VoxelSource
 from .split import Margin, bytes_of, check_stored, divided, fits, split, stored_of, stored_shape
@@ -121,11 +120,9 @@ class Traversal:
         self.memory = max(memory, bytes_of(self.min_stored, source.dtype, self.margin))
         self.order = self.grid.order(self.space, marched.source)
         # last, since it may read the whole source
-        known = request.traversals
-        self.summary = known[0].summary if known else summary_of(source, memory=memory)
-        known.append(self)
-        occupied = self.summary.where(eqx.Partial(marched.compositing.occupied, marched.transfer))
-        self.visible = self.summary.bricks_with(occupied, self.grid)
+        occupied = eqx.Partial(marched.compositing.occupied, marched.transfer)
+        self.visible = summary_of(source, memory=memory).bricks_where(occupied, self.grid)
+        request.traversals.append(self)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
         """Each brick that rays need, and their cells there, while the next one is read. Before this one is
@@ -141,7 +138,7 @@ class Traversal:
             if self.bytes_read - given_back >= KEPT:
                 give_back()
                 given_back = self.bytes_read
-            # on a CPU, voxels are not copied if aligned (`empty_array`)
+            # on a CPU, aligned voxels are not copied
             brick = with_voxels(self.scene.volume, jax.device_put(load.voxels.result()))
             brick = part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
             cells = load.cells
@@ -171,18 +168,10 @@ class Traversal:
         )
 
     def cells_of(
-        self, brick: int, passable: set[int], reached: Array, *, over_empty: bool = True
+        self, brick: int, passable: np.ndarray, empty: np.ndarray, reached: Array, beyond: int = 0
     ) -> BrickCells | None:
-        """The cells of curved rays in a brick and in those through which they go on from it. `over_empty`:
-        and in those that are empty."""
-        empty = np.append(~self.visible, True)
-        on = empty & over_empty
-        on[list(passable)] = True
-        visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(on), jnp.asarray(empty))
-        return self.cells_in(visit, reached, self.margin.steps)
-
-    def cells_in(self, visit: Visit, reached: Array, beyond: int = 0) -> BrickCells | None:
-        """The cells of `curved_cells`; None if there are none."""
+        """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
+        visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty))
         mesh, march = self.options.tiling.devices, self.scene.march
         found = _curved(mesh, self.grid, beyond, march, self.rays, self.at, reached, visit)
         return found if bool(found.any) else None
@@ -190,28 +179,22 @@ class Traversal:
     def around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
         """The box that is read for all cells of a brick."""
         low, high = (np.asarray(end) for end in self.grid.cells(brick))
-        cells = self.margin.cells  # where rays are straight, of any box
-        if not self.margin.straight:
-            cells = self.margin.of_box(self.space, self.grid.shape, low, high)
-        return low - cells, high + cells
+        return low - self.margin.cells, high + self.margin.cells
 
-    def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray]:
-        """The box that is read for these cells."""
+    def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
+        """The box that is read for these cells. `stored` is enlarged for it as far as memory goes, so far that
+        any single brick still fits; None if that does not suffice."""
+        shape = self.grid.shape
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
-        around = self.margin.of_points(self.space, self.grid.shape, low, high)
+        around = self.margin.of_points(self.space, shape, low, high)
         low, high = np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
-        return np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
-
-    def make_room(self, found: BrickCells) -> bool:
-        """Whether the box of these cells fits into what is read at a time, which is enlarged for it as far as
-        memory goes: so far that any single brick still fits."""
-        low, high = self.box_of(found)
-        wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
-        x, y, z = map(max, wanted, self.stored)
+        low, high = np.maximum(low, 0), np.minimum(high, np.asarray(shape) - 1)
+        x, y, z = map(max, stored_shape(shape, tuple((high - low + 1).tolist())), self.stored)
         nx, ny, nz = map(max, (x, y, z), self.min_stored)
-        room = fits((nx, ny, nz), self.source.dtype, self.margin, self.memory)
-        self.stored = (x, y, z) if room else self.stored
-        return room
+        if not fits((nx, ny, nz), self.source.dtype, self.margin, self.memory):
+            return None
+        self.stored = x, y, z
+        return low, high
 
     def load(self, brick: int, cells: CellRange | None, low: np.ndarray, high: np.ndarray) -> Load:
         """Starts to read a brick, for these cells: a box that begins at a multiple of BLOCK and holds these
@@ -222,18 +205,8 @@ class Traversal:
         x, y, z = first.tolist()
         self.loads.append(brick)
         self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
-        return Load(brick, cells, (x, y, z), READERS.submit(self._read, first, first + stored))
-
-    def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """The voxels of a box, whose range tells whether they are those of the summary."""
-        voxels = self.source.read(low, high, self.source.order)
-        (least, most), (lowest, highest) = self.summary.range_of(low, high), range_of(voxels)
-        if lowest < least or highest > most:
-            raise ValueError(
-                f"{self.source.name} changed since the ranges of its values were found: {least} to {most} "
-                f"then, and {lowest} to {highest} now, in the box from {tuple(low.tolist())}. Open it again."
-            )
-        return voxels
+        voxels = READERS.submit(self.source.read, first, first + stored, self.source.order)
+        return Load(brick, cells, (x, y, z), voxels)
 
 
 def in_order(traversal: Traversal) -> Iterator[Load]:
@@ -249,21 +222,26 @@ def in_order(traversal: Traversal) -> Iterator[Load]:
 def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
     """Where rays are curved: bricks front to back, and again as long as rays come back to them. With
     `overlap`, each is read with what rays come back to of those before it, as far as memory goes."""
-    reached, going = jnp.zeros(traversal.rays.length.shape, jnp.int32), True
-    while going:
-        before, going = set[int](), False
+    empty, steps = np.append(~traversal.visible, True), traversal.margin.steps
+    reached, unfinished = jnp.zeros(traversal.rays.length.shape, jnp.int32), True
+    while unfinished:
+        before, unfinished = np.zeros_like(empty), False
         for brick in traversal.order:
             if not traversal.visible[brick]:
                 continue
-            found = traversal.cells_of(brick, {brick, *(before if overlap else ())}, reached)
-            if found is not None and not traversal.make_room(found):
-                found = traversal.cells_of(brick, {brick}, reached, over_empty=False)
-                assert found is None or traversal.make_room(found)
-            before.add(brick)
+            this = np.arange(len(empty)) == brick
+            passable = empty | this | before if overlap else empty | this
+            found = traversal.cells_of(brick, passable, empty, reached, steps)
+            box = None if found is None else traversal.box_of(found)
+            if found is not None and box is None:
+                found = traversal.cells_of(brick, this, empty, reached, steps)
+                box = None if found is None else traversal.box_of(found)
+            before |= this
             if found is not None:
-                going, reached = True, found.reached
-                yield traversal.load(brick, padded(found.cells), *traversal.box_of(found))
-        going &= not bool(jnp.all(traversal.at.finished))
+                assert box is not None
+                unfinished, reached = True, found.reached
+                yield traversal.load(brick, padded(found.cells), *box)
+        unfinished &= not bool(jnp.all(traversal.at.finished))
 
 
 METHODS: dict[str, Schedule] = {
