@@ -19,12 +19,8 @@ from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..ray import Progress
 from ..scene.space import Ray, Straight, slab_interval
-from .grid import BrickGrid
+from .grid import SLACK, BrickGrid
 
-
-SLACK = 3
-"""Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more
-for rounding."""
 
 CHUNK = 8
 """Cells of a ray that are tested at a time."""

@@ -23,14 +23,16 @@ from ..engine.brick_march import RayStates, begin_rays, finish_image, join_segme
 from ..engine.devices import AXIS, REPLICATED, SHARDED
 from ..engine.tiling import RenderOptions
 from ..engine.wavefront import CellRange
+from ..march.strides import stride_control
 from ..ray import Scene
 from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
 from ..xla.compiling import compiled
+from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 from .cells import first_behind, straight_cells
-from .grid import BrickGrid
-from .traversal import Load, Traversal
+from .grid import BrickGrid, is_straight
+from .traversal import Load, Method, Traversal
 
 
 Loads: TypeAlias = dict[int, Load]
@@ -51,6 +53,22 @@ class Share(eqx.Module):
         first, until = jnp.maximum(cells.first, self.own.first), jnp.minimum(cells.until, self.own.until)
         some = first < until
         return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
+
+
+def check_joins(scene: Scene, method: Method) -> None:
+    """Raises where partial images of bricks cannot be combined."""
+    march, mode = scene.march, scene.compositing
+    refused = {
+        f"method={method!r}": method != "overlap",
+        f"compositing by {type(mode).__name__}, which does not join segments of a ray": not mode.joins,
+        "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
+        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
+        "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
+        "gradients": is_traced(scene),
+    }
+    for what, refuses in refused.items():
+        if refuses:
+            raise ValueError(f'own="bricks" does not go with {what}. Use own="rays".')
 
 
 def render_distributed(traversal: Traversal, mesh: Mesh) -> Rendering:

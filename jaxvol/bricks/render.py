@@ -8,22 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import Arrayable, integer, shortened
+from .._util.checks import Arrayable, integer
 from .._util.memory import memory_of_device
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
-from ..engine.acceleration import VolumeAcceleration
-from ..engine.brick_march import (
-    NO_ACCELERATION,
-    begin_rays,
-    begin_vjp,
-    finish_image,
-    finish_vjp,
-    march_brick,
-    resolve_brick,
-    vjp_of_brick,
-)
+from ..engine import brick_march
+from ..engine.acceleration import NO_ACCELERATION, VolumeAcceleration
 from ..engine.devices import Devices, check_not_sharded, mesh_of, on_all
 from ..engine.gradients import of_all_outputs, of_perturbed
 from ..engine.image import RenderOutputs
@@ -31,7 +22,6 @@ from ..engine.resolve import resolve_image
 from ..engine.tiling import RenderOptions
 from ..lighting.shading import Lighting
 from ..march.march import March
-from ..march.strides import stride_control
 from ..march.transforms import SpaceLeaping, ToroidalMap
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
@@ -43,15 +33,10 @@ from ..xla.compiling import compiled
 from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
 from ..xla.trees import strong
-from .distributed import render_distributed
-from .grid import Node, is_straight
+from .distributed import check_joins, render_distributed
 from .opening import level_for, levels_of
 from .sources import VoxelSource
 from .traversal import METHODS, Method, Request, Traversal
-
-
-Own = Literal["rays", "bricks"]
-"""What may be dealt out to devices."""
 
 
 def render_bricks(
@@ -71,7 +56,7 @@ def render_bricks(
     level: int | Literal["auto"] | Any = "auto",
     progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
-    own: Own | Any = "rays",
+    own: Literal["rays", "bricks"] | Any = "rays",
     **options: Any,
 ) -> Rendering:
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
@@ -141,24 +126,27 @@ def render_bricks(
     """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    _check(march, transfer, lighting, method, outputs, own)
+    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, ("rays", "bricks"))]
+    words += [] if callable(method) else [("method", method, tuple(METHODS))]
+    for name, given, known in words:
+        if not isinstance(given, str) or given not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
     place = {"spacing": spacing, "origin": origin}
     traced = {name: value for name, value in place.items() if is_traced(value)}
-    known = {name: value for name, value in place.items() if name not in traced}
-    levels = levels_of(source, **known, **options)
+    concrete = {name: value for name, value in place.items() if name not in traced}
+    levels = levels_of(source, **concrete, **options)
     if traced and len(levels) > 1:
         raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
-    room = budget(memory)
-    chosen = _level(levels, level, camera, march)
+    room, chosen = budget(memory), _level(levels, level, camera, march)
     scene = _scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
     check_not_sharded(mesh, scene)
     scene = on_all(mesh, scene)
-    request = Request(chosen, room, _counts(bricks), method, progress, outputs, mesh, own == "bricks")
+    request = Request(chosen, room, bricks, method, progress, outputs, mesh, own == "bricks")
     if request.deals_bricks:
-        _check_distributed(scene, method)
+        check_joins(scene, method)
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
         raise ValueError(
             "render_bricks has gradients in reverse mode, but none in forward mode (jax.jvp) or of 2nd order."
@@ -186,9 +174,9 @@ def bricks_of(
     lighting: Lighting | None = None,
 ) -> Traversal:
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
-    _check(march, transfer, lighting)
-    scene = _scene_of(source, transfer, camera, march, compositing, lighting)
-    return Traversal(Request(source, memory), _marched(scene), scene, "all")
+    return Traversal(
+        Request(source, memory), _scene_of(source, transfer, camera, march, compositing, lighting)
+    )
 
 
 def _scene_of(
@@ -201,6 +189,13 @@ def _scene_of(
     **traced: Any,
 ) -> Scene:
     """The scene of a source, without its voxels. `traced`: spacing and origin in place of the source's."""
+    if isinstance(transfer, LabelTransferFunction):
+        raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
+    if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
+        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
+    if lighting is not None and lighting.farthest_read is None:
+        what = f"{type(lighting).__name__} needs the whole volume here"
+        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); {what}.")
     place = {"spacing": source.spacing, "origin": source.origin} | traced
     volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
@@ -208,27 +203,20 @@ def _scene_of(
     return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
 
 
-def _marched(scene: Scene) -> Scene:
-    """The scene as its rays are marched: of a mode that resolves, without light, since pixels are computed
-    from what that march finds."""
-    mode = scene.compositing
-    if not mode.resolves:
-        return scene
-    transfer, march = mode.marched(scene.transfer, scene.march, scene.volume)
-    return scene._replace(transfer=transfer, march=march, lighting=None)
-
-
-_begin_rays, _march_brick, _finish_image = map(compiled, (begin_rays, march_brick, finish_image))
-_resolve_brick, _resolve_image = map(compiled, (resolve_brick, resolve_image))
-_begin_vjp, _vjp_of_brick, _finish_vjp = map(compiled, (begin_vjp, vjp_of_brick, finish_vjp))
+_begin_rays = compiled(brick_march.begin_rays)
+_march_brick = compiled(brick_march.march_brick)
+_finish_image = compiled(brick_march.finish_image)
+_resolve_brick = compiled(brick_march.resolve_brick)
+_resolve_image = compiled(resolve_image)
+_begin_vjp = compiled(brick_march.begin_vjp)
+_vjp_of_brick = compiled(brick_march.vjp_of_brick)
+_finish_vjp = compiled(brick_march.finish_vjp)
 
 
 def _image(scene: Scene, request: Request) -> Rendering:
-    mode, outputs = scene.compositing, request.outputs
-    marched, selects = _marched(scene), isinstance(mode, Selection)
-    found = "depth" if mode.resolves and outputs == "rgba" else outputs
-    traversal = Traversal(request, marched, scene, found)
-    options = traversal.options
+    mode, selects = scene.compositing, isinstance(scene.compositing, Selection)
+    traversal = Traversal(request, scene)
+    marched, options = traversal.scene, traversal.options
     if request.deals_bricks:
         assert request.mesh is not None
         return render_distributed(traversal, request.mesh)
@@ -249,7 +237,7 @@ def _image(scene: Scene, request: Request) -> Rendering:
     elif pixels is None:  # no brick was read
         pixels = jnp.zeros((*rendering.rgba.shape[:-1], 5), rendering.rgba.dtype).at[..., 4].set(jnp.inf)
     details = Details()
-    if outputs == "all":
+    if request.outputs == "all":
         normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
         details = rendering.details._replace(depth=pixels[..., 4], normal=normal, selected=None)
     return Rendering(pixels[..., :4], rendering.exhausted, details)
@@ -282,7 +270,7 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, reques
             "the gradient by bricks reads its source while it is computed, and so not inside jax.jit, "
             "jax.vmap or jax.jacrev: call what jax.vjp returns outside of them, once for each cotangent."
         )
-    traversal = Traversal(request, scene, scene, request.outputs)
+    traversal = Traversal(request, scene)
     options, whole = traversal.options, of_all_outputs(rendering, cotangent)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
@@ -314,54 +302,3 @@ def _level(
     if most and is_traced(camera):
         raise ValueError(f"level must be one of 0 to {most} where gradients are taken; got 'auto'.")
     return levels[level_for(levels, camera) if most else 0]
-
-
-def _counts(bricks: Any) -> Node | None:
-    if bricks is None:
-        return None
-    try:
-        x, y, z = bricks
-        return integer("x", x, 1), integer("y", y, 1), integer("z", z, 1)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(
-            f"bricks must be three numbers of bricks, each an integer of at least 1; got {shortened(bricks)}."
-        ) from fault
-
-
-def _check(
-    march: March,
-    transfer: Transfer,
-    lighting: Lighting | None,
-    method: Any = "overlap",
-    outputs: Any = "all",
-    own: Any = "rays",
-) -> None:
-    """Raises for arguments that are no such, and for what needs the whole volume."""
-    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, get_args(Own))]
-    words += [] if callable(method) else [("method", method, tuple(METHODS))]
-    for name, given, known in words:
-        if not isinstance(given, str) or given not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
-    if isinstance(transfer, LabelTransferFunction):
-        raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
-    if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
-        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
-    if lighting is not None and lighting.farthest_read is None:
-        what = f"{type(lighting).__name__} needs the whole volume here"
-        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); {what}.")
-
-
-def _check_distributed(scene: Scene, method: Method) -> None:
-    """Raises where partial images of bricks cannot be combined."""
-    march, mode = scene.march, scene.compositing
-    refused = {
-        f"method={method!r}": method != "overlap",
-        f"compositing by {type(mode).__name__}, which does not join parts of a ray": not mode.joins,
-        "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
-        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
-        "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
-        "gradients": is_traced(scene),
-    }
-    for what, refuses in refused.items():
-        if refuses:
-            raise ValueError(f'own="bricks" does not go with {what}. Use own="rays".')

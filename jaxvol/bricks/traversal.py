@@ -1,5 +1,6 @@
 """Marches an image's rays through all bricks, while the next brick is read."""
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -26,9 +27,19 @@ from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
 from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
-from .grid import BrickGrid, Node
+from .grid import (
+    MOST_VOXELS,
+    BrickGrid,
+    Margin,
+    Node,
+    bytes_of,
+    divided,
+    fits,
+    split,
+    stored_of,
+    stored_shape,
+)
 from .sources import READERS, VoxelSource
-from .split import Margin, bytes_of, check_stored, divided, fits, split, stored_of, stored_shape
 from .summary import summary_of
 
 
@@ -69,7 +80,7 @@ class Request:
 
     source: VoxelSource
     memory: int
-    counts: Node | None = None
+    counts: Any = None
     method: Method = "overlap"
     progress: Callable[[int, int], Any] | None = None
     outputs: Any = "all"
@@ -92,8 +103,12 @@ class Traversal:
     rays: Ray
     at: Progress
 
-    def __init__(self, request: Request, marched: Scene, shown: Scene, outputs: Any):
-        """Of a scene as its rays are marched, and as it is `shown`."""
+    def __init__(self, request: Request, shown: Scene):
+        marched, mode, outputs = shown, shown.compositing, request.outputs
+        if mode.resolves:  # without light: pixels are computed from what the march finds
+            transfer, march = mode.marched(shown.transfer, shown.march, shown.volume)
+            marched = shown._replace(transfer=transfer, march=march, lighting=None)
+            outputs = "depth" if outputs == "rgba" else outputs
         assert isinstance(marched.source, Camera)
         self.request, self.source, self.scene = request, request.source, marched
         source, memory, counts = request.source, request.memory, request.counts
@@ -108,10 +123,18 @@ class Traversal:
         self.space, shape = marched.march.locate(marched.volume), source.shape
         margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
         least = devices.number_of(request.mesh) if request.deals_bricks else 1
-        self.grid = divided(shape, counts) if counts else split(shape, source.dtype, memory, margin, least)
+        self.grid = (
+            divided(shape, counts)
+            if counts is not None
+            else split(shape, source.dtype, memory, margin, least)
+        )
         self.margin = margin if request.method == "overlap" else replace(margin, probe=None)
         self.stored = self.min_stored = stored_of(self.grid, self.margin)
-        check_stored(self.stored)
+        if math.prod(self.stored) > MOST_VOXELS:
+            read = " x ".join(map(str, self.stored))
+            raise ValueError(
+                f"bricks must be so many that fewer than 2**31 voxels are read for each; got {read}."
+            )
         if not self.margin.straight and not callable(request.method):
             # what is read follows from the rays: begin with less
             middle = (np.asarray(shape) - 1) / 2

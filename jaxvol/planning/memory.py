@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from ..bricks.opening import Openable, source_of
 from ..bricks.render import bricks_of, budget
 from ..bricks.sources import VoxelSource
-from ..bricks.split import TooLittleMemory
+from ..bricks.grid import TooLittleMemory
 from ..compositing.blending import Compositing
 from ..lighting.shading import Lighting
 from ..march.march import March

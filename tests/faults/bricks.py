@@ -59,7 +59,7 @@ FAULTS = [
     ),
     Fault(
         "bricks: nothing is read around them but what interpolation needs",
-        "bricks.split:nodes_within",
+        "bricks.grid:nodes_within",
         lambda nodes: lambda *given: 0 * nodes(*given),
         (IMAGE,),
     ),
