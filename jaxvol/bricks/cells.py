@@ -22,8 +22,7 @@ from ..scene.space import Ray, Straight, slab_interval
 from .grid import SLACK, BrickGrid
 
 
-CHUNK = 8
-"""Cells of a ray that are tested at a time."""
+CHUNK = 8  # cells of a ray that are tested at a time
 
 
 class Visit(eqx.Module):
@@ -104,17 +103,8 @@ def curved_cells(
     visit: Visit,
     beyond: int,
 ) -> BrickCells:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other.
-
-    Args:
-        grid: The bricks.
-        march: How rays are marched.
-        rays: The rays.
-        at: Where the march has come to.
-        reached: To which cell of each ray bricks have been found.
-        visit: The brick.
-        beyond: Steps before and behind its cells that `low` and `high` are to hold, too.
-    """
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other from `reached` on;
+    `low` and `high` also hold `beyond` steps before and behind these."""
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]

@@ -1,4 +1,4 @@
-"""Divides a volume into bricks, orders them, and says how large they may be and how much is read around them."""
+"""Divides a volume into bricks, orders them, and says how large they may be and what is read around them."""
 
 import math
 from dataclasses import dataclass, replace
@@ -25,20 +25,20 @@ from ..xla.compiling import compiled
 
 Node = tuple[int, int, int]
 
+# Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more for
+# rounding.
 SLACK = 3
-"""Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more
-for rounding."""
 
+# Bricks are at least so many cells long, and of a multiple of these, where the volume is.
 EDGE = 16
-"""Bricks are at least so many cells long, and of a multiple of these, where the volume is."""
 
+# How many a user may ask for: each is searched for along all rays, also where it is not read.
 MOST_BRICKS = 2**16
-"""How many a user may ask for: each is searched for along all rays, also where it is not read."""
 
+# Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of blocks
+# takes, less than half. Voxels of another type take `sources.AT_ONCE` bytes more, or a layer of chunks, while
+# they are read.
 COPIES = 2.5
-"""Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of
-blocks takes, less than half. Voxels of another type take `sources.AT_ONCE` bytes more, or a layer of chunks,
-while they are read."""
 
 
 class TooLittleMemory(ValueError):
@@ -49,7 +49,9 @@ class TooLittleMemory(ValueError):
 class BrickGrid:
     """Bricks of equally many cells, numbered in row-major order; the last ones along an axis may have fewer.
 
-    - `shape`: nodes of the volume. `size`: cells of a brick.
+    Attributes:
+        shape: Nodes of the volume.
+        size: Cells of a brick.
     """
 
     shape: Node
@@ -67,8 +69,7 @@ class BrickGrid:
         return math.prod(self.counts)
 
     def cells(self, brick: int) -> tuple[Node, Node]:
-        """First cell of a brick along each axis, and the one after its last: also the nodes between which it
-        lies."""
+        """First and last node of a brick along each axis."""
         index = np.unravel_index(brick, self.counts)
         x, y, z = (int(i) * s for i, s in zip(index, self.size, strict=True))
         end = [min(a + s, n - 1) for a, s, n in zip((x, y, z), self.size, self.shape, strict=True)]
@@ -125,9 +126,12 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     With less, rays from side to side of a brick are blended in the wrong order. `render_bricks` does not use
     it for what it reads, which follows from the rays.
 
-    **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
+    Args:
+        probe: Of the volume.
+        grid: How it is divided into bricks.
 
-    **Returns:** K* of each face between two bricks, from the probe outwards, voxels.
+    Returns:
+        K* of each face between two bricks, from the probe outwards, voxels.
 
     Source: Kim, Kwon and Shin 2008, section 3.2.
     """
@@ -146,23 +150,16 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
 
 @dataclass(frozen=True)
 class Margin:
-    """What is read around a brick.
+    """What is read around a brick."""
 
-    - `cells`: along each axis, on both sides, around any brick.
-    - `steps`, `length`: how far cells that begin in the brick may reach along a ray, and in the world.
-    - `light`: world length around a sample within which light is looked for.
-    - `around`: nodes more, for interpolation, `slopes`, and the windows of `AdaptiveSampling`.
-    - `straight`: whether rays are straight in the grid. `probe`: whose bricks overlap, if they do.
-    """
-
-    cells: Node
-    steps: int
-    length: float
-    light: float
-    around: int
+    cells: Node  # along each axis, on both sides, around any brick
+    steps: int  # how far cells that begin in the brick may reach along a ray
+    length: float  # and in the world
+    light: float  # world length around a sample within which light is looked for
+    around: int  # nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`
     slopes: bool
-    straight: bool = True
-    probe: ToroidalMap | None = None
+    straight: bool = True  # whether rays are straight in the grid
+    probe: ToroidalMap | None = None  # whose bricks overlap, if they do
 
     @classmethod
     def of(cls, march: March, space: Space, shape: Node, segment: int, shown: Scene) -> "Margin":
@@ -194,6 +191,21 @@ class Margin:
     def of_points(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Nodes along each axis that are read around points in a box."""
         return nodes_within(space, shape, low, high, self.light) + self.around
+
+    def stored(self, grid: BrickGrid) -> Node:
+        """Nodes that are read at a time for the bricks of a grid."""
+        overlap = 0 if self.probe is None else math.ceil(max(overlap_of(self.probe, grid), default=0.0))
+        x, y, z = (size + 1 + 2 * around for size, around in zip(grid.size, self.cells, strict=True))
+        return stored_shape(grid.shape, (x, y, z + overlap))
+
+    def bytes(self, stored: Node, dtype: np.dtype) -> int:
+        """Memory that such bricks take: the one that is rendered, what is made of it, and the next one."""
+        packed = (8 if dtype.itemsize == 1 else 4) if self.slopes and dtype.kind in "ui" else 0
+        return math.ceil(math.prod(stored) * (COPIES * dtype.itemsize + packed))
+
+    def fits(self, stored: Node, dtype: np.dtype, memory: int) -> bool:
+        """Whether such bricks can be volumes, and take no more than so many bytes."""
+        return math.prod(stored) <= MOST_VOXELS and self.bytes(stored, dtype) <= memory
 
 
 def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, length: float) -> np.ndarray:
@@ -227,25 +239,6 @@ def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
     return x, y, z
 
 
-def stored_of(grid: BrickGrid, margin: Margin) -> Node:
-    """Nodes that are read at a time for the bricks of this grid."""
-    overlap = 0 if margin.probe is None else math.ceil(max(overlap_of(margin.probe, grid), default=0.0))
-    x, y, z = (size + 1 + 2 * around for size, around in zip(grid.size, margin.cells, strict=True))
-    return stored_shape(grid.shape, (x, y, z + overlap))
-
-
-def bytes_of(stored: Node, dtype: Any, margin: Margin) -> int:
-    """Memory that bricks of this shape take: the one that is rendered, what is made of it, and the next."""
-    kind = np.dtype(dtype)
-    packed = (8 if kind.itemsize == 1 else 4) if margin.slopes and kind.kind in "ui" else 0
-    return math.ceil(math.prod(stored) * (COPIES * kind.itemsize + packed))
-
-
-def fits(stored: Node, dtype: Any, margin: Margin, memory: int) -> bool:
-    """Whether bricks of this shape can be volumes, and take no more than so many bytes."""
-    return math.prod(stored) <= MOST_VOXELS and bytes_of(stored, dtype, margin) <= memory
-
-
 def divided(shape: Node, counts: Any) -> BrickGrid:
     """So many bricks along each axis, or fewer along one of too few voxels."""
     try:
@@ -260,24 +253,24 @@ def divided(shape: Node, counts: Any) -> BrickGrid:
     return grid
 
 
-def split(shape: Node, dtype: Any, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
+def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
     """The fewest bricks of about cubic shape, and at least as many as `devices` if these are not too small,
     that fit into so many bytes: there is one more along the axis where they are longest, until they do. Axes
     along which even the smallest bricks would be read whole are split last."""
     cells = [n - 1 for n in shape]
     x, y, z = (min(EDGE, c) for c in cells)
-    short = np.less(stored_of(BrickGrid(shape, (x, y, z)), margin), shape).tolist()
+    short = np.less(margin.stored(BrickGrid(shape, (x, y, z))), shape).tolist()
     counts = [1, 1, 1]
     while True:
         x, y, z = (min(-(-c // (count * EDGE)) * EDGE, c) for c, count in zip(cells, counts, strict=True))
         grid = BrickGrid(shape, (x, y, z))
-        stored = stored_of(grid, margin)
+        stored = margin.stored(grid)
         divisible = [axis for axis in range(3) if grid.size[axis] > min(EDGE, cells[axis])]
-        if fits(stored, dtype, margin, memory) and (grid.number >= devices or not divisible):
+        if margin.fits(stored, dtype, memory) and (grid.number >= devices or not divisible):
             return grid
         if not divisible:
             raise TooLittleMemory(
-                f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
+                f"memory must be at least {margin.bytes(stored, dtype)} bytes, for bricks of "
                 f"{' x '.join(map(str, grid.size))} cells and what is read around them, less for a "
                 f"shorter step; got {memory}."
             )

@@ -21,22 +21,13 @@ from ..scene.volume import Volume
 from ..xla.platform import is_traced
 
 
-Corner: TypeAlias = Sequence[int] | np.ndarray | Any
-"""Three voxel indices along x, y, z, checked at run time."""
-
-Box: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]
-"""First voxel along x, y and z, and the one behind the last."""
+Corner: TypeAlias = Sequence[int] | np.ndarray | Any  # three voxel indices along x, y, z
+Box: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]  # the first voxel, and the one behind the last
 
 SPACE = ("x", "y", "z")
-
-AT_ONCE = 2**23
-"""Bytes of voxels that are read at a time: a larger box is read in several steps."""
-
-ALIGNED = 64
-"""JAX uses an array of NumPy in place if its address is a multiple of so many bytes."""
-
+AT_ONCE = 2**23  # bytes of voxels that are read at a time: a larger box is read in several steps
+ALIGNED = 64  # JAX uses an array of NumPy in place if its address is a multiple of so many bytes
 READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
-"""Threads that read bricks and chunks while others are computed."""
 
 
 class VoxelSource:
@@ -44,30 +35,26 @@ class VoxelSource:
 
     It keeps its `Summary` once that is found: make another source after writing to the array.
 
-    **Arguments:**
+    Args:
+        array: Anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
+            axis, such as an array of NumPy, zarr, h5py, dask or tensorstore. Several threads read it at once.
+        spacing: As in `Volume`.
+        origin: As in `Volume`.
+        direction: As in `Volume`.
+        axes: The name of each axis, such as "tczyx" or ["z", "y", "x"]; by default "xyz".
+        index: The entry of each axis other than x, y and z, such as {"c": 1, "t": 0}; by default the only
+            one.
+        name: What it is called in errors.
 
-    - `array`: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
-      axis, such as an array of NumPy, zarr, h5py, dask or tensorstore. Several threads read it at once.
-    - `spacing`: as in `Volume`.
-    - `origin`: as in `Volume`.
-    - `direction`: as in `Volume`.
-    - `axes`: the name of each axis, such as "tczyx" or ["z", "y", "x"]; by default "xyz".
-    - `index`: the entry of each axis other than x, y and z, such as {"c": 1, "t": 0}; by default the only
-      one.
-    - `name`: what it is called in errors.
+    Attributes:
+        shape: Number of voxels along x, y, z.
+        dtype: Of the voxels that `read` returns.
+        chunks: Voxels along x, y, z of the chunks in which it is stored, or of a row if it has none.
+        order: Axes in the order of storage, the slowest first, 0 for x.
 
-    **Attributes:**
-
-    - `shape`: number of voxels along x, y, z.
-    - `spacing`: as given.
-    - `origin`: as given.
-    - `direction`: as given.
-    - `dtype`: of the voxels that `read` returns.
-    - `chunks`: voxels along x, y, z of the chunks in which it is stored, or of a row if it has none.
-    - `order`: axes in the order of storage, the slowest first, 0 for x.
-
-    **Raises:** `ValueError` for a shape or type that no volume has, for axes or an index that the array does
-    not have, and for a traced array.
+    Raises:
+        ValueError: For a shape or type that no volume has, for axes or an index that the array does not have,
+            and for a traced array.
     """
 
     def __init__(
@@ -88,7 +75,7 @@ class VoxelSource:
             )
         if not all(hasattr(array, attribute) for attribute in ("shape", "dtype", "__getitem__")):
             raise ValueError(
-                f"source must be an array, a Volume, a VoxelSource, or the path of one; got {described(array)}."
+                f"source must be an array, a Volume, a VoxelSource or a path; got {described(array)}."
             )
         if isinstance(array, jax.Array):
             array = np.asarray(array)  # JAX would compile a program for each box
@@ -132,8 +119,8 @@ class VoxelSource:
         return None
 
     def check_unchanged(self) -> None:
-        """**Raises:** `ValueError` if the file under a memory map was written to since the source was made.
-        To read one that became shorter would end the process."""
+        """Raises if the file under a memory map was written to since the source was made. To read one that
+        became shorter would end the process."""
         now = self._file_state()
         if now is not None and now != self._file:
             raise ValueError(f"{self.name} changed after it was opened as a source. Open it again.")
@@ -141,19 +128,20 @@ class VoxelSource:
     def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
         """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
 
-        **Arguments:**
+        Args:
+            low: First voxel along x, y, z.
+            high: The one behind the last.
+            axes: Order of the axes of what is returned, data[z, y, x] for (2, 1, 0); in the `order` of
+                storage, voxels are read fastest.
 
-        - `low`: first voxel along x, y, z.
-        - `high`: the one behind the last.
-        - `axes`: order of the axes of what is returned, data[z, y, x] for (2, 1, 0); in the `order` of
-          storage, voxels are read fastest.
+        Returns:
+            A C-contiguous array of type `dtype` in native byte order, which may be a view of the source: do
+            not write to it.
 
-        **Returns:** a C-contiguous array of type `dtype` in native byte order, which may be a view of the
-        source: do not write to it.
-
-        **Raises:** `ValueError` for a box that is empty or exceeds the volume; for voxels that are NaN,
-        infinite, or not exact in `dtype`; where the array raises anything; and if the file under a memory map
-        was written to since the source was made.
+        Raises:
+            ValueError: For a box that is empty or exceeds the volume; for voxels that are NaN, infinite, or
+                not exact in `dtype`; where the array raises anything; and if the file under a memory map was
+                written to since the source was made.
         """
         box = tuple(map(operator.index, low)), tuple(map(operator.index, high))
         if not all(0 <= a < b <= n for a, b, n in zip(*box, self.shape, strict=True)):
@@ -206,8 +194,8 @@ class VoxelSource:
             found = np.asarray(given)
         except Exception as fault:  # of whatever library
             raise ValueError(
-                f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). Fetch it again; "
-                'of Zarr without the chunks that hold only the fill value, pass missing="fill".'
+                f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). Fetch it "
+                'again, or pass missing="fill" if the chunks of Zarr were left out that hold the fill value.'
             ) from fault
         if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
             raise ValueError(f"{self.name}: voxels from {box[0]} to {box[1]} are masked. Fill them first.")
@@ -229,8 +217,8 @@ class VoxelSource:
             voxels = np.ascontiguousarray(voxels, self.dtype)
         if self.dtype.kind not in "iu" and not np.isfinite(voxels).all():
             raise ValueError(
-                f"{self.name}: voxels must be finite in {self.dtype}; got {np.sum(~np.isfinite(voxels))} that "
-                f"are NaN or infinite {place}. Replace them first."
+                f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite "
+                f"{place}. Replace them first."
             )
         return voxels
 

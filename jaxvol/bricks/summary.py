@@ -17,32 +17,22 @@ from .grid import BrickGrid
 from .sources import READERS, VoxelSource
 
 
-CELL = 16
-"""Cells along the side of a block, if the volume has more."""
-
-AT_ONCE = 2**18
-"""Blocks that are tested at a time, if a layer of them has no more."""
-
-COPIES = 8
-"""Of the voxels that are read at a time: these, the next ones, and what finding their ranges takes."""
-
-MOST = 2**25
-"""Bytes of voxels that are read at a time, if a chunk has no more: larger ones leave the caches."""
+CELL = 16  # cells along the side of a block, if the volume has more
+AT_ONCE = 2**18  # blocks that are tested at a time, if a layer of them has no more
+COPIES = 8  # of the voxels that are read at a time: these, the next ones, and what finding their ranges takes
+MOST = 2**25  # bytes of voxels that are read at a time, if a chunk has no more: larger ones leave the caches
 
 
 @dataclass(frozen=True)
 class Summary:
     """Ranges of the voxels in each block of `cell`³ cells, including the nodes on its faces.
 
-    **Attributes:**
-
-    - `shape`: of the volume, in voxels.
-    - `cell`: cells along the side of a block.
-    - `low`: least voxel, in the voxels' type, (bx, by, bz).
-    - `high`: greatest voxel, in the voxels' type, (bx, by, bz).
+    Attributes:
+        cell: Cells along the side of a block.
+        low: Least voxel, in the voxels' type, (bx, by, bz).
+        high: Greatest voxel, in the voxels' type, (bx, by, bz).
     """
 
-    shape: tuple[int, int, int]
     cell: int
     low: np.ndarray
     high: np.ndarray
@@ -50,11 +40,13 @@ class Summary:
     def bricks_where(self, holds: Callable[[Blocks], Any], grid: BrickGrid) -> Bool[np.ndarray, " bricks"]:
         """For each brick, whether something holds of any of its blocks.
 
-        **Arguments:**
+        Args:
+            holds: Of `Blocks`, an array of the same shape, such as `transfer.visible`. It is a tree
+                (`eqx.Partial`), so that it is compiled once.
+            grid: The bricks.
 
-        - `holds`: of `Blocks`, an array of the same shape, such as `transfer.visible`. It is a tree
-          (`eqx.Partial`), so that it is compiled once.
-        - `grid`: the bricks.
+        Returns:
+            An answer for each brick.
         """
         layers = max(1, AT_ONCE // self.low[0].size)  # a transfer function may need 100 times their memory
         some = [slice(begin, begin + layers) for begin in range(0, len(self.low), layers)]
@@ -71,14 +63,15 @@ def summary_of(source: VoxelSource, *, memory: int = 2**28) -> Summary:
     """The summary of a source, from one pass over its voxels. The source keeps it: make another source after
     writing to the array.
 
-    **Arguments:**
+    Args:
+        source: The voxels.
+        memory: Bytes for the pass, in addition to the summary. It is exceeded where one chunk takes more.
 
-    - `source`: the voxels.
-    - `memory`: bytes for the pass, in addition to the summary. It is exceeded where one chunk takes more.
+    Returns:
+        The summary. It takes 2 / 16³ of the voxels' memory.
 
-    **Returns:** the summary. It takes 2 / 16³ of the voxels' memory.
-
-    **Raises:** `ValueError` for what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
+    Raises:
+        ValueError: For what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
     """
     if source._summary is not None:
         source.check_unchanged()
@@ -88,7 +81,7 @@ def summary_of(source: VoxelSource, *, memory: int = 2**28) -> Summary:
 
 
 def scan(source: VoxelSource, cell: int, *, memory: int = 2**28) -> Summary:
-    """As `summary_of`, in blocks of `cell`³ cells. The next voxels are read while the last ones are searched."""
+    """As `summary_of`, in blocks of `cell`³ cells. The next voxels are read while the last are searched."""
     order, shape = source.order, tuple(-(-(n - 1) // cell) for n in source.shape)
     limits = (jnp.iinfo if source.dtype.kind in "iu" else jnp.finfo)(source.dtype)
     low, high = np.full(shape, limits.max, source.dtype), np.full(shape, limits.min, source.dtype)
@@ -110,7 +103,7 @@ def scan(source: VoxelSource, cell: int, *, memory: int = 2**28) -> Summary:
             found = found.transpose(inverse(order)).astype(source.dtype)
             ranges[blocks] = combine(ranges[blocks], found)
     give_back()
-    return Summary(source.shape, cell, low, high)
+    return Summary(cell, low, high)
 
 
 def _over_blocks(

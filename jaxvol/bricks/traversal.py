@@ -27,18 +27,7 @@ from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
 from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
-from .grid import (
-    MOST_VOXELS,
-    BrickGrid,
-    Margin,
-    Node,
-    bytes_of,
-    divided,
-    fits,
-    split,
-    stored_of,
-    stored_shape,
-)
+from .grid import MOST_VOXELS, BrickGrid, Margin, Node, divided, split, stored_shape
 from .sources import READERS, VoxelSource
 from .summary import summary_of
 
@@ -49,15 +38,11 @@ Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
-BEAMS = 32
-"""Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
-rays."""
-
-BATCH = 72
-"""`Tiling.batch` on a CPU. Few rays meet a brick, and the last batch takes as long as its longest ray."""
-
-KEPT = 64 * 2**20
-"""Bytes that are read before freed memory is given back to the system, which takes some 8 ms."""
+BEAMS = 32  # of curved rays, searched at a time: it takes as long as the longest of these
+BATCH = (
+    72  # `Tiling.batch` on a CPU: few rays meet a brick, and the last batch lasts as long as its longest ray
+)
+KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
 
 
 class Load(NamedTuple):
@@ -71,37 +56,25 @@ class Load(NamedTuple):
 
 @dataclass(frozen=True)
 class Request:
-    """What `render_bricks` was asked for.
-
-    - `counts`: bricks along x, y and z, in place of those chosen to fit into `memory`.
-    - `mesh`: devices over which rays are dealt out, or bricks, if `deals_bricks`.
-    - `traversals`: filled while the scene is rendered. A gradient has a second one.
-    """
+    """What `render_bricks` was asked for."""
 
     source: VoxelSource
     memory: int
-    counts: Any = None
+    counts: Any = None  # bricks along x, y and z, in place of those chosen to fit into `memory`
     method: Method = "overlap"
     progress: Callable[[int, int], Any] | None = None
     outputs: Any = "all"
-    mesh: Mesh | None = None
+    mesh: Mesh | None = None  # devices over which rays are dealt out, or bricks, if `deals_bricks`
     deals_bricks: bool = False
-    traversals: "list[Traversal]" = field(default_factory=list)
+    traversals: "list[Traversal]" = field(default_factory=list)  # so far; a gradient has a second one
 
 
 class Traversal:
-    """An image's rays on their way through all bricks.
-
-    - `scene`: with a volume without its voxels. `space`: of its grid.
-    - `order`: bricks, front to back. `visible`: for each brick, whether anything may be visible in it.
-    - `stored`: nodes along each axis that are read at a time. `min_stored`: as many as any single brick
-      needs. `memory`: bytes that these may take.
-    - `rays`, `at`: the rays, and how far they have been marched.
-    - `done`: number of bricks that were rendered. `loads`: bricks whose reading has begun.
-    """
+    """An image's rays on their way through all bricks. Its `scene` is as rays are marched, and its volume is
+    without voxels."""
 
     rays: Ray
-    at: Progress
+    at: Progress  # how far they have been marched
 
     def __init__(self, request: Request, shown: Scene):
         marched, mode, outputs = shown, shown.compositing, request.outputs
@@ -111,25 +84,24 @@ class Traversal:
             outputs = "depth" if outputs == "rgba" else outputs
         assert isinstance(marched.source, Camera)
         self.request, self.source, self.scene = request, request.source, marched
-        source, memory, counts = request.source, request.memory, request.counts
+        source, shape, counts = request.source, request.source.shape, request.counts
         tiling = Tiling.of_backend(request.mesh)
         if not tiling.turns:  # on a CPU
             tiling = tiling._replace(batch=BATCH)
-        self.options = RenderOptions(
-            outputs, tiling._replace(devices=None) if request.deals_bricks else tiling
-        )
+        tiling = tiling._replace(devices=None) if request.deals_bricks else tiling
+        self.options = RenderOptions(outputs, tiling)
         self.done, self.bytes_read = 0, 0
-        self.loads: list[int] = []
-        self.space, shape = marched.march.locate(marched.volume), source.shape
+        self.loads: list[int] = []  # bricks whose reading has begun
+        self.space = marched.march.locate(marched.volume)
         margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
         least = devices.number_of(request.mesh) if request.deals_bricks else 1
-        self.grid = (
-            divided(shape, counts)
-            if counts is not None
-            else split(shape, source.dtype, memory, margin, least)
-        )
+        if counts is None:
+            self.grid = split(shape, source.dtype, request.memory, margin, least)
+        else:
+            self.grid = divided(shape, counts)
         self.margin = margin if request.method == "overlap" else replace(margin, probe=None)
-        self.stored = self.min_stored = stored_of(self.grid, self.margin)
+        # nodes along each axis that are read at a time, and that any single brick needs
+        self.stored = self.min_stored = self.margin.stored(self.grid)
         if math.prod(self.stored) > MOST_VOXELS:
             read = " x ".join(map(str, self.stored))
             raise ValueError(
@@ -139,12 +111,12 @@ class Traversal:
             # what is read follows from the rays: begin with less
             middle = (np.asarray(shape) - 1) / 2
             cells = self.margin.of_box(self.space, shape, middle, middle)
-            self.stored = stored_of(self.grid, replace(self.margin, cells=cells))
-        self.memory = max(memory, bytes_of(self.min_stored, source.dtype, self.margin))
+            self.stored = replace(self.margin, cells=cells).stored(self.grid)
+        self.memory = max(request.memory, self.margin.bytes(self.min_stored, source.dtype))
         self.order = self.grid.order(self.space, marched.source)
         # last, since it may read the whole source
         occupied = eqx.Partial(marched.compositing.occupied, marched.transfer)
-        self.visible = summary_of(source, memory=memory).bricks_where(occupied, self.grid)
+        self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
         request.traversals.append(self)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
@@ -187,7 +159,7 @@ class Traversal:
             len(self.loads) - len(set(self.loads)),
             self.bytes_read,
             self.stored,
-            bytes_of(self.stored, self.source.dtype, self.margin),
+            self.margin.bytes(self.stored, self.source.dtype),
         )
 
     def cells_of(
@@ -205,8 +177,8 @@ class Traversal:
         return low - self.margin.cells, high + self.margin.cells
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
-        """The box that is read for these cells. `stored` is enlarged for it as far as memory goes, so far that
-        any single brick still fits; None if that does not suffice."""
+        """The box that is read for these cells, for which `stored` is enlarged; None if it, or then any
+        single brick, does not fit into memory."""
         shape = self.grid.shape
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
         around = self.margin.of_points(self.space, shape, low, high)
@@ -214,14 +186,13 @@ class Traversal:
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(shape) - 1)
         x, y, z = map(max, stored_shape(shape, tuple((high - low + 1).tolist())), self.stored)
         nx, ny, nz = map(max, (x, y, z), self.min_stored)
-        if not fits((nx, ny, nz), self.source.dtype, self.margin, self.memory):
+        if not self.margin.fits((nx, ny, nz), self.source.dtype, self.memory):
             return None
         self.stored = x, y, z
         return low, high
 
     def load(self, brick: int, cells: CellRange | None, low: np.ndarray, high: np.ndarray) -> Load:
-        """Starts to read a brick, for these cells: a box that begins at a multiple of BLOCK and holds these
-        nodes."""
+        """Starts to read a brick: a box that begins at a multiple of BLOCK and holds these nodes."""
         shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
         first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
         assert np.all(np.minimum(high, shape - 1) < first + stored), (low, high, first, stored)
@@ -299,8 +270,7 @@ def _curved(
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), dealt)
 
         def some(each: tuple[Ray, Progress, Array]) -> BrickCells:
-            rays, at, reached = each
-            return curved_cells(grid, march, rays, at, reached, visit, beyond)
+            return curved_cells(grid, march, *each, visit, beyond)
 
         found: BrickCells = jax.lax.map(some, by_beam, batch_size=BEAMS)
         shape = dealt[0].length.shape

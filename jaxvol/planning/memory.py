@@ -5,10 +5,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ..bricks.opening import Openable, source_of
-from ..bricks.render import bricks_of, budget
-from ..bricks.sources import VoxelSource
 from ..bricks.grid import TooLittleMemory
+from ..bricks.opening import Openable, source_of
+from ..bricks.render import budget, scene_of
+from ..bricks.sources import VoxelSource
+from ..bricks.traversal import Request, Traversal
 from ..compositing.blending import Compositing
 from ..lighting.shading import Lighting
 from ..march.march import March
@@ -54,12 +55,12 @@ def with_bricks(
 ) -> tuple[March, BrickReport]:
     """The march that was planned for a copy of every n-th voxel, with steps of 1/n, and shorter ones if
     bricks fit only then; and the bricks."""
-    how: dict[str, Any] = {"memory": memory, "compositing": compositing, "lighting": lighting}
     finer = stride
     while True:
         shorter = March(jnp.asarray(march.step) / finer, march.transforms, march.quadrature)
         try:
-            return shorter, bricks_of(source, transfer, camera, shorter, **how).report()
+            scene = scene_of(source, transfer, camera, shorter, compositing, lighting)
+            return shorter, Traversal(Request(source, memory), scene).report()
         except TooLittleMemory:  # what is read around a brick is a number of steps
             if finer == stride * 2**HALVED:
                 raise
