@@ -28,7 +28,7 @@ def each_at_once(traversal: Traversal) -> Iterator[Load]:
             if found is None:
                 break
             if load is None:
-                load = traversal.load(brick, found.cells, *traversal.around(brick))
+                load = traversal.load(brick, found.cells)
             else:
                 load = load._replace(cells=found.cells)
             reached = found.reached

@@ -6,9 +6,8 @@ then visited one after the other, and a ray goes on while it is in this one, or 
 before: those cells are read with the brick, which is the overlap of Kim, Kwon and Shin 2008.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -25,13 +24,13 @@ from .grid import SLACK, BrickGrid
 CHUNK = 8  # cells of a ray that are tested at a time
 
 
-class Visit(eqx.Module):
-    """A brick; through which bricks rays go on from it, itself included; and which are `empty`, so that rays
-    move through them to it. The masks are of all bricks, and of what lies outside of the volume."""
+Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " bricks"]]
+"""A brick; through which bricks rays go on from it, itself included; and which are empty, so that rays move
+through them to it. The masks are of all bricks, and of what lies outside of the volume."""
 
-    brick: Int[Array, ""]
-    passable: Bool[Array, " bricks"]
-    empty: Bool[Array, " bricks"]
+
+CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
+"""Rays, where their march has come to, and to which cell of each ray bricks have been found."""
 
 
 class BrickCells(NamedTuple):
@@ -94,17 +93,11 @@ def _within(
     return jnp.clip(near / march.step, 0, last), jnp.clip(far / march.step, 0, last), hit
 
 
-def curved_cells(
-    grid: BrickGrid,
-    march: March,
-    rays: Ray,
-    at: Progress,
-    reached: Int[Array, "*rays"],
-    visit: Visit,
-    beyond: int,
-) -> BrickCells:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other from `reached` on;
-    `low` and `high` also hold `beyond` steps before and behind these."""
+def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit, beyond: int) -> BrickCells:
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other; `low` and `high`
+    also hold `beyond` steps before and behind these."""
+    rays, at, reached = curved
+    brick, passable, empty = visit
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
@@ -142,7 +135,7 @@ def curved_cells(
             at = bricks(index[None] + number)
             stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
             passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
-            seen = passed & jnp.any(~visit.empty[at], axis=0) & going[None]
+            seen = passed & jnp.any(~empty[at], axis=0) & going[None]
             last = jnp.maximum(last, jnp.max(jnp.where(seen, index[None] + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
             return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
@@ -151,11 +144,11 @@ def curved_cells(
         index, last, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), more, start)
         return index, last
 
-    first, _ = while_in(visit.empty, reached, ~at.finished)
-    here = jnp.any(bricks(first[None])[:, 0] == visit.brick, axis=0)
+    first, _ = while_in(empty, reached, ~at.finished)
+    here = jnp.any(bricks(first[None])[:, 0] == brick, axis=0)
     # where its points lie in several bricks, the cell belongs to the first one that is visited
     enters = ~at.finished & here & ahead(first[None])[0]
-    _, until = while_in(visit.passable, first + 1, enters)
+    _, until = while_in(passable, first + 1, enters)
     until = jnp.maximum(until, first + 1)
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

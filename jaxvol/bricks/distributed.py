@@ -103,7 +103,7 @@ def _next_loads(
         given = traversal.grid, traversal.scene
         needed = np.asarray(_on_each(mesh, _met, True, given, share, jnp.asarray(bricks)[:, None]))[:, 0]
         loads = {
-            d: traversal.load(each[d], None, *traversal.around(each[d]))
+            d: traversal.load(each[d], None)
             for d, device in enumerate(mesh.devices)
             if device.process_index == jax.process_index() and needed[d]
         }

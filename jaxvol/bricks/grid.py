@@ -25,15 +25,11 @@ from ..xla.compiling import compiled
 
 Node = tuple[int, int, int]
 
-# Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more for
-# rounding.
-SLACK = 3
-
-# Bricks are at least so many cells long, and of a multiple of these, where the volume is.
-EDGE = 16
-
-# How many a user may ask for: each is searched for along all rays, also where it is not read.
-MOST_BRICKS = 2**16
+SLACK = (
+    3  # steps by which jitter may move samples away from where their cells begin, and one more for rounding
+)
+EDGE = 16  # bricks are at least so many cells long, and of a multiple of these, where the volume is
+MOST_BRICKS = 2**16  # that a user may ask for: each is searched for along all rays
 
 # Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of blocks
 # takes, less than half. Voxels of another type take `sources.AT_ONCE` bytes more, or a layer of chunks, while
@@ -123,8 +119,7 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     includes the cap between the curved face and its chord, it need not be rendered again. At a face at the
     distance l from the apex the cap has the height K = l - l cos(θ/2), where θ is the angle of a brick's fan;
     along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger counts.
-    With less, rays from side to side of a brick are blended in the wrong order. `render_bricks` does not use
-    it for what it reads, which follows from the rays.
+    What `render_bricks` reads follows from its rays instead.
 
     Args:
         probe: Of the volume.
@@ -209,9 +204,8 @@ class Margin:
 
 
 def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, length: float) -> np.ndarray:
-    """Nodes along each axis, on both sides of a box, that hold everything within a world length of it. Where
-    rays are curved they follow from the least distances between nodes in the box and in these nodes
-    themselves, also beyond the grid, through which a ray may come to other nodes of it."""
+    """Nodes along each axis, on both sides of a box, that hold everything within a world length of it, by the
+    least distances between nodes in both, also beyond the grid, where a ray may return to it."""
     nodes = np.zeros(3)
     while length > 0:
         distances = _distances(space, low - nodes, high + nodes)
@@ -270,8 +264,7 @@ def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: in
             return grid
         if not divisible:
             raise TooLittleMemory(
-                f"memory must be at least {margin.bytes(stored, dtype)} bytes, for bricks of "
-                f"{' x '.join(map(str, grid.size))} cells and what is read around them, less for a "
-                f"shorter step; got {memory}."
+                f"memory must be at least {margin.bytes(stored, dtype)} bytes, for bricks of {grid.size} "
+                f"cells and what is read around them, less for a shorter step; got {memory}."
             )
         counts[max(divisible, key=lambda axis: (short[axis], grid.size[axis]))] += 1

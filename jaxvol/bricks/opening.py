@@ -1,8 +1,8 @@
 """Opens arrays, files and folders as sources, and chooses the level of detail for a view.
 
-Zarr arrays are read by tensorstore: all chunks that a box touches at once. yaozarrs checks the `multiscales`
-of OME-Zarr 0.4 (Zarr 2, in .zattrs) and 0.5 (Zarr 3, in zarr.json), which say where levels of detail lie in
-the world: https://ngff.openmicroscopy.org/0.5/. A voxel's position is that of its centre.
+tensorstore reads Zarr arrays. yaozarrs checks the `multiscales` of OME-Zarr 0.4 (Zarr 2, in .zattrs) and 0.5
+(Zarr 3, in zarr.json), which say where levels of detail lie in the world: https://ngff.openmicroscopy.org/0.5/.
+A voxel's position is that of its centre.
 """
 
 import json

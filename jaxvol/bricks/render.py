@@ -77,9 +77,8 @@ def render_bricks(
         spacing: As in `Volume`; by default what the source says.
         origin: As in `Volume`; by default what the source says.
         memory: Bytes for voxels and what is made of them: the brick that is rendered and the next one; by
-            default a quarter of the device's. In addition an image takes some 550 bytes for each pixel,
-            compiled programs some 300 MiB, the ranges of values 2 / 16³ of the voxels, and Zarr 16 MiB for
-            each level.
+            default a quarter of the device's. In addition an image takes some 550 bytes for each pixel, and
+            compiled programs some 300 MiB.
         bricks: Number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
             may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
         method: Where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
@@ -101,8 +100,8 @@ def render_bricks(
             for several processes. Rays must be straight in the grid, and what a ray shows must not depend on
             what lies in front but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`;
             compositing by `"over"`). An `EarlyTermination` sees only what is in front on the same device: up
-            to `opacity_left` of the colours behind are added, and depth changes with them. Without it, depth
-            agrees to 1e-5 of itself. Each device keeps some 300 bytes for each pixel. No gradients.
+            to `opacity_left` of the colours behind are added, and depth changes with them; without it, depth
+            agrees to 1e-5 of itself. No gradients.
         **options: For the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
 
     Returns:
@@ -116,15 +115,12 @@ def render_bricks(
     Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
     spacing and origin: a second march reads the bricks again. Where the march leaps, the derivative by the
     extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other cells.
-    There is no gradient to the voxels, none of modes that choose a sample or resolve (`"maximum"`,
-    `"average"`, `Isosurface`), none in forward mode (`jax.jvp`) or of second order, and none inside `jax.jit`
-    or `jax.vmap`.
+    There is no gradient to the voxels, none of modes other than `"over"`, none in forward mode (`jax.jvp`) or
+    of second order, and none inside `jax.jit` or `jax.vmap`.
 
-    Where it fails, and where not: `experiments/stability.py`, "wrong order".
-
-    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
-    are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the
-    image; `bricks.overlap_of` has their formula.
+    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3; their future work are ranges of values,
+    by which empty bricks are not read. Unlike there, how far bricks overlap follows from the rays of the
+    image; `bricks.overlap_of` has their formula. Where it fails: `experiments/stability.py`, "wrong order".
     """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
@@ -180,8 +176,8 @@ def scene_of(
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
         raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
     if lighting is not None and lighting.farthest_read is None:
-        what = f"{type(lighting).__name__} needs the whole volume here"
-        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); {what}.")
+        needs = f"{type(lighting).__name__}, which needs the whole volume"
+        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); got {needs}.")
     place = {"spacing": source.spacing, "origin": source.origin} | traced
     volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
@@ -189,14 +185,10 @@ def scene_of(
     return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
 
 
-_begin_rays = compiled(brick_march.begin_rays)
-_march_brick = compiled(brick_march.march_brick)
-_finish_image = compiled(brick_march.finish_image)
-_resolve_brick = compiled(brick_march.resolve_brick)
-_resolve_image = compiled(resolve_image)
-_begin_vjp = compiled(brick_march.begin_vjp)
-_vjp_of_brick = compiled(brick_march.vjp_of_brick)
-_finish_vjp = compiled(brick_march.finish_vjp)
+_begin_rays, _march_brick = compiled(brick_march.begin_rays), compiled(brick_march.march_brick)
+_finish_image, _resolve_image = compiled(brick_march.finish_image), compiled(resolve_image)
+_resolve_brick, _begin_vjp = compiled(brick_march.resolve_brick), compiled(brick_march.begin_vjp)
+_vjp_of_brick, _finish_vjp = compiled(brick_march.vjp_of_brick), compiled(brick_march.finish_vjp)
 
 
 def _image(scene: Scene, request: Request) -> Rendering:
@@ -283,8 +275,7 @@ def _level(
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
     most = 0 if mapped else len(levels) - 1  # a map's ranges are those of the finest level
     if level != "auto":
-        otherwise = ', or "auto" under a ToroidalMap' if mapped else ', or "auto"'
-        return levels[integer("level", level, 0, most, otherwise=otherwise)]
+        return levels[integer("level", level, 0, most, otherwise=', or "auto"')]
     if most and is_traced(camera):
         raise ValueError(f"level must be one of 0 to {most} where gradients are taken; got 'auto'.")
     return levels[level_for(levels, camera) if most else 0]

@@ -16,7 +16,7 @@ import numpy as np
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, described, finite_array, integer
-from .._util.voxels import DTYPES, WHOLE, check_shape, check_type
+from .._util.voxels import DTYPES, check_shape, check_type
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 
@@ -89,26 +89,23 @@ class VoxelSource:
         shape = tuple(map(int, array.shape))
         if len(shape) < 3:
             check_shape(shape)
-        place, self._index = _axes(name, shape, axes, index or {})
-        self.shape: tuple[int, int, int] = permuted([shape[axis] for axis in place], XYZ)
+        self._place, self._index = _axes(name, shape, axes, index or {})
+        self.shape: tuple[int, int, int] = permuted([shape[axis] for axis in self._place], XYZ)
         check_shape(self.shape)
         self.dtype = voxel_type(np.dtype(getattr(array.dtype, "numpy_dtype", array.dtype)))  # of tensorstore
         chunks, order = _layout_of(array, shape)
-        slow, middle, fast = (place.index(axis) for axis in order if axis in place)
-        self.order: Axes = slow, middle, fast
+        self.order: Axes = permuted([self._place.index(axis) for axis in order if axis in self._place], XYZ)
         if chunks is None:
-            chunks = [n if axis == place[fast] else 1 for axis, n in enumerate(shape)]
-        x, y, z = (min(chunks[axis], n) for axis, n in zip(place, self.shape, strict=True))
-        self.chunks: tuple[int, int, int] = x, y, z
-        self._place, self._map = place, _map_under(array)
+            sizes = [n if axis == self.order[2] else 1 for axis, n in enumerate(self.shape)]
+        else:  # of zarr and h5py a number for each axis, of dask all numbers
+            sizes = [min(int(np.max(chunks[k])), n) for k, n in zip(self._place, self.shape, strict=True)]
+        self.chunks: tuple[int, int, int] = permuted(sizes, XYZ)
+        while isinstance(array, np.ndarray) and not isinstance(array.base, mmap.mmap):
+            array = array.base
+        self._map = array if isinstance(array, np.memmap) else None  # of which the array is a part
         self._file = self._file_state()
-        self._in_memory = isinstance(array, np.ndarray) and self._map is None
+        self._in_memory = isinstance(self.array, np.ndarray) and self._map is None
         self._summary: Any = None  # found by `summary.summary_of`
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all voxels, as they are read."""
-        return math.prod(self.shape) * self.dtype.itemsize
 
     def _file_state(self) -> tuple[int, int] | None:
         """Size and time of the file under a read-only memory map."""
@@ -139,9 +136,9 @@ class VoxelSource:
             not write to it.
 
         Raises:
-            ValueError: For a box that is empty or exceeds the volume; for voxels that are NaN, infinite, or
-                not exact in `dtype`; where the array raises anything; and if the file under a memory map was
-                written to since the source was made.
+            ValueError: For a box that is empty or exceeds the volume; for voxels that are NaN or infinite;
+                where the array raises anything; and if the file under a memory map was written to since the
+                source was made.
         """
         box = tuple(map(operator.index, low)), tuple(map(operator.index, high))
         if not all(0 <= a < b <= n for a, b, n in zip(*box, self.shape, strict=True)):
@@ -150,12 +147,16 @@ class VoxelSource:
                 f"{self.shape}, `high` exclusive; got {low!r} and {high!r}."
             )
         if self._in_memory:
-            return self._converted(self._stored(box, axes), box)
+            return self._read_at_once(box, axes)
         self.check_unchanged()
-        voxels = _aligned(permuted([b - a for a, b in zip(*box, strict=True)], axes), self.dtype)
-        for part in self.parts(box, AT_ONCE):
-            place = [slice(a - x, b - x) for a, b, x in zip(*part, box[0], strict=True)]
-            voxels[permuted(place, axes)] = self._converted(self._stored(part, axes), part)
+        shape = permuted([b - a for a, b in zip(*box, strict=True)], axes)
+        size = math.prod(shape) * self.dtype.itemsize
+        memory = np.empty(size + ALIGNED, np.uint8)
+        start = -memory.ctypes.data % ALIGNED
+        voxels = memory[start : start + size].view(self.dtype).reshape(shape)
+        for low, high in self.boxes(box, AT_ONCE):
+            place = [slice(a - x, b - x) for a, b, x in zip(low, high, box[0], strict=True)]
+            voxels[permuted(place, axes)] = self._read_at_once((low, high), axes)
         if self._map is not None and self._map.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
             mapped: Any = self._map.base
             mapped.madvise(mmap.MADV_DONTNEED)  # or what was read would count as the process's memory
@@ -164,12 +165,12 @@ class VoxelSource:
     def subsampled(self, stride: int) -> Volume:
         """Every `stride`-th voxel."""
         found = np.empty([-(-n // stride) for n in self.shape], self.dtype)
-        for low, high in self.parts(((0, 0, 0), self.shape), AT_ONCE):
+        for low, high in self.boxes(((0, 0, 0), self.shape), AT_ONCE):
             place = tuple(slice(-(-a // stride), -(-b // stride)) for a, b in zip(low, high, strict=True))
             found[place] = self.read(low, high)[tuple(slice(-a % stride, None, stride) for a in low)]
         return Volume(found, [stride * s for s in self.spacing], self.origin)
 
-    def parts(self, box: Box, most: int) -> Iterator[Box]:
+    def boxes(self, box: Box, most: int) -> Iterator[Box]:
         """Cuts a box between chunks, into boxes of at most `most` bytes or of one chunk, in the order of
         storage."""
         extent, item = list(self.chunks), self.dtype.itemsize
@@ -184,8 +185,7 @@ class VoxelSource:
             x, y, z = permuted(piece, inverse(self.order))
             yield (x[0], y[0], z[0]), (x[1], y[1], z[1])
 
-    def _stored(self, box: Box, axes: Axes) -> np.ndarray:
-        """The voxels of a box as they are stored, with their axes in the order `axes`."""
+    def _read_at_once(self, box: Box, axes: Axes) -> np.ndarray:
         index: list[Any] = list(self._index)
         for a, b, axis in zip(*box, self._place, strict=True):
             index[axis] = slice(a, b)
@@ -200,34 +200,19 @@ class VoxelSource:
         if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
             raise ValueError(f"{self.name}: voxels from {box[0]} to {box[1]} are masked. Fill them first.")
         rank = [sorted(self._place).index(axis) for axis in self._place]
-        return found.transpose(permuted(rank, axes))
-
-    def _converted(self, voxels: np.ndarray, box: Box) -> np.ndarray:
-        """Voxels of a box in the source's type, C-contiguous."""
-        place = f"from {box[0]} to {box[1]}"
-        if self.dtype == np.float32 and voxels.dtype.kind in "iu":
-            least, most = WHOLE["float32"]
-            low, high = int(voxels.min()), int(voxels.max())
-            if low < least or high > most:
-                raise ValueError(
-                    f"{self.name}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds "
-                    f"exactly; got {voxels.dtype} from {low} to {high} {place}."
-                )
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
-            voxels = np.ascontiguousarray(voxels, self.dtype)
+            voxels = np.ascontiguousarray(found.transpose(permuted(rank, axes)), self.dtype)
         if self.dtype.kind not in "iu" and not np.isfinite(voxels).all():
             raise ValueError(
-                f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite "
-                f"{place}. Replace them first."
+                f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite from "
+                f"{box[0]} to {box[1]}. Replace them first."
             )
         return voxels
 
 
 def voxel_type(stored: np.dtype) -> np.dtype:
-    """The type in which voxels stored as `stored` are read: one of `Volume`'s, in native byte order.
-
-    Booleans become uint8, integers of 32 and 64 bits float32. float64 stays where JAX's 64-bit types are
-    enabled."""
+    """The type in which voxels are read: one of `Volume`'s, in native byte order. Booleans become uint8,
+    integers of 32 and 64 bits float32; float64 stays where JAX's 64-bit types are enabled."""
     check_type(stored)
     if stored.kind == "b":
         return np.dtype(np.uint8)
@@ -236,26 +221,16 @@ def voxel_type(stored: np.dtype) -> np.dtype:
     return np.dtype(np.float32) if stored.kind in "iu" else np.dtype(jnp.result_type(float))
 
 
-def _map_under(array: Any) -> np.memmap | None:
-    """The memory map that an array is a part of."""
-    while isinstance(array, np.ndarray) and not isinstance(array.base, mmap.mmap):
-        array = array.base
-    return array if isinstance(array, np.memmap) else None
-
-
-def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[list[int] | None, list[int]]:
+def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[Any, list[int]]:
     """Voxels of a chunk along each axis, None where there are no chunks; and the axes in the order of
     storage, the slowest first."""
-    axes = list(range(len(shape)))
-    layout = getattr(array, "chunk_layout", None)
+    axes, layout = list(range(len(shape))), getattr(array, "chunk_layout", None)
     if layout is not None:  # tensorstore
         chunks = [c or n for c, n in zip(layout.read_chunk.shape, shape, strict=True)]
         return chunks, list(layout.inner_order or axes)
     if isinstance(array, np.ndarray):
         return None, sorted(axes, key=lambda axis: -abs(array.strides[axis]))
-    chunks = getattr(array, "chunks", None)
-    # of zarr and h5py a number for each axis, of dask all numbers
-    return None if chunks is None else [int(np.max(c)) for c in chunks], axes
+    return getattr(array, "chunks", None), axes
 
 
 def _axes(
@@ -275,14 +250,6 @@ def _axes(
         only = 0 if count == 1 or axis in SPACE else None
         fixed.append(integer(f"index[{axis!r}]", index.get(axis, only), 0, max(count - 1, 0)))
     return [names.index(axis) for axis in SPACE], fixed
-
-
-def _aligned(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An uninitialized array that `jax.device_put` uses in place where the device is the CPU."""
-    size = math.prod(shape) * dtype.itemsize
-    memory = np.empty(size + ALIGNED, np.uint8)
-    start = -memory.ctypes.data % ALIGNED
-    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def _triple(name: str, value: Any) -> tuple[float, float, float]:

@@ -25,29 +25,15 @@ MOST = 2**25  # bytes of voxels that are read at a time, if a chunk has no more:
 
 @dataclass(frozen=True)
 class Summary:
-    """Ranges of the voxels in each block of `cell`³ cells, including the nodes on its faces.
-
-    Attributes:
-        cell: Cells along the side of a block.
-        low: Least voxel, in the voxels' type, (bx, by, bz).
-        high: Greatest voxel, in the voxels' type, (bx, by, bz).
-    """
+    """Ranges of the voxels in each block of `cell`³ cells, including the nodes on its faces."""
 
     cell: int
     low: np.ndarray
     high: np.ndarray
 
     def bricks_where(self, holds: Callable[[Blocks], Any], grid: BrickGrid) -> Bool[np.ndarray, " bricks"]:
-        """For each brick, whether something holds of any of its blocks.
-
-        Args:
-            holds: Of `Blocks`, an array of the same shape, such as `transfer.visible`. It is a tree
-                (`eqx.Partial`), so that it is compiled once.
-            grid: The bricks.
-
-        Returns:
-            An answer for each brick.
-        """
+        """For each brick, whether something such as `transfer.visible` holds of any of its blocks. `holds` is
+        a tree (`eqx.Partial`), so that it is compiled once."""
         layers = max(1, AT_ONCE // self.low[0].size)  # a transfer function may need 100 times their memory
         some = [slice(begin, begin + layers) for begin in range(0, len(self.low), layers)]
         blocks = np.concatenate([_holding(holds, self.low[each], self.high[each]) for each in some])
@@ -60,19 +46,8 @@ class Summary:
 
 
 def summary_of(source: VoxelSource, *, memory: int = 2**28) -> Summary:
-    """The summary of a source, from one pass over its voxels. The source keeps it: make another source after
-    writing to the array.
-
-    Args:
-        source: The voxels.
-        memory: Bytes for the pass, in addition to the summary. It is exceeded where one chunk takes more.
-
-    Returns:
-        The summary. It takes 2 / 16³ of the voxels' memory.
-
-    Raises:
-        ValueError: For what `VoxelSource.read` raises it for, such as NaN, anywhere in the source.
-    """
+    """The summary of a source, from one pass over its voxels, which the source keeps. `memory`: bytes for the
+    pass, which one chunk may exceed."""
     if source._summary is not None:
         source.check_unchanged()
         return source._summary
@@ -85,7 +60,7 @@ def scan(source: VoxelSource, cell: int, *, memory: int = 2**28) -> Summary:
     order, shape = source.order, tuple(-(-(n - 1) // cell) for n in source.shape)
     limits = (jnp.iinfo if source.dtype.kind in "iu" else jnp.finfo)(source.dtype)
     low, high = np.full(shape, limits.max, source.dtype), np.full(shape, limits.min, source.dtype)
-    boxes = list(source.parts(((0, 0, 0), source.shape), min(memory // COPIES, MOST)))
+    boxes = list(source.boxes(((0, 0, 0), source.shape), min(memory // COPIES, MOST)))
     coming = READERS.submit(source.read, *boxes[0], order)
     for (begin, end), following in zip(boxes, [*boxes[1:], None], strict=True):
         voxels = coming.result()

@@ -26,7 +26,7 @@ from ..scene.rendering import BrickReport
 from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
-from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
+from .cells import BrickCells, CurvedRays, Visit, curved_cells, padded, straight_cells
 from .grid import MOST_VOXELS, BrickGrid, Margin, Node, divided, split, stored_shape
 from .sources import READERS, VoxelSource
 from .summary import summary_of
@@ -103,9 +103,8 @@ class Traversal:
         # nodes along each axis that are read at a time, and that any single brick needs
         self.stored = self.min_stored = self.margin.stored(self.grid)
         if math.prod(self.stored) > MOST_VOXELS:
-            read = " x ".join(map(str, self.stored))
             raise ValueError(
-                f"bricks must be so many that fewer than 2**31 voxels are read for each; got {read}."
+                f"bricks must be so many that each has fewer than 2**31 voxels; got {self.stored}."
             )
         if not self.margin.straight and not callable(request.method):
             # what is read follows from the rays: begin with less
@@ -152,29 +151,20 @@ class Traversal:
 
     def report(self) -> BrickReport:
         """What the bricks so far took."""
+        needed, loads, distinct = int(self.visible.sum()), len(self.loads), len(set(self.loads))
+        held = self.margin.bytes(self.stored, self.source.dtype)
         return BrickReport(
-            self.grid.counts,
-            int(self.visible.sum()),
-            len(self.loads),
-            len(self.loads) - len(set(self.loads)),
-            self.bytes_read,
-            self.stored,
-            self.margin.bytes(self.stored, self.source.dtype),
+            self.grid.counts, needed, loads, loads - distinct, self.bytes_read, self.stored, held
         )
 
     def cells_of(
         self, brick: int, passable: np.ndarray, empty: np.ndarray, reached: Array, beyond: int = 0
     ) -> BrickCells | None:
         """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
-        visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty))
+        visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty)
         mesh, march = self.options.tiling.devices, self.scene.march
-        found = _curved(mesh, self.grid, beyond, march, self.rays, self.at, reached, visit)
+        found = _curved(mesh, self.grid, beyond, march, (self.rays, self.at, reached), visit)
         return found if bool(found.any) else None
-
-    def around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
-        """The box that is read for all cells of a brick."""
-        low, high = (np.asarray(end) for end in self.grid.cells(brick))
-        return low - self.margin.cells, high + self.margin.cells
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
         """The box that is read for these cells, for which `stored` is enlarged; None if it, or then any
@@ -191,8 +181,15 @@ class Traversal:
         self.stored = x, y, z
         return low, high
 
-    def load(self, brick: int, cells: CellRange | None, low: np.ndarray, high: np.ndarray) -> Load:
-        """Starts to read a brick: a box that begins at a multiple of BLOCK and holds these nodes."""
+    def load(
+        self, brick: int, cells: CellRange | None, box: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Load:
+        """Starts to read a brick, from a multiple of BLOCK on. `box`: nodes that it holds, by default what
+        all of its cells need."""
+        if box is None:
+            low, high = (np.asarray(end) for end in self.grid.cells(brick))
+            box = low - self.margin.cells, high + self.margin.cells
+        low, high = box
         shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
         first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
         assert np.all(np.minimum(high, shape - 1) < first + stored), (low, high, first, stored)
@@ -210,7 +207,7 @@ def in_order(traversal: Traversal) -> Iterator[Load]:
             number, march = jnp.asarray(brick, jnp.int32), traversal.scene.march
             cells, any_ = _straight(traversal.grid, march, traversal.rays, traversal.at.finished, number)
             if any_:
-                yield traversal.load(brick, cells, *traversal.around(brick))
+                yield traversal.load(brick, cells)
 
 
 def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
@@ -225,16 +222,15 @@ def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
                 continue
             this = np.arange(len(empty)) == brick
             passable = empty | this | before if overlap else empty | this
-            found = traversal.cells_of(brick, passable, empty, reached, steps)
-            box = None if found is None else traversal.box_of(found)
-            if found is not None and box is None:
-                found = traversal.cells_of(brick, this, empty, reached, steps)
-                box = None if found is None else traversal.box_of(found)
             before |= this
-            if found is not None:
-                assert box is not None
-                unfinished, reached = True, found.reached
-                yield traversal.load(brick, padded(found.cells), *box)
+            for through in (passable, this):  # through fewer bricks if memory does not suffice
+                found = traversal.cells_of(brick, through, empty, reached, steps)
+                box = None if found is None else traversal.box_of(found)
+                if found is not None and box is not None:
+                    unfinished, reached = True, found.reached
+                    yield traversal.load(brick, padded(found.cells), box)
+                if found is None or box is not None:
+                    break
         unfinished &= not bool(jnp.all(traversal.at.finished))
 
 
@@ -254,29 +250,20 @@ def _straight(
 
 @compiled
 def _curved(
-    mesh: Mesh | None,
-    grid: BrickGrid,
-    beyond: int,
-    march: March,
-    rays: Ray,
-    at: Progress,
-    reached: Array,
-    visit: Visit,
+    mesh: Mesh | None, grid: BrickGrid, beyond: int, march: March, rays: CurvedRays, visit: Visit
 ) -> BrickCells:
     """By beams of rays, BEAMS of them at a time."""
 
-    def program(whole: tuple[March, Visit], dealt: tuple[Ray, Progress, Array]) -> tuple[None, BrickCells]:
+    def program(whole: tuple[March, Visit], rays: CurvedRays) -> tuple[None, BrickCells]:
         march, visit = whole
-        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), dealt)
-
-        def some(each: tuple[Ray, Progress, Array]) -> BrickCells:
-            return curved_cells(grid, march, *each, visit, beyond)
-
-        found: BrickCells = jax.lax.map(some, by_beam, batch_size=BEAMS)
-        shape = dealt[0].length.shape
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), rays)
+        found: BrickCells = jax.lax.map(
+            lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=BEAMS
+        )
+        shape = rays[0].length.shape
         cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
         return None, found._replace(cells=cells, reached=found.reached.reshape(shape))
 
-    _, found = devices.split(mesh, program, (march, visit), (rays, at, reached))
+    _, found = devices.split(mesh, program, (march, visit), rays)
     low, high = jnp.min(found.low, 0), jnp.max(found.high, 0)
     return found._replace(low=low, high=high, any=jnp.any(found.any))

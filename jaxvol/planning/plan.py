@@ -115,7 +115,8 @@ class Plan(NamedTuple):
         lines += [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
         if self.source is None or self.memory is None:
             return "\n".join(lines)
-        size, room = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
+        voxels = math.prod(self.source.shape) * self.source.dtype.itemsize
+        size, room = (f"{count / 2**20:.1f} MiB" for count in (voxels, self.memory))
         if self.bricks is None:
             head = f"in memory: {size} of voxels, and what is made of them, fit into {room}"
         else:

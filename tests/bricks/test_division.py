@@ -10,10 +10,10 @@ import pytest
 
 import jaxvol as jv
 from experiments import bricks_paper
-from jaxvol.bricks import BrickGrid, Summary, overlap_of, source_of
-from jaxvol.bricks.cells import Visit
+from jaxvol.bricks import BrickGrid, overlap_of, source_of
 from jaxvol.bricks.grid import EDGE, Margin, nodes_within, split
 from jaxvol.bricks.render import scene_of
+from jaxvol.bricks.summary import Summary
 from jaxvol.bricks.traversal import _curved
 from jaxvol.engine.brick_march import begin_rays
 from jaxvol.engine.tiling import RenderOptions, Tiling
@@ -116,7 +116,7 @@ def test_a_brick_has_fewer_voxels_than_a_volume_may_have():
     assert grid.counts == (2, 1, 1)  # and no more than that takes
     with pytest.raises(
         ValueError,
-        match=r"bricks must be so many that fewer than 2\*\*31 voxels are read for each; got 1600 x 1600",
+        match=r"bricks must be so many that each has fewer than 2\*\*31 voxels; got \(1600, 1600",
     ):
         jv.render_bricks(nothing(shape), TRANSFER, CAMERA, PLAIN, bricks=(1, 1, 1))
     # no axis is split along which bricks would be read whole
@@ -188,9 +188,9 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
     def cells_of(scene):
         underway = begin_rays(scene, RenderOptions("all", Tiling.of_backend(None)))
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
-        visit = Visit(jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty)
+        visit = jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
-        return _curved(None, grid, 11, scene.march, underway.rays, underway.at, reached, visit)
+        return _curved(None, grid, 11, scene.march, (underway.rays, underway.at, reached), visit)
 
     with in_float64():
         found = eqx.filter_eval_shape(cells_of, to_float64(scene))

@@ -232,7 +232,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
 
 
 class Unread(VoxelSource):
-    def _stored(self, box, axes):
+    def _read_at_once(self, box, axes):
         raise AssertionError("read")
 
 

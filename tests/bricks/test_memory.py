@@ -34,13 +34,13 @@ IMAGES = """
 
     measure()  # compiles
     measure()
-    some = VoxelSource._stored
+    some = VoxelSource._read_at_once
 
     def all_of_it(source, box, axes):
         whole = some(source, ((0, 0, 0), source.shape), (0, 1, 2)).copy()
         return whole[tuple(map(slice, *box))].transpose(axes)
 
-    VoxelSource._stored = all_of_it
+    VoxelSource._read_at_once = all_of_it
     measure()
 """
 

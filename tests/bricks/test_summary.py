@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxvol.bricks import VoxelSource, source_of, summary, summary_of
-from jaxvol.bricks.summary import scan
+from jaxvol.bricks import VoxelSource, source_of, summary
+from jaxvol.bricks.summary import scan, summary_of
 
 from .test_sources import voxels, x_fastest
 from .test_zarr import written
