@@ -27,9 +27,6 @@ def each_at_once(traversal: Traversal) -> Iterator[Load]:
             found = traversal.cells_of(brick, own, outside, reached)
             if found is None:
                 break
-            if load is None:
-                load = traversal.load(brick, found.cells)
-            else:
-                load = load._replace(cells=found.cells)
+            load = traversal.load(brick, found.cells) if load is None else load._replace(cells=found.cells)
             reached = found.reached
             yield load

@@ -126,21 +126,21 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
         front = index.astype(rays.length.dtype) * march.step
         return (front < (rays.length + march.step)[None]) & (index < march.most_samples)
 
-    def while_in(allowed: Bool[Array, " bricks"], index: Array, going: Array) -> tuple[Array, Array]:
+    def while_in(allowed: Bool[Array, " bricks"], index: Array, active: Array) -> tuple[Array, Array]:
         """Moves rays on while they are in these bricks; and the index behind the last cell on the way that
         is not empty."""
 
         def more(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            index, last, going = state
+            index, last, active = state
             at = bricks(index[None] + number)
             stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
             passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
-            seen = passed & jnp.any(~empty[at], axis=0) & going[None]
+            seen = passed & jnp.any(~empty[at], axis=0) & active[None]
             last = jnp.maximum(last, jnp.max(jnp.where(seen, index[None] + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
-            return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
+            return index + jnp.where(active, steps, 0), last, active & (steps == CHUNK)
 
-        start = index, jnp.zeros_like(index), going
+        start = index, jnp.zeros_like(index), active
         index, last, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), more, start)
         return index, last
 

@@ -136,12 +136,12 @@ def _on_each(mesh: Mesh, one: Callable[..., Any], replicated: bool, given: Any, 
     """`one(*given, *shares)` on each device, of its part of each share. `replicated`: it returns the same on
     all devices."""
 
-    def own(*parts: Any) -> Any:
-        found = one(*given, *jax.tree.map(lambda leaf: leaf[0], parts))
+    def local(*shares: Any) -> Any:
+        found = one(*given, *jax.tree.map(lambda leaf: leaf[0], shares))
         return found if replicated else jax.tree.map(lambda leaf: leaf[None], found)
 
     out = REPLICATED if replicated else SHARDED
-    return jax.shard_map(own, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
+    return jax.shard_map(local, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
 
 
 def _begin(scene: Scene, options: RenderOptions, _: Array) -> Share:

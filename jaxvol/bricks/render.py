@@ -277,5 +277,5 @@ def _level(
     if level != "auto":
         return levels[integer("level", level, 0, most, otherwise=', or "auto"')]
     if most and is_traced(camera):
-        raise ValueError(f"level must be one of 0 to {most} where gradients are taken; got 'auto'.")
+        raise ValueError(f"level must be one of 0 to {most} under jax.grad; got 'auto'.")
     return levels[level_for(levels, camera) if most else 0]

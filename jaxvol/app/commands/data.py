@@ -25,7 +25,11 @@ def volume_of(options: argparse.Namespace) -> Volume:
 def source_of(options: argparse.Namespace) -> VoxelSource:
     """The volume in the file, of which parts are read."""
     given = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
-    return levels_of(options.file, **{name: value for name, value in given.items() if value is not None})[0]
+    given = {name: value for name, value in given.items() if value is not None}
+    try:
+        return levels_of(options.file, **given)[0]
+    except TypeError as fault:  # such as a shape of what is no raw file
+        raise ValueError(f"{', '.join(given)}: not for {options.file} ({fault}).") from fault
 
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
