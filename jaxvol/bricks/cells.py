@@ -23,11 +23,9 @@ from .grid import SLACK, BrickGrid
 
 CHUNK = 8  # cells of a ray that are tested at a time
 
-
 Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " bricks"]]
 """A brick; through which bricks rays go on from it, itself included; and which are empty, so that rays move
 through them to it. The masks are of all bricks, and of what lies outside of the volume."""
-
 
 CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
 """Rays, where their march has come to, and to which cell of each ray bricks have been found."""

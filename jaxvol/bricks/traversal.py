@@ -217,9 +217,7 @@ def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
     reached, unfinished = jnp.zeros(traversal.rays.length.shape, jnp.int32), True
     while unfinished:
         before, unfinished = np.zeros_like(empty), False
-        for brick in traversal.order:
-            if not traversal.visible[brick]:
-                continue
+        for brick in [b for b in traversal.order if traversal.visible[b]]:
             this = np.arange(len(empty)) == brick
             passable = empty | this | before if overlap else empty | this
             before |= this
@@ -231,6 +229,7 @@ def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
                     yield traversal.load(brick, padded(found.cells), box)
                 if found is None or box is not None:
                     break
+            assert found is None or box is not None
         unfinished &= not bool(jnp.all(traversal.at.finished))
 
 

@@ -72,5 +72,5 @@ def test_an_image_of_ome_zarr_takes_the_level_of_its_pixels_or_the_one_that_is_a
     def traced(position):
         return _level(found, "auto", eqx.tree_at(lambda c: c.position, far, position), march)
 
-    with pytest.raises(ValueError, match="level must be one of 0 to 2 under jax.grad"):
+    with pytest.raises(ValueError, match=r"level must be one of 0 to 2 under jax\.grad"):
         eqx.filter_eval_shape(lambda p: traced(p) and p, far.position)
