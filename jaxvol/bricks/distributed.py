@@ -30,7 +30,7 @@ from ..xla.compiling import compiled
 from ..xla.platform import is_traced
 from .cells import first_behind, straight_cells
 from .grid import BrickGrid, is_straight
-from .traversal import Load, Method, Traversal
+from .traversal import Load, Traversal
 
 
 class Share(eqx.Module):
@@ -49,7 +49,7 @@ class Share(eqx.Module):
         return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
 
 
-def check_joins(scene: Scene, method: Method) -> None:
+def check_joins(scene: Scene, method: Any) -> None:
     """Raises where partial images of bricks cannot be combined."""
     march, mode = scene.march, scene.compositing
     refused = {

@@ -149,7 +149,7 @@ def _zarr_array(path: Path, *, axes: Any = None, missing: Any = "error", **how: 
         "context": {"cache_pool": {"total_bytes_limit": CACHE}},
     }
     try:
-        store = tensorstore.open(spec, open=True, read=True).result()
+        store: Any = tensorstore.open(spec, open=True, read=True).result()
     except ValueError as fault:
         raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
     # a chunk is decoded as a whole, even beyond the array

@@ -61,7 +61,7 @@ class Request:
     source: VoxelSource
     memory: int
     counts: Any = None  # bricks along x, y and z, in place of those chosen to fit into `memory`
-    method: Method = "overlap"
+    method: Method | Any = "overlap"
     progress: Callable[[int, int], Any] | None = None
     outputs: Any = "all"
     mesh: Mesh | None = None  # devices over which rays are dealt out, or bricks, if `deals_bricks`
