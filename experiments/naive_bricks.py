@@ -9,7 +9,6 @@ from collections.abc import Iterator
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol.bricks.cells import Visit
 from jaxvol.bricks.traversal import Load, Traversal
 
 
@@ -23,15 +22,11 @@ def each_at_once(traversal: Traversal) -> Iterator[Load]:
         outside[brick] = False
         own = ~outside
         own[-1] = True  # a ray goes on through a gap, in which there is no brick
-        visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(own), jnp.asarray(outside))
         reached, load = jnp.zeros(traversal.rays.length.shape, jnp.int32), None
         while True:
-            found = traversal.cells_in(visit, reached)
+            found = traversal.cells_of(brick, own, outside, reached)
             if found is None:
                 break
-            if load is None:
-                load = traversal.load(brick, found.cells, *traversal.around(brick))
-            else:
-                load = load._replace(cells=found.cells)
+            load = traversal.load(brick, found.cells) if load is None else load._replace(cells=found.cells)
             reached = found.reached
             yield load

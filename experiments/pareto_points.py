@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.bricks.split import COPIES
+from jaxvol.bricks.grid import COPIES
 from jaxvol.lighting import Lighting
 
 from . import peer_vtk

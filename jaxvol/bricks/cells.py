@@ -6,9 +6,8 @@ then visited one after the other, and a ray goes on while it is in this one, or 
 before: those cells are read with the brick, which is the overlap of Kim, Kwon and Shin 2008.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -19,29 +18,22 @@ from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..ray import Progress
 from ..scene.space import Ray, Straight, slab_interval
-from .grid import BrickGrid
+from .grid import SLACK, BrickGrid
 
 
-SLACK = 3
-"""Steps by which samples may lie before or behind where their cells begin, because of jitter, and one more
-for rounding."""
+CHUNK = 8  # cells of a ray that are tested at a time
 
-CHUNK = 8
-"""Cells of a ray that are tested at a time."""
+Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " bricks"]]
+"""A brick; through which bricks rays go on from it, itself included; and which are empty, so that rays move
+through them to it. The masks are of all bricks, and of what lies outside of the volume."""
 
-
-class Visit(eqx.Module):
-    """A brick; through which bricks rays go on from it, itself included, while it is in memory; and which are
-    `empty`, so that rays move through them to it. Of all bricks, and of what lies outside of the volume."""
-
-    brick: Int[Array, ""]
-    passable: Bool[Array, " bricks"]
-    empty: Bool[Array, " bricks"]
+CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
+"""Rays, where their march has come to, and to which cell of each ray bricks have been found."""
 
 
 class BrickCells(NamedTuple):
-    """Cells of rays that are marched while a brick is in memory; the index that each ray has then `reached`;
-    a box of grid coordinates that holds all points of these cells; and whether there are any."""
+    """Cells of rays that are marched in a brick; to which cell of each ray bricks have then been found; a box
+    of grid coordinates that holds all points of these cells; and whether there are any."""
 
     cells: CellRange
     reached: Int[Array, "*rays"]
@@ -99,79 +91,72 @@ def _within(
     return jnp.clip(near / march.step, 0, last), jnp.clip(far / march.step, 0, last), hit
 
 
-def curved_cells(
-    grid: BrickGrid,
-    march: March,
-    rays: Ray,
-    at: Progress,
-    reached: Int[Array, "*rays"],
-    visit: Visit,
-    beyond: int,
-) -> BrickCells:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other.
-
-    - `at`: where the march has come to. `reached`: to which cell of each ray its bricks have been found.
-    - `beyond`: steps before and behind its cells that `low` and `high` are to hold, too."""
+def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit, beyond: int) -> BrickCells:
+    """The cells of any rays, of shape (groups, rays in a group), found one after the other; `low` and `high`
+    also hold `beyond` steps before and behind these."""
+    rays, at, reached = curved
+    brick, passable, empty = visit
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
     # A ray may come back into the volume and leave it before the next of these points: this counts, too.
-    returns = [_Return.of(grid, rays, back) for _, back in rays.gaps]
+    returns = [(back, _located(rays, back)) for _, back in rays.gaps]
     number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
+    def depths(index: Int[Array, "cells *rays"]) -> Float[Array, "points cells *rays"]:
+        return jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
+
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
-        depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
-        return jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        depth, end = depths(index), depths(index + 1)
+        found = jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        every = [found]
+        for back, located in returns:
+            within = (depth <= back) & (back < end)
+            every += [jax.tree.map(lambda a, b, within=within: jnp.where(within, a, b), located, found)]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *every)
 
     def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
         coordinate, inside = points(index)
-        found = jnp.where(inside, grid.brick_of(coordinate), grid.number)
-        more = [
-            jnp.where(back.within(index, offset, march.step), back.brick, grid.number)
-            for back in returns
-            for offset in fronts
-        ]
-        return jnp.concatenate([found, jnp.stack(more)]) if more else found
+        return jnp.where(inside, grid.brick_of(coordinate), grid.number)
 
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
         front = index.astype(rays.length.dtype) * march.step
         return (front < (rays.length + march.step)[None]) & (index < march.most_samples)
 
-    def while_in(allowed: Bool[Array, " bricks"], index: Array, going: Array) -> tuple[Array, Array]:
+    def while_in(allowed: Bool[Array, " bricks"], index: Array, active: Array) -> tuple[Array, Array]:
         """Moves rays on while they are in these bricks; and the index behind the last cell on the way that
         is not empty."""
 
         def more(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            index, last, going = state
+            index, last, active = state
             at = bricks(index[None] + number)
             stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
             passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
-            seen = passed & jnp.any(~visit.empty[at], axis=0) & going[None]
+            seen = passed & jnp.any(~empty[at], axis=0) & active[None]
             last = jnp.maximum(last, jnp.max(jnp.where(seen, index[None] + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
-            return index + jnp.where(going, steps, 0), last, going & (steps == CHUNK)
+            return index + jnp.where(active, steps, 0), last, active & (steps == CHUNK)
 
-        start = index, jnp.zeros_like(index), going
+        start = index, jnp.zeros_like(index), active
         index, last, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), more, start)
         return index, last
 
-    first, _ = while_in(visit.empty, reached, ~at.finished)
-    here = jnp.any(bricks(first[None])[:, 0] == visit.brick, axis=0)
-    # where its points lie in several bricks, the first one that is visited takes the cell
+    first, _ = while_in(empty, reached, ~at.finished)
+    here = jnp.any(bricks(first[None])[:, 0] == brick, axis=0)
+    # where its points lie in several bricks, the cell belongs to the first one that is visited
     enters = ~at.finished & here & ahead(first[None])[0]
-    _, until = while_in(visit.passable, first, enters)
+    _, until = while_in(passable, first + 1, enters)
     until = jnp.maximum(until, first + 1)
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         start, low, high = state
         index = start[None] + number
         coordinate, inside = points(index)
-        counts = enters[None] & (index <= (until + beyond)[None]) & (index >= 0)
-        low, high = _around(low, high, coordinate, inside & counts[None])
-        for back in returns:
-            held = [back.within(index, offset, march.step) & counts for offset in fronts]
-            low, high = _around(low, high, back.coordinate, jnp.any(jnp.stack(held), axis=(0, 1)))
+        counts = inside & (enters[None] & (index <= (until + beyond)[None]) & (index >= 0))
+        point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
+        low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
+        high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
         return start + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)
@@ -187,36 +172,3 @@ def curved_cells(
 def _located(rays: Ray, depth: Float[Array, "*rays"]) -> tuple[Vec3, Bool[Array, "*rays"]]:
     """Grid coordinates of points on rays, and whether these lie in the volume."""
     return vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)
-
-
-class _Return(NamedTuple):
-    """Where rays come back into the volume: depth, grid coordinate and brick, and whether they do."""
-
-    depth: Float[Array, "*rays"]
-    coordinate: Vec3
-    brick: Int[Array, "*rays"]
-    there: Bool[Array, "*rays"]
-
-    @classmethod
-    def of(cls, grid: BrickGrid, rays: Ray, depth: Float[Array, "*rays"]) -> "_Return":
-        known = jnp.isfinite(depth)
-        depth = jnp.where(known, depth, 0)
-        coordinate, inside = _located(rays, depth)
-        return cls(depth, coordinate, grid.brick_of(coordinate), known & inside)
-
-    def within(
-        self, index: Int[Array, "cells *rays"], offset: Float[Array, "*rays"], step: Float[Array, ""]
-    ) -> Bool[Array, "cells *rays"]:
-        """Whether that is in cells that begin at `offset` + index."""
-        front, back = ((offset[None] + (index + more).astype(offset.dtype)) * step for more in (0, 1))
-        return self.there[None] & (front <= self.depth[None]) & (self.depth[None] < back)
-
-
-def _around(
-    low: Float[Array, "3"], high: Float[Array, "3"], coordinate: Vec3, counts: Bool[Array, "..."]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """A box, and the points that count."""
-    point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
-    low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
-    high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
-    return low, high

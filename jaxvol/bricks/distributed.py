@@ -1,14 +1,13 @@
-"""Bricks distributed over devices: each device reads and renders its own, of all rays, and the partial images
-are combined front to back.
+"""Distributes bricks over devices: each device reads and renders its own bricks, for all rays.
 
 Devices get consecutive bricks of the order front to back, which straight rays meet in this order. Each device
-marches its cells as if nothing lay in front, and the operator "over", which is associative, joins them. All
-devices take a brick each at a time, in one program.
+marches its cells as if nothing lay in front, and the operator "over", which is associative, joins the partial
+images. All devices render one brick each at a time, in one program.
 """
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise, zip_longest
-from typing import Any, TypeAlias
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,34 +17,32 @@ from jax.sharding import Mesh, NamedSharding
 from jaxtyping import Array, Bool, Int, Shaped
 
 from .._util.axes import permuted
+from ..compositing.blending import Over
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.brick_march import RayStates, begin_rays, finish_image, join_segments, march_brick
 from ..engine.devices import AXIS, REPLICATED, SHARDED
 from ..engine.tiling import RenderOptions
 from ..engine.wavefront import CellRange
+from ..march.strides import stride_control
 from ..ray import Scene
 from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
 from ..xla.compiling import compiled
-from ..xla.trees import PyTree
+from ..xla.platform import is_traced
 from .cells import first_behind, straight_cells
-from .grid import BrickGrid
+from .grid import BrickGrid, is_straight
 from .traversal import Load, Traversal
 
 
-Loads: TypeAlias = dict[int, Load]
-"""By device, the brick that this process reads for it."""
-
-
 class Share(eqx.Module):
-    """What a device marches: all rays, and which of their cells are its own. Arrays of many shares have one
+    """All rays as a device marches them, and which of their cells are its own. Arrays of many shares have one
     more axis in front, which is sharded."""
 
     underway: RayStates
     own: CellRange
 
     def of_brick(self, grid: BrickGrid, scene: Scene, brick: Int[Array, ""]) -> CellRange:
-        """The cells that lie in one of the bricks; none in the brick -1."""
+        """The device's cells in a brick; none in the brick -1."""
         rays, alive = self.underway.rays, ~self.underway.at.finished & (brick >= 0)
         cells = straight_cells(grid, scene.march, rays, alive, jnp.maximum(brick, 0))
         first, until = jnp.maximum(cells.first, self.own.first), jnp.minimum(cells.until, self.own.until)
@@ -53,16 +50,33 @@ class Share(eqx.Module):
         return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
 
 
+def check_joins(scene: Scene, method: Any) -> None:
+    """Raises where partial images of bricks cannot be combined."""
+    march, mode = scene.march, scene.compositing
+    refused = {
+        f"method={method!r}": method != "overlap",
+        f"compositing by {type(mode).__name__}, which does not join segments of a ray": not isinstance(
+            mode, Over
+        ),
+        "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
+        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
+        "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
+        "gradients": is_traced(scene),
+    }
+    for what, refuses in refused.items():
+        if refuses:
+            raise ValueError(f'own="bricks" does not go with {what}. Use own="rays".')
+
+
 def render_distributed(traversal: Traversal, mesh: Mesh) -> Rendering:
-    """The image of a traversal's scene. Rays are straight, and nothing that shows on a ray depends on what
-    lies in front but by its transmittance."""
+    """The image of a traversal's scene, for which `check_joins` holds."""
     scene, options, grid = traversal.scene, traversal.options, traversal.grid
-    share = _begin(mesh, (scene, options), jnp.arange(mesh.size))
+    share = _on_each(mesh, _begin, False, (scene, options), jnp.arange(mesh.size))
     every = jnp.broadcast_to(jnp.arange(grid.number, dtype=jnp.int32), (mesh.size, grid.number))
-    wanted = traversal.visible & np.asarray(_met(mesh, (grid, scene), share, every))[0]
+    wanted = traversal.visible & np.asarray(_on_each(mesh, _met, True, (grid, scene), share, every))[0]
     bounds = bounds_of(wanted[traversal.order], mesh.size)
     order = jnp.asarray(traversal.order, jnp.int32)
-    share = _divided(mesh, (grid, scene, order), share, jnp.asarray(bounds, jnp.int32))
+    share = _on_each(mesh, _divided, False, (grid, scene, order), share, jnp.asarray(bounds, jnp.int32))
     own = [[brick for brick in traversal.order[i:j] if wanted[brick]] for i, j in bounds]
     remaining = zip_longest(*own, fillvalue=-1)
     following = _next_loads(traversal, mesh, share, remaining)
@@ -70,13 +84,13 @@ def render_distributed(traversal: Traversal, mesh: Mesh) -> Rendering:
         jax.block_until_ready(share)  # or two bricks, and what is made of both, would be in memory
         placed, number = _placed(traversal, mesh, *following), len(following[1])
         following = _next_loads(traversal, mesh, share, remaining)
-        share = _march(mesh, (grid, scene, options), share, *placed)
+        share = _on_each(mesh, _march, False, (grid, scene, options), share, *placed)
         traversal.finish(number, int(wanted.sum()))
-    return _join(mesh, (scene, options), share)
+    return _on_each(mesh, _join, True, (scene, options), share)
 
 
 def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[int, int]]:
-    """Cuts bricks in their order into so many parts, with about as many wanted ones in each."""
+    """Cuts ordered bricks into `number` ranges, with about as many wanted ones in each."""
     seen = np.cumsum(wanted)
     ends = [int(np.searchsorted(seen, seen[-1] * i / number)) + 1 for i in range(1, number)]
     return list(pairwise([0, *ends, len(wanted)]))
@@ -84,21 +98,26 @@ def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[in
 
 def _next_loads(
     traversal: Traversal, mesh: Mesh, share: Share, remaining: Iterator[tuple[int, ...]]
-) -> tuple[np.ndarray, Loads] | None:
-    """The next brick of each device, -1 where none of its rays needs one. `remaining`: those to come."""
+) -> tuple[np.ndarray, dict[int, Load]] | None:
+    """The next brick of each device, -1 where none of its rays needs one; and those that this process reads,
+    by device. `remaining`: the bricks to come."""
     for each in remaining:
         bricks = np.asarray(each, np.int32)
-        met = _met(mesh, (traversal.grid, traversal.scene), share, jnp.asarray(bricks)[:, None])
-        needed, loads = np.asarray(met)[:, 0], {}
-        for d, device in enumerate(mesh.devices):
-            if device.process_index == jax.process_index() and needed[d]:
-                loads[d] = traversal.load(each[d], None, *traversal.around(each[d]))
+        given = traversal.grid, traversal.scene
+        needed = np.asarray(_on_each(mesh, _met, True, given, share, jnp.asarray(bricks)[:, None]))[:, 0]
+        loads = {
+            d: traversal.load(each[d], None)
+            for d, device in enumerate(mesh.devices)
+            if device.process_index == jax.process_index() and needed[d]
+        }
         if needed.any():
             return np.where(needed, bricks, -1), loads
     return None
 
 
-def _placed(traversal: Traversal, mesh: Mesh, bricks: np.ndarray, loads: Loads) -> tuple[Array, Array, Array]:
+def _placed(
+    traversal: Traversal, mesh: Mesh, bricks: np.ndarray, loads: dict[int, Load]
+) -> tuple[Array, Array, Array]:
     """The bricks, their first nodes and their voxels, each on its device."""
     shape = permuted(traversal.stored, traversal.source.order)
     nothing, first, voxels = np.zeros(shape, traversal.source.dtype), np.zeros((mesh.size, 3), np.int32), []
@@ -115,25 +134,19 @@ def _placed(traversal: Traversal, mesh: Mesh, bricks: np.ndarray, loads: Loads) 
     )
 
 
-def _on_each(*, whole: bool = False) -> Callable[[Callable[..., PyTree]], Callable[..., Any]]:
-    """Decorator: `one(*given, *parts)` becomes a program `run(mesh, given, *shares)`, where each device has
-    its own part of each share. `whole`: it returns the same on all devices."""
+@compiled
+def _on_each(mesh: Mesh, one: Callable[..., Any], replicated: bool, given: Any, *shares: Any) -> Any:
+    """`one(*given, *shares)` on each device, of its part of each share. `replicated`: it returns the same on
+    all devices."""
 
-    def decorate(one: Callable[..., PyTree]) -> Callable[..., Any]:
-        def run(mesh: Mesh, given: tuple[Any, ...], *shares: PyTree) -> PyTree:
-            def own(*parts: PyTree) -> PyTree:
-                found = one(*given, *jax.tree.map(lambda leaf: leaf[0], parts))
-                return found if whole else jax.tree.map(lambda leaf: leaf[None], found)
+    def local(*shares: Any) -> Any:
+        found = one(*given, *jax.tree.map(lambda leaf: leaf[0], shares))
+        return found if replicated else jax.tree.map(lambda leaf: leaf[None], found)
 
-            out = REPLICATED if whole else SHARDED
-            return jax.shard_map(own, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
-
-        return compiled(run)
-
-    return decorate
+    out = REPLICATED if replicated else SHARDED
+    return jax.shard_map(local, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
 
 
-@_on_each()
 def _begin(scene: Scene, options: RenderOptions, _: Array) -> Share:
     """All rays at their entries, and all of their cells."""
     underway = begin_rays(scene, options)
@@ -141,7 +154,6 @@ def _begin(scene: Scene, options: RenderOptions, _: Array) -> Share:
     return Share(underway, CellRange(none, jnp.full_like(none, jnp.iinfo(jnp.int32).max)))
 
 
-@_on_each(whole=True)
 def _met(grid: BrickGrid, scene: Scene, share: Share, bricks: Int[Array, " n"]) -> Bool[Array, "devices n"]:
     """Whether any ray of a device needs each of its bricks: the answers of all devices."""
 
@@ -152,7 +164,6 @@ def _met(grid: BrickGrid, scene: Scene, share: Share, bricks: Int[Array, " n"]) 
     return jax.lax.all_gather(jax.lax.map(met, bricks), AXIS)
 
 
-@_on_each()
 def _divided(
     grid: BrickGrid, scene: Scene, order: Int[Array, " bricks"], share: Share, bounds: Int[Array, "2"]
 ) -> Share:
@@ -162,7 +173,6 @@ def _divided(
     return Share(share.underway, CellRange(first, until))
 
 
-@_on_each()
 def _march(
     grid: BrickGrid,
     scene: Scene,
@@ -179,7 +189,6 @@ def _march(
     return Share(march_brick(here, options, acceleration, share.underway, cells, exact=True), share.own)
 
 
-@_on_each(whole=True)
 def _join(scene: Scene, options: RenderOptions, share: Share) -> Rendering:
     """The whole image, on all devices."""
     at = jax.lax.all_gather(share.underway.at, AXIS)

@@ -1,27 +1,53 @@
-"""How is a volume divided into bricks, and in which order are these rendered?"""
+"""Divides a volume into bricks, orders them, and says how large they may be and what is read around them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._util.checks import integer, shortened
+from .._util.files import MOST_VOXELS
 from .._util.vec3 import Vec3, apart
+from ..march.march import March
+from ..march.strides import longest_run, stride_control
 from ..march.transforms import ToroidalMap
+from ..march.transforms.adaptive_sampling import FARTHEST
+from ..ray import Scene
 from ..scene.camera import Camera, axes_of
+from ..scene.occupancy import BLOCK
 from ..scene.space import Space, Straight
+from ..xla.compiling import compiled
 
 
 Node = tuple[int, int, int]
+
+SLACK = (
+    3  # steps by which jitter may move samples away from where their cells begin, and one more for rounding
+)
+EDGE = 16  # bricks are at least so many cells long, and of a multiple of these, where the volume is
+MOST_BRICKS = 2**16  # that a user may ask for: each is searched for along all rays
+
+# Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of blocks
+# takes, less than half. Voxels of another type take `sources.AT_ONCE` bytes more, or a layer of chunks, while
+# they are read.
+COPIES = 2.5
+
+
+class TooLittleMemory(ValueError):
+    """The smallest bricks, with what is read around them, do not fit into the budget."""
 
 
 @dataclass(frozen=True)
 class BrickGrid:
     """Bricks of equally many cells, numbered in row-major order; the last ones along an axis may have fewer.
 
-    - `shape`: nodes of the volume. `size`: cells of a brick.
+    Attributes:
+        shape: Nodes of the volume.
+        size: Cells of a brick.
     """
 
     shape: Node
@@ -39,8 +65,7 @@ class BrickGrid:
         return math.prod(self.counts)
 
     def cells(self, brick: int) -> tuple[Node, Node]:
-        """First cell of a brick along each axis, and the one after its last: also the nodes between which it
-        lies."""
+        """First and last node of a brick along each axis."""
         index = np.unravel_index(brick, self.counts)
         x, y, z = (int(i) * s for i, s in zip(index, self.size, strict=True))
         end = [min(a + s, n - 1) for a, s, n in zip((x, y, z), self.size, self.shape, strict=True)]
@@ -94,12 +119,14 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     includes the cap between the curved face and its chord, it need not be rendered again. At a face at the
     distance l from the apex the cap has the height K = l - l cos(θ/2), where θ is the angle of a brick's fan;
     along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger counts.
-    With less, rays from side to side of a brick are blended in the wrong order. `render_bricks` does not use
-    it for what it reads, which follows from the rays.
+    What `render_bricks` reads follows from its rays instead.
 
-    **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
+    Args:
+        probe: Of the volume.
+        grid: How it is divided into bricks.
 
-    **Returns:** K* of each face between two bricks, from the probe outwards, voxels.
+    Returns:
+        K* of each face between two bricks, from the probe outwards, voxels.
 
     Source: Kim, Kwon and Shin 2008, section 3.2.
     """
@@ -114,3 +141,130 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     from_apex, from_axis = float(probe.b) + at, float(probe.a) + float(probe.b) + at
     height = np.maximum(from_apex * (1 - np.cos(fan / 2)), from_axis * (1 - np.cos(sweep / 2)))
     return (np.maximum(height, 0) * cells[2] / np.ptp(gamma)).tolist()
+
+
+@dataclass(frozen=True)
+class Margin:
+    """What is read around a brick."""
+
+    cells: Node  # along each axis, on both sides, around any brick
+    steps: int  # how far cells that begin in the brick may reach along a ray
+    length: float  # and in the world
+    light: float  # world length around a sample within which light is looked for
+    around: int  # nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`
+    slopes: bool
+    straight: bool = True  # whether rays are straight in the grid
+    probe: ToroidalMap | None = None  # whose bricks overlap, if they do
+
+    @classmethod
+    def of(cls, march: March, space: Space, shape: Node, segment: int, shown: Scene) -> "Margin":
+        """That of a march in a grid of this shape, which takes `segment` cells of a ray at a time. `shown`:
+        what is measured and lit there."""
+        transfer, lighting, straight = shown.transfer, shown.lighting, is_straight(space)
+        steps = SLACK + max(segment, longest_run(march))
+        # where rays are curved, a brick's own cells are found by points that may lie four steps apart
+        length = (steps + (0 if straight else 4)) * float(march.step)
+        slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
+        around = 2 if slopes else 1
+        if stride_control(march) is not None:  # blocks around a run's own, and the windows of these
+            shortest = min(_distances(space, np.zeros(3), np.asarray(shape) + BLOCK))
+            rounds = longest_run(march) * float(march.step) / max(2 * BLOCK * shortest, 1e-30)
+            around += BLOCK * (math.ceil(min(rounds, FARTHEST)) + 2)  # runs that touch more are not made
+        light = 0.0 if lighting is None else lighting.farthest_read
+        assert light is not None
+        probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)
+        margin = cls((0, 0, 0), steps, length, light, around, slopes, straight, probe)
+        return replace(margin, cells=margin.of_box(space, shape, np.zeros(3), np.asarray(shape) - 1))
+
+    def of_box(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> Node:
+        """Nodes along each axis that are read around the cells that begin in a box."""
+        far = nodes_within(space, shape, low, high, self.length)
+        low, high = np.maximum(low - far, 0), np.minimum(high + far, np.asarray(shape) - 1)
+        x, y, z = far + self.of_points(space, shape, low, high) + (0 if self.straight else 1)
+        return int(x), int(y), int(z)
+
+    def of_points(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        """Nodes along each axis that are read around points in a box."""
+        return nodes_within(space, shape, low, high, self.light) + self.around
+
+    def stored(self, grid: BrickGrid) -> Node:
+        """Nodes that are read at a time for the bricks of a grid."""
+        overlap = 0 if self.probe is None else math.ceil(max(overlap_of(self.probe, grid), default=0.0))
+        x, y, z = (size + 1 + 2 * around for size, around in zip(grid.size, self.cells, strict=True))
+        return stored_shape(grid.shape, (x, y, z + overlap))
+
+    def bytes(self, stored: Node, dtype: np.dtype) -> int:
+        """Memory that such bricks take: the one that is rendered, what is made of it, and the next one."""
+        packed = (8 if dtype.itemsize == 1 else 4) if self.slopes and dtype.kind in "ui" else 0
+        return math.ceil(math.prod(stored) * (COPIES * dtype.itemsize + packed))
+
+    def fits(self, stored: Node, dtype: np.dtype, memory: int) -> bool:
+        """Whether such bricks can be volumes, and take no more than so many bytes."""
+        return math.prod(stored) <= MOST_VOXELS and self.bytes(stored, dtype) <= memory
+
+
+def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, length: float) -> np.ndarray:
+    """Nodes along each axis, on both sides of a box, that hold everything within a world length of it, by the
+    least distances between nodes in both, also beyond the grid, where a ray may return to it."""
+    nodes = np.zeros(3)
+    while length > 0:
+        distances = _distances(space, low - nodes, high + nodes)
+        with np.errstate(divide="ignore"):
+            more = np.maximum(nodes, np.minimum(np.ceil(length / distances), shape))
+        if np.array_equal(more, nodes):
+            break
+        nodes = more
+    return nodes.astype(int)
+
+
+_least_distances = compiled(lambda space, low, high: space.least_distances(low, high))
+
+
+def _distances(space: Space, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Least distances between neighbouring nodes along each axis in a box."""
+    ends = (tuple(jnp.asarray(c, space.middle[0].dtype) for c in end.tolist()) for end in (low, high))
+    return np.asarray([float(distance) for distance in _least_distances(space, *ends)])
+
+
+def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
+    """Nodes that are read at a time, at least so many. Such a box can begin at a multiple of BLOCK wherever
+    it lies, so that its blocks are those of the whole."""
+    x, y, z = (n - BLOCK * max((n - w - BLOCK + 1) // BLOCK, 0) for n, w in zip(shape, wanted, strict=True))
+    return x, y, z
+
+
+def divided(shape: Node, counts: Any) -> BrickGrid:
+    """So many bricks along each axis, or fewer along one of too few voxels."""
+    try:
+        x, y, z = (-(-(n - 1) // integer("bricks", c, 1)) for n, c in zip(shape, counts, strict=True))
+    except (TypeError, ValueError) as fault:
+        raise ValueError(
+            f"bricks must be three numbers, each an integer of at least 1; got {shortened(counts)}."
+        ) from fault
+    grid = BrickGrid(shape, (x, y, z))
+    if grid.number > MOST_BRICKS:
+        raise ValueError(f"bricks must be no more than {MOST_BRICKS} in all; got {counts}, {grid.number}.")
+    return grid
+
+
+def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
+    """The fewest bricks of about cubic shape, and at least as many as `devices` if these are not too small,
+    that fit into so many bytes: there is one more along the axis where they are longest, until they do. Axes
+    along which even the smallest bricks would be read whole are split last."""
+    cells = [n - 1 for n in shape]
+    x, y, z = (min(EDGE, c) for c in cells)
+    short = np.less(margin.stored(BrickGrid(shape, (x, y, z))), shape).tolist()
+    counts = [1, 1, 1]
+    while True:
+        x, y, z = (min(-(-c // (count * EDGE)) * EDGE, c) for c, count in zip(cells, counts, strict=True))
+        grid = BrickGrid(shape, (x, y, z))
+        stored = margin.stored(grid)
+        divisible = [axis for axis in range(3) if grid.size[axis] > min(EDGE, cells[axis])]
+        if margin.fits(stored, dtype, memory) and (grid.number >= devices or not divisible):
+            return grid
+        if not divisible:
+            raise TooLittleMemory(
+                f"memory must be at least {margin.bytes(stored, dtype)} bytes, for bricks of {grid.size} "
+                f"cells and what is read around them, less for a shorter step; got {memory}."
+            )
+        counts[max(divisible, key=lambda axis: (short[axis], grid.size[axis]))] += 1

@@ -1,162 +1,232 @@
-"""Which source, and which levels of detail, does a user mean, and which level is fine enough for a view?"""
+"""Opens arrays, files and folders as sources, and chooses the level of detail for a view.
 
+tensorstore reads Zarr arrays. yaozarrs checks the `multiscales` of OME-Zarr 0.4 (Zarr 2, in .zattrs) and 0.5
+(Zarr 3, in zarr.json), which say where levels of detail lie in the world: https://ngff.openmicroscopy.org/0.5/.
+A voxel's position is that of its centre.
+"""
+
+import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from .._util.checks import Arrayable, described
-from .._util.files import check_size, decoding, file_size
+from .._util.files import check_size, file_size
 from .._util.named_axes import along_xyz, is_named
-from .._util.npy import npy_header
 from ..io.formats.raw import raw_header
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume
-from .sources import VoxelSource, check_is_array
-from .zarr import METADATA, is_zarr_array, ome_zarr_levels, zarr_array
+from .sources import SPACE, VoxelSource
 
 
 Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
-"""A source, a volume, the path of a file or folder, or an array."""
 
-OF_RAW, OF_ARRAY, OF_ZARR = ("shape", "dtype"), ("axes", "index"), ("axes", "index", "missing")
+METADATA = (
+    "zarr.json",
+    ".zarray",
+    ".zgroup",
+    ".zattrs",
+)  # a Zarr array or group has at least one of these files
+LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
+CACHE = 2**24  # bytes of decoded chunks and indices of shards that are kept, for boxes that share them
 
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:
     """The finest level of what `levels_of` opens.
 
-    **Arguments:** `thing`, `options`: as for `levels_of`.
+    Args:
+        thing: As for `levels_of`.
+        **options: As for `levels_of`.
 
-    **Returns:** the source.
+    Returns:
+        The source.
 
-    **Raises:** as `levels_of`.
+    Raises:
+        ValueError: As `levels_of`.
+        ImportError: For Zarr without tensorstore and yaozarrs.
     """
     return levels_of(thing, **options)[0]
 
 
 def levels_of(
-    thing: Openable,
-    *,
-    spacing: Arrayable | None = None,
-    origin: Arrayable | None = None,
-    shape: Sequence[int] | None = None,
-    dtype: str | Any | None = None,
-    axes: str | Sequence[str] | Any | None = None,
-    index: Mapping[str, int] | None = None,
-    missing: Literal["error", "fill"] | Any | None = None,
+    thing: Openable, *, spacing: Arrayable | None = None, origin: Arrayable | None = None, **options: Any
 ) -> tuple[VoxelSource, ...]:
     """The levels of detail of a volume, finest first; only that of an OME-Zarr image may have several.
 
-    **Arguments:**
+    | `thing` | read |
+    |---|---|
+    | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
+    | an xarray `DataArray` | whole, its axes and coordinates as in `Volume`; of a lazy one pass `.data` |
+    | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
+    | path of a `.npy` file, data[x, y, z] | by `np.lib.format.open_memmap` |
+    | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
+    | a `Volume` without labels and field, or a `VoxelSource` | as it is |
 
-    - `thing`: what holds the voxels.
+    Args:
+        thing: What holds the voxels.
+        spacing: As in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
+        origin: As in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
+        **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes` and `index`: see `VoxelSource`;
+            the axes of Zarr are by default its own (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in
+            version 2). `missing`: what it means if a chunk of a path's Zarr array is not there: `"error"`,
+            the default, that the data are incomplete; `"fill"`, that all its voxels have the fill value, as
+            where programs leave out such chunks.
 
-      | | read |
-      |---|---|
-      | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
-      | an xarray `DataArray` | whole, its axes and coordinates as in `Volume`; of a lazy one pass `.data` |
-      | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
-      | path of a `.npy` file, data[x, y, z] | by `np.load(mmap_mode="r")` |
-      | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
-      | a `Volume` without labels and field, or a `VoxelSource` | as it is |
+    Returns:
+        A source for each level.
 
-    - `spacing`, `origin`: as in `Volume`, of the finest level; by default what the source says.
-    - `shape`, `dtype`: of a raw file, as in `jv.load`.
-    - `axes`, `index`: of arrays, .npy files and Zarr; see `VoxelSource`. By default Zarr's own
-      (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in version 2).
-    - `missing`: what it means if a chunk of a path's Zarr array is not there. `"error"`: that the data are
-      incomplete. `"fill"`: that all its voxels have the fill value, as where programs leave out such chunks.
-
-    **Returns:** a source for each level.
-
-    **Raises:** `ValueError` for anything else, for options that do not belong to it, for a file that is
-    missing, damaged, or larger or smaller than it says, and for shapes and types that no volume has;
-    `ImportError` for Zarr without tensorstore.
+    Raises:
+        ValueError: For anything else, for a file that is missing, damaged or cut short, and for shapes and
+            types that no volume has.
+        TypeError: For options that do not belong to it.
+        ImportError: For Zarr without tensorstore and yaozarrs.
     """
-    options = {"shape": shape, "dtype": dtype, "axes": axes, "index": index, "missing": missing}
-    options = {name: value for name, value in options.items() if value is not None}
-    place: dict[str, Any] = {"spacing": spacing, "origin": origin}
-    if isinstance(thing, str | os.PathLike) and str(thing):
-        return _of_path(Path(thing), options, place)
+    place = {"spacing": spacing, "origin": origin}
+    place = {name: value for name, value in place.items() if value is not None}
+    if isinstance(thing, VoxelSource):
+        if place or options:
+            raise TypeError(
+                f"{', '.join(place | options)}: a VoxelSource takes no options; make another one."
+            )
+        return (thing,)
+    if isinstance(thing, Volume):
+        if thing.labels is not None or thing.field is not None:
+            raise ValueError("source must be a Volume without labels and field. Use jv.render.")
+        own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
+        return (VoxelSource(thing.data, **(own | place), axes="xyz", **options, name="volume"),)
     if is_named(thing):
-        _refuse(described(thing), options, ())
         thing, own = along_xyz(thing)
-        return (VoxelSource(thing, **_with_own(place, own)),)
-    if not isinstance(thing, VoxelSource | Volume):
-        _refuse(described(thing), options, OF_ARRAY)
-        return (VoxelSource(thing, **options, **place),)
-    _refuse(described(thing), options | {k: v for k, v in place.items() if v is not None}, ())
-    return (thing if isinstance(thing, VoxelSource) else _of_volume(thing),)
-
-
-def _of_volume(volume: Volume) -> VoxelSource:
-    check_is_array(volume)
-    for part in ("labels", "field"):
-        if getattr(volume, part) is not None:
-            raise ValueError(f"source must hold voxels alone; got a Volume with {part}. Use jv.render.")
-    return VoxelSource(volume.data, volume.spacing, volume.origin, direction=volume.direction, name="volume")
-
-
-def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tuple[VoxelSource, ...]:
+        return (VoxelSource(thing, **(own | place), axes="xyz", **options),)
+    if not isinstance(thing, str | os.PathLike):
+        return (VoxelSource(thing, **place, **options),)
+    path = Path(thing)
     if not path.exists():
         raise ValueError(f"path: there is no file {path} (working directory {Path.cwd()}).")
-    if path.is_dir():
-        return _of_folder(path, options, place)
+    if _is_zarr_array(path):
+        return (_zarr_array(path, **place, **options),)
+    if any((path / name).is_file() for name in METADATA):
+        return _ome_zarr_levels(path, **place, **options)
     if path.suffix.lower() == ".raw":
-        _refuse(str(path), options, OF_RAW)
-        size, stored, own = raw_header(path, options.get("shape"), options.get("dtype"), 48)
+        size, stored, own = raw_header(path, options.pop("shape", None), options.pop("dtype", None), 48)
         check_size(path, file_size(path), math.prod(size) * stored.itemsize)
         mapped = np.memmap(path, stored, "r", shape=size, order="F")
-        return (VoxelSource(mapped, **_with_own(place, own), name=str(path)),)
+        return (VoxelSource(mapped, **(own | place), **options, name=str(path)),)
     if path.suffix.lower() == ".npy":
-        _refuse(str(path), options, OF_ARRAY)
-        whole = file_size(path)
-        with decoding(path), path.open("rb") as stream:
-            size, _, stored = npy_header(path, stream)
-            check_size(path, whole - stream.tell(), math.prod(size) * stored.itemsize)
-        return (VoxelSource(np.load(path, mmap_mode="r"), **options, **place, name=str(path)),)
+        try:
+            mapped = np.lib.format.open_memmap(path, "r")
+        except Exception as fault:  # NumPy raises different errors for different faults
+            raise ValueError(f"path: {path} cannot be opened as .npy ({fault}).") from fault
+        return (VoxelSource(mapped, **place, **options, name=str(path)),)
     raise ValueError(
-        f"path: {path} is not of a kind that is read in parts: .raw (uncompressed: gunzip -k), .npy, or the "
-        "folder of a Zarr array or an OME-Zarr image. Pass what fits into memory as jv.load(path) or "
-        "jv.load_ultrasound(path), and of HDF5 the array h5py.File(path)[name]."
+        f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, or "
+        "the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as DICOM slices, as "
+        "jv.load(path) or jv.load_ultrasound(path), and of HDF5 the array h5py.File(path)[name]."
     )
 
 
-def _of_folder(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tuple[VoxelSource, ...]:
-    if not any((path / name).is_file() for name in METADATA):
+def _is_zarr_array(path: Path) -> bool:
+    if (path / "zarr.json").is_file():
+        return _read_json(path / "zarr.json").get("node_type") == "array"
+    return (path / ".zarray").is_file()
+
+
+def _zarr_array(path: Path, *, axes: Any = None, missing: Any = "error", **how: Any) -> VoxelSource:
+    try:
+        import tensorstore
+    except ImportError as fault:
+        raise ImportError(f'{path} is read by tensorstore: pip install "jaxvol[bricks]".') from fault
+    if missing not in ("error", "fill"):
+        raise ValueError(f'missing must be "error" or "fill"; got {missing!r}.')
+    spec = {
+        "driver": "zarr" if (path / ".zarray").is_file() else "zarr3",
+        "kvstore": {"driver": "file", "path": f"{path.resolve()}{os.sep}"},
+        "fill_missing_data_reads": missing == "fill",
+        "context": {"cache_pool": {"total_bytes_limit": CACHE}},
+    }
+    try:
+        store: Any = tensorstore.open(spec, open=True, read=True).result()
+    except ValueError as fault:
+        raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
+    # a chunk is decoded as a whole, even beyond the array
+    chunk = [c or n for c, n in zip(store.chunk_layout.read_chunk.shape, store.shape, strict=True)]
+    of_chunk, whole = (math.prod(shape) * store.dtype.numpy_dtype.itemsize for shape in (chunk, store.shape))
+    if of_chunk > max(LARGE, BEYOND * whole):
         raise ValueError(
-            f"path: {path} is a folder without Zarr in it: it has none of {', '.join(METADATA)}. For a DICOM "
-            "series, pass jv.load(path)."
+            f"path: {path} must have chunks that are not much larger than it; got chunks of {tuple(chunk)} "
+            f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
         )
-    if is_zarr_array(path):
-        _refuse(str(path), options, OF_ZARR)
-        return (zarr_array(path, **options, **place),)
-    _refuse(f"the OME-Zarr image {path}, whose metadata name its axes,", options, OF_ZARR[1:])
-    return ome_zarr_levels(path, **options, **place)
+    names: Any = list(store.domain.labels)  # Zarr 3
+    if (path / ".zattrs").is_file():  # xarray's in Zarr 2
+        names = _read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS")
+    names = [str(name).lower() for name in names] if isinstance(names, list) else []
+    if axes is None and {*SPACE} <= {*names}:
+        axes = names
+    return VoxelSource(store, axes=axes, name=str(path), **how)
 
 
-def _with_own(place: dict[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Spacing and origin as given, or else as the data say."""
-    return {name: own.get(name) if given is None else given for name, given in place.items()}
+def _ome_zarr_levels(path: Path, **options: Any) -> tuple[VoxelSource, ...]:
+    """The levels of the first image in an OME-Zarr group, finest first, in the unit of the file."""
+    try:
+        from yaozarrs import v04, v05
+    except ImportError as fault:
+        raise ImportError(f'{path} is read by yaozarrs: pip install "jaxvol[bricks]".') from fault
+    zarr3 = (path / "zarr.json").is_file()
+    metadata = _read_json(path / ("zarr.json" if zarr3 else ".zattrs"))
+    try:
+        model, content = (v05.Image, metadata["attributes"]["ome"]) if zarr3 else (v04.Image, metadata)
+        image: Any = model.model_validate(content).multiscales[0]
+    except (KeyError, TypeError, ValueError) as fault:
+        version, said = "0.5" if zarr3 else "0.4", " ".join(str(fault).split())
+        raise ValueError(
+            f"path: {path} does not follow OME-Zarr {version} ({said}). Give the path of an image, or of an "
+            "array in it, such as its folder 0."
+        ) from fault
+    names = [axis.name for axis in image.axes]
+    units = {axis.name: getattr(axis, "unit", None) for axis in image.axes if axis.name in SPACE}
+    if len(units) < 3 or len({*units.values()}) > 1:
+        raise ValueError(f"path: {path} must have axes x, y and z of the same unit; got {names}, {units}.")
+    at, levels = [names.index(axis) for axis in SPACE], []
+    for dataset in image.datasets:
+        scale, offset = np.ones(len(names)), np.zeros(len(names))
+        for described_by in (dataset, image):  # those of all levels come last
+            for each in described_by.coordinateTransformations or ():
+                if each.type == "scale":
+                    scale, offset = scale * each.scale, offset * each.scale
+                else:
+                    offset = offset + each.translation
+        if not _is_zarr_array(path / dataset.path):
+            raise ValueError(f"path: {path}: {dataset.path} is no Zarr array within the group.")
+        place = {"spacing": scale[at], "origin": offset[at]}
+        levels.append(_zarr_array(path / dataset.path, axes=names, **place, **options))
+    return tuple(levels)
 
 
-def _refuse(what: str, options: dict[str, Any], allowed: tuple[str, ...]) -> None:
-    if unused := [name for name in options if name not in allowed]:
-        expected = f"only {', '.join(allowed)}" if allowed else "none"
-        raise ValueError(f"{', '.join(unused)}: {what} takes no such option; expected {expected}.")
+def _read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in a file."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as fault:
+        raise ValueError(f"path: {path} cannot be read as JSON ({fault}).") from fault
+    if not isinstance(content, dict):
+        raise ValueError(f"path: {path} must hold a JSON object; got {described(content)}.")
+    return content
 
 
 def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:
     """The coarsest level whose voxels are no larger than a pixel at the volume's corner nearest to the image
     plane. An axis along which a level is as fine as the finest does not count against it.
 
-    **Arguments:** `levels`: of the same volume, finest first (`levels_of`). `camera`: the view.
+    Args:
+        levels: Of the same volume, finest first (`levels_of`).
+        camera: The view.
 
-    **Returns:** its index, 0 for the finest; also where the camera is within the volume.
+    Returns:
+        Its index, 0 for the finest; also where the camera is within the volume.
     """
     finest = levels[0]
     width, height = camera.size

@@ -8,22 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import Arrayable, described, integer, shortened
+from .._util.checks import Arrayable, integer
 from .._util.memory import memory_of_device
-from ..compositing.blending import Compositing, Over
+from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
-from ..engine.acceleration import VolumeAcceleration
-from ..engine.brick_march import (
-    NO_ACCELERATION,
-    begin_rays,
-    begin_vjp,
-    finish_image,
-    finish_vjp,
-    march_brick,
-    resolve_brick,
-    vjp_of_brick,
-)
+from ..engine import brick_march
+from ..engine.acceleration import NO_ACCELERATION, VolumeAcceleration
 from ..engine.devices import Devices, check_not_sharded, mesh_of, on_all
 from ..engine.gradients import of_all_outputs, of_perturbed
 from ..engine.image import RenderOutputs
@@ -31,7 +22,6 @@ from ..engine.resolve import resolve_image
 from ..engine.tiling import RenderOptions
 from ..lighting.shading import Lighting
 from ..march.march import March
-from ..march.strides import stride_control
 from ..march.transforms import SpaceLeaping, ToroidalMap
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
@@ -43,15 +33,10 @@ from ..xla.compiling import compiled
 from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
 from ..xla.trees import strong
-from .distributed import render_distributed
-from .grid import Node, is_straight
+from .distributed import check_joins, render_distributed
 from .opening import level_for, levels_of
 from .sources import VoxelSource
 from .traversal import METHODS, Method, Request, Traversal
-
-
-Own = Literal["rays", "bricks"]
-"""What may be dealt out to devices."""
 
 
 def render_bricks(
@@ -71,7 +56,7 @@ def render_bricks(
     level: int | Literal["auto"] | Any = "auto",
     progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
-    own: Own | Any = "rays",
+    own: Literal["rays", "bricks"] | Any = "rays",
     **options: Any,
 ) -> Rendering:
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
@@ -83,78 +68,83 @@ def render_bricks(
     function that rises within an eightieth of the values, 3e-5). `samples`, `error`, and `exhausted` where a
     `max_samples` is too small, may differ.
 
-    **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
-    but `SpaceLeaping("min_distance")`.
+    Args:
+        source: See `bricks.levels_of`. One pass over all voxels finds their ranges before the first image. A
+            `bricks.VoxelSource` keeps them for the next: open it once, by `bricks.source_of`.
+        transfer: As for `render`.
+        camera: As for `render`.
+        march: As for `render`; all transforms but `SpaceLeaping("min_distance")`.
+        spacing: As in `Volume`; by default what the source says.
+        origin: As in `Volume`; by default what the source says.
+        memory: Bytes for voxels and what is made of them: the brick that is rendered and the next one; by
+            default a quarter of the device's. In addition an image takes some 550 bytes for each pixel, and
+            compiled programs some 300 MiB.
+        bricks: Number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
+            may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
+        method: Where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
+            left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as
+            `memory` goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
+            (`bricks.traversal.Schedule`), which has no gradient.
+        compositing: As for `render`.
+        lighting: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
+            (`Lighting.farthest_read`).
+        outputs: As for `render`.
+        level: Of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
+            are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
+        progress: Called after each brick, with the numbers of bricks rendered so far and of those that hold
+            anything visible, some of which may not be needed, or be read again.
+        devices: As for `render`. `memory` is that of each device.
+        own: What is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
+            is read once and copied to all. `"bricks"`: each device reads its own bricks, marches all rays
+            through them, and the partial images are combined front to back: where reading takes longest, and
+            for several processes. Rays must be straight in the grid, and what a ray shows must not depend on
+            what lies in front but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`;
+            compositing by `"over"`). An `EarlyTermination` sees only what is in front on the same device: up
+            to `opacity_left` of the colours behind are added, and depth changes with them; without it, depth
+            agrees to 1e-5 of itself. No gradients.
+        **options: For the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
 
-    - `source`, and `options` for it (`shape`, `dtype`, `axes`, `index`, `missing`): see `bricks.levels_of`.
-      One pass over all voxels finds their ranges before the first image. A `bricks.VoxelSource` of a file
-      keeps them for the next: open it once, by `bricks.source_of`.
-    - `spacing`, `origin`: as in `Volume`; by default what the source says.
-    - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
-      default a quarter of the device's. Beside them an image takes some 550 bytes for each pixel, compiled
-      programs some 300 MiB, the ranges of values 2 / 16³ of the voxels, and Zarr 16 MiB for each level.
-    - `bricks`: number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
-      may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
-    - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
-      left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as `memory`
-      goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
-      (`bricks.traversal.Schedule`).
-    - `lighting`: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
-      (`Lighting.farthest_read`).
-    - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
-      are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
-    - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
-      anything visible, some of which may not be needed, or be read again.
-    - `devices`: as for `render`. `memory` is that of each device.
-    - `own`: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
-      is read once and copied to all. `"bricks"`: each device reads its own bricks, marches all rays through
-      them, and the partial images are combined front to back: where reading takes longest, and for several
-      processes. Rays must be straight in the grid, and what a ray shows must not depend on what lies in front
-      but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by `"over"`). An
-      `EarlyTermination` sees what is in front on the same device alone: up to `opacity_left` of the colours
-      behind are added, and depth changes with them. Without it, depth agrees to 1e-5 of itself. Each device
-      keeps some 300 bytes for each pixel. No gradients.
+    Returns:
+        As `render`, and in `Rendering.bricks` what it took.
 
-    **Returns:** as `render`, and in `Rendering.bricks` what it took.
+    Raises:
+        ValueError: Naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
+            whose file changed; for less memory than the smallest bricks take; for what needs the whole volume
+            at once (labels, baked or deferred light); and for what cannot be had with `own="bricks"`.
 
     Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
     spacing and origin: a second march reads the bricks again. Where the march leaps, the derivative by the
-    extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other parts
-    of it. There is no gradient to the voxels, none of modes that choose a sample or resolve (`"maximum"`,
-    `"average"`, `Isosurface`), none in forward mode (`jax.jvp`) or of second order, and none inside `jax.jit`
-    or `jax.vmap`.
+    extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other cells.
+    There is no gradient to the voxels, none of modes other than `"over"`, none in forward mode (`jax.jvp`) or
+    of second order, and none inside `jax.jit` or `jax.vmap`.
 
-    **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
-    unknown, or that changed after its ranges of values were found; for less memory than the smallest bricks
-    take; for what needs the whole volume at once (labels, baked or deferred light); and for what cannot be
-    had with `own="bricks"`. Nothing is written.
-
-    Where it fails, and where not: `experiments/stability.py`, "wrong order".
-
-    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
-    are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the
-    image; `bricks.overlap_of` has their formula.
+    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3; their future work are ranges of values,
+    by which empty bricks are not read. Unlike there, how far bricks overlap follows from the rays of the
+    image; `bricks.overlap_of` has their formula. Where it fails: `experiments/stability.py`, "wrong order".
     """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    _check(march, transfer, lighting, method, outputs, own, progress)
+    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, ("rays", "bricks"))]
+    words += [] if callable(method) else [("method", method, tuple(METHODS))]
+    for name, given, known in words:
+        if not isinstance(given, str) or given not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
     place = {"spacing": spacing, "origin": origin}
     traced = {name: value for name, value in place.items() if is_traced(value)}
-    known = {name: value for name, value in place.items() if name not in traced}
-    levels = levels_of(source, **known, **options)
+    concrete = {name: value for name, value in place.items() if name not in traced}
+    levels = levels_of(source, **concrete, **options)
     if traced and len(levels) > 1:
         raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
-    room = budget(memory)
-    chosen = _level(levels, level, camera, march)
-    scene = _scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
+    room, chosen = budget(memory), _level(levels, level, camera, march)
+    scene = scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
     check_not_sharded(mesh, scene)
     scene = on_all(mesh, scene)
-    request = Request(chosen, room, _counts(bricks), method, progress, outputs, mesh, own == "bricks")
+    request = Request(chosen, room, bricks, method, progress, outputs, mesh, own == "bricks")
     if request.deals_bricks:
-        _check_distributed(scene, method)
+        check_joins(scene, method)
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
         raise ValueError(
             "render_bricks has gradients in reverse mode, but none in forward mode (jax.jvp) or of 2nd order."
@@ -171,23 +161,7 @@ def budget(memory: int | Any | None) -> int:
     return integer("memory", memory, 1, otherwise=", a number of bytes")
 
 
-def bricks_of(
-    source: VoxelSource,
-    transfer: Transfer,
-    camera: Camera,
-    march: March,
-    *,
-    memory: int,
-    compositing: Mode | Compositing[Any] | Any = "over",
-    lighting: Lighting | None = None,
-) -> Traversal:
-    """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
-    _check(march, transfer, lighting)
-    scene = _scene_of(source, transfer, camera, march, compositing, lighting)
-    return Traversal(Request(source, memory), _marched(scene), scene, "all")
-
-
-def _scene_of(
+def scene_of(
     source: VoxelSource,
     transfer: Transfer,
     camera: Camera,
@@ -197,6 +171,13 @@ def _scene_of(
     **traced: Any,
 ) -> Scene:
     """The scene of a source, without its voxels. `traced`: spacing and origin in place of the source's."""
+    if isinstance(transfer, LabelTransferFunction):
+        raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
+    if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
+        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
+    if lighting is not None and lighting.farthest_read is None:
+        needs = f"{type(lighting).__name__}, which needs the whole volume"
+        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); got {needs}.")
     place = {"spacing": source.spacing, "origin": source.origin} | traced
     volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
@@ -204,48 +185,37 @@ def _scene_of(
     return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
 
 
-def _marched(scene: Scene) -> Scene:
-    """The scene as its rays are marched: of a mode that resolves, without light, since pixels are computed
-    from what that march finds."""
-    mode = scene.compositing
-    if not mode.resolves:
-        return scene
-    transfer, march = mode.marched(scene.transfer, scene.march, scene.volume)
-    return scene._replace(transfer=transfer, march=march, lighting=None)
-
-
-_set_out, _march_part, _arrive = map(compiled, (begin_rays, march_brick, finish_image))
-_resolve_part, _resolve = map(compiled, (resolve_brick, resolve_image))
-_start_pull, _pull_part, _end_pull = map(compiled, (begin_vjp, vjp_of_brick, finish_vjp))
+_begin_rays, _march_brick = compiled(brick_march.begin_rays), compiled(brick_march.march_brick)
+_finish_image, _resolve_image = compiled(brick_march.finish_image), compiled(resolve_image)
+_resolve_brick, _begin_vjp = compiled(brick_march.resolve_brick), compiled(brick_march.begin_vjp)
+_vjp_of_brick, _finish_vjp = compiled(brick_march.vjp_of_brick), compiled(brick_march.finish_vjp)
 
 
 def _image(scene: Scene, request: Request) -> Rendering:
-    mode, outputs = scene.compositing, request.outputs
-    marched, selects = _marched(scene), isinstance(mode, Selection)
-    found = "depth" if mode.resolves and outputs == "rgba" else outputs
-    traversal = Traversal(request, marched, scene, found)
-    options = traversal.options
+    mode, selects = scene.compositing, isinstance(scene.compositing, Selection)
+    traversal = Traversal(request, scene)
+    marched, options = traversal.scene, traversal.options
     if request.deals_bricks:
         assert request.mesh is not None
         return render_distributed(traversal, request.mesh)
-    underway, pixels = _set_out(marched, options), None
+    underway, pixels = _begin_rays(marched, options), None
     for brick, cells in traversal.bricks(underway.rays, underway.at):
         before, restart = underway.at, callable(request.method)
-        underway = _march_part(*_on(brick, marched, options), underway, cells, restart)
+        underway = _march_brick(*_on(brick, marched, options), underway, cells, restart)
         if selects:
-            pixels = _resolve_part(*_on(brick, scene, options), marched.march, before, underway, pixels)
+            pixels = _resolve_brick(*_on(brick, scene, options), marched.march, before, underway, pixels)
             jax.block_until_ready(pixels)
         traversal.at = underway.at
         del brick
-    rendering = _arrive(marched, options, underway)
+    rendering = _finish_image(marched, options, underway)
     if not mode.resolves:
         return rendering
     if not selects:
-        pixels = _resolve(scene, options, NO_ACCELERATION, (rendering.rgba, rendering.depth, None))
+        pixels = _resolve_image(scene, options, NO_ACCELERATION, (rendering.rgba, rendering.depth, None))
     elif pixels is None:  # no brick was read
         pixels = jnp.zeros((*rendering.rgba.shape[:-1], 5), rendering.rgba.dtype).at[..., 4].set(jnp.inf)
     details = Details()
-    if outputs == "all":
+    if request.outputs == "all":
         normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
         details = rendering.details._replace(depth=pixels[..., 4], normal=normal, selected=None)
     return Rendering(pixels[..., :4], rendering.exhausted, details)
@@ -278,16 +248,16 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, reques
             "the gradient by bricks reads its source while it is computed, and so not inside jax.jit, "
             "jax.vmap or jax.jacrev: call what jax.vjp returns outside of them, once for each cotangent."
         )
-    traversal = Traversal(request, scene, scene, request.outputs)
+    traversal = Traversal(request, scene)
     options, whole = traversal.options, of_all_outputs(rendering, cotangent)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
-    sums, replay = _start_pull(scene, perturbed, options, rendering, whole)
+    sums, replay = _begin_vjp(scene, perturbed, options, rendering, whole)
     for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
-        sums, replay = _pull_part(*_on(brick, scene, options), perturbed, sums, replay, cells)
+        sums, replay = _vjp_of_brick(*_on(brick, scene, options), perturbed, sums, replay, cells)
         traversal.at = replay.states.at
         del brick
-    found = _end_pull(scene, perturbed, options, sums, replay, rendering, whole)
+    found = _finish_vjp(scene, perturbed, options, sums, replay, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 
@@ -305,62 +275,7 @@ def _level(
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
     most = 0 if mapped else len(levels) - 1  # a map's ranges are those of the finest level
     if level != "auto":
-        otherwise = ', or "auto" under a ToroidalMap' if mapped else ', or "auto"'
-        return levels[integer("level", level, 0, most, otherwise=otherwise)]
+        return levels[integer("level", level, 0, most, otherwise=', or "auto"')]
     if most and is_traced(camera):
-        raise ValueError(f"level must be one of 0 to {most} where gradients are taken; got 'auto'.")
+        raise ValueError(f"level must be one of 0 to {most} under jax.grad; got 'auto'.")
     return levels[level_for(levels, camera) if most else 0]
-
-
-def _counts(bricks: Any) -> Node | None:
-    if bricks is None:
-        return None
-    try:
-        x, y, z = bricks
-        return integer("x", x, 1), integer("y", y, 1), integer("z", z, 1)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(
-            f"bricks must be three numbers of bricks, each an integer of at least 1; got {shortened(bricks)}."
-        ) from fault
-
-
-def _check(
-    march: March,
-    transfer: Transfer,
-    lighting: Lighting | None,
-    method: Any = "overlap",
-    outputs: Any = "all",
-    own: Any = "rays",
-    progress: Any = None,
-) -> None:
-    """Raises for arguments that are no such, and for what needs the whole volume."""
-    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, get_args(Own))]
-    words += [] if callable(method) else [("method", method, tuple(METHODS))]
-    for name, given, known in words:
-        if not isinstance(given, str) or given not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
-    if progress is not None and not callable(progress):
-        raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
-    if isinstance(transfer, LabelTransferFunction):
-        raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
-    if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
-        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
-    if lighting is not None and lighting.farthest_read is None:
-        what = f"{type(lighting).__name__} needs the whole volume here"
-        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); {what}.")
-
-
-def _check_distributed(scene: Scene, method: Method) -> None:
-    """Raises where partial images of bricks cannot be combined."""
-    march, mode = scene.march, scene.compositing
-    refused = {
-        f"method={method!r}": method != "overlap",
-        f"compositing by {type(mode).__name__}, which joins no parts of a ray": not isinstance(mode, Over),
-        "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
-        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
-        "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
-        "gradients": is_traced(scene),
-    }
-    for what, refuses in refused.items():
-        if refuses:
-            raise ValueError(f'own="bricks" does not go with {what}. Use own="rays".')

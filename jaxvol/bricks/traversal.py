@@ -1,5 +1,6 @@
-"""Takes an image's rays through all bricks, while the next brick is read."""
+"""Marches an image's rays through all bricks, while the next brick is read."""
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -25,11 +26,9 @@ from ..scene.rendering import BrickReport
 from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
-from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
-from .conversion import range_of
-from .grid import BrickGrid, Node
+from .cells import BrickCells, CurvedRays, Visit, curved_cells, padded, straight_cells
+from .grid import MOST_VOXELS, BrickGrid, Margin, Node, divided, split, stored_shape
 from .sources import READERS, VoxelSource
-from .split import Margin, bytes_of, check_stored, divided, fits, split, stored_of, stored_shape
 from .summary import summary_of
 
 
@@ -39,15 +38,11 @@ Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
-BEAMS = 32
-"""Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
-rays."""
-
-BATCH = 72
-"""`Tiling.batch` on a CPU. Few rays meet a brick, and the last batch takes as long as its longest ray."""
-
-KEPT = 64 * 2**20
-"""Bytes that are read before freed memory is given back to the system, which takes some 8 ms."""
+BEAMS = 32  # of curved rays, searched at a time: it takes as long as the longest of these
+BATCH = (
+    72  # `Tiling.batch` on a CPU: few rays meet a brick, and the last batch lasts as long as its longest ray
+)
+KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
 
 
 class Load(NamedTuple):
@@ -61,71 +56,67 @@ class Load(NamedTuple):
 
 @dataclass(frozen=True)
 class Request:
-    """What `render_bricks` was asked for.
-
-    - `counts`: bricks along x, y and z, in place of those chosen to fit into `memory`.
-    - `mesh`: devices over which rays are dealt out, or bricks, if `deals_bricks`.
-    - `traversals`: filled while the scene is rendered. A gradient has a second one.
-    """
+    """What `render_bricks` was asked for."""
 
     source: VoxelSource
     memory: int
-    counts: Node | None = None
-    method: Method = "overlap"
+    counts: Any = None  # bricks along x, y and z, in place of those chosen to fit into `memory`
+    method: Method | Any = "overlap"
     progress: Callable[[int, int], Any] | None = None
     outputs: Any = "all"
-    mesh: Mesh | None = None
+    mesh: Mesh | None = None  # devices over which rays are dealt out, or bricks, if `deals_bricks`
     deals_bricks: bool = False
-    traversals: "list[Traversal]" = field(default_factory=list)
+    traversals: "list[Traversal]" = field(default_factory=list)  # so far; a gradient has a second one
 
 
 class Traversal:
-    """An image's rays on their way through all bricks.
-
-    - `scene`: with a volume without its voxels. `space`: of its grid.
-    - `order`: bricks, front to back. `visible`: for each brick, whether anything may be visible in it.
-    - `stored`: nodes along each axis that are read at a time. `min_stored`: as many as any single brick
-      needs. `memory`: bytes that these may take.
-    - `rays`, `at`: the rays, and how far they have been marched.
-    - `done`: number of bricks that were rendered. `loads`: bricks whose reading has begun.
-    """
+    """An image's rays on their way through all bricks. Its `scene` is as rays are marched, and its volume is
+    without voxels."""
 
     rays: Ray
-    at: Progress
+    at: Progress  # how far they have been marched
 
-    def __init__(self, request: Request, marched: Scene, shown: Scene, outputs: Any):
-        """Of a scene as its rays are marched, and as it is `shown`."""
+    def __init__(self, request: Request, shown: Scene):
+        marched, mode, outputs = shown, shown.compositing, request.outputs
+        if mode.resolves:  # without light: pixels are computed from what the march finds
+            transfer, march = mode.marched(shown.transfer, shown.march, shown.volume)
+            marched = shown._replace(transfer=transfer, march=march, lighting=None)
+            outputs = "depth" if outputs == "rgba" else outputs
         assert isinstance(marched.source, Camera)
         self.request, self.source, self.scene = request, request.source, marched
-        source, memory, counts = request.source, request.memory, request.counts
+        source, shape, counts = request.source, request.source.shape, request.counts
         tiling = Tiling.of_backend(request.mesh)
         if not tiling.turns:  # on a CPU
             tiling = tiling._replace(batch=BATCH)
-        self.options = RenderOptions(
-            outputs, tiling._replace(devices=None) if request.deals_bricks else tiling
-        )
+        tiling = tiling._replace(devices=None) if request.deals_bricks else tiling
+        self.options = RenderOptions(outputs, tiling)
         self.done, self.bytes_read = 0, 0
-        self.loads: list[int] = []
-        self.space, shape = marched.march.locate(marched.volume), source.shape
+        self.loads: list[int] = []  # bricks whose reading has begun
+        self.space = marched.march.locate(marched.volume)
         margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
         least = devices.number_of(request.mesh) if request.deals_bricks else 1
-        self.grid = divided(shape, counts) if counts else split(shape, source.dtype, memory, margin, least)
+        if counts is None:
+            self.grid = split(shape, source.dtype, request.memory, margin, least)
+        else:
+            self.grid = divided(shape, counts)
         self.margin = margin if request.method == "overlap" else replace(margin, probe=None)
-        self.stored = self.min_stored = stored_of(self.grid, self.margin)
-        check_stored(self.stored)
+        # nodes along each axis that are read at a time, and that any single brick needs
+        self.stored = self.min_stored = self.margin.stored(self.grid)
+        if math.prod(self.stored) > MOST_VOXELS:
+            raise ValueError(
+                f"bricks must be so many that each has fewer than 2**31 voxels; got {self.stored}."
+            )
         if not self.margin.straight and not callable(request.method):
             # what is read follows from the rays: begin with less
             middle = (np.asarray(shape) - 1) / 2
             cells = self.margin.of_box(self.space, shape, middle, middle)
-            self.stored = stored_of(self.grid, replace(self.margin, cells=cells))
-        self.memory = max(memory, bytes_of(self.min_stored, source.dtype, self.margin))
+            self.stored = replace(self.margin, cells=cells).stored(self.grid)
+        self.memory = max(request.memory, self.margin.bytes(self.min_stored, source.dtype))
         self.order = self.grid.order(self.space, marched.source)
         # last, since it may read the whole source
-        known = request.traversals
-        self.summary = known[0].summary if known else summary_of(source, memory=memory)
-        known.append(self)
-        occupied = self.summary.where(eqx.Partial(marched.compositing.occupied, marched.transfer))
-        self.visible = self.summary.bricks_with(occupied, self.grid)
+        occupied = eqx.Partial(marched.compositing.occupied, marched.transfer)
+        self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
+        request.traversals.append(self)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
         """Each brick that rays need, and their cells there, while the next one is read. Before this one is
@@ -141,7 +132,7 @@ class Traversal:
             if self.bytes_read - given_back >= KEPT:
                 give_back()
                 given_back = self.bytes_read
-            # on a CPU, voxels are not copied if aligned (`empty_array`)
+            # on a CPU, aligned voxels are not copied
             brick = with_voxels(self.scene.volume, jax.device_put(load.voxels.result()))
             brick = part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
             cells = load.cells
@@ -160,80 +151,53 @@ class Traversal:
 
     def report(self) -> BrickReport:
         """What the bricks so far took."""
+        needed, loads, distinct = int(self.visible.sum()), len(self.loads), len(set(self.loads))
+        held = self.margin.bytes(self.stored, self.source.dtype)
         return BrickReport(
-            self.grid.counts,
-            int(self.visible.sum()),
-            len(self.loads),
-            len(self.loads) - len(set(self.loads)),
-            self.bytes_read,
-            self.stored,
-            bytes_of(self.stored, self.source.dtype, self.margin),
+            self.grid.counts, needed, loads, loads - distinct, self.bytes_read, self.stored, held
         )
 
     def cells_of(
-        self, brick: int, passable: set[int], reached: Array, *, over_empty: bool = True
+        self, brick: int, passable: np.ndarray, empty: np.ndarray, reached: Array, beyond: int = 0
     ) -> BrickCells | None:
-        """The cells of curved rays in a brick and in those through which they go on from it. `over_empty`:
-        and in those that are empty."""
-        empty = np.append(~self.visible, True)
-        on = empty & over_empty
-        on[list(passable)] = True
-        visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(on), jnp.asarray(empty))
-        return self.cells_in(visit, reached, self.margin.steps)
-
-    def cells_in(self, visit: Visit, reached: Array, beyond: int = 0) -> BrickCells | None:
-        """The cells of `curved_cells`; None if there are none."""
+        """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
+        visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty)
         mesh, march = self.options.tiling.devices, self.scene.march
-        found = _curved(mesh, self.grid, beyond, march, self.rays, self.at, reached, visit)
+        found = _curved(mesh, self.grid, beyond, march, (self.rays, self.at, reached), visit)
         return found if bool(found.any) else None
 
-    def around(self, brick: int) -> tuple[np.ndarray, np.ndarray]:
-        """The box that is read for all cells of a brick."""
-        low, high = (np.asarray(end) for end in self.grid.cells(brick))
-        cells = self.margin.cells  # where rays are straight, of any box
-        if not self.margin.straight:
-            cells = self.margin.of_box(self.space, self.grid.shape, low, high)
-        return low - cells, high + cells
-
-    def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray]:
-        """The box that is read for these cells."""
+    def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
+        """The box that is read for these cells, for which `stored` is enlarged; None if it, or then any
+        single brick, does not fit into memory."""
+        shape = self.grid.shape
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
-        around = self.margin.of_points(self.space, self.grid.shape, low, high)
+        around = self.margin.of_points(self.space, shape, low, high)
         low, high = np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
-        return np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
-
-    def make_room(self, found: BrickCells) -> bool:
-        """Whether the box of these cells fits into what is read at a time, which is enlarged for it as far as
-        memory goes: so far that any single brick still fits."""
-        low, high = self.box_of(found)
-        wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
-        x, y, z = map(max, wanted, self.stored)
+        low, high = np.maximum(low, 0), np.minimum(high, np.asarray(shape) - 1)
+        x, y, z = map(max, stored_shape(shape, tuple((high - low + 1).tolist())), self.stored)
         nx, ny, nz = map(max, (x, y, z), self.min_stored)
-        room = fits((nx, ny, nz), self.source.dtype, self.margin, self.memory)
-        self.stored = (x, y, z) if room else self.stored
-        return room
+        if not self.margin.fits((nx, ny, nz), self.source.dtype, self.memory):
+            return None
+        self.stored = x, y, z
+        return low, high
 
-    def load(self, brick: int, cells: CellRange | None, low: np.ndarray, high: np.ndarray) -> Load:
-        """Starts to read a brick, for these cells: a box that begins at a multiple of BLOCK and holds these
-        nodes."""
+    def load(
+        self, brick: int, cells: CellRange | None, box: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> Load:
+        """Starts to read a brick, from a multiple of BLOCK on. `box`: nodes that it holds, by default what
+        all of its cells need."""
+        if box is None:
+            low, high = (np.asarray(end) for end in self.grid.cells(brick))
+            box = low - self.margin.cells, high + self.margin.cells
+        low, high = box
         shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
         first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
         assert np.all(np.minimum(high, shape - 1) < first + stored), (low, high, first, stored)
         x, y, z = first.tolist()
         self.loads.append(brick)
         self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
-        return Load(brick, cells, (x, y, z), READERS.submit(self._read, first, first + stored))
-
-    def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """The voxels of a box, whose range tells whether they are those of the summary."""
-        voxels = self.source.read(low, high, self.source.order)
-        (least, most), (lowest, highest) = self.summary.range_of(low, high), range_of(voxels)
-        if lowest < least or highest > most:
-            raise ValueError(
-                f"{self.source.name} changed since the ranges of its values were found: {least} to {most} "
-                f"then, and {lowest} to {highest} now, in the box from {tuple(low.tolist())}. Open it again."
-            )
-        return voxels
+        voxels = READERS.submit(self.source.read, first, first + stored, self.source.order)
+        return Load(brick, cells, (x, y, z), voxels)
 
 
 def in_order(traversal: Traversal) -> Iterator[Load]:
@@ -243,27 +207,30 @@ def in_order(traversal: Traversal) -> Iterator[Load]:
             number, march = jnp.asarray(brick, jnp.int32), traversal.scene.march
             cells, any_ = _straight(traversal.grid, march, traversal.rays, traversal.at.finished, number)
             if any_:
-                yield traversal.load(brick, cells, *traversal.around(brick))
+                yield traversal.load(brick, cells)
 
 
 def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
     """Where rays are curved: bricks front to back, and again as long as rays come back to them. With
     `overlap`, each is read with what rays come back to of those before it, as far as memory goes."""
-    reached, going = jnp.zeros(traversal.rays.length.shape, jnp.int32), True
-    while going:
-        before, going = set[int](), False
-        for brick in traversal.order:
-            if not traversal.visible[brick]:
-                continue
-            found = traversal.cells_of(brick, {brick, *(before if overlap else ())}, reached)
-            if found is not None and not traversal.make_room(found):
-                found = traversal.cells_of(brick, {brick}, reached, over_empty=False)
-                assert found is None or traversal.make_room(found)
-            before.add(brick)
-            if found is not None:
-                going, reached = True, found.reached
-                yield traversal.load(brick, padded(found.cells), *traversal.box_of(found))
-        going &= not bool(jnp.all(traversal.at.finished))
+    empty, steps = np.append(~traversal.visible, True), traversal.margin.steps
+    reached, unfinished = jnp.zeros(traversal.rays.length.shape, jnp.int32), True
+    while unfinished:
+        before, unfinished = np.zeros_like(empty), False
+        for brick in [b for b in traversal.order if traversal.visible[b]]:
+            this = np.arange(len(empty)) == brick
+            passable = empty | this | before if overlap else empty | this
+            before |= this
+            for through in (passable, this):  # through fewer bricks if memory does not suffice
+                found = traversal.cells_of(brick, through, empty, reached, steps)
+                box = None if found is None else traversal.box_of(found)
+                if found is not None and box is not None:
+                    unfinished, reached = True, found.reached
+                    yield traversal.load(brick, padded(found.cells), box)
+                if found is None or box is not None:
+                    break
+            assert found is None or box is not None
+        unfinished &= not bool(jnp.all(traversal.at.finished))
 
 
 METHODS: dict[str, Schedule] = {
@@ -282,30 +249,20 @@ def _straight(
 
 @compiled
 def _curved(
-    mesh: Mesh | None,
-    grid: BrickGrid,
-    beyond: int,
-    march: March,
-    rays: Ray,
-    at: Progress,
-    reached: Array,
-    visit: Visit,
+    mesh: Mesh | None, grid: BrickGrid, beyond: int, march: March, rays: CurvedRays, visit: Visit
 ) -> BrickCells:
     """By beams of rays, BEAMS of them at a time."""
 
-    def program(whole: tuple[March, Visit], dealt: tuple[Ray, Progress, Array]) -> tuple[None, BrickCells]:
+    def program(whole: tuple[March, Visit], rays: CurvedRays) -> tuple[None, BrickCells]:
         march, visit = whole
-        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), dealt)
-
-        def some(each: tuple[Ray, Progress, Array]) -> BrickCells:
-            rays, at, reached = each
-            return curved_cells(grid, march, rays, at, reached, visit, beyond)
-
-        found: BrickCells = jax.lax.map(some, by_beam, batch_size=BEAMS)
-        shape = dealt[0].length.shape
+        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), rays)
+        found: BrickCells = jax.lax.map(
+            lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=BEAMS
+        )
+        shape = rays[0].length.shape
         cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
         return None, found._replace(cells=cells, reached=found.reached.reshape(shape))
 
-    _, found = devices.split(mesh, program, (march, visit), (rays, at, reached))
+    _, found = devices.split(mesh, program, (march, visit), rays)
     low, high = jnp.min(found.low, 0), jnp.max(found.high, 0)
     return found._replace(low=low, high=high, any=jnp.any(found.any))

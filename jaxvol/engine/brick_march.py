@@ -111,7 +111,7 @@ def resolve_brick(
     rendering = _assembled(scene._replace(march=march), tiles, after)
     states = zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True)
     changed = tiles.assemble(jnp.any(jnp.stack([old != new for old, new in states]), axis=0))[..., None]
-    found = rendering.rgba * changed, rendering.depth, rendering.details.selected
+    found = jnp.where(changed, rendering.rgba, 0), rendering.depth, rendering.details.selected
     resolved = resolve_pixels(scene, options, acceleration, found)
     return resolved if pixels is None else jnp.where(changed, resolved, pixels)
 
@@ -122,7 +122,7 @@ def _assembled(scene: Scene, tiles: RayTiles, states: RayStates) -> Rendering:
     return jax.tree.map(tiles.assemble, renderings)
 
 
-def join_segments(scene: Scene, parts: RayStates) -> RayStates:
+def join_segments(scene: Scene, segments: RayStates) -> RayStates:
     """Combines independently marched segments of rays, front to back, along the first axis, to rays that have
     passed all bricks. What is behind does not show where a ray was stopped in front."""
     prepared = scene._replace(lighting=None).prepared()
@@ -142,9 +142,11 @@ def join_segments(scene: Scene, parts: RayStates) -> RayStates:
         stops = stopped(prepared, front.composite)
         return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
 
-    at = _passed(scene.march, parts.at)
+    at = _passed(scene.march, segments.at)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(at.finished.shape[0])]
-    return RayStates(jax.tree.map(lambda leaf: leaf[0], parts.rays), reduce(jax.vmap(vmap_rays(join)), each))
+    return RayStates(
+        jax.tree.map(lambda leaf: leaf[0], segments.rays), reduce(jax.vmap(vmap_rays(join)), each)
+    )
 
 
 @on_devices("replicated", sharded=("states",))
@@ -228,7 +230,7 @@ def finish_vjp(
     rendering: Rendering,
     cotangent: Rendering,
 ) -> Any:
-    """The cotangents of a scene's parts, from a march through all bricks of its volume."""
+    """The cotangents of a scene's leaves, from a march through all bricks of its volume."""
     image = ImageVjp.of(scene, perturbed, options, NO_ACCELERATION)
 
     def one(sums: Sums, each: Any) -> tuple[Sums, None]:
@@ -236,6 +238,6 @@ def finish_vjp(
         _, pull = image.rays(number)
         return image.of_rays(sums, pull, of_rays, rendering, cotangent), None
 
-    parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    sums, _ = image.tiles.scan(one, sums, replayed.of_rays, *parts)
+    pixels = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
+    sums, _ = image.tiles.scan(one, sums, replayed.of_rays, *pixels)
     return image.cotangents(sums)

@@ -5,10 +5,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from ..bricks.grid import TooLittleMemory
 from ..bricks.opening import Openable, source_of
-from ..bricks.render import bricks_of, budget
+from ..bricks.render import budget, scene_of
 from ..bricks.sources import VoxelSource
-from ..bricks.split import TooLittleMemory
+from ..bricks.traversal import Request, Traversal
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import BrickReport
@@ -47,7 +48,8 @@ def with_bricks(
     while True:
         shorter = March(jnp.asarray(march.step) / finer, march.transforms, march.quadrature)
         try:
-            return shorter, bricks_of(source, transfer, camera, shorter, **how).report()
+            scene = scene_of(source, transfer, camera, shorter, how["compositing"], how["lighting"])
+            return shorter, Traversal(Request(source, how["memory"]), scene).report()
         except TooLittleMemory:  # what is read around a brick is a number of steps
             if finer == stride * 2**HALVED:
                 raise

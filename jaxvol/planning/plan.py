@@ -119,7 +119,8 @@ class Plan(NamedTuple):
             copy = f"planned on a copy of one voxel in {self.stride} along each axis, with this error:"
             lines.insert(0, f"{counts} bricks: at most {self.bricks.needed} are read; {copy}")
         elif self.source is not None:
-            lines.insert(0, f"in memory: {self.source.nbytes / 2**20:.1f} MiB of voxels fit")
+            voxels = math.prod(self.source.shape) * self.source.dtype.itemsize
+            lines.insert(0, f"in memory: {voxels / 2**20:.1f} MiB of voxels fit")
         return "\n".join(lines)
 
 

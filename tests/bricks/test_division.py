@@ -10,10 +10,10 @@ import pytest
 
 import jaxvol as jv
 from experiments import bricks_paper
-from jaxvol.bricks import BrickGrid, Summary, overlap_of, source_of
-from jaxvol.bricks.cells import Visit
-from jaxvol.bricks.render import _scene_of
-from jaxvol.bricks.split import EDGE, Margin, fits, nodes_within, split, stored_of
+from jaxvol.bricks import BrickGrid, overlap_of, source_of
+from jaxvol.bricks.grid import EDGE, Margin, nodes_within, split
+from jaxvol.bricks.render import scene_of
+from jaxvol.bricks.summary import Summary
 from jaxvol.bricks.traversal import _curved
 from jaxvol.engine.brick_march import begin_rays
 from jaxvol.engine.tiling import RenderOptions, Tiling
@@ -69,59 +69,58 @@ def test_no_ray_meets_a_brick_after_one_that_is_behind_it(spacing, distance, par
 
 MARGIN = Margin((4, 4, 4), 3, 3.0, 0.0, 1, False)
 CELL = 16
+UINT8 = np.dtype(np.uint8)
 CUBE = (257, 257, 257)
-
-
-def summary_with(shape, box):
-    """Ranges of a volume in which something lies in a box of blocks, and these blocks."""
-    high = np.zeros([-(-(n - 1) // CELL) for n in shape], np.uint8)
-    high[box] = 200
-    return Summary(shape, CELL, np.zeros_like(high), high), high > 0
 
 
 def nothing(shape):
     return source_of(np.broadcast_to(np.uint8(0), shape))
 
 
+def above_100(blocks):
+    return blocks.high > 100
+
+
 @pytest.mark.parametrize("size", [(16, 32, 48), (32, 127, 16), (48, 64, 99)])
 def test_a_brick_is_visible_if_any_of_its_blocks_is(size):
     shape = (97, 128, 100)
-    summary, occupied = summary_with(shape, np.s_[2:4, 5:6, :3])
+    most = np.zeros([-(-(n - 1) // CELL) for n in shape], np.uint8)
+    most[2:4, 5:6, :3] = 200
     grid = BrickGrid(shape, size)
-    found = summary.bricks_with(occupied, grid)
+    found = Summary(CELL, np.zeros_like(most), most).bricks_where(eqx.Partial(above_100), grid)
     for brick in range(grid.number):
         low, high = grid.cells(brick)
         part = tuple(slice(a // CELL, -(-b // CELL)) for a, b in zip(low, high, strict=True))
-        assert found[brick] == occupied[part].any()
+        assert found[brick] == (most[part] > 100).any()
 
 
 @pytest.mark.parametrize("memory", [2**22, 2**20, 2**18])
 def test_the_largest_bricks_of_about_cubic_shape_are_taken_that_fit(memory):
-    grid = split(CUBE, np.uint8, memory, MARGIN)
-    assert fits(stored_of(grid, MARGIN), np.uint8, MARGIN, memory)
+    grid = split(CUBE, UINT8, memory, MARGIN)
+    assert MARGIN.fits(MARGIN.stored(grid), UINT8, memory)
     assert max(grid.size) - min(grid.size) <= 2 * EDGE
     side = min(grid.size) + EDGE
-    assert not fits(stored_of(BrickGrid(CUBE, (side, side, side)), MARGIN), np.uint8, MARGIN, memory)
+    assert not MARGIN.fits(MARGIN.stored(BrickGrid(CUBE, (side, side, side))), UINT8, memory)
 
 
 def test_devices_that_share_bricks_have_one_each():
-    assert split(CUBE, np.uint8, 2**30, MARGIN).number == 1
-    assert split(CUBE, np.uint8, 2**30, MARGIN, 8).number >= 8
+    assert split(CUBE, UINT8, 2**30, MARGIN).number == 1
+    assert split(CUBE, UINT8, 2**30, MARGIN, 8).number >= 8
 
 
 def test_a_brick_has_fewer_voxels_than_a_volume_may_have():
     shape, margin = (1600, 1600, 1600), Margin((11, 11, 11), 11, 11.0, 0.0, 1, False)
-    grid = split(shape, np.uint8, 20 * 2**30, margin)
-    stored = stored_of(grid, margin)
+    grid = split(shape, UINT8, 20 * 2**30, margin)
+    stored = margin.stored(grid)
     assert math.prod(stored) < 2**31
     assert grid.counts == (2, 1, 1)  # and no more than that takes
     with pytest.raises(
         ValueError,
-        match=r"bricks must be so many that fewer than 2\*\*31 voxels are read for each; got 1600 x 1600",
+        match=r"bricks must be so many that each has fewer than 2\*\*31 voxels; got \(1600, 1600",
     ):
         jv.render_bricks(nothing(shape), TRANSFER, CAMERA, PLAIN, bricks=(1, 1, 1))
     # no axis is split along which bricks would be read whole
-    grid = split((65, 49, 65), np.uint8, 125_000, Margin((1, 20, 2), 1, 1.0, 0.0, 1, False))
+    grid = split((65, 49, 65), UINT8, 125_000, Margin((1, 20, 2), 1, 1.0, 0.0, 1, False))
     assert grid.counts[1] == 1
 
 
@@ -184,14 +183,14 @@ def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other()
 
 def test_cells_of_curved_rays_are_found_under_64_bits():
     """Traced only: a loop whose state changes its type is an error then."""
-    scene = _scene_of(source_of(fog()), SHEETS, FROM_THE_SIDE, CURVED, "over", None)
+    scene = scene_of(source_of(fog()), SHEETS, FROM_THE_SIDE, CURVED, "over", None)
 
     def cells_of(scene):
         underway = begin_rays(scene, RenderOptions("all", Tiling.of_backend(None)))
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
-        visit = Visit(jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty)
+        visit = jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
-        return _curved(None, grid, 11, scene.march, underway.rays, underway.at, reached, visit)
+        return _curved(None, grid, 11, scene.march, (underway.rays, underway.at, reached), visit)
 
     with in_float64():
         found = eqx.filter_eval_shape(cells_of, to_float64(scene))

@@ -1,4 +1,4 @@
-"""Does memory stay within the budget, and is it noticed if what is read has changed?"""
+"""Does memory stay within the budget?"""
 
 import subprocess
 import sys
@@ -8,10 +8,6 @@ import numpy as np
 import pytest
 
 from experiments.peak_memory import STATUS
-from jaxvol.bricks import source_of
-from jaxvol.bricks.render import bricks_of
-
-from .scenes import CAMERA, PLAIN, TRANSFER
 
 
 SIDE = 461
@@ -38,13 +34,13 @@ IMAGES = """
 
     measure()  # compiles
     measure()
-    some = VoxelSource._stored
+    some = VoxelSource._read_at_once
 
     def all_of_it(source, box, axes):
         whole = some(source, ((0, 0, 0), source.shape), (0, 1, 2)).copy()
         return whole[tuple(map(slice, *box))].transpose(axes)
 
-    VoxelSource._stored = all_of_it
+    VoxelSource._read_at_once = all_of_it
     measure()
 """
 
@@ -69,22 +65,3 @@ def test_memory_stays_within_the_budget_and_30_percent(tmp_path):
     assert loads == needed > 10
     assert peak < 1.3 * BUDGET + BESIDE < SIDE**3 / 2**20
     assert float(faulty[2]) > SIDE**3 / 2**20
-
-
-# ---- what is read ----
-
-
-@pytest.mark.parametrize("value", [0, 250])
-def test_voxels_outside_of_the_ranges_found_before_are_refused(value, tmp_path):
-    """As where another process writes to a map."""
-    data = np.memmap(tmp_path / "a", np.uint8, "w+", shape=(24, 25, 26))
-    data[:] = 100
-    traversal = bricks_of(source_of(data), TRANSFER, CAMERA, PLAIN, memory=10**6)
-
-    def read():
-        return traversal.load(0, None, *traversal.around(0)).voxels.result()
-
-    np.testing.assert_array_equal(read(), data)
-    data[20, 20, 20] = value
-    with pytest.raises(ValueError, match=rf"array changed since the ranges.* 100\.0 to 100\.0 .*{value}"):
-        read()

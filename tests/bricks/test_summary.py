@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.bricks import VoxelSource, source_of, summary, summary_of
-from jaxvol.bricks.summary import scan
+from jaxvol.bricks import VoxelSource, source_of, summary
+from jaxvol.bricks.summary import scan, summary_of
 
 from .test_sources import voxels, x_fastest
 from .test_zarr import written
@@ -32,46 +31,25 @@ def test_ranges_are_those_of_the_voxels_in_each_block(dtype, shape):
         assert_ranges(scan(source_of(given), cell, memory=memory), data)
 
 
-def test_the_range_of_a_box_holds_its_voxels_and_no_more_than_its_blocks():
-    data, rng = np.random.default_rng(0).normal(size=SHAPE).astype(np.float32), np.random.default_rng(1)
-    for cell in (4, 12):
-        found = scan(source_of(data), cell)
-        for _ in range(200):
-            low = rng.integers(0, SHAPE)
-            high = rng.integers(low + 1, np.array(SHAPE) + 1)
-            least, most = found.range_of(low, high)
-            part = data[tuple(map(slice, low, high))]
-            assert least <= part.min() <= part.max() <= most
-            wider = data[tuple(slice(max(0, a - cell), b + cell) for a, b in zip(low, high, strict=True))]
-            assert wider.min() <= least <= most <= wider.max()
-        corner = found.range_of((0, 0, 0), (cell + 1,) * 3)
-        part = data[: cell + 1, : cell + 1, : cell + 1]
-        assert corner == (part.min(), part.max())
-
-
 def test_faults_of_a_pass():
     data = np.zeros(SHAPE, np.float32)
     data[22, 17, 32] = np.nan
-    with pytest.raises(ValueError, match=r"must be finite.*\(22, 17, 32\)"):
+    with pytest.raises(ValueError, match=r"must be finite.* to \(23, 18, 33\)"):
         scan(source_of(data), 4, memory=10_000)
 
 
 # ---- kept ----
 
 
-def test_the_pass_is_kept_by_a_source_that_nobody_writes_to(tmp_path, monkeypatch):
+def test_the_pass_is_kept_by_its_source(tmp_path, monkeypatch):
     data = voxels("int16", SHAPE)
     passes = []
     monkeypatch.setattr(summary, "scan", lambda *given, **more: passes.append(1) or scan(*given, **more))
     of_file = source_of(x_fastest(tmp_path / "data.raw", data), shape=SHAPE, dtype="int16")
-    writable = np.memmap(tmp_path / "data.raw", np.int16, "r+", shape=SHAPE, order="F")
-    immutable = source_of(jnp.asarray(data))
-    for source, number in ((of_file, 1), (immutable, 1), (source_of(data), 3), (source_of(writable), 3)):
-        passes.clear()
-        for _ in range(3):
-            assert_ranges(summary_of(source), data)
-        assert len(passes) == number
-    x_fastest(tmp_path / "data.raw", data + 1)  # what is kept is not told of another file
+    for _ in range(3):
+        assert_ranges(summary_of(of_file), data)
+    assert len(passes) == 1
+    x_fastest(tmp_path / "data.raw", data + 1)
     with pytest.raises(ValueError, match="changed after it was opened"):
         summary_of(of_file)
 

@@ -55,13 +55,13 @@ def test_zarr_arrays_of_every_layout_and_their_damage(layout, tmp_path):
     assert_reads(source, data)
     first, *_, last = chunk_files(path)
     first.unlink()
-    with pytest.raises(ValueError, match=r'cannot be read .*A chunk is missing.*missing="fill"'):
+    with pytest.raises(ValueError, match=r'cannot be read .*missing="fill"'):
         source_of(path).read((0, 0, 0), SHAPE)
     filled, expected = source_of(path, missing="fill").read((0, 0, 0), SHAPE), data.copy()
     expected[(slice(16), slice(16), slice(32)) if "sharded" in layout else np.s_[:8, :8, :16]] = 7
     np.testing.assert_array_equal(filled, expected)
     last.write_bytes(last.read_bytes()[:-20])
-    with pytest.raises(ValueError, match=r"from .* to .* cannot be read .* A chunk is damaged"):
+    with pytest.raises(ValueError, match=r"from .* to .* cannot be read .* Fetch it again"):
         source_of(path, missing="fill").read((0, 0, 0), SHAPE)
 
 
@@ -131,7 +131,7 @@ def test_what_is_no_zarr_array_or_cannot_be_read_says_so(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=r"a\.zarr"):
             source_of(path)
     zarr.create_group(tmp_path / "e")
-    with pytest.raises(ValueError, match="is a Zarr group without the multiscales"):
+    with pytest.raises(ValueError, match=r"does not follow OME-Zarr 0\.5"):
         source_of(tmp_path / "e")
     zarr.create_group(tmp_path / "f", attributes={"ome": {"bioformats2raw.layout": 3}})
     with pytest.raises(ValueError, match="such as its folder 0"):
@@ -188,9 +188,6 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
         assert_reads(source, data)
         np.testing.assert_allclose(source.spacing, np.array([0.3, 0.4, 2.0]) * 2**number)
         np.testing.assert_allclose(source.origin, np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
-    # a user's spacing and origin move all levels
-    second = levels_of(path, spacing=(3, 4, 10), origin=(1, 1, 1))[1]
-    np.testing.assert_allclose((second.spacing, second.origin), ((6, 8, 20), (2.5, 3, 6)))
     # transformations of all levels come after their own
     outer = [{"type": "scale", "scale": [10] * len(axes)}]
     outer += [{"type": "translation", "translation": [3] * len(axes)}]

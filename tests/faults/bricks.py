@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from . import Fault
 
@@ -26,6 +27,11 @@ def _all_of_its_cells(of_brick: Callable[..., Any]) -> Callable[..., Any]:
         return of_brick(type(self)(self.underway, everything), grid, scene, brick)
 
     return faulty
+
+
+def _only(brick: int, empty: Any) -> Any:
+    """A ray goes on from a brick through none but itself, and what is empty."""
+    return empty | (np.arange(len(empty)) == brick)
 
 
 def _without_carry(pulled: Any) -> Any:
@@ -53,19 +59,19 @@ FAULTS = [
     ),
     Fault(
         "bricks: nothing is read around them but what interpolation needs",
-        "bricks.split:nodes_within",
+        "bricks.grid:nodes_within",
         lambda nodes: lambda *given: 0 * nodes(*given),
         (IMAGE,),
     ),
     Fault(
         "bricks: none takes what rays meet in another one that was read before",
         "bricks.traversal:Traversal.cells_of",
-        lambda of: lambda self, brick, _, *given, **more: of(self, brick, {brick}, *given, **more),
+        lambda of: lambda self, brick, _, empty, *given: of(self, brick, _only(brick, empty), empty, *given),
         (CURVED,),
     ),
     Fault(
         "bricks: the second march of a gradient forgets what lies in front",
-        "bricks.render:_pull_part",
+        "bricks.render:_vjp_of_brick",
         lambda pull: lambda *given: pull(*given[:5], _without_carry(given[5]), *given[6:]),
         (GRADIENT,),
     ),

@@ -93,7 +93,7 @@ BAD: list[tuple[Any, Any, str]] = [
     (np.zeros((4, 512, 512), np.uint8), 500_000, "memory must hold a copy of 2 voxels along each axis"),
     (None, 1.5, r"memory must be an integer of at least 1, a number of bytes; got 1\.5"),
     ("no_such.raw", 10**9, r"no file no_such\.raw"),
-    (3, None, "source must be an array, a Volume, a VoxelSource, or the path"),
+    (3, None, "source must be an array, a Volume, a VoxelSource or a path"),
 ]
 
 

@@ -95,7 +95,10 @@ def scene_of(
     else:
         header = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
         header = {name: value for name, value in header.items() if value is not None}
-        source = levels_of(options.file, **header)[0]
+        try:
+            source = levels_of(options.file, **header)[0]
+        except TypeError as fault:  # such as a shape of what is no raw file
+            raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
         volume = copy_of(source, options.memory)
         transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume)
 
