@@ -19,6 +19,7 @@ Steps are one voxel long. Rays end at 1 % of transmittance. Without the folder J
 the phantoms of a head and an engine stand in.
 """
 
+import math
 from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
@@ -95,8 +96,8 @@ class VisiblePhong(Phong):
         super().__init__()
 
     @property
-    def farthest_read(self) -> None:
-        return None
+    def farthest_read(self) -> float:
+        return math.inf
 
 
 SHADED: dict[str, tuple[tuple[jv.Transform, ...], Lighting]] = {

@@ -33,13 +33,13 @@ def rmse(image: Any, reference: Any) -> float:
 
     Args:
         image: (height, width) or (height, width, channels).
-        reference: An image of the same shape.
+        reference: an image of the same shape.
 
     Returns:
         The difference, in the unit of the images.
 
     Raises:
-        ValueError: For NaN or infinity, shapes that differ, and input that is not an image.
+        ValueError: for NaN or infinity, shapes that differ, and input that is not an image.
     """
     image, reference = _pair(image, reference)
     return float(np.sqrt(np.mean((image - reference) ** 2)))
@@ -49,15 +49,15 @@ def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Peak signal-to-noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
 
     Args:
-        image: As for `rmse`.
-        reference: As for `rmse`.
-        data_range: The greatest value of an image, > 0.
+        image: as for `rmse`.
+        reference: as for `rmse`.
+        data_range: the greatest value of an image, > 0.
 
     Returns:
         The ratio, dB.
 
     Raises:
-        ValueError: As `rmse`, and for a `data_range` that is not positive.
+        ValueError: as `rmse`, and for a `data_range` that is not positive.
     """
     number("data_range", data_range, above=0)
     error = rmse(image, reference)
@@ -68,15 +68,15 @@ def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """Mean structural similarity over windows of 7 x 7 pixels, then over channels; 1 for equal images.
 
     Args:
-        image: As for `psnr`.
-        reference: As for `psnr`.
-        data_range: As for `psnr`.
+        image: as for `psnr`.
+        reference: as for `psnr`.
+        data_range: as for `psnr`.
 
     Returns:
         The similarity, at most 1.
 
     Raises:
-        ValueError: As `psnr`, and for an image with fewer than 7 pixels along a side.
+        ValueError: as `psnr`, and for an image with fewer than 7 pixels along a side.
 
     Source: Wang et al. 2004, as implemented in scikit-image.
     """
@@ -95,15 +95,15 @@ def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: fl
     The plane's depth grows by one step, and the rings repeat, every `step / (pixel_size depth_slope)` pixels.
 
     Args:
-        step: Distance between samples, world length, > 0.
-        depth_slope: World depth gained per world length to the right and downwards in the image.
-        pixel_size: World length of a pixel, > 0.
+        step: distance between samples, world length, > 0.
+        depth_slope: world depth gained per world length to the right and downwards in the image.
+        pixel_size: world length of a pixel, > 0.
 
     Returns:
         The frequency to the right and downwards, cycles per pixel, as `wood_grain_energy` takes it.
 
     Raises:
-        ValueError: For a step or pixel size that is not positive, and slopes that are not finite.
+        ValueError: for a step or pixel size that is not positive, and slopes that are not finite.
     """
     number("step", step, above=0)
     number("pixel_size", pixel_size, above=0)
@@ -132,15 +132,15 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
     edge counts as structure, a single pixel does not.
 
     Args:
-        error: An image minus its reference, (height, width) or (height, width, channels).
-        frequency: To the right and downwards, cycles per pixel; None where it is not known.
-        harmonics: How many are summed, with `frequency`.
+        error: an image minus its reference, (height, width) or (height, width, channels).
+        frequency: to the right and downwards, cycles per pixel; None where it is not known.
+        harmonics: how many are summed, with `frequency`.
 
     Returns:
         The energy, in squared units of the error.
 
     Raises:
-        ValueError: For NaN or infinity, input that is not an image, an image smaller than a block,
+        ValueError: for NaN or infinity, input that is not an image, an image smaller than a block,
             harmonics < 1, and a fundamental that cannot be separated from 0 or from its mirror image.
     """
     error = _image("error", error)
@@ -160,14 +160,14 @@ def boundary_noise(image: Any, region: Any) -> float:
     ∂⁴/∂x²∂y².
 
     Args:
-        image: An image, or an error, (height, width) or (height, width, channels).
+        image: an image, or an error, (height, width) or (height, width, channels).
         region: (height, width) booleans, for example where the bounds cut through material.
 
     Returns:
         The variance, in squared units of the image.
 
     Raises:
-        ValueError: For NaN or infinity, input that is not an image, a region of another shape, and one that
+        ValueError: for NaN or infinity, input that is not an image, a region of another shape, and one that
             holds no 3 x 3 pixels.
 
     Source: Immerkær, "Fast noise variance estimation", CVIU 64(2), 1996, with squares for absolute values.

@@ -71,7 +71,7 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
         volume: the `Volume`. Of more than 2 million voxels, every n-th is looked at.
 
     Returns:
-        the `TransferFunction`.
+        The `TransferFunction`.
 
     Raises:
         ValueError: for what is no volume, or traced.

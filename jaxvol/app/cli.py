@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the words after `jaxvol`; by default those of the process.
 
     Returns:
-        the exit code: 0; 2 for bad input, reported in one line; 1, with nothing said, where what reads stdout
+        The exit code: 0; 2 for bad input, reported in one line; 1, with nothing said, where what reads stdout
         has ended. Ctrl-C is reported in one line and ends the process at once with code 130, as in shells, by
         `os._exit`: XLA does not stop for a signal. Unfinished files are removed.
     """

@@ -46,8 +46,8 @@ class BrickGrid:
     """Bricks of equally many cells, numbered in row-major order; the last ones along an axis may have fewer.
 
     Attributes:
-        shape: Nodes of the volume.
-        size: Cells of a brick.
+        shape: nodes of the volume.
+        size: cells of a brick.
     """
 
     shape: Node
@@ -122,8 +122,8 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     What `render_bricks` reads follows from its rays instead.
 
     Args:
-        probe: Of the volume.
-        grid: How it is divided into bricks.
+        probe: of the volume.
+        grid: how it is divided into bricks.
 
     Returns:
         K* of each face between two bricks, from the probe outwards, voxels.

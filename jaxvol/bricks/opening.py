@@ -40,15 +40,15 @@ def source_of(thing: Openable, **options: Any) -> VoxelSource:
     """The finest level of what `levels_of` opens.
 
     Args:
-        thing: As for `levels_of`.
-        **options: As for `levels_of`.
+        thing: as for `levels_of`.
+        **options: as for `levels_of`.
 
     Returns:
         The source.
 
     Raises:
-        ValueError: As `levels_of`.
-        ImportError: For Zarr without tensorstore and yaozarrs.
+        ValueError: as `levels_of`.
+        ImportError: for Zarr without tensorstore and yaozarrs.
     """
     return levels_of(thing, **options)[0]
 
@@ -68,9 +68,9 @@ def levels_of(
     | a `Volume` without labels and field, or a `VoxelSource` | as it is |
 
     Args:
-        thing: What holds the voxels.
-        spacing: As in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
-        origin: As in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
+        thing: what holds the voxels.
+        spacing: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
+        origin: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
         **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes` and `index`: see `VoxelSource`;
             the axes of Zarr are by default its own (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in
             version 2). `missing`: what it means if a chunk of a path's Zarr array is not there: `"error"`,
@@ -81,10 +81,10 @@ def levels_of(
         A source for each level.
 
     Raises:
-        ValueError: For anything else, for a file that is missing, damaged or cut short, and for shapes and
+        ValueError: for anything else, for a file that is missing, damaged or cut short, and for shapes and
             types that no volume has.
-        TypeError: For options that do not belong to it.
-        ImportError: For Zarr without tensorstore and yaozarrs.
+        TypeError: for options that do not belong to it.
+        ImportError: for Zarr without tensorstore and yaozarrs.
     """
     place = {"spacing": spacing, "origin": origin}
     place = {name: value for name, value in place.items() if value is not None}
@@ -222,8 +222,8 @@ def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:
     plane. An axis along which a level is as fine as the finest does not count against it.
 
     Args:
-        levels: Of the same volume, finest first (`levels_of`).
-        camera: The view.
+        levels: of the same volume, finest first (`levels_of`).
+        camera: the view.
 
     Returns:
         Its index, 0 for the finest; also where the camera is within the volume.

@@ -69,32 +69,32 @@ def render_bricks(
     `max_samples` is too small, may differ.
 
     Args:
-        source: See `bricks.levels_of`. One pass over all voxels finds their ranges before the first image. A
+        source: see `bricks.levels_of`. One pass over all voxels finds their ranges before the first image. A
             `bricks.VoxelSource` keeps them for the next: open it once, by `bricks.source_of`.
-        transfer: As for `render`.
-        camera: As for `render`.
-        march: As for `render`; all transforms but `SpaceLeaping("min_distance")`.
-        spacing: As in `Volume`; by default what the source says.
-        origin: As in `Volume`; by default what the source says.
-        memory: Bytes for voxels and what is made of them: the brick that is rendered and the next one; by
+        transfer: as for `render`.
+        camera: as for `render`.
+        march: as for `render`; all transforms but `SpaceLeaping("min_distance")`.
+        spacing: as in `Volume`; by default what the source says.
+        origin: as in `Volume`; by default what the source says.
+        memory: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
             default a quarter of the device's. In addition an image takes some 550 bytes for each pixel, and
             compiled programs some 300 MiB.
-        bricks: Number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
+        bricks: number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
             may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
-        method: Where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
+        method: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
             left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as
             `memory` goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
             (`bricks.traversal.Schedule`), which has no gradient.
-        compositing: As for `render`.
+        compositing: as for `render`.
         lighting: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
             (`Lighting.farthest_read`).
-        outputs: As for `render`.
-        level: Of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
+        outputs: as for `render`.
+        level: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
             are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
-        progress: Called after each brick, with the numbers of bricks rendered so far and of those that hold
+        progress: called after each brick, with the numbers of bricks rendered so far and of those that hold
             anything visible, some of which may not be needed, or be read again.
-        devices: As for `render`. `memory` is that of each device.
-        own: What is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
+        devices: as for `render`. `memory` is that of each device.
+        own: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
             is read once and copied to all. `"bricks"`: each device reads its own bricks, marches all rays
             through them, and the partial images are combined front to back: where reading takes longest, and
             for several processes. Rays must be straight in the grid, and what a ray shows must not depend on
@@ -102,13 +102,13 @@ def render_bricks(
             compositing by `"over"`). An `EarlyTermination` sees only what is in front on the same device: up
             to `opacity_left` of the colours behind are added, and depth changes with them; without it, depth
             agrees to 1e-5 of itself. No gradients.
-        **options: For the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
+        **options: for the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
 
     Returns:
         As `render`, and in `Rendering.bricks` what it took.
 
     Raises:
-        ValueError: Naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
+        ValueError: naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
             whose file changed; for less memory than the smallest bricks take; for what needs the whole volume
             at once (labels, baked or deferred light); and for what cannot be had with `own="bricks"`.
 

@@ -36,24 +36,24 @@ class VoxelSource:
     It keeps its `Summary` once that is found: make another source after writing to the array.
 
     Args:
-        array: Anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
+        array: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
             axis, such as an array of NumPy, zarr, h5py, dask or tensorstore. Several threads read it at once.
-        spacing: As in `Volume`.
-        origin: As in `Volume`.
-        direction: As in `Volume`.
-        axes: The name of each axis, such as "tczyx" or ["z", "y", "x"]; by default "xyz".
-        index: The entry of each axis other than x, y and z, such as {"c": 1, "t": 0}; by default the only
+        spacing: as in `Volume`.
+        origin: as in `Volume`.
+        direction: as in `Volume`.
+        axes: the name of each axis, such as "tczyx" or ["z", "y", "x"]; by default "xyz".
+        index: the entry of each axis other than x, y and z, such as {"c": 1, "t": 0}; by default the only
             one.
-        name: What it is called in errors.
+        name: what it is called in errors.
 
     Attributes:
-        shape: Number of voxels along x, y, z.
-        dtype: Of the voxels that `read` returns.
-        chunks: Voxels along x, y, z of the chunks in which it is stored, or of a row if it has none.
-        order: Axes in the order of storage, the slowest first, 0 for x.
+        shape: number of voxels along x, y, z.
+        dtype: of the voxels that `read` returns.
+        chunks: voxels along x, y, z of the chunks in which it is stored, or of a row if it has none.
+        order: axes in the order of storage, the slowest first, 0 for x.
 
     Raises:
-        ValueError: For a shape or type that no volume has, for axes or an index that the array does not have,
+        ValueError: for a shape or type that no volume has, for axes or an index that the array does not have,
             and for a traced array.
     """
 
@@ -126,9 +126,9 @@ class VoxelSource:
         """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
 
         Args:
-            low: First voxel along x, y, z.
-            high: The one behind the last.
-            axes: Order of the axes of what is returned, data[z, y, x] for (2, 1, 0); in the `order` of
+            low: first voxel along x, y, z.
+            high: the one behind the last.
+            axes: order of the axes of what is returned, data[z, y, x] for (2, 1, 0); in the `order` of
                 storage, voxels are read fastest.
 
         Returns:
@@ -136,7 +136,7 @@ class VoxelSource:
             not write to it.
 
         Raises:
-            ValueError: For a box that is empty or exceeds the volume; for voxels that are NaN or infinite;
+            ValueError: for a box that is empty or exceeds the volume; for voxels that are NaN or infinite;
                 where the array raises anything; and if the file under a memory map was written to since the
                 source was made.
         """

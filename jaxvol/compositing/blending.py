@@ -35,7 +35,7 @@ class Fragment(NamedTuple):
         cell: the piece of the ray that it stands for.
         measured: what was read from the volume; for a `Weighting`, only the value.
         color: as shaded; None for a `Selection`, or where only opacities are computed.
-        valid: False past the ray's end, in gaps of the volume, and for cells of width 0.
+        valid: false past the ray's end, in gaps of the volume, and for cells of width 0.
     """
 
     alpha: Scalar

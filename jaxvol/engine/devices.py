@@ -44,7 +44,7 @@ def mesh_of(devices: Any) -> Mesh | None:
     """The devices as a mesh of one axis; None for None: JAX decides where the image is computed.
 
     Raises:
-        ValueError: For what is neither a sequence of JAX's devices nor a mesh of them of one axis, for none,
+        ValueError: for what is neither a sequence of JAX's devices nor a mesh of them of one axis, for none,
             for one that is there twice, and for devices of several kinds.
     """
     if devices is None:

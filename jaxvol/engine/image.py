@@ -50,7 +50,7 @@ def render_scene(
     """The image of a scene whose arguments have been checked.
 
     Raises:
-        ValueError: For unknown outputs or an unknown adjoint; for `"direct"` where the march or the spacing
+        ValueError: for unknown outputs or an unknown adjoint; for `"direct"` where the march or the spacing
             is traced and `march.max_samples` is not given; and as `mesh_of` and `check_not_sharded` do for
             devices.
     """

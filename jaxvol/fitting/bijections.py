@@ -72,11 +72,11 @@ class Positive(Bijection):
     """Positive numbers: `scale` · log(1 + exp(free)). A start below `scale` / 1000 is raised to that.
 
     Args:
-        scale: A typical value, in the value's unit, > 0. The map is linear far above it and exponential far
+        scale: a typical value, in the value's unit, > 0. The map is linear far above it and exponential far
             below.
 
     Raises:
-        ValueError: For a scale that is not positive, and for negative starts.
+        ValueError: for a scale that is not positive, and for negative starts.
     """
 
     scale: Float[Array, ""]
@@ -98,7 +98,7 @@ class UnitInterval(Bijection):
     """Numbers between 0 and 1: 1 / (1 + exp(-free)). Starts keep a distance of 1/1000 from both ends.
 
     Raises:
-        ValueError: For starts outside [0, 1].
+        ValueError: for starts outside [0, 1].
     """
 
     def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -119,10 +119,10 @@ class Pose(Bijection):
     than about the camera itself, keeps rotation and translation from imitating each other.
 
     Args:
-        start: The camera at which both are 0.
+        start: the camera at which both are 0.
 
     Raises:
-        ValueError: For a camera that is not a rigid motion of `start`.
+        ValueError: for a camera that is not a rigid motion of `start`.
     """
 
     whole: bool = eqx.field(static=True, default=True, init=False)
@@ -196,10 +196,10 @@ class ProbeGeometry(Bijection):
     these limits, relative to π or the size of the probe.
 
     Args:
-        start: Sets the typical lengths, and the first depth.
+        start: sets the typical lengths, and the first depth.
 
     Raises:
-        ValueError: For what is not a `ToroidalMap`, for one that begins at another depth, and for one with
+        ValueError: for what is not a `ToroidalMap`, for one that begins at another depth, and for one with
             samples behind the motor axis.
     """
 

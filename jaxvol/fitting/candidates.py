@@ -21,15 +21,15 @@ def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = No
     """A transfer function to start a fit from: middle grey, with the same extinction everywhere.
 
     Args:
-        volume: Its optical depth becomes about 1, so that the back is visible as well as the front.
-        points: Number of control points, at least 2, evenly spaced.
-        clim: Their range (low, high), in value units; by default that of the volume's values.
+        volume: its optical depth becomes about 1, so that the back is visible as well as the front.
+        points: number of control points, at least 2, evenly spaced.
+        clim: their range (low, high), in value units; by default that of the volume's values.
 
     Returns:
         The `TransferFunction`, of colours 0.5.
 
     Raises:
-        ValueError: For fewer than two points, and for a range that does not increase.
+        ValueError: for fewer than two points, and for a range that does not increase.
     """
     points = integer("points", points, 2)
     clim = (float(volume.data.min()), float(volume.data.max())) if clim is None else clim
@@ -47,14 +47,14 @@ def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
     even points become even ones again from n to 2n - 1, as 2, 3, 5, 9, and nearly even ones otherwise.
 
     Args:
-        transfer: The transfer function.
-        points: Their number, at least that of `transfer`.
+        transfer: the transfer function.
+        points: their number, at least that of `transfer`.
 
     Returns:
         A `TransferFunction` that shows the same.
 
     Raises:
-        ValueError: For fewer points than `transfer` has.
+        ValueError: for fewer points than `transfer` has.
     """
     values = np.asarray(transfer.values)
     points = integer("points", points, len(values))
@@ -75,13 +75,13 @@ class Candidate(NamedTuple):
     """A model that `choose` may choose.
 
     Attributes:
-        name: In the table of results.
-        start: The parameters that its fit starts from, as for `fit`; or
+        name: in the table of results.
+        start: the parameters that its fit starts from, as for `fit`; or
         grow: `grow(found)` makes them from the fitted parameters of the candidate before. Give one of the
             two.
         expand: `expand(parameters)` is what the residual takes; by default the parameters themselves.
-        constraints: As for `fit`, of the model's own parameters.
-        where: As for `fit`, of the model's own parameters.
+        constraints: as for `fit`, of the model's own parameters.
+        where: as for `fit`, of the model's own parameters.
     """
 
     name: str
@@ -98,16 +98,16 @@ def nested_points(
     """Candidates that are transfer functions of more and more control points.
 
     Args:
-        start: Where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
+        start: where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
             of points.
-        points: Increasing numbers of control points. Each candidate keeps those of the one before.
-        of_each: Other fields of each `Candidate`, such as `constraints`.
+        points: increasing numbers of control points. Each candidate keeps those of the one before.
+        of_each: other fields of each `Candidate`, such as `constraints`.
 
     Returns:
         The candidates, for `choose`, from the fewest points to the most.
 
     Raises:
-        ValueError: For numbers that do not increase, or fewer than `start` has.
+        ValueError: for numbers that do not increase, or fewer than `start` has.
     """
     if not isinstance(start, TransferFunction):
         raise ValueError(f"start must be a TransferFunction; got {described(start)}.")
@@ -126,9 +126,9 @@ def nested_materials(
     like `parts`, whichever of them share parameters.
 
     Args:
-        parts: The starting point: materials, which share their mean free path and nothing else; or other
+        parts: the starting point: materials, which share their mean free path and nothing else; or other
             trees of one kind, such as the transfer functions of labels, which are shared as a whole.
-        partitions: For each candidate the class of each part, numbered from 0 on: `[(0, 0, 0), (0, 1, 2)]`
+        partitions: for each candidate the class of each part, numbered from 0 on: `[(0, 0, 0), (0, 1, 2)]`
             for one mean free path for all and then one for each; `[(0, 0, 1), (0, 1, 2)]` to ask whether the
             first two differ. Each divides classes of the one before.
 
@@ -137,7 +137,7 @@ def nested_materials(
         the first part of each class; `candidate._replace(where=...)` fixes some of them.
 
     Raises:
-        ValueError: For no parts, and for partitions that do not match these or are not nested.
+        ValueError: for no parts, and for partitions that do not match these or are not nested.
     """
     if not isinstance(parts, list | tuple) or not parts or len({type(part) for part in parts}) > 1:
         raise ValueError(f"parts must be a list of materials or parameters of one kind; got {parts!r}.")

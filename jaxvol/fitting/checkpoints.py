@@ -23,7 +23,7 @@ def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]]
     """The saved state, a tree like `like`, with its description; or None if none was saved.
 
     Raises:
-        ValueError: For a damaged file, and for a checkpoint of another fit than `about` describes (the saved
+        ValueError: for a damaged file, and for a checkpoint of another fit than `about` describes (the saved
             description may have more entries).
     """
     if not path.exists():

@@ -37,12 +37,12 @@ class Evidence(NamedTuple):
     """What is known of one candidate.
 
     Attributes:
-        name: That of the candidate.
-        numbers: Number of free parameters.
-        determined: How many directions of these the training views determine.
-        fit: To the training views.
-        held_out_loss: Mean over held-out views of half the sum of squares of the residual of each.
-        standard_error: Of its difference from that of the best candidate; 0 for the best one.
+        name: that of the candidate.
+        numbers: number of free parameters.
+        determined: how many directions of these the training views determine.
+        fit: to the training views.
+        held_out_loss: mean over held-out views of half the sum of squares of the residual of each.
+        standard_error: of its difference from that of the best candidate; 0 for the best one.
     """
 
     name: str
@@ -57,9 +57,9 @@ class Choice(NamedTuple):
     """Result of `choose`; `print(choice)` shows it as a table.
 
     Attributes:
-        candidates: What is known of each, in the order given.
-        chosen: Index of the chosen one.
-        parameters: The chosen fit's, as the residual takes them (`Candidate.expand`).
+        candidates: what is known of each, in the order given.
+        chosen: index of the chosen one.
+        parameters: the chosen fit's, as the residual takes them (`Candidate.expand`).
     """
 
     candidates: list[Evidence]
@@ -121,25 +121,25 @@ def choose(
     noise, and too large a model may be chosen. A fit that ends in a wrong minimum counts against its model.
 
     Args:
-        residual: An `ImageResidual` of the training views; or `residual(views)`, a function from a list of
+        residual: an `ImageResidual` of the training views; or `residual(views)`, a function from a list of
             views, of any kind, to what `fit` takes.
-        candidates: Nested models, each with more free parameters than the one before, such as
+        candidates: nested models, each with more free parameters than the one before, such as
             `nested_points` and `nested_materials` make.
-        held_out: Views that none is fitted to: pairs (camera, image), or what the function takes.
-        views: The training views, for a function.
-        errors: Standard errors of the difference up to which a candidate is not significantly worse, ≥ 0. If
+        held_out: views that none is fitted to: pairs (camera, image), or what the function takes.
+        views: the training views, for a function.
+        errors: standard errors of the difference up to which a candidate is not significantly worse, ≥ 0. If
             both models hold the truth, the larger one seems better by more than 2 in at most 2.3 % of trials.
-        block: Pixels along a side of blocks within which noise may be correlated: 1 for noise of single
+        block: pixels along a side of blocks within which noise may be correlated: 1 for noise of single
             pixels, more for pictures that were smoothed or compressed.
-        checkpoint: A file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
-        options: Others of `fit`, such as `max_steps`, for all candidates.
+        checkpoint: a file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
+        options: others of `fit`, such as `max_steps`, for all candidates.
 
     Returns:
         A `Choice`, with the evidence for each candidate. If the largest is chosen, a larger one may be better
         still. Undetermined directions are counted there, in place of the warnings of `fit`.
 
     Raises:
-        ValueError: For no candidates, candidates that do not grow or have no start, no held-out views, a view
+        ValueError: for no candidates, candidates that do not grow or have no start, no held-out views, a view
             that is in both sets, and as `fit` does.
     """
     errors, block = float(not_negative("errors", errors)), integer("block", block, 1)

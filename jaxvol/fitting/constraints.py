@@ -43,7 +43,7 @@ class Free(eqx.Module):
         """The mapping from free variables to parameters, and the free variables for `parameters`.
 
         Raises:
-            ValueError: For constraints or a `where` that do not match the parameters, parameters outside
+            ValueError: for constraints or a `where` that do not match the parameters, parameters outside
                 their bounds or not finite, and if nothing is free.
         """
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
@@ -51,7 +51,7 @@ class Free(eqx.Module):
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
         nodes = structure.flatten_up_to(parameters)
         pairs = zip(found, nodes, strict=True)
-        bijections = [Fixed(node) if isinstance(b, Fixed) else b for (_, b), node in pairs]
+        bijections: list[Bijection] = [Fixed(node) if isinstance(b, Fixed) else b for (_, b), node in pairs]
         paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
         start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, paths, strict=True))
         if not jax.tree.leaves(start):

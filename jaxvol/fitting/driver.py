@@ -52,9 +52,9 @@ class Fit(eqx.Module):
     """Result of a fit.
 
     Attributes:
-        parameters: The best ones found, as a tree like the starting parameters.
-        solution: Optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
-        losses: Half the sum of squared residuals at the solver's point after each step.
+        parameters: the best ones found, as a tree like the starting parameters.
+        solution: optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
+        losses: half the sum of squared residuals at the solver's point after each step.
         uncertainty: `covariance`, `names`, `standard_errors` and `undetermined` directions, for a
             least-squares solver; else None.
     """
@@ -106,32 +106,32 @@ def fit(
     "fits under noise".
 
     Args:
-        residual: An `ImageResidual`, or a function from parameters to arrays. A function that renders must
+        residual: an `ImageResidual`, or a function from parameters to arrays. A function that renders must
             use `adjoint="forward"` for the first two solvers and `"replay"` for the others.
-        parameters: The starting point: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
+        parameters: the starting point: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
             float arrays are fitted.
         solver: `"levenberg_marquardt"` or `"gauss_newton"`: least squares, up to a few hundred parameters;
             start with the first. `"bfgs"` needs only the gradient, and a matrix of parameters × parameters.
             `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays. Or a solver
             of Optimistix, with its own tolerances; or a transformation of Optax.
-        constraints: A tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
+        constraints: a tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
             `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`, `ProbeGeometry(probe)`, or None
             for the default: of a transfer function, positive extinction, colours in [0, 1] and fixed values;
             of a camera, its pose; of a `ToroidalMap`, its geometry; of a volume, its data if they are float;
             of a material, a positive mean free path; of a march, nothing is free; any other float array is
             unconstrained.
-        where: What is free, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
+        where: what is free, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
             example `lambda transfer: transfer.extinction`, or a tuple of such.
-        rtol: A fit has converged when neither the free variables nor the residual change in a step by more
+        rtol: a fit has converged when neither the free variables nor the residual change in a step by more
             than `atol` plus this, relatively.
-        atol: See `rtol`.
-        max_steps: Maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
-        patience: Number of steps after which a fit has stalled if the loss has not fallen by more than
+        atol: see `rtol`.
+        max_steps: maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
+        patience: number of steps after which a fit has stalled if the loss has not fallen by more than
             `rtol`, relatively; by default 10, or 100 for Optax.
-        max_jacobian: Bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
+        max_jacobian: bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
             (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image.
         callback: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.
-        checkpoint: A file to which the state is written after steps, as often as takes a tenth of the time,
+        checkpoint: a file to which the state is written after steps, as often as takes a tenth of the time,
             and when the fit ends or is interrupted. If it exists, the fit continues from it and ends with the
             same bits as an uninterrupted one (on the same machine).
 
@@ -141,9 +141,9 @@ def fit(
         determine.
 
     Raises:
-        ValueError: For incompatible arguments, parameters that are not finite or out of bounds, a residual
+        ValueError: for incompatible arguments, parameters that are not finite or out of bounds, a residual
             that is not finite at the start, and a checkpoint that is damaged or of another fit.
-        ImportError: If Optax is requested but not installed.
+        ImportError: if Optax is requested but not installed.
     """
     not_negative("rtol", rtol)
     not_negative("atol", atol)
@@ -198,17 +198,17 @@ def fit_coarse_to_fine(
     must be of a voxel or shorter: under longer ones, fine texture is sampled too sparsely, and fits stall.
 
     Args:
-        residual: An `ImageResidual`. Its own `blur` is not used.
-        parameters: The starting point.
-        blurs: Of each fit, in order, as `ImageResidual`'s. End with None: only the standard errors of an
+        residual: an `ImageResidual`. Its own `blur` is not used.
+        parameters: the starting point.
+        blurs: of each fit, in order, as `ImageResidual`'s. End with None: only the standard errors of an
             unblurred fit are right.
-        options: Those of `fit`, for all of them, but for `checkpoint`. A `patience` of 4 saves steps.
+        options: those of `fit`, for all of them, but for `checkpoint`. A `patience` of 4 saves steps.
 
     Returns:
         The fits, in order. The last one's `parameters` and `uncertainty` are the result.
 
     Raises:
-        ValueError: For no blurs, for what is not an `ImageResidual`, for `checkpoint`, and as `fit`.
+        ValueError: for no blurs, for what is not an `ImageResidual`, for `checkpoint`, and as `fit`.
     """
     if not isinstance(residual, ImageResidual):
         raise ValueError(f"residual must be an ImageResidual, to be blurred; got {described(residual)}.")

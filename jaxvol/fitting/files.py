@@ -27,8 +27,8 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
     """Read pictures and their cameras, as `ImageResidual` takes them.
 
     Args:
-        images: Pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They are converted to linear RGB.
-        cameras: A JSON file with a list of one object per image, in the same order, with the fields
+        images: pictures of 8 or 16 bits in sRGB, such as `save_png` writes. They are converted to linear RGB.
+        cameras: a JSON file with a list of one object per image, in the same order, with the fields
             `position`, `focal_point`, and optionally `view_up`, `view_angle`, `parallel_scale` and `window`,
             as `Camera` takes them.
 
@@ -36,7 +36,7 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
         A pair for each image: its `Camera`, and the picture, linear RGB.
 
     Raises:
-        ValueError: Naming the file, if it is missing or holds anything else.
+        ValueError: naming the file, if it is missing or holds anything else.
     """
     entries = _json(cameras)
     if not isinstance(entries, list) or len(entries) != len(images):
@@ -55,13 +55,13 @@ def read_transfer(path: File) -> TransferFunction:
     """Read a transfer function from a JSON file with the fields `values`, `colors` and `extinction`.
 
     Args:
-        path: The file.
+        path: the file.
 
     Returns:
         The `TransferFunction`.
 
     Raises:
-        ValueError: Naming the file, if it is missing or holds anything else.
+        ValueError: naming the file, if it is missing or holds anything else.
     """
     return transfer_of_fields(str(path), _json(path))
 
@@ -80,14 +80,14 @@ def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
     """Write a transfer function in the format that `read_transfer` reads.
 
     Args:
-        path: The file.
-        transfer: A `TransferFunction`.
+        path: the file.
+        transfer: a `TransferFunction`.
 
     Returns:
         The path.
 
     Raises:
-        ValueError: For other kinds of them, which that format does not hold.
+        ValueError: for other kinds of them, which that format does not hold.
     """
     if not isinstance(transfer, TransferFunction):
         raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")

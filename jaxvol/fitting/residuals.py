@@ -64,17 +64,17 @@ class ImageResidual(eqx.Module):
         scene: `scene(parameters, camera)` returns what to render for the parameters and a view's camera:
             `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit. The solver
             chooses the adjoint.
-        views: Pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
+        views: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
             `background`, or (height, width, 4), as `Rendering.rgba`.
-        background: Linear RGB behind the volume, for three-channel images.
-        compositing: As in `render`.
-        blur: Compare blurred images: standard deviation of a Gaussian, as a fraction of the image's height,
+        background: linear RGB behind the volume, for three-channel images.
+        compositing: as in `render`.
+        blur: compare blurred images: standard deviation of a Gaussian, as a fraction of the image's height,
             for `fit_coarse_to_fine`. Whole images are then differentiated at once. Pixels beyond the border
             do not count. Standard errors are too small, since the noise of blurred pixels is not independent:
             take those of a last fit without blur.
 
     Raises:
-        ValueError: For no views, an image that differs in size from its camera or holds integers, NaN or
+        ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or
             infinite pixels, a negative `blur`, and a scene that returns something else; and when it is
             fitted, for blurred images that `max_jacobian` leaves no room for.
     """
@@ -97,7 +97,7 @@ class ImageResidual(eqx.Module):
     ):
         if not callable(scene):
             raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
-        self.scene = scene
+        self.scene = cast(Any, scene)
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
         self.blur = None if blur is None else not_negative("blur", blur)
@@ -148,7 +148,7 @@ class ImageResidual(eqx.Module):
         def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
             of_view = jax.tree.map(lambda leaf: leaf[view], cameras)
-            result = self.scene(parameters, of_view)
+            result: Any = self.scene(parameters, of_view)
             order = "(volume, transfer, camera, march, lighting)"
             if not isinstance(result, tuple) or len(result) not in (4, 5):
                 raise ValueError(
@@ -298,7 +298,8 @@ class Problem(eqx.Module):
         if isinstance(self.residual, ImageResidual):
             tiles = self.residual.tiles(self.tile)
         else:
-            tiles = [(lambda parameters, *_: ravel_pytree(self.residual(parameters))[0], jnp.zeros(1))]
+            own: Any = self.residual
+            tiles = [(lambda parameters, *_: ravel_pytree(own(parameters))[0], jnp.zeros(1))]
         for function, items in tiles:
             total, _ = jax.lax.scan(lambda sum, item, f=function: (add(f, sum, item), None), total, items)
         return total

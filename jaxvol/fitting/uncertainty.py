@@ -26,10 +26,10 @@ class Uncertainty(NamedTuple):
     """Uncertainty of fitted parameters.
 
     Attributes:
-        covariance: In the order of `names`. If a direction that the residual does not determine changes a
+        covariance: in the order of `names`. If a direction that the residual does not determine changes a
             parameter, its variance is infinite and its covariances are NaN.
-        names: Such as `.extinction[3]`.
-        undetermined: For each such direction, the parameters that it changes most.
+        names: such as `.extinction[3]`.
+        undetermined: for each such direction, the parameters that it changes most.
     """
 
     covariance: Float[np.ndarray, "parameters parameters"]

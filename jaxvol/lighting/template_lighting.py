@@ -81,7 +81,7 @@ class ScattererTemplates(Lighting):
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
             misses the photons that are skipped.
         seed: of the templates, and of their choice for each pixel.
-        baked: False, or the number of nodes, along the volume's longest side, of a grid on which the light of
+        baked: false, or the number of nodes, along the volume's longest side, of a grid on which the light of
             all templates is computed once and then fetched, as long as volume, transfer function and lighting
             stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
         packets: of the templates, see `scatterer_template`.

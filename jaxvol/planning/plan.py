@@ -52,19 +52,19 @@ class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
     Attributes:
-        march: What to pass to `render`, with `volume`, `lighting` and `compositing`.
-        volume: Where `bricks` is given, only the copy that was planned with.
-        lighting: As given.
-        tolerance: As given.
-        error: Predicted, on the safe side; just above the tolerance where nothing could be proven.
-        samples: Predicted for each pixel.
-        parts: What was kept or left out, and why.
-        probed: Seconds that planning took, compilation included.
-        compositing: As given.
-        source: The volume, if there was a budget of memory.
-        memory: The budget, bytes.
-        stride: Of the copy that was planned with, to which `error` and `samples` belong; 1 if all fits.
-        bricks: What to expect of `render_bricks`; None if all fits.
+        march: what to pass to `render`, with `volume`, `lighting` and `compositing`.
+        volume: where `bricks` is given, only the copy that was planned with.
+        lighting: as given.
+        tolerance: as given.
+        error: predicted, on the safe side; just above the tolerance where nothing could be proven.
+        samples: predicted for each pixel.
+        parts: what was kept or left out, and why.
+        probed: seconds that planning took, compilation included.
+        compositing: as given.
+        source: the volume, if there was a budget of memory.
+        memory: the budget, bytes.
+        stride: of the copy that was planned with, to which `error` and `samples` belong; 1 if all fits.
+        bricks: what to expect of `render_bricks`; None if all fits.
     """
 
     march: March
@@ -90,8 +90,8 @@ class Plan(NamedTuple):
         """The image as planned.
 
         Args:
-            transfer: As for the plan.
-            camera: As for the plan.
+            transfer: as for the plan.
+            camera: as for the plan.
             options: `outputs` and `devices`, as for `render`.
 
         Returns:
@@ -162,28 +162,28 @@ def plan(
     not its size. On other devices than CPUs, the errors hold, but what is cheapest was not measured.
 
     Args:
-        volume: A `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
-        transfer: As for `render`.
-        camera: As for `render`. An image of another camera needs a plan of its own.
+        volume: a `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
+        transfer: as for `render`.
+        camera: as for `render`. An image of another camera needs a plan of its own.
         tolerance: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
-        memory: Bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
+        memory: bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
             quarter of the device's memory otherwise.
-        transforms: Those that belong to the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
+        transforms: those that belong to the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
             kept.
-        compositing: As for `render`.
-        lighting: As for `render`.
-        gradients: Whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
+        compositing: as for `render`.
+        lighting: as for `render`.
+        gradients: whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
             (empty space, faces) is proven for this transfer function only.
-        once: Whether the march is for a single image. `"preintegrated"`, whose program takes longer to
+        once: whether the march is for a single image. `"preintegrated"`, whose program takes longer to
             compile than it saves, is then tried only where the midpoint rule is not within the tolerance.
-        seed: Of the choice of patches. With it, the plan depends on nothing but the scene.
+        seed: of the choice of patches. With it, the plan depends on nothing but the scene.
 
     Returns:
         A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
         False and `Plan.parts` says so.
 
     Raises:
-        ValueError: For arguments of another kind, a tolerance out of range, arrays that are traced (plan
+        ValueError: for arguments of another kind, a tolerance out of range, arrays that are traced (plan
             outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides; for a source that
             `bricks.source_of` refuses; and for less memory than a copy or the smallest bricks take.
     """

@@ -42,11 +42,11 @@ class Probe(NamedTuple):
     """Patches of an image: one of each stratum of neighbours, of those that may show anything.
 
     Attributes:
-        source: Their rays, patch by patch.
-        strata: How many patches of the image each stands for; 0 for those that only fill up the program.
-        likely: Which were chosen where something is likely to be visible.
+        source: their rays, patch by patch.
+        strata: how many patches of the image each stands for; 0 for those that only fill up the program.
+        likely: which were chosen where something is likely to be visible.
         inside: 1 for pixels of the image, 0 for those past its edges.
-        pixels: Of the whole image.
+        pixels: of the whole image.
     """
 
     source: GivenRays
@@ -123,9 +123,9 @@ class Truth(NamedTuple):
     """What images are compared with.
 
     Attributes:
-        probe: The patches.
-        image: The most accurate one.
-        own: Its own error, as the last halvings of the step let expect; ten times their difference, where
+        probe: the patches.
+        image: the most accurate one.
+        own: its own error, as the last halvings of the step let expect; ten times their difference, where
             that grew.
     """
 

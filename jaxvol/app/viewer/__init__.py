@@ -63,7 +63,7 @@ def view(
         size: (width, height) of the image in the notebook's pixels.
 
     Returns:
-        a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a widget `v`
+        A widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a widget `v`
         renders what it shows.
 
     Raises:
@@ -106,7 +106,7 @@ def serve(
         how: `lighting`, `lit`, `compositing` and `background`, as for `view`.
 
     Returns:
-        the `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
+        The `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
 
     Raises:
         ValueError: as `view` does, and for another port.

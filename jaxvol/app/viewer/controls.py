@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -64,8 +64,11 @@ def _range_controls(model: Model) -> list[Control]:
     """The histogram with the transfer function, and window and level."""
     low, high, bars = histogram(model.scene.volume)
 
+    def shown() -> TransferFunction:
+        return cast(TransferFunction, model.state.transfer)
+
     def now() -> tuple[float, float]:
-        return editing.window_level(model.state.transfer)
+        return editing.window_level(shown())
 
     def set_window(window: float) -> None:
         _edit(model, editing.with_window_level, window, now()[1])
@@ -78,7 +81,7 @@ def _range_controls(model: Model) -> list[Control]:
     windows = min(width / 100, window), 4 * width, width / 100
     levels = level - window / 2 - width, level + window / 2 + width, width / 100
     return [
-        Control("html", get=lambda: _plot(low, high, bars, model.state.transfer, model.scene.voxel)),
+        Control("html", get=lambda: _plot(low, high, bars, shown(), model.scene.voxel)),
         Control("slider", "window", lambda: now()[0], set_window, windows),
         Control("slider", "level", lambda: now()[1], set_level, levels),
     ]

@@ -10,7 +10,7 @@ import os
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -68,7 +68,7 @@ def registry() -> dict[str, Dataset]:
     fields = json.loads(Path(__file__).with_name("open_scivis.json").read_text(encoding="utf-8"))["datasets"]
     keys = ("name", "size", "type", "spacing", "sha512sum", "description", "acknowledgement")
     return {
-        name: Dataset(name, *(tuple(v) if isinstance(v := each[key], list) else v for key in keys))
+        name: Dataset(name, *cast(Any, [tuple(v) if isinstance(v := each[k], list) else v for k in keys]))
         for name, each in fields.items()
     }
 

@@ -77,7 +77,8 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
         )
     step = 1000 * resolution  # mm
     try:
-        probe = ToroidalMap(apex * step, first * step, *ends, (0.0, (samples - 1) * step))
+        beta, sigma = ends
+        probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (samples - 1) * step))
         nearest = float(probe.nearest_to_axis)
         if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
             raise ValueError(f"its outermost beams begin {-nearest:.4g} mm behind the motor axis.")

@@ -4,6 +4,7 @@ import re
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from skimage.io import imread
@@ -243,7 +244,7 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
     volume = jv.Volume(np.linspace(20, 90, 8, dtype=np.float32).reshape(2, 2, 2))
     camera, march = jv.Camera.looking_at(volume, size=(8, 8)), jv.March(0.1)
     scene = Scene(volume, transfer, camera, Over(), None, (1, 1, 1), (), None, None, march)
-    empty = jv.Rendering(np.zeros((8, 8, 4), np.float32), np.zeros((8, 8), bool))
+    empty = jv.Rendering(jnp.zeros((8, 8, 4), np.float32), jnp.zeros((8, 8), bool))
     said = why_empty(scene, empty)
     assert said is not None
     assert said.startswith("the volume's values run from 20 to 90, and the transfer function")
