@@ -122,7 +122,7 @@ class Traversal:
         """Each brick that rays need, and their cells there, while the next one is read. Before this one is
         asked for, `at` is set to where rays have come, and the brick dropped."""
         self.rays, self.at, given_back = rays, at, self.bytes_read
-        asked = self.request.method
+        asked: Any = self.request.method
         method: Schedule = asked if callable(asked) else in_order if self.margin.straight else METHODS[asked]
         schedule = method(self)
         load = next(schedule, None)
