@@ -190,9 +190,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "accuracy",
-    "What does accuracy cost, by step and quadrature, beside VTK and Dr.Jit?",
-    __doc__,
     draw,
     repetitions=9,
     size=512,

@@ -110,14 +110,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "adaptive_error",
-    "Does adaptive sampling keep its tolerance, and is its estimate of the error right?",
-    __doc__,
-    draw,
-    size=256,
-    resolution=256,
-    only=some_of(SCENES, "VOLUME"),
-    quick={"size": 32, "resolution": 32},
+    draw, size=256, resolution=256, only=some_of(SCENES, "VOLUME"), quick={"size": 32, "resolution": 32}
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     scenes: dict[str, Any] = {}

@@ -194,9 +194,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "bricks",
-    "What do bricks of an ultrasound scan cost, by how it is split, and does overlap save time?",
-    __doc__,
     draw,
     repetitions=5,
     size=64,
@@ -232,7 +229,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
             "step, mm": round(scan.step, 5),
         }
     others = [name for name in map(named, TABLE) if name not in rows]
-    rows |= recorded("bricks", chosen, "splits", others, about)
+    rows |= recorded(chosen, "splits", others, about)
     if not views and not chosen.quick and (path := chosen.output / "bricks.json").is_file():
         views = record.read(path)["result"][FROM]
     return {

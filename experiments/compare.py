@@ -166,9 +166,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "compare",
-    "Is one commit slower than another?",
-    __doc__,
     draw,
     commits={"nargs": "+", "metavar": "COMMIT", "help": "the baseline first; WORKTREE: files as they are"},
     size=512,

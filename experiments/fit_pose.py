@@ -89,16 +89,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     charts.save(figure, path)
 
 
-@experiment(
-    "fit_pose",
-    "Is a camera's pose found from one image, from 10° and 5 % off?",
-    __doc__,
-    draw,
-    size=96,
-    resolution=96,
-    starts=10,
-    quick={"size": 32, "resolution": 24, "starts": 2},
-)
+@experiment(draw, size=96, resolution=96, starts=10, quick={"size": 32, "resolution": 24, "starts": 2})
 def main(chosen: Namespace) -> dict[str, Any]:
     starts = measure(chosen.size, chosen.resolution, chosen.starts, chosen.seed)
     result = {

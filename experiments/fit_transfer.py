@@ -138,15 +138,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     charts.save(figure, path)
 
 
-@experiment(
-    "fit_transfer",
-    "Is a transfer function recovered from four views, and do other views agree?",
-    __doc__,
-    draw,
-    size=96,
-    resolution=96,
-    quick={"size": 24, "resolution": 24},
-)
+@experiment(draw, size=96, resolution=96, quick={"size": 24, "resolution": 24})
 def main(chosen: Namespace) -> dict[str, Any]:
     folder, scenes = harness.data(), {}
     for name, make in SCENES.items():

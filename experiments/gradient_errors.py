@@ -190,9 +190,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "gradient_errors",
-    "Which gradients are wrong without AlphaCorrection, per transform?",
-    __doc__,
     draw,
     size=6,
     names=tuple(marches()),

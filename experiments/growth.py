@@ -109,15 +109,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     charts.save(figure, path)
 
 
-@experiment(
-    "growth",
-    "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",
-    __doc__,
-    draw,
-    repetitions=5,
-    only=some_of(SWEEPS, "AXIS"),
-    quick={"repetitions": 1},
-)
+@experiment(draw, repetitions=5, only=some_of(SWEEPS, "AXIS"), quick={"repetitions": 1})
 def main(chosen: Namespace) -> dict[str, Any]:
     sweeps, usual = (TINY, dict.fromkeys(USUAL, 32)) if chosen.quick else (SWEEPS, USUAL)
     found: dict[str, Any] = {}

@@ -87,59 +87,51 @@ def _without_output(given: Sequence[str]) -> list[str]:
 
 
 def experiment(
-    name: str,
-    question: str,
-    about: str | None,
-    draw: Draw | None = None,
-    *,
-    quick: Mapping[str, Any] | None = None,
-    **options: Any,
+    draw: Draw | None = None, *, quick: Mapping[str, Any] | None = None, **options: Any
 ) -> Callable[[Callable[[Namespace], Any]], Main]:
     """Decorator that makes an experiment's `main` of a function from its options to its result: it writes the
-    record and draws the chart. A result of None writes nothing.
+    record and draws the chart. A result of None writes nothing. Both files have the module's name, and the
+    question is how its docstring begins.
 
-    - `name`: of the module, and of the two files.
-    - `about`: the module's docstring.
     - `draw`: draws the chart; None if a chart cannot be drawn from the record alone.
     - `quick`: options and constants under `--quick`.
     - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
     """
-
     if unknown := set(quick or ()) - set(options):
-        raise ValueError(f"quick of {name} must be some of its options; got {', '.join(sorted(unknown))}.")
+        raise ValueError(f"quick must be some of the options; got {', '.join(sorted(unknown))}.")
 
     def made(measure: Callable[[Namespace], Any]) -> Main:
+        module = sys.modules[measure.__module__]
+        about, spec = module.__doc__ or "", module.__spec__
+        assert spec is not None
+
         @command(about, record.RESULTS, seed=0, quick=QUICK, **options)
         def main(chosen: Namespace) -> None:
+            chosen.path = chosen.output / f"{spec.name.split('.')[-1]}.json"
+            chosen.command = [spec.name, *chosen.argv]
             if chosen.quick:
                 vars(chosen).update(quick or {})
             result = measure(chosen)
             if result is None:
                 return
-            path = chosen.output / f"{name}.json"
-            record.write(path, question, result, seed=chosen.seed, command=ran(name, chosen))
+            question = " ".join(about.partition("?")[0].split()) + "?"
+            record.write(chosen.path, question, result, seed=chosen.seed, command=chosen.command)
             if draw is not None:
-                draw(record.read(path)["result"], path.with_suffix(".png"))
+                draw(record.read(chosen.path)["result"], chosen.path.with_suffix(".png"))
 
         return main
 
     return made
 
 
-def ran(name: str, chosen: Namespace) -> list[str]:
-    """Module and arguments of an experiment that runs, as after `python -m`."""
-    return [f"experiments.{name}", *chosen.argv]
-
-
 def recorded(
-    name: str, chosen: Namespace, part: str, others: Iterable[str], same: Mapping[str, Any] = {}
+    chosen: Namespace, part: str, others: Iterable[str], same: Mapping[str, Any] = {}
 ) -> dict[str, Any]:
     """Of the record in the output, the rows of `part` with these names, with the commit and the command that
     measured them; nothing if quick, or if what it says of `same` is something else."""
-    path = chosen.output / f"{name}.json"
-    if chosen.quick or not path.is_file():
+    if chosen.quick or not chosen.path.is_file():
         return {}
-    found = record.read(path)
+    found = record.read(chosen.path)
     if any(found["result"][key] != value for key, value in same.items()):
         return {}
     made = {"commit": found["commit"], "command": found["command"]}

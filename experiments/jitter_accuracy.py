@@ -158,9 +158,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "jitter_accuracy",
-    "What do jitter and alignment do to wood grain, noise on cut faces, the whole error and the time?",
-    __doc__,
     draw,
     repetitions=5,
     size=192,

@@ -186,9 +186,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "kisti",
-    "What do early ray termination and empty-space skipping save, apart and together?",
-    __doc__,
     draw,
     repetitions=9,
     resolution=192,

@@ -28,14 +28,7 @@ import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import jaxvol as jv
-from jaxvol.lighting import (
-    ConstantLight,
-    Deferred,
-    DirectionalLight,
-    Lighting,
-    Phong,
-    ScattererTemplates,
-)
+from jaxvol.lighting import ConstantLight, Deferred, DirectionalLight, Lighting, Phong, ScattererTemplates
 from jaxvol.metrics import rmse
 
 from . import charts, harness, timing
@@ -217,9 +210,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "lighting",
-    "What do photons, templates, occlusion, baking and deferring cost, and what do they buy?",
-    __doc__,
     draw,
     repetitions=5,
     size=256,

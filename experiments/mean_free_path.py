@@ -193,9 +193,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "mean_free_path",
-    "Are mean free paths found back from images, of templates and path-traced?",
-    __doc__,
     draw,
     size=32,
     resolution=32,

@@ -130,9 +130,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "minimum_distance",
-    "What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil?",
-    __doc__,
     draw,
     repetitions=15,
     size=512,

@@ -197,9 +197,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "model_choice",
-    "Is the true number of materials, and of control points, chosen by held-out views?",
-    __doc__,
     draw,
     size=10,
     resolution=10,

@@ -123,9 +123,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "out_of_core",
-    "How much memory and time does an image take of a volume that does not fit into the memory given?",
-    __doc__,
     draw,
     pixels={"type": int, "default": 512, "help": "pixels along a side"},
     sizes={"nargs": "+", "type": int, "default": SIZES, "help": "MiB of voxels"},

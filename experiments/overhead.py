@@ -83,9 +83,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "overhead",
-    "What do empty-space jitter and alignment add to the time of a whole frame?",
-    __doc__,
     draw,
     repetitions=15,
     sizes={"nargs": "+", "type": int, "default": SIZES, "help": "pixels along a side; the paper's are 1024"},

@@ -160,9 +160,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "pareto",
-    "What does accuracy cost, for every setting of every method, and where are the Pareto fronts?",
-    __doc__,
     draw,
     repetitions=5,
     size=256,
@@ -190,7 +187,7 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
     options = [f"--{n}={getattr(chosen, n)}" for n in ("size", "resolution", "repetitions", "seed")]
     made = {
         "commit": record.commit(),
-        "command": shlex.join(["python", "-m", *harness.ran("pareto", chosen)]),
+        "command": shlex.join(["python", "-m", *chosen.command]),
     }
     scenes: dict[str, Any] = {}
     try:
@@ -208,7 +205,7 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
         if not scenes:
             return None
     same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
-    scenes |= recorded("pareto", chosen, "scenes", [name for name in ROWS if name not in scenes], same)
+    scenes |= recorded(chosen, "scenes", [name for name in ROWS if name not in scenes], same)
     scenes = {name: scenes[name] for name in ROWS if name in scenes}
     show(summary(scenes))
     return {**same, "threads": THREADS, "peers": present, "summary": summary(scenes), "scenes": scenes}

@@ -33,10 +33,7 @@ EXPLAINED = (
 """The text beside the images."""
 TRACED, UNLIT = "path traced", "unlit"
 LIGHTS = (DirectionalLight((0.9, 0.2, -0.5), (2.0, 2.0, 1.9)), ConstantLight((0.12, 0.12, 0.14)))
-MATERIALS = (
-    jv.Material(0.3, 0.06, 1.39, values=(50, 150)),
-    jv.Material(0.2, 0.03, 1.55, values=(150, 256)),
-)
+MATERIALS = (jv.Material(0.3, 0.06, 1.39, values=(50, 150)), jv.Material(0.2, 0.03, 1.55, values=(150, 256)))
 POINTS = [
     (50, (0.85, 0.55, 0.42), 0.0),
     (80, (0.85, 0.55, 0.42), 0.8),
@@ -118,9 +115,6 @@ def pictures(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) ->
 
 
 @experiment(
-    "path_traced",
-    "How near do scatterer templates come to path tracing, and in what time?",
-    __doc__,
     repetitions=3,
     size=256,
     resolution=96,

@@ -321,9 +321,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "planning",
-    "Does a plan hold its tolerance, and is anything faster within it?",
-    __doc__,
     draw,
     scenes=200,
     size=192,

@@ -250,15 +250,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "probe_geometry",
-    "Is the geometry of a swept probe found from images, and what do the images leave open?",
-    __doc__,
-    draw,
-    size=32,
-    resolution=64,
-    starts=5,
-    threads=3,
-    quick={"size": 12, "resolution": 24, "starts": 1},
+    draw, size=32, resolution=64, starts=5, threads=3, quick={"size": 12, "resolution": 24, "starts": 1}
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     starts, variants = directions(np.random.default_rng(chosen.seed), chosen.starts), VARIANTS

@@ -1,8 +1,8 @@
 """Draws charts and pages from their records; nothing is measured.
 
 `python -m experiments.redraw` draws all, `--only speed kisti` some. They are not kept beside the records, and
-the documentation draws its own. `path_traced.webp`, `tomography.png` and `lit.png` show images that no record
-holds: their experiments alone draw them. `pareto.html` holds images only if its experiment left some here.
+the documentation draws its own. `path_traced.webp`, `tomography.png` and `lit.png` are drawn by their
+experiments alone. `pareto.html` holds images only if its experiment left some here.
 
 To measure a result again, run the `command` of its record, on a machine that does nothing else.
 """
@@ -17,8 +17,11 @@ from .harness import command, some_of
 
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
-DRAWN = [name for name in NAMES if name not in ("path_traced", "tomography")]
-"""Records whose experiment draws a chart from them."""
+IMAGES = {"path_traced", "tomography"}
+"""Records whose charts show images that no record holds."""
+OTHERS = {"viewer_latency", "gradient_agreement", "gradient_agreement_gpu"}
+"""Records without a chart."""
+DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]
 
 
 def draw(file: Path, path: Path) -> None:

@@ -129,9 +129,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "scan_conversion",
-    "What error does scan conversion bring against rendering as acquired, and what does it cost?",
-    __doc__,
     draw,
     repetitions=7,
     size=128,

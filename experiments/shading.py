@@ -63,9 +63,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "shading",
-    "What does shading by gradients cost, beside the unshaded frame and beside VTK's?",
-    __doc__,
     draw,
     repetitions=15,
     size=512,

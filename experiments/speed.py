@@ -179,9 +179,6 @@ def means(volumes: dict[str, Any], slopes: dict[str, Any], sizes: Sequence[int])
 
 
 @experiment(
-    "speed",
-    "How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?",
-    __doc__,
     draw,
     repetitions=15,
     sizes={"nargs": "+", "type": int, "default": SIZES},

@@ -34,9 +34,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 @experiment(
-    "stability",
-    "In which regimes do the methods fail, and what does jaxvol do there?",
-    __doc__,
     draw,
     only=some_of(ENTRIES, "ENTRY"),
     picture={"type": int, "default": 96, "help": "pixels along a side of pictures"},
@@ -54,7 +51,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
             keep(entry, images, chosen.output / "stability")
         entries[name] = found | {key: getattr(entry, key) for key in ABOUT}
         show({name: found["edge"]})
-    entries |= recorded("stability", chosen, "entries", [name for name in ENTRIES if name not in entries])
+    entries |= recorded(chosen, "entries", [name for name in ENTRIES if name not in entries])
     return {"entries": {name: entries[name] for name in ENTRIES if name in entries}}
 
 

@@ -87,7 +87,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     charts.save(figure, path)
 
 
-@experiment("templates", "Which photons do templates hold, and do they lean to one side?", __doc__, draw)
+@experiment(draw)
 def main(chosen: Namespace) -> dict[str, Any]:
     tables = {name: brightest(*how, chosen.seed) for name, how in TABLES.items()}
     show(tables)

@@ -231,9 +231,6 @@ def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> N
 
 
 @experiment(
-    "tomography",
-    "Is a density recovered from 24 X-ray views, beside filtered back projection and SART?",
-    __doc__,
     resolution=64,
     views=24,
     photons={"nargs": "*", "type": float, "default": [1e4], "help": "photons per ray; also without noise"},

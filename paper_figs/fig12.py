@@ -7,12 +7,7 @@ from .common import pictures
 
 
 TITLE = "Fig. 12: vessels; boundary noise is that of the pixels that alignment changes"
-main = pictures(
-    __doc__,
-    "fig12.webp",
-    TITLE,
-    fig12,
-)
+main = pictures(__doc__, "fig12.webp", TITLE, fig12)
 
 if __name__ == "__main__":
     main()

@@ -14,13 +14,7 @@ from .common import pictures
 
 
 TITLE = "Kim, Kwon and Shin, Fig. 8: bricks of a scan, in the wrong and the right order"
-main = pictures(
-    __doc__,
-    "kim_fig8.webp",
-    TITLE,
-    kim_fig8,
-    resolution=360,
-)
+main = pictures(__doc__, "kim_fig8.webp", TITLE, kim_fig8, resolution=360)
 
 if __name__ == "__main__":
     main()

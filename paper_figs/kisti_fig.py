@@ -9,14 +9,7 @@ from .common import pictures
 
 
 TITLE = "KISTI report, Fig. V-1: a head and an engine under two transfer functions"
-main = pictures(
-    __doc__,
-    "kisti_fig.webp",
-    TITLE,
-    kisti_fig,
-    resolution=192,
-    size=320,
-)
+main = pictures(__doc__, "kisti_fig.webp", TITLE, kisti_fig, resolution=192, size=320)
 
 if __name__ == "__main__":
     main()

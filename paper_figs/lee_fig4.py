@@ -11,13 +11,7 @@ from .common import pictures
 
 
 TITLE = "Lee, Kwon and Shin, Fig. 4: an ear, light from behind the head"
-main = pictures(
-    __doc__,
-    "lee_fig4.webp",
-    TITLE,
-    lee_fig4,
-    resolution=96,
-)
+main = pictures(__doc__, "lee_fig4.webp", TITLE, lee_fig4, resolution=96)
 
 if __name__ == "__main__":
     main()

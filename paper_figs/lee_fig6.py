@@ -13,14 +13,7 @@ from .common import pictures
 
 
 TITLE = "Lee, Kwon and Shin, Fig. 6: light from the left"
-main = pictures(
-    __doc__,
-    "lee_fig6.webp",
-    TITLE,
-    lee_fig6,
-    resolution=128,
-    size=512,
-)
+main = pictures(__doc__, "lee_fig6.webp", TITLE, lee_fig6, resolution=128, size=512)
 
 if __name__ == "__main__":
     main()
