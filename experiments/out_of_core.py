@@ -15,87 +15,200 @@ import json
 import subprocess
 import sys
 import tempfile
+import time
 from argparse import Namespace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
+import jaxvol as jv
+
 from . import charts, timing
 from .harness import experiment, show
-from .large_volume import write_raw, zarr_of_raw
+from .peak_memory import peak
+from .scenes import seen_head
 
 
-SIZES = 64, 256, 2048
-"""MiB of voxels."""
-LARGE = 2048
-"""The size that the goals are for."""
-RESIDENT = 64, LARGE
-MEMORY = 256
-"""MiB, the budget."""
+LARGE, FITTING = 2048, 64
+"""MiB of voxels: of the size that the goals are for, and of the one whose time in memory is scaled."""
 SMALL = 128
-"""Voxels along a side of the volume whose images take little but what all images take; and MiB for it."""
+"""Voxels along a side of the volume whose images take little but what all images take."""
 OVER = 1.3
-RATIO = 1.5
 FORMATS = "raw", "zarr"
-SCENES = "opaque", "translucent"
+SCENES = {"opaque": 1.0, "translucent": 0.02}
+"""Factors to the extinction."""
+REPETITIONS = 2
+"""Images that are timed of each scene, once programs are compiled and ranges of values known."""
 
 
-def side(size: float) -> int:
-    """Voxels along a side of a volume of so many MiB."""
-    return int((size * 2**20) ** (1 / 3))
+# -- a volume of any size, made on disk without ever being in memory ---------------------------------------
+
+COARSE = 192
+"""Voxels along a side of the phantom that is interpolated."""
+GRAIN, AIR = 8, 8
+"""Values by which neighbouring voxels differ beside what the phantom says, and up to which they do not, so
+that a compressed file is no smaller than that of a scan."""
+CHUNK = 64
+"""Voxels along a side of a Zarr chunk."""
 
 
-def volume(folder: Path, voxels: int, kind: str, seed: int) -> Path:
-    """The file of a volume. It is made if it is not there."""
-    raw = folder / f"head_{voxels}.raw"
+def slabs(n: int, seed: int) -> Iterator[np.ndarray]:
+    """Slabs (thickness, n, n) of n³ voxels of type uint8, data[z, y, x], from the first to the last."""
+    coarse = np.asarray(jv.phantom("head", COARSE).data, np.float32)
+    at = np.linspace(0, COARSE - 1, n)
+    low, rows = np.minimum(at.astype(int), COARSE - 2), np.arange(n)
+    weights = np.zeros((n, COARSE), np.float32)  # of linear interpolation
+    weights[rows, low], weights[rows, low + 1] = 1 - (at - low), at - low
+    rng = np.random.default_rng(seed)
+    for first in range(0, n, CHUNK):
+        along_z = np.tensordot(weights[first : first + CHUNK], coarse, (1, 2))  # (z, x, y)
+        slab = np.empty((len(along_z), n, n), np.uint8)  # (z, y, x)
+        for plane, found in zip(along_z, slab, strict=True):
+            values = weights @ (weights @ plane).T
+            grain = rng.integers(0, GRAIN, values.shape, np.uint8)
+            grain[values < AIR] = 0
+            np.minimum(np.rint(values) + grain, 255, out=found, casting="unsafe")
+        yield slab
+
+
+def volume(folder: Path, n: int, kind: str, seed: int) -> Path:
+    """The file of a volume of n³ voxels, which is made if it is not there."""
+    raw = folder / f"head_{n}.raw"
     path = raw.with_suffix(f".{kind}")
     if kind == "raw" and not raw.exists():
-        write_raw(raw, voxels, seed)
+        with raw.open("wb") as file:
+            for slab in slabs(n, seed):
+                file.write(slab.data)
     if kind == "zarr" and not path.exists():
-        zarr_of_raw(path, raw, voxels)
+        zarr_of_raw(path, raw, n)
     return path
 
 
-def image(path: Path, voxels: int, pixels: int, memory: int | None) -> dict[str, Any]:
-    """What `experiments.out_of_core_image` tells of a file. `memory`: MiB; None for all."""
-    given = "resident" if memory is None else str(memory * 2**20)
-    words = ["-m", "experiments.out_of_core_image", str(path), str(voxels), str(pixels), given]
+def zarr_of_raw(path: Path, raw: Path, n: int) -> None:
+    """The voxels of a raw file as a Zarr array, version 3, in compressed chunks."""
+    import tensorstore
+
+    codec = {"name": "blosc", "configuration": {"cname": "lz4", "clevel": 5, "shuffle": "noshuffle"}}
+    grid = {"name": "regular", "configuration": {"chunk_shape": [CHUNK] * 3}}
+    spec = {
+        "driver": "zarr3",
+        "kvstore": {"driver": "file", "path": f"{path}/"},
+        "metadata": {"shape": [n] * 3, "data_type": "uint8", "chunk_grid": grid, "codecs": [codec]},
+        "store_data_equal_to_fill_value": True,  # an empty chunk is not a missing one
+    }
+    array = tensorstore.open(spec, create=True, delete_existing=True).result()
+    with raw.open("rb") as file:
+        for first in range(0, n, CHUNK):
+            slab = np.fromfile(file, np.uint8, n * n * min(CHUNK, n - first)).reshape(-1, n, n)
+            array[:, :, first : first + len(slab)].write(slab.transpose(2, 1, 0)).result()
+
+
+# -- its images, in a process of their own ------------------------------------------------------------------
+
+CHILD = """
+import json, sys
+from pathlib import Path
+from experiments.out_of_core import measure
+path, *sizes = sys.argv[1:]
+print(json.dumps(measure(Path(path), *map(int, sizes))))
+"""
+
+
+def in_a_process(path: Path, voxels: int, pixels: int, memory: int) -> dict[str, Any]:
+    """What `measure` finds. `memory`: MiB; 0 for all."""
+    words = [str(path), str(voxels), str(pixels), str(memory * 2**20)]
     ran = subprocess.run(
-        [sys.executable, *words], cwd=Path(__file__).parent.parent, capture_output=True, text=True, check=True
+        [sys.executable, "-c", CHILD, *words],
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     return json.loads(ran.stdout.splitlines()[-1])
 
 
-def seconds(row: dict[str, Any]) -> float:
+def read() -> float:
+    """What this process has read from files so far, MiB, from the system's cache or not."""
+    file = Path("/proc/self/io")
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    return sum(int(line.split()[1]) for line in lines if line.startswith("rchar")) / 2**20
+
+
+def measure(path: Path, voxels: int, pixels: int, memory: int) -> dict[str, Any]:
+    """Time and memory of images of a file, at steps of one voxel, leaping over empty space. `memory`: bytes;
+    0 to render the volume as a whole, in memory."""
+    _, opaque, camera, _ = seen_head(jv.phantom("head", 16), pixels)
+    spacing, origin = (2 / (voxels - 1),) * 3, (-1.0,) * 3
+    march = jv.March(spacing[0], (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
+    raw = {"shape": (voxels,) * 3, "dtype": "uint8"} if path.suffix == ".raw" else {}
+    jax.block_until_ready(camera.position + 1)  # JAX is up
+    found: dict[str, Any] = {"before": round(peak(), 1)}
+    whole = source = None
+    if memory:
+        source = jv.bricks.source_of(path, spacing=spacing, origin=origin, **raw)
+    else:
+        begun = time.perf_counter()
+        whole = jv.Volume(np.fromfile(path, np.uint8).reshape((voxels,) * 3).T, spacing, origin)
+        found["seconds to read"] = round(time.perf_counter() - begun, 3)
+
+    def image(transfer: jv.TransferFunction) -> jv.Rendering:
+        if whole is not None:
+            return jv.render(whole, transfer, camera, march, outputs="rgba")
+        return jv.render_bricks(source, transfer, camera, march, outputs="rgba", memory=memory)
+
+    for name, factor in SCENES.items():
+        transfer = jv.TransferFunction(opaque.values, opaque.colors, factor * opaque.extinction)
+        seconds, before = [], 0.0
+        for _ in range(1 + REPETITIONS):
+            begun, before = time.perf_counter(), read()
+            rendering = jax.block_until_ready(image(transfer))
+            seconds.append(round(time.perf_counter() - begun, 3))
+        row = found[name] = {"first seconds": seconds[0], "seconds": seconds[1:]}
+        row["peak"] = round(peak() - found["before"], 1)
+        row["mean"] = np.mean(np.asarray(rendering.rgba, np.float64), (0, 1)).tolist()
+        if whole is not None:
+            samples = jv.render(whole, transfer, camera, march).samples
+            row["samples"] = int(np.sum(np.asarray(samples), dtype=np.int64))
+        else:
+            row |= {"MiB read": round(read() - before, 1), "bricks": rendering.bricks._asdict()}
+    return found
+
+
+# -- against the goals --------------------------------------------------------------------------------------
+
+
+def seconds_of(row: dict[str, Any]) -> float:
     return timing.median(row["seconds"])
 
 
-def peak(row: dict[str, Any]) -> float:
+def peak_of(row: dict[str, Any]) -> float:
     return max(row[name]["peak"] for name in SCENES)
 
 
 def allowed(result: dict[str, Any], kind: str) -> float:
     """The peak that is allowed, MiB."""
-    return OVER * result["memory"] + peak(result["constant"][kind])
+    return OVER * result["memory"] + peak_of(result["constant"][kind])
 
 
 def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]:
     """The largest size of both kinds, against the goals. `fitting`: the size in memory that is scaled."""
     found: dict[str, Any] = {}
     for kind in FORMATS:
-        of_kind = result["bricks"][kind][large]
-        found[kind] = {"peak": peak(of_kind), "allowed": round(allowed(result, kind), 1)}
+        rows = result["bricks"][kind][large]
+        found[kind] = {"peak": peak_of(rows), "allowed": round(allowed(result, kind), 1)}
         for name in SCENES:
             small, whole = (result["resident"][size][name] for size in (fitting, large))
-            scaled = seconds(small) * whole["samples"] / small["samples"]
+            taken, scaled = seconds_of(rows[name]), seconds_of(small) * whole["samples"] / small["samples"]
             found[kind][name] = {
-                "seconds": seconds(of_kind[name]),
-                "in memory": seconds(whole),
-                "ratio": round(seconds(of_kind[name]) / seconds(whole), 3),
+                "seconds": taken,
+                "in memory": seconds_of(whole),
+                "ratio": round(taken / seconds_of(whole), 3),
                 "scaled": round(scaled, 4),
-                "ratio, scaled": round(seconds(of_kind[name]) / scaled, 3),
-                "difference": max(
-                    abs(a - b) for a, b in zip(of_kind[name]["mean"], whole["mean"], strict=True)
-                ),
+                "ratio, scaled": round(taken / scaled, 3),
+                "difference": float(np.max(np.abs(np.subtract(rows[name]["mean"], whole["mean"])))),
             }
     return found
 
@@ -103,17 +216,16 @@ def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]
 def draw(result: dict[str, Any], path: Path) -> None:
     """Time and memory against the size."""
     figure, (axes,) = charts.panels(1, 3, 12, 3.6)
-    sizes, at = result["sizes"], [int(size) for size in result["resident"]]
-    for kind, color in zip(FORMATS, ("C0", "C1"), strict=True):
-        rows = [result["bricks"][kind][str(size)] for size in sizes]
+    lines = {f"bricks, {kind}": (result["bricks"][kind], f"C{n}o-") for n, kind in enumerate(FORMATS)}
+    lines["in memory"] = result["resident"], "ks--"
+    for label, (by_size, style) in lines.items():
+        sizes = [int(size) for size in by_size]
         for panel, name in zip(axes, SCENES, strict=False):
-            panel.plot(sizes, [seconds(row[name]) for row in rows], f"{color}o-", label=f"bricks, {kind}")
-        axes[2].plot(sizes, [peak(row) for row in rows], f"{color}o-")
-        axes[2].axhline(allowed(result, kind), color=color, linestyle=":")
-    for panel, name in zip(axes, SCENES, strict=False):
-        panel.plot(at, [seconds(row[name]) for row in result["resident"].values()], "ks--", label="in memory")
-        panel.set_title(f"{name}: seconds for an image", fontsize=9)
-    axes[2].plot(at, [peak(row) for row in result["resident"].values()], "ks--")
+            panel.plot(sizes, [seconds_of(row[name]) for row in by_size.values()], style, label=label)
+            panel.set_title(f"{name}: seconds for an image", fontsize=9)
+        axes[2].plot(sizes, [peak_of(row) for row in by_size.values()], style)
+    for number, kind in enumerate(FORMATS):
+        axes[2].axhline(allowed(result, kind), color=f"C{number}", linestyle=":")
     axes[2].set_title(f"peak memory, MiB; dotted: allowed for {result['memory']} MiB", fontsize=9)
     for panel in axes:
         charts.logarithmic(panel, x=2, y=2)
@@ -125,10 +237,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
 @experiment(
     draw,
     pixels={"type": int, "default": 512, "help": "pixels along a side"},
-    sizes={"nargs": "+", "type": int, "default": SIZES, "help": "MiB of voxels"},
+    sizes={"nargs": "+", "type": int, "default": (FITTING, 256, LARGE), "help": "MiB of voxels"},
     volumes={"type": Path, "metavar": "FOLDER", "help": "keep the volumes here (default: delete them)"},
-    memory={"type": int, "default": MEMORY, "help": "MiB, the budget"},
-    resident=RESIDENT,
+    memory={"type": int, "default": 256, "help": "MiB, the budget"},
+    resident=(FITTING, LARGE),
     quick={"pixels": 32, "sizes": [2], "memory": 4, "resident": (2, 2)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
@@ -138,18 +250,19 @@ def main(chosen: Namespace) -> dict[str, Any]:
         folder = chosen.volumes or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
 
-        def measured(voxels: int, kind: str, memory: int | None) -> dict[str, Any]:
-            found = image(volume(folder, voxels, kind, chosen.seed), voxels, chosen.pixels, memory)
-            show(found, f"{voxels}³", kind, "in memory" if memory is None else f"{memory} MiB")
+        def measured(voxels: int, kind: str, memory: int) -> dict[str, Any]:
+            found = in_a_process(volume(folder, voxels, kind, chosen.seed), voxels, chosen.pixels, memory)
+            show(found, f"{voxels}³", kind, f"{memory} MiB" if memory else "in memory")
             return found
 
         for kind in FORMATS:
             result["constant"][kind] = measured(SMALL, kind, 8)
         for size in chosen.sizes:
+            side = int((size * 2**20) ** (1 / 3))
             for kind in FORMATS:
-                result["bricks"][kind][str(size)] = measured(side(size), kind, chosen.memory)
+                result["bricks"][kind][str(size)] = measured(side, kind, chosen.memory)
             if size in chosen.resident:
-                result["resident"][str(size)] = measured(side(size), "raw", None)
+                result["resident"][str(size)] = measured(side, "raw", 0)
     fitting, large = map(str, chosen.resident)
     result["compared"] = compared(result, large, fitting)
     show(result["compared"])

@@ -6,31 +6,42 @@ limit and the first at which it is not. What jaxvol does beyond: *bounded*, the 
 is no edge in the sweep; *detected and said*, an error, a warning or an output of the rendering says so;
 *documented*, a docstring states it; *fails*, none of these.
 
-Besides the record and the chart this writes `stability.html`, a page with the question, the curve and the
-edge of each entry, and pictures on both sides of it where the image itself is what is measured.
+Beside the record and the chart, the folder `stability` holds pictures on both sides of an edge, where an
+image is what is measured. The documentation's page of failures shows all of it.
 """
 
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from . import record
+import numpy as np
+from PIL import Image
+
+import jaxvol as jv
+from jaxvol._util.whole_files import whole_file
+
 from .atlas import ENTRIES, FAMILIES
-from .atlas.entry import pictured, sweep
-from .atlas.page import chart, keep, page
+from .atlas.chart import chart
+from .atlas.entry import Entry, pictured, sweep
 from .harness import experiment, recorded, show, some_of
 
 
-ABOUT = ("question", "method", "regime", "metric", "judged", "limit", "outcome", "does", "size")
+ABOUT = ("question", "method", "regime", "metric", "judged", "limit", "outcome", "does", "shows", "size")
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    """The chart of all entries, and the page beside it, with the pictures that the experiment left there."""
-    entries, pictures = result["entries"], path.parent / "stability"
-    chart(ENTRIES, entries, path)
-    families = {family: [e for e in row if e.name in entries] for family, row in FAMILIES.items()}
-    text = page(families, entries, pictures if pictures.is_dir() else record.RESULTS / "stability")
-    path.with_suffix(".html").write_text(text, encoding="utf-8")
+    chart(ENTRIES, result["entries"], path)
+
+
+def keep(entry: Entry, values: tuple[float, float], size: int, folder: Path) -> None:
+    """Write the pictures of an entry at two values of its regime."""
+    assert entry.picture is not None
+    folder.mkdir(exist_ok=True)
+    for number, value in enumerate(values, 1):
+        image = np.clip(entry.picture(value, size), 0, 1)
+        levels = np.round(255 * np.asarray(jv.to_srgb(image))).astype(np.uint8)
+        with whole_file(folder / f"{entry.name.replace(' ', '-')}.{number}.webp") as part:
+            Image.fromarray(levels).save(part, "WEBP", lossless=True)
 
 
 @experiment(
@@ -47,8 +58,8 @@ def main(chosen: Namespace) -> dict[str, Any]:
         entry = ENTRIES[name]
         found = sweep(entry, entry.size, entry.values[:: len(entry.values) - 1] if chosen.quick else None)
         if entry.picture is not None:
-            images = [entry.picture(value, chosen.picture) for value in pictured(entry, found)]
-            keep(entry, images, chosen.output / "stability")
+            found["pictured"] = pictured(entry, found)
+            keep(entry, found["pictured"], chosen.picture, chosen.output / "stability")
         entries[name] = found | {key: getattr(entry, key) for key in ABOUT}
         show({name: found["edge"]})
     entries |= recorded(chosen, "entries", [name for name in ENTRIES if name not in entries])

@@ -57,9 +57,7 @@ def test_what_is_not_measured_again_is_kept_with_its_commit_if_it_is_of_the_same
     path = record.write(tmp_path / "kept.json", "?", result, seed=0, command=["experiments.kept"])
     made = {key: record.read(path)[key] for key in ("commit", "command")}
     chosen = Namespace(path=path, quick=False)
-    assert recorded(chosen, "rows", ["b", "c"], {"size": 3}) == {
-        "b": {"measured": made, "seconds": 2}
-    }
+    assert recorded(chosen, "rows", ["b", "c"], {"size": 3}) == {"b": {"measured": made, "seconds": 2}}
     assert recorded(chosen, "rows", ["b"], {"size": 4}) == {}
     chosen.quick = True
     assert recorded(chosen, "rows", ["b"], {"size": 3}) == {}

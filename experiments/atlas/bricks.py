@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from ..naive_bricks import each_at_once
+from ..bricks import each_at_once
 from .entry import Entry
 
 

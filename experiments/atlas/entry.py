@@ -85,6 +85,14 @@ def sweep(entry: Entry, size: int, values: Sequence[float] | None = None) -> dic
     return {"values": list(values), "curves": curves, "edge": found._asdict()}
 
 
+def method(name: str) -> Any:
+    """The object of `Entry.method`."""
+    found: Any = jv
+    for part in name.split(".")[1:]:
+        found = getattr(found, part)
+    return found
+
+
 def pictured(entry: Entry, found: dict[str, Any]) -> tuple[float, float]:
     """The two values of which an entry has pictures."""
     if entry.pictured is not None:

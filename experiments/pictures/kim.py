@@ -9,9 +9,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from ..bricks import phantom
-from ..bricks_paper import grid, probe
-from ..naive_bricks import each_at_once
+from ..bricks import each_at_once, grid, phantom, probe
 from . import BLACK, Panels, panel
 
 
