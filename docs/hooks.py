@@ -4,8 +4,8 @@
   places: a page of `docs/` names `../paper_figs/README.md`, as it must where the repository is read.
 - Charts and pages of records are drawn from these, as `python -m experiments.redraw` does.
 - `<!-- section FILE: HEADING -->` is replaced by the text under that heading of a Markdown file.
-- `<!-- table failures -->`, `<!-- table pictures -->` and `<!-- table references -->` are replaced by tables made
-  from the record of the failure atlas and from CITATION.cff.
+- `<!-- table failures -->`, `<!-- table pictures -->` and `<!-- table references -->` are replaced by tables,
+  made from the record of the failure atlas and from CITATION.cff.
 """
 
 import json
