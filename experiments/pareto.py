@@ -28,7 +28,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import harness, pareto_measure, pareto_page, pareto_points, programs, record
+from . import charts, harness, pareto_measure, pareto_page, pareto_points, programs, record
 from .harness import experiment, recorded, show, some_of
 from .pareto_measure import Sizes, slug
 from .pareto_scenes import ROWS
@@ -153,7 +153,7 @@ def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, 
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """The chart, and the page beside it, with the pictures that the experiment left there."""
-    pareto_page.chart(result, path)
+    charts.save(pareto_page.chart(result), path)
     file = path.with_suffix(".json")
     file = file if file.is_file() else record.RESULTS / "pareto.json"
     pareto_page.write(file, file.parent / "pareto", path.with_suffix(".html"))
