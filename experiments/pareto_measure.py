@@ -130,16 +130,16 @@ def fine(case: Case, finer: float, quadrature: Quadrature = "midpoint") -> jv.Ma
 
 def converged(case: Case, row: Row, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
     """The reference, over white. `row`: how fine it is; `count`: of templates."""
-    how = {"templates": count, "blend": True, "seed": seed} if row.noisy else {}
+    how = {"templates": count, "blend": True, "seed": seed} if row.kind == "lit" else {}
     lighting = None if case.lighting is None else lighting_of(case, **how)
     return program(case, fine(case, row.finer, row.quadrature), lighting).image()
 
 
 def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
     """What is estimated of the reference's own error: `rmse` in total, and its parts."""
-    few: Lighting | None = None if case.lighting is None or row.noisy else lighting_of(case)
+    few: Lighting | None = None if case.lighting is None or row.kind == "lit" else lighting_of(case)
     image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
-    if row.noisy:
+    if row.kind == "lit":
         # grown once: in float64, random numbers are others
         grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).simulated(blend=False)
         few = lighting_of(case, given=grown)
@@ -157,7 +157,7 @@ def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dic
         "difference to float64": float(np.sqrt(np.mean(off**2))),
         "largest difference to float64": float(np.abs(off).max()),
     }
-    if row.noisy:
+    if row.kind == "lit":
         found["templates"] = count
         counts = zip((count, count // 2), SEEDS, strict=True)
         one, other = (converged(case, row._replace(finer=1), n, seed) for n, seed in counts)

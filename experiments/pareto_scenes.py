@@ -7,7 +7,7 @@ them, in twice the distance between the samples of a beam.
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, Phong, ScattererTemplates
@@ -18,6 +18,10 @@ from .programs import Case, Quadrature
 from .scenes import PHANTOM, SCENES, Scene, inside, peaked
 
 
+Kind: TypeAlias = Literal["unlit", "lit", "shaded", "surface", "bricks"]
+"""Of a scene: what is lit by templates, shaded by `Phong`, an isosurface, or rendered whole and in bricks."""
+
+
 class Row(NamedTuple):
     """A scene of the chart.
 
@@ -25,9 +29,7 @@ class Row(NamedTuple):
       phantom.
     - `file`: the real volume, None for a phantom.
     - `peers`: None, or why VTK and Dr.Jit are left out.
-    - `bricks`: whether it is rendered whole and in bricks, and not by all other settings.
-    - `lit`: whether there is light; `shaded`: whether it is `Phong`'s; `surface`: whether an isosurface is
-      shown.
+    - `kind`: which settings it is rendered under.
     - `gradients`: whether gradients are measured, too.
     - `finer`, `quadrature`: of the converged image, into how many parts it divides a step, and its rule.
     - `part`: of the image's side, where frames take longer.
@@ -39,19 +41,15 @@ class Row(NamedTuple):
     look: Literal["translucent", "opaque", "thin peak"] = "translucent"
     peers: str | None = None
     toroidal: bool = False
-    bricks: bool = False
-    lit: bool = False
-    shaded: bool = False
-    surface: bool = False
+    kind: Kind = "unlit"
     gradients: bool = False
     finer: int = 16
     quadrature: Quadrature = "midpoint"
     part: float = 1.0
 
     @property
-    def noisy(self) -> bool:
-        """Whether its light is made of templates, which are random."""
-        return self.lit and not self.shaded and not self.surface
+    def lit(self) -> bool:
+        return self.kind in ("lit", "shaded", "surface")
 
 
 UNBENT = "the ray casters of VTK and Dr.Jit that are compared here have no toroidal grids"
@@ -155,11 +153,11 @@ ROWS: dict[str, Row] = {
     "aneurism": Row(partial(real, "aneurism"), ANEURISM),
     "fetus phantom": Row(partial(scan, "fetus phantom"), **TOROIDAL),
     "us_aplio_convex": Row(partial(scan, "us_aplio_convex"), scan_conversion.APLIO, **TOROIDAL),
-    f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=TEMPLATES, lit=True, finer=4, part=0.5),
-    "engine, lit": Row(lit_engine, ENGINE, peers=TEMPLATES, lit=True, finer=4, part=0.25),
-    "engine, shaded": Row(partial(shaded, "engine"), ENGINE, lit=True, shaded=True),
-    "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, lit=True, shaded=True),
+    f"{PHANTOM}, lit": Row(lit_head, look="opaque", peers=TEMPLATES, kind="lit", finer=4, part=0.5),
+    "engine, lit": Row(lit_engine, ENGINE, peers=TEMPLATES, kind="lit", finer=4, part=0.25),
+    "engine, shaded": Row(partial(shaded, "engine"), ENGINE, kind="shaded"),
+    "bonsai, shaded": Row(partial(shaded, "bonsai"), BONSAI, kind="shaded"),
     "engine, cut": Row(cut, ENGINE, peers=WHOLE),
-    "engine, in bricks": Row(partial(real, "engine"), ENGINE, peers=WHOLE, bricks=True),
-    "engine, isosurface": Row(surface, ENGINE, peers=SURFACES, lit=True, surface=True),
+    "engine, in bricks": Row(partial(real, "engine"), ENGINE, peers=WHOLE, kind="bricks"),
+    "engine, isosurface": Row(surface, ENGINE, peers=SURFACES, kind="surface"),
 }

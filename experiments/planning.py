@@ -18,7 +18,6 @@ the most of a volume's `planning seconds`.
 """
 
 import math
-import time
 from argparse import Namespace
 from collections.abc import Iterator
 from functools import partial
@@ -156,63 +155,43 @@ def converged(scene: Scene) -> tuple[np.ndarray, float]:
 
 
 def table(scene: Scene, tolerance: float) -> dict[str, list[jv.March]]:
-    """All marches that a search tries, by kind, the cheapest of each first; without leaps."""
-    transforms = jv.AlphaCorrection(), jv.EarlyTermination(tolerance / 8)
+    """All marches that a search tries, by kind, the cheapest of each first."""
+    transforms = jv.AlphaCorrection(), jv.EarlyTermination(tolerance / 8), jv.SpaceLeaping()
     found = {
         quadrature: [jv.March(step * scene.voxel, transforms, quadrature) for step in reversed(STEPS)]
         for quadrature in ("left", "midpoint", "preintegrated")
     }
     for step in (1 / 8, 1 / 4, 1 / 2):
         found[f"adaptive, shortest step {step:g}"] = [
-            jv.March(step * scene.voxel, (*transforms, jv.AdaptiveSampling(own, 8)), "midpoint")
+            jv.March(step * scene.voxel, (jv.AdaptiveSampling(own, 8), *transforms), "midpoint")
             for own in reversed(OWN)
         ]
     return found
 
 
-def accurate(scene: Scene, marches: list[jv.March], truth: np.ndarray, tolerance: float) -> list[jv.March]:
-    """The first two within the tolerance."""
-    leaps = (leaping(march) for march in marches)  # the same image, sooner
-    within = (march for march in leaps if distance(image(scene, march), truth) <= tolerance)
-    return list(islice(within, 2))
-
-
-def leaping(march: jv.March) -> jv.March:
-    return jv.March(march.step, (*march.transforms, jv.SpaceLeaping()), march.quadrature)
-
-
 def searched(
     scene: Scene, found: jv.Plan, truth: np.ndarray, tolerance: float, repetitions: int
 ) -> dict[str, Any]:
-    """How much longer the planned image takes than the fastest of the table within the tolerance."""
-
-    def seconds(march: jv.March) -> float:
-        begun = time.perf_counter()
-        image(scene, march)
-        return time.perf_counter() - begun
-
-    within = {
-        f"{kind}, step {float(march.step) / scene.voxel:.3g}, {number}, {how}": each
-        for kind, marches in table(scene, tolerance).items()
-        for number, march in enumerate(accurate(scene, marches, truth, tolerance))
-        for how, each in (
-            ("leaps", march),
-            ("no leaps", jv.March(march.step, march.transforms[:-1], march.quadrature)),
-        )
-    }
+    """How much longer the planned image takes than the fastest of the table within the tolerance: of each
+    kind the first two, with leaps and without, which render the same image."""
+    within: dict[str, jv.March] = {}
+    for kind, marches in table(scene, tolerance).items():
+        accurate = (march for march in marches if distance(image(scene, march), truth) <= tolerance)
+        for number, march in enumerate(islice(accurate, 2)):
+            name = f"{kind}, step {float(march.step) / scene.voxel:.3g}, {number}"
+            within[f"{name}, leaps"] = march
+            within[f"{name}, no leaps"] = jv.March(march.step, march.transforms[:-1], march.quadrature)
     if not within:
         return {"fastest": None}
-    once = {name: min(seconds(march) for _ in range(2)) for name, march in within.items()}
+    programs: dict[str, Any] = {name: partial(image, scene, march) for name, march in within.items()}
+    once = {name: min(times) for name, times in timing.interleaved(programs, 2).items()}
     best = sorted(once, key=lambda name: once[name])[:3]
-    programs: dict[str, Any] = {name: partial(image, scene, within[name]) for name in best}
+    programs = {name: programs[name] for name in best}
     programs["plan"] = partial(image, scene, found.march, found.volume)
     times = timing.interleaved(programs, repetitions)
     fastest = min(best, key=lambda name: float(np.median(times[name])))
-    return {
-        "fastest": fastest,
-        "ratio": timing.ratio(times["plan"], times[fastest])["median"],
-        "planned": str(found).splitlines()[0],
-    }
+    ratio = timing.ratio(times["plan"], times[fastest])["median"]
+    return {"fastest": fastest, "ratio": ratio, "planned": str(found).splitlines()[0]}
 
 
 def measure(scene: Scene, number: int, search: bool, repetitions: int) -> dict[str, Any]:
@@ -260,31 +239,28 @@ def summary(rows: list[dict[str, Any]], costs: dict[str, dict[str, dict[str, flo
     by_tolerance = {}
     for tolerance in TOLERANCES:
         plans = [row["plans"][f"{tolerance:g}"] for row in rows]
-        held = [each["error"] <= tolerance for each in plans]
+        held = np.array([each["error"] <= tolerance for each in plans])
+        said = np.array([each["within"] for each in plans])
         ratios = [each["ratio"] for each in plans if each.get("fastest")]
         by_tolerance[f"{tolerance:g}"] = {
             "scenes": len(plans),
-            "held": sum(held),
-            "not held though said to be within": sum(
-                not held_ and each["within"] for held_, each in zip(held, plans, strict=True)
-            ),
+            "held": int(held.sum()),
+            "not held though said to be within": int((~held & said).sum()),
             "error at most what was predicted": sum(each["error"] <= each["predicted"] for each in plans),
-            "share": float(np.mean(held)),
+            "share": float(held.mean()),
             "largest error over tolerance": max(each["error"] for each in plans) / tolerance,
-            "said not to be within": sum(not each["within"] for each in plans),
+            "said not to be within": int((~said).sum()),
             "time over the fastest: median": float(np.median(ratios)) if ratios else None,
             "largest": max(ratios, default=None),
             "within 1.5 times": sum(ratio <= 1.5 for ratio in ratios),
             "searched": len(ratios),
-            "searched, nothing found within": sum(
-                "fastest" in each and each["fastest"] is None for each in plans
-            ),
+            "searched, nothing found within": sum(each.get("fastest", "") is None for each in plans),
         }
     each = [one for of in costs.values() for one in of.values()]
-    cold = {}
+    cold: dict[str, float] = {}
     for row in rows:
-        of = [plan["planning seconds"] for plan in row["plans"].values()]
-        cold[row["volume"]] = max(*of, cold.get(row["volume"], 0))
+        most = max(plan["planning seconds"] for plan in row["plans"].values())
+        cold[row["volume"]] = max(most, cold.get(row["volume"], 0))
     return {
         "by tolerance": by_tolerance,
         "planning, in images: largest": max((one["images"] for one in each), default=None),
