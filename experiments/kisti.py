@@ -48,6 +48,8 @@ METHODS: dict[str, tuple[jv.Transform, ...]] = {
     BOTH: (jv.SpaceLeaping(), jv.EarlyTermination(LEFT)),
 }
 SKIPPED, BOTH_SKIPPED = "ESS, shading skipped", "ERT + ESS, shading skipped"
+PARTS = "scenes", "shaded"
+"""Of the record: without shading, and with it."""
 SIZES = (256, 512)
 EVERY = (1, 4, 8, 16)  # samples
 GOAL = 4.55
@@ -106,28 +108,23 @@ SHADED: dict[str, tuple[tuple[jv.Transform, ...], Lighting]] = {
 }
 
 
-def measure(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
+Rows = dict[str, dict[str, Any]]
+
+
+def measure(scene: Scene, lit: bool, repetitions: int) -> Rows:
     """Time, speed-up over neither method, and error of a scene's frame under every method."""
-    under = {name: jv.March(scene.step, transforms) for name, transforms in METHODS.items()}
-    return with_gains(harness.compare(scene, under, repetitions))
+    if lit:
 
+        def frame(march: jv.March, lighting: Lighting) -> Any:
+            return jv.render(*scene[:3], march, lighting=lighting, outputs="rgba").rgba
 
-def measure_shaded(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
-    """The same, shaded."""
-
-    def frame(name: str) -> Any:
-        transforms, lighting = SHADED[name]
-        march = jv.March(scene.step, transforms)
-        return jv.render(*scene[:3], march, lighting=lighting, outputs="rgba").rgba
-
-    seconds = timing.interleaved({name: partial(frame, name) for name in SHADED}, repetitions)
-    finer = marches.converged(scene.step, harness.FINER)
-    truth = jv.render(*scene[:3], finer, lighting=Phong(), outputs="rgba").rgba
-    return with_gains({n: harness.row(seconds[n], seconds[NEITHER], rmse(frame(n), truth)) for n in SHADED})
-
-
-def with_gains(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The rows of a table, with their speed-up over neither method."""
+        drawn = {n: partial(frame, jv.March(scene.step, how), light) for n, (how, light) in SHADED.items()}
+        seconds = timing.interleaved(drawn, repetitions)
+        truth = frame(marches.converged(scene.step, harness.FINER), Phong())
+        rows = {n: harness.row(seconds[n], seconds[NEITHER], rmse(drawn[n](), truth)) for n in drawn}
+    else:
+        under = {name: jv.March(scene.step, transforms) for name, transforms in METHODS.items()}
+        rows = harness.compare(scene, under, repetitions)
     for row in rows.values():
         row["speed-up"] = timing.ratio(rows[NEITHER]["all seconds"], row["all seconds"])
     return rows
@@ -138,9 +135,8 @@ def tested_every(scene: Scene, samples: int, repetitions: int) -> dict[str, Any]
     early termination, and what this gains."""
 
     def frame(method: str) -> Any:
-        march = jv.March(scene.step, METHODS[method])
-        parts = EngineScene(*scene[:3], march, lighting=Phong())
-        return render_scene(parts, "rgba", "replay", Tiling(cells=samples)).rgba
+        whole = EngineScene(*scene[:3], jv.March(scene.step, METHODS[method]), lighting=Phong())
+        return render_scene(whole, "rgba", "replay", Tiling(cells=samples)).rgba
 
     seconds = timing.interleaved({name: partial(frame, name) for name in (NEITHER, ERT)}, repetitions)
     medians = {name: timing.median(all_) for name, all_ in seconds.items()}
@@ -196,21 +192,22 @@ def draw(result: dict[str, Any], path: Path) -> None:
 def main(chosen: Namespace) -> dict[str, Any]:
     folder = harness.data()
     makers = PHANTOMS if folder is None or chosen.quick else REAL
-    scenes: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
-    shaded: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
+    measured: dict[str, dict[str, Any]] = {part: {name: {} for name in REPORT} for part in PARTS}
     every: dict[str, dict[str, Any]] = {}
     for name, make in makers.items():
         for size in chosen.sizes:
             scene = make(folder, size, chosen.resolution)
             for tf, seen in (("tf 1", scene), ("tf 2", opaque(scene))):
                 case = f"{name}, {tf}"
-                scenes[case][str(size)] = measure(seen, chosen.repetitions)
-                shaded[case][str(size)] = measure_shaded(seen, chosen.repetitions)
-                show(scenes[case][str(size)], case, size, "unshaded")
-                show(shaded[case][str(size)], case, size, "shaded")
+                for part in PARTS:
+                    rows = measured[part][case][str(size)] = measure(
+                        seen, part == "shaded", chosen.repetitions
+                    )
+                    show(rows, case, size, part)
                 if size == chosen.sizes[-1]:
                     every[case] = {str(n): tested_every(seen, n, chosen.repetitions) for n in chosen.every}
                     show(every[case], case, "ended rays are looked for every so many samples")
+    scenes, shaded = measured.values()
     gains = [rows[BOTH]["speed-up"]["median"] for of_size in scenes.values() for rows in of_size.values()]
     over = {
         f"{case}, {size}": round(rows[BOTH]["speed-up"]["median"] / REPORT[case][BOTH][at], 3)
@@ -224,8 +221,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "opacity left": LEFT,
         "goal": GOAL,
         "both, geometric mean": geometric_mean(gains),
-        "scenes": scenes,
-        "shaded": shaded,
+        **measured,
         "both, shaded, over the report's": over,
         "ended rays are looked for every so many samples": every,
     }

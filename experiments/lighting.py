@@ -131,10 +131,9 @@ def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
 def deferring(scene: Scene, thinned: Sequence[float], seed: int) -> list[dict[str, float]]:
     """Errors of deferred light, and of no light, against light on all samples, with every extinction
     multiplied by each of the factors in `thinned`."""
-    each = ScattererTemplates(FLESH, LIGHTS, photons=8)
-    rows = []
+    each, rows = ScattererTemplates(FLESH, LIGHTS, photons=8), []
     for times in thinned:
-        thin = eqx.tree_at(lambda t: t.extinction, scene.transfer, replace_fn=lambda e, by=times: e * by)
+        thin = replace(scene.transfer, extinction=times * scene.transfer.extinction)
         under = scene._replace(transfer=thin)
         truth, once, unlit = (frame(under, how, seed).rgba for how in (each, Deferred(each), None))
         errors = {"rmse": float(rmse(once, truth)), "rmse of no light": float(rmse(unlit, truth))}

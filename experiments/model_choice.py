@@ -62,24 +62,32 @@ class Problem(NamedTuple):
     labels: list[str]
 
 
+def grid(resolution: int) -> tuple[np.ndarray, dict[str, Any]]:
+    """Points of [-1, 1]³, (n, n, n, 3), and the spacing and origin of a volume of them."""
+    line = np.linspace(-1, 1, resolution)
+    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
+    return points, {"spacing": (2 / (resolution - 1),) * 3, "origin": (-1.0,) * 3}
+
+
+def marching(volume: jv.Volume, *, labels: bool = False) -> jv.March:
+    return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(labels=labels),), "midpoint")
+
+
 def materials(resolution: int) -> Problem:
     """How many mean free paths?"""
-    line = np.linspace(-1, 1, resolution)
-    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
-    distance = np.stack([np.linalg.norm(grid - center, axis=-1) for center in CENTERS])
+    points, where = grid(resolution)
+    distance = np.stack([np.linalg.norm(points - center, axis=-1) for center in CENTERS])
     labels = np.where(distance.min(axis=0) < RADIUS, 1 + distance.argmin(axis=0), 0)
-    volume = jv.Volume(
-        labels.astype(np.float32), (2 / (resolution - 1),) * 3, (-1.0,) * 3, labels.astype(np.uint8)
-    )
-    march = _marching(volume, labels=True)
+    volume = jv.Volume(labels.astype(np.float32), labels=labels.astype(np.uint8), **where)
+    march = marching(volume, labels=True)
 
     def of_paths(paths: Sequence[Any]) -> tuple[jv.Material, ...]:
         return tuple(jv.Material(0.5, path, label=at + 1) for at, path in enumerate(paths))
 
-    def scene(parts: Any, camera: jv.Camera) -> tuple[Any, ...]:
+    def scene(given: Any, camera: jv.Camera) -> tuple[Any, ...]:
         functions = {
-            part.label: jv.TransferFunction((0, 4), (color, color), jnp.ones(2) / part.mean_free_path)
-            for part, color in zip(parts, COLORS, strict=True)
+            each.label: jv.TransferFunction((0, 4), (color, color), jnp.ones(2) / each.mean_free_path)
+            for each, color in zip(given, COLORS, strict=True)
         }
         return volume, jv.LabelTransferFunction(functions), camera, march
 
@@ -94,20 +102,16 @@ def materials(resolution: int) -> Problem:
     return Problem(scene, candidates, draw, [str(max(classes) + 1) for classes in CLASSES])
 
 
-def _marching(volume: jv.Volume, *, labels: bool = False) -> jv.March:
-    return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(labels=labels),), "midpoint")
-
-
-def control_points(resolution: int, points: Sequence[int]) -> Problem:
+def control_points(resolution: int, numbers: Sequence[int]) -> Problem:
     """How many control points?"""
-    line = np.linspace(-1, 1, resolution)
-    x, y, z = np.meshgrid(line, line, line, indexing="ij")
+    points, where = grid(resolution)
+    x, y, z = np.moveaxis(points, -1, 0)
     waves = 0.5 + 0.25 * (np.sin(3 * x + y) + np.sin(2 * y - 3 * z + 1))
-    volume = jv.Volume(waves.astype(np.float32), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
-    march = _marching(volume)
+    volume = jv.Volume(waves.astype(np.float32), **where)
+    march = marching(volume)
     start = jv.flat_grey(volume, 2, (0, 1))
     functions = [start]
-    for number in points[1:]:
+    for number in numbers[1:]:
         functions.append(jv.refined(functions[-1], number))
 
     def scene(transfer: Any, camera: jv.Camera) -> tuple[Any, ...]:
@@ -118,7 +122,7 @@ def control_points(resolution: int, points: Sequence[int]) -> Problem:
         colors = generator.uniform(0.1, 0.9, (len(values), 3))
         return jv.TransferFunction(values, colors, np.exp(generator.uniform(-2, 1, len(values))))
 
-    return Problem(scene, jv.nested_points(start, points), draw, list(map(str, points)))
+    return Problem(scene, jv.nested_points(start, numbers), draw, list(map(str, numbers)))
 
 
 def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any]:

@@ -38,6 +38,11 @@ BLURS = (1 / 8, 1 / 32, None)
 independent, as the covariance supposes."""
 HOW = {"max_steps": 100, "rtol": 1e-5, "patience": 4}
 NAMES = ("a", "b", "first β", "last β", "first σ", "last σ", "last γ")
+ENDINGS: Any = (
+    *(".a", ".b", ".beta_range[0]", ".beta_range[1]", ".sigma_range[0]", ".sigma_range[1]"),
+    (".last_gamma", ".gamma_range[1]"),
+)
+"""How `Uncertainty.standard_errors` calls them."""
 PLACES = ((60, -250, -110), (0, 0, 85), (1, 0, 0)), ((-220, 120, 40), (0, 0, 85), (0, 0, 1))
 """Position, focal point and up of the cameras, mm."""
 TISSUE = [
@@ -81,11 +86,11 @@ def cameras(size: int) -> list[jv.Camera]:
 
 
 def views(
-    scene: Scene, probe: jv.ToroidalMap, size: int, noise: float, seed: int, finer: int = 1
+    scene: Scene, probe: jv.ToroidalMap, seen: list[jv.Camera], noise: float, seed: int, finer: int = 1
 ) -> list[Any]:
     """References with their cameras."""
     rng = np.random.default_rng(seed)
-    images = [(camera, scene.reference(probe, camera, finer).image()) for camera in cameras(size)]
+    images = [(camera, scene.reference(probe, camera, finer).image()) for camera in seen]
     return [(camera, image + noise * rng.normal(size=image.shape)) for camera, image in images]
 
 
@@ -143,20 +148,8 @@ def determined(residual: Any, at: Any, truth: jv.ToroidalMap, **options: Any) ->
         warnings.simplefilter("ignore")  # that directions are not determined is what is asked here
         found = jv.fit(residual, at, **HOW | {"max_steps": 1}, **options).uncertainty
     assert found is not None
-    of_number = {
-        "a": ".a",
-        "b": ".b",
-        "first β": ".beta_range[0]",
-        "last β": ".beta_range[1]",
-        "first σ": ".sigma_range[0]",
-        "last σ": ".sigma_range[1]",
-        "last γ": (".last_gamma", ".gamma_range[1]"),
-    }
-    errors = {
-        number: next(error for name, error in found.standard_errors.items() if name.endswith(ending))
-        for number, ending in of_number.items()
-    }
-    relative = {name: errors[name] / scale for name, scale in zip(NAMES, scales(truth), strict=True)}
+    errors = [next(e for n, e in found.standard_errors.items() if n.endswith(ends)) for ends in ENDINGS]
+    relative = dict(zip(NAMES, np.divide(errors, scales(truth)).tolist(), strict=True))
     return {"undetermined": found.undetermined, "standard errors": relative}
 
 
@@ -176,43 +169,23 @@ class UpToScale(eqx.Module):
         return volume, transfer, scaled, march
 
 
-def as_it_is(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """Spheres and wires from known cameras."""
+def left_open(variant: str, resolution: int, size: int, seed: int) -> dict[str, Any]:
+    """What a variant of the problem leaves open."""
+    if variant == "shells through a window":  # of equal depth, their ends out of view
+        scene, probe = phantom(resolution, "shells", speckle=False)
+        inside = jv.Camera((20, 12, 350), (5, 3, 85), (1, 0, 0), 8.0, size=(size, size))
+        return determined(jv.ImageResidual(scene, views(scene, probe, [inside], NOISE, seed)), probe, probe)
     scene, probe = phantom(resolution)
-    residual = jv.ImageResidual(scene, views(scene, probe, size, NOISE, seed))
-    return determined(residual, probe, probe)
-
-
-def all_eight(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """The first depth is free, too."""
-    scene, probe = phantom(resolution)
+    targets = views(scene, probe, cameras(size), NOISE, seed)
+    if variant == "cameras up to scale":
+        residual = jv.ImageResidual(UpToScale(scene), targets)
+        return determined(residual, (probe, jnp.float32(1.0)), probe)
     free = jax.tree.map(lambda _: jv.Unconstrained(), probe)
-    residual = jv.ImageResidual(scene, views(scene, probe, size, NOISE, seed))
-    return determined(residual, probe, probe, constraints=free)
+    options = {"constraints": free} if variant == "all eight numbers" else {}
+    return determined(jv.ImageResidual(scene, targets), probe, probe, **options)
 
 
-def up_to_scale(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """The places of the cameras are known but for a factor."""
-    scene, probe = phantom(resolution)
-    residual = jv.ImageResidual(UpToScale(scene), views(scene, probe, size, NOISE, seed))
-    return determined(residual, (probe, jnp.float32(1.0)), probe)
-
-
-def through_a_window(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """Shells of equal depth, whose ends are out of view."""
-    scene, probe = phantom(resolution, "shells", speckle=False)
-    inside = jv.Camera((20, 12, 350), (5, 3, 85), (1, 0, 0), 8.0, size=(size, size))
-    image = scene.reference(probe, inside).image()
-    noise = NOISE * np.random.default_rng(seed).normal(size=image.shape)
-    return determined(jv.ImageResidual(scene, [(inside, image + noise)]), probe, probe)
-
-
-VARIANTS = {
-    "all eight numbers": all_eight,
-    "cameras up to scale": up_to_scale,
-    "shells through a window": through_a_window,
-    "spheres and wires": as_it_is,
-}
+VARIANTS = "all eight numbers", "cameras up to scale", "shells through a window", "spheres and wires"
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -255,24 +228,22 @@ def draw(result: dict[str, Any], path: Path) -> None:
 def main(chosen: Namespace) -> dict[str, Any]:
     starts, variants = directions(np.random.default_rng(chosen.seed), chosen.starts), VARIANTS
     if chosen.quick:  # each of the other variants takes a program of its own
-        starts, variants = dict(list(starts.items())[:1]), {"spheres and wires": as_it_is}
+        starts, variants = dict(list(starts.items())[:1]), ("spheres and wires",)
 
     def found_from(number: int) -> dict[str, Any]:
         name, signs = list(starts.items())[number]
         scene, truth = phantom(chosen.resolution, seed=chosen.seed + number)
-        targets = views(scene, truth, chosen.size, NOISE, chosen.seed + number, harness.FINER)
+        targets = views(scene, truth, cameras(chosen.size), NOISE, chosen.seed + number, harness.FINER)
         row = recovered(scene, targets, truth, moved(truth, signs))
         show({key: row[key] for key in ("worst", "steps", "message")}, name)
         return row
 
     with ThreadPoolExecutor(chosen.threads) as pool:
-        of_variants = {
-            name: pool.submit(variant, chosen.resolution, chosen.size, chosen.seed)
-            for name, variant in variants.items()
-        }
+        sizes = chosen.resolution, chosen.size, chosen.seed
+        of_variants = {name: pool.submit(left_open, name, *sizes) for name in variants}
         first = found_from(0)  # compiles what the others share
         rows = [first, *pool.map(found_from, range(1, len(starts)))]
-        left_open = {name: of_variants[name].result() for name in reversed(variants)}
+        answers = {name: of_variants[name].result() for name in reversed(variants)}
     return {
         "image": [chosen.size, chosen.size],
         "off": OFF,
@@ -281,7 +252,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "step, voxels": VOXELS,
         "blurs": BLURS,
         "recovered": dict(zip(starts, rows, strict=True)),
-        "left open": left_open,
+        "left open": answers,
     }
 
 
