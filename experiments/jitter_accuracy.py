@@ -100,8 +100,8 @@ def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> l
         under = {name: jv.March(step * voxel, marches.transforms(name, seed)) for name in METHODS}
         drawn = {name: partial(frame, scene, march) for name, march in under.items()}
         seconds = timing.interleaved(drawn, repetitions)
-        for name, march in under.items():
-            rendering = frame(scene, march)
+        for name in under:
+            rendering = drawn[name]()
             assert not np.any(rendering.exhausted)
             error = image(rendering) - truth
             rows.append(
@@ -122,17 +122,14 @@ def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> l
 
 def compared(result: dict[str, list[dict[str, Any]]]) -> str:
     """A sentence that compares the RMSE of both jitters with that of ray casting."""
-
-    def over(name: str) -> str:
-        ratios = []
-        for rows in result.values():
-            errors = {(row["step"], row["march"]): row["rmse off the face"] for row in rows}
-            ratios += [
-                error / errors[at, marches.PLAIN] for (at, march), error in errors.items() if march == name
-            ]
-        return f"{name} {min(ratios):.2f} to {max(ratios):.2f}"
-
-    return f"RMSE off the cut face / ray casting: {over(marches.JITTER)}, {over(marches.EMPTY)}."
+    ratios: dict[str, list[float]] = {marches.JITTER: [], marches.EMPTY: []}
+    for rows in result.values():
+        errors = {(row["step"], row["march"]): row["rmse off the face"] for row in rows}
+        for (step, march), error in errors.items():
+            if march in ratios:
+                ratios[march].append(error / errors[step, marches.PLAIN])
+    said = (f"{name} {min(each):.2f} to {max(each):.2f}" for name, each in ratios.items())
+    return f"RMSE off the cut face / ray casting: {', '.join(said)}."
 
 
 def draw(result: dict[str, Any], path: Path) -> None:

@@ -8,13 +8,19 @@ image, over white, against one converged image of ours; VTK's image is compared 
 display would show it.
 
 Also measured: the time of our frame as a program under `jax.jit`, without what Python does before it; the
-time from the start of a fresh process to its first image (`fresh.py`); and, with --gradients, the time of an
+time from the start of a fresh process to its first image; and, with --gradients, the time of an
 image with the gradient of every entry of a transfer function (256 for 8-bit data), and with that of every
 voxel as float32, relative to the image alone and to Dr.Jit's replay adjoint, with the relative difference of
 the two gradients.
 """
 
 import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
@@ -28,12 +34,13 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 import jaxvol as jv
+from jaxvol.metrics import rmse
 from jaxvol.xla.compiling import OPTIONS
 
-from . import charts, fresh, harness, marches, peer_vtk, programs, timing
+from . import charts, harness, marches, peer_vtk, programs, timing
 from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
 from .programs import DRJIT, THREADS, VTK, Case, is_here
-from .scenes import PHANTOM, SCENES, Scene
+from .scenes import PHANTOM, SCENES, Scene, seen_head
 
 
 OURS, PLAIN, VTK_RAYS = "jaxvol", "jaxvol, plain", "VTK, its rays alone"
@@ -88,16 +95,12 @@ def gradients(
     if of == "voxels":
         volume = eqx.tree_at(lambda v: v.data, volume, jnp.asarray(volume.data, jnp.float32))
         scene = scene._replace(volume=volume)
-    leaf = volume.data if of == "voxels" else (transfer.colors, transfer.extinction)
-    march = fast(scene)
+    where: Any = (lambda p: p[0].data) if of == "voxels" else (lambda p: (p[1].colors, p[1].extinction))
+    leaf, march = where((volume, transfer)), fast(scene)
 
     def loss(leaf: Any, march: jv.March = march) -> jax.Array:
-        if of == "voxels":
-            here = scene._replace(volume=eqx.tree_at(lambda v: v.data, volume, leaf))
-        else:
-            changed = eqx.tree_at(lambda t: (t.colors, t.extinction), transfer, leaf)
-            here = scene._replace(transfer=changed)
-        return jnp.mean(harness.image(here, march).rgba ** 2)
+        volume_, transfer_ = eqx.tree_at(where, (volume, transfer), leaf)
+        return jnp.mean(harness.image(scene._replace(volume=volume_, transfer=transfer_), march).rgba ** 2)
 
     def entries(found: Any) -> np.ndarray:
         return np.asarray(found) if of == "voxels" else np.column_stack(found)
@@ -131,6 +134,62 @@ def gradients(
     if DRJIT in seconds:
         found["Dr.Jit over ours"] = timing.ratio(seconds[DRJIT], both)
     return found
+
+
+# -- the first image of a process ---------------------------------------------------------------------------
+
+CACHE = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+"""Small programs are kept as well."""
+
+CHILD = """
+import json, sys, time
+begun, voxels, size, left, image = sys.argv[1:]
+import numpy as np
+import jax
+import jaxvol as jv
+imported = time.time()
+from experiments.scenes import seen_head
+data = np.load(voxels)
+volume = jv.Volume(data, (2 / (data.shape[0] - 1),) * 3, (-1.0,) * 3)
+scene = seen_head(volume, int(size))
+march = jv.March(scene.step, (jv.SpaceLeaping(), jv.EarlyTermination(float(left))))
+ready = time.time()
+rendering = jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
+rendering = jax.block_until_ready(rendering)
+done = time.time()
+np.save(image, rendering.rgba)
+times = [at - float(begun) for at in (imported, ready, done)]
+print(json.dumps(dict(zip(("import", "scene", "image"), times))))
+"""
+
+
+def first_image(size: int, resolution: int, repetitions: int) -> dict[str, Any]:
+    """Seconds from the start of a process until import, scene and image of the head phantom are done: without
+    a compilation cache, and where programs were compiled before."""
+    volume = jv.phantom("head", resolution)
+    scene = seen_head(volume, size)
+    truth = harness.frame(scene, marches.converged(scene.step, harness.FINER)).rgba
+    found: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        voxels, image, cache = (Path(folder) / name for name in ("voxels.npy", "image.npy", "cache"))
+        np.save(voxels, np.asarray(volume.data))
+
+        def child(more: dict[str, str]) -> dict[str, float]:
+            settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | more
+            words = [str(time.time()), str(voxels), str(size), str(LEFT), str(image)]
+            how: dict[str, Any] = {"cwd": Path(__file__).parent.parent, "env": settings, "text": True}
+            ran = subprocess.run(
+                [sys.executable, "-c", CHILD, *words], capture_output=True, check=True, **how
+            )
+            return json.loads(ran.stdout.splitlines()[-1])
+
+        warm = {**CACHE, "JAX_COMPILATION_CACHE_DIR": str(cache)}
+        child(warm)  # fills the cache
+        for name, more in (("nothing kept", {}), ("compiled before", warm)):
+            times = [child(more) for _ in range(repetitions)]
+            medians = {part: timing.median([t[part] for t in times]) for part in times[0]}
+            found[name] = {**medians, "all": times, "rmse": rmse(np.load(image), truth)}
+    return {"pixels": size, "voxels": resolution, "settings": CACHE, **found}
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -206,7 +265,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
                 show(slopes[name], name, size, "gradient")
     first = None
     if chosen.processes:
-        first = fresh.measure(chosen.sizes[0], chosen.resolution, LEFT, chosen.processes)
+        first = first_image(chosen.sizes[0], chosen.resolution, chosen.processes)
     return {
         "sizes": chosen.sizes,
         "steps to a voxel": chosen.steps,
