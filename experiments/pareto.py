@@ -114,7 +114,6 @@ def concluded(name: str, found: dict[str, Any], options: list[str]) -> dict[str,
         "jaxvol's front is left of and below all points of VTK and Dr.Jit": not ahead if theirs else None,
         "their points that it is not": ahead,
         "points": points,
-        **({"gradients": found["gradients"]} if "gradients" in found else {}),
     }
 
 

@@ -6,14 +6,9 @@ many templates. Its own error is estimated twice: by the difference to the image
 some pixels, to `render_ray_reference` in float64 by the midpoint rule, at half the step (under a thin peak
 at an eighth). In lit scenes both take one template only, and a third estimate follows from the difference to
 half as many templates from another seed.
-
-Gradients are those of the mean square of all premultiplied pixels, by `adjoint="replay"`, to the colours and
-to the extinction of all control points. Extinctions of 0, whose gradient leaping leaves out by design, do not
-count.
 """
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +21,9 @@ from PIL import Image as Pillow
 import jaxvol as jv
 from jaxvol.lighting import Lighting
 from jaxvol.metrics import psnr, rmse, ssim, wood_grain_energy
-from jaxvol.xla.compiling import OPTIONS
 
-from . import harness, pareto_points, programs, timing
-from .pareto_points import BASE, GRADIENTS, Setting
+from . import harness, pareto_points, programs
+from .pareto_points import Setting
 from .pareto_scenes import ROWS, Row
 from .programs import Case, Image, Program, Quadrature, lighting_of, program
 
@@ -45,8 +39,6 @@ PIXELS = 256
 """Compared with float64."""
 SEEDS = 1001, 2002
 """Of the reference's templates: not those of the settings."""
-FINER = 8
-"""Steps in a voxel of the converged gradient."""
 
 
 class Sizes(NamedTuple):
@@ -90,8 +82,6 @@ def scene(name: str, folder: Path, sizes: Sizes, settings: dict[str, Setting]) -
             found["points"][point] = {"family": family, **rows[point], **quality(each, truth)}
             small(beside(each, truth)).save(folder / f"{slug(point)}.webp", quality=72, method=6)
         harness.show({n: found["points"][n] for n in made}, name)
-    if row.gradients:
-        found["gradients"] = gradients(case, settings, sizes.repetitions)
     jax.clear_caches()  # a process cannot hold the programs of all scenes
     return found
 
@@ -199,49 +189,3 @@ def doubled(leaf: Any) -> Any:
     if eqx.is_inexact_array(leaf):
         return jnp.asarray(np.asarray(leaf, np.float64))
     return leaf
-
-
-# -- gradients --------------------------------------------------------------------------------------------
-
-
-def gradients(case: Case, settings: dict[str, Setting], repetitions: int) -> dict[str, Any]:
-    """By setting, where one is compared: relative errors, seconds, and their ratio to the base's image."""
-    transfer = case.scene.transfer
-    truth, coarser = (
-        gradient(program(case, fine(case, finer)).of_transfer, transfer)()[1] for finer in (FINER, FINER / 2)
-    )
-    rows, drawn = {}, {"image": settings[BASE].make(case).draw}
-    for name in (name for name in GRADIENTS if name in settings):
-        drawn[name] = gradient(settings[name].make(case).of_transfer, transfer)
-        rows[name] = relative(drawn[name]()[1], truth, transfer)
-    seconds = timing.interleaved(drawn, repetitions)
-    for name, row in rows.items():
-        row["seconds"] = timing.median(seconds[name])
-        row["over the base's image"] = timing.ratio(seconds[name], seconds["image"])
-    own = relative(coarser, truth, transfer)
-    return {"steps in a voxel": FINER, "reference to twice its step": own, "points": rows}
-
-
-def gradient(
-    rgba: Callable[[jv.TransferFunction], jax.Array] | None, transfer: jv.TransferFunction
-) -> Callable[[], Any]:
-    """A program of the image's loss and its gradient, to the colours and to the extinction."""
-    assert rgba is not None
-
-    def loss(leaf: Any) -> jax.Array:
-        return jnp.mean(rgba(eqx.tree_at(lambda t: (t.colors, t.extinction), transfer, leaf)) ** 2)
-
-    # compiled as one program, like the image
-    both = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
-    return lambda: both((transfer.colors, transfer.extinction))
-
-
-def relative(found: Any, truth: Any, transfer: jv.TransferFunction) -> dict[str, Any]:
-    """|g - g*| / |g*|, of colours and of extinctions."""
-    visible = np.asarray(transfer.extinction) > 0
-
-    def of(g: jax.Array, exact: jax.Array) -> float:
-        ours, theirs = (np.asarray(each, np.float64)[visible] for each in (g, exact))
-        return float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
-
-    return {"colours": of(found[0], truth[0]), "extinction": of(found[1], truth[1])}

@@ -223,13 +223,6 @@ OF_DRJIT = {
     for step in STEPS[1:]
 }
 
-GRADIENTS = (
-    *("midpoint, step 0.5", BASE, "midpoint, step 2", "left, step 1", "preintegrated, step 1"),
-    *("adaptive, tolerance 0.01", "not aligned, step 1", "no leaping, step 1"),
-    *("empty-space jittered, step 1", "ending at 0.01", f"ending at {1 / 255:g}"),
-)
-"""At which gradients are compared."""
-
 
 def of(row: Row, there: dict[str, str]) -> Settings:
     """The settings of a scene, its base first; `there`: version of each peer, or why it is missing."""

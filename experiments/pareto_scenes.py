@@ -30,7 +30,6 @@ class Row(NamedTuple):
     - `file`: the real volume, None for a phantom.
     - `peers`: None, or why VTK and Dr.Jit are left out.
     - `kind`: which settings it is rendered under.
-    - `gradients`: whether gradients are measured, too.
     - `finer`, `quadrature`: of the converged image, into how many parts it divides a step, and its rule.
     - `part`: of the image's side, where frames take longer.
     """
@@ -42,7 +41,6 @@ class Row(NamedTuple):
     peers: str | None = None
     toroidal: bool = False
     kind: Kind = "unlit"
-    gradients: bool = False
     finer: int = 16
     quadrature: Quadrature = "midpoint"
     part: float = 1.0
@@ -140,11 +138,11 @@ PEAK: Any = {"finer": 32, "quadrature": "preintegrated"}
 TOROIDAL: Any = {"peers": UNBENT, "toroidal": True, "finer": 8, "part": 0.25}
 
 ROWS: dict[str, Row] = {
-    PHANTOM: Row(head, gradients=True),
+    PHANTOM: Row(head),
     f"{PHANTOM}, inside": Row(partial(within, head), view="inside"),
     f"{PHANTOM}, opaque": Row(skin, look="opaque"),
     f"{PHANTOM}, thin peak": Row(partial(thin, head), look="thin peak", **PEAK),
-    "engine": Row(partial(real, "engine"), ENGINE, gradients=True),
+    "engine": Row(partial(real, "engine"), ENGINE),
     "engine, thin peak": Row(partial(thin, partial(real, "engine")), ENGINE, look="thin peak", **PEAK),
     "bonsai": Row(partial(real, "bonsai"), BONSAI),
     "bonsai, inside": Row(partial(within, partial(real, "bonsai")), BONSAI, view="inside"),

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -56,36 +55,26 @@ class Program(NamedTuple):
     - `draw`: renders a frame; this is what is timed.
     - `image`: the frame, linear RGB over white.
     - `seen`: the converged image as this program's display would show it.
-    - `of_transfer`: the frame's premultiplied RGBA, as a function of the transfer function; None where it
-      cannot be differentiated.
     - `samples`: mean number of a ray's samples; None where that is not known.
     """
 
     draw: Callable[[], Any]
     image: Callable[[], Image]
     seen: Callable[[Image], Image] = lambda truth: truth
-    of_transfer: Callable[[jv.TransferFunction], jax.Array] | None = None
     samples: Callable[[], float] | None = None
 
 
 def program(case: Case, march: jv.March, lighting: Lighting | None = None) -> Program:
-    volume, transfer, camera, _ = case.scene
-
-    def render(transfer: jv.TransferFunction, outputs: Any = "rgba") -> jv.Rendering:
+    def render(outputs: Any = "rgba") -> jv.Rendering:
         how = {"compositing": case.compositing, "lighting": lighting, "outputs": outputs}
-        return jv.render(volume, transfer, camera, march, **how)
+        return jv.render(*case.scene[:3], march, **how)
 
     def image() -> np.ndarray:
-        rendering = render(transfer)
+        rendering = render()
         assert not np.any(rendering.exhausted)
         return np.asarray(rendering.image())
 
-    return Program(
-        lambda: render(transfer).rgba,
-        image,
-        of_transfer=lambda t: render(t).rgba,
-        samples=lambda: float(np.mean(render(transfer, "all").samples)),
-    )
+    return Program(lambda: render().rgba, image, samples=lambda: float(np.mean(render("all").samples)))
 
 
 def ours(

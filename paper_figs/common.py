@@ -32,15 +32,19 @@ def pictures(
     render: Callable[[Namespace], Panels],
     resolution: int = 160,
     size: int = 256,
+    data: bool = False,
 ) -> Main:
     """The `main` of a page of pictures of scenes.
 
     - `title`: of the page, or a function from the options to it.
     - `render`: from the options to the panels.
     - `resolution`: voxels along an axis of a phantom, by default. `size`: pixels along a side of an image.
+    - `data`: whether it can show real volumes.
     """
 
-    @command(f"Renders {name}.", OUTPUT, data=DATA, size=size, resolution=resolution, quick=QUICK)
+    @command(
+        f"Renders {name}.", OUTPUT, data=DATA if data else (), size=size, resolution=resolution, quick=QUICK
+    )
     def main(chosen: Namespace) -> None:
         if chosen.quick:
             chosen.size, chosen.resolution = 48, 40

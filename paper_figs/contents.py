@@ -25,7 +25,7 @@ class Entry:
     - `reported`: what the paper shows and reports. `ours`: what to look at in ours.
     - `record`: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes,
       so that the kept picture is its record.
-    - `data`: whether the kept picture shows real volumes (`--data`).
+    - `data`: whether it shows real volumes (`--data`).
     """
 
     name: str

@@ -10,22 +10,14 @@ from experiments.pictures.kim import kim_fig8, order_of_bricks
 from .common import OUTPUT, pictures
 
 
-def fig10(chosen: Namespace) -> str:
-    shown = "bones of the chest" if chosen.data else "a cut engine"
-    return f"Fig. 10: {shown} in place of the heart; boundary noise is that of the cut faces"
-
-
-def fig11(chosen: Namespace) -> str:
-    shown = "a cut engine" if chosen.data else "a colon in soft tissue"
-    return f"Fig. 11: {shown} in place of the kidney; boundary noise is that of the cut face"
-
-
 def chae_fig6(chosen: Namespace) -> str:
     size = chosen.size * chae.WHOLE
     return f"Chae and Shin, Fig. 6: part of an image of {size} x {size} pixels"
 
 
 FIG09 = "Fig. 9: the head; boundary noise is that of the cut face"
+FIG10 = "Fig. 10: a cut engine in place of the heart; boundary noise is that of the cut faces"
+FIG11 = "Fig. 11: a colon in soft tissue in place of the kidney; boundary noise is that of the cut face"
 FIG12 = "Fig. 12: vessels; boundary noise is that of the pixels that alignment changes"
 KIM = "Kim, Kwon and Shin, Fig. 8: bricks of a scan, in the wrong and the right order"
 KISTI = "KISTI report, Fig. V-1: a head and an engine under two transfer functions"
@@ -68,18 +60,18 @@ def kim_fig6(chosen: Namespace) -> None:
 PICTURES: dict[str, Main] = {
     "fig01": pictures("fig01", "Fig. 1: wood grain, and noise on the cut face", kye.fig01),
     "fig09": pictures("fig09", FIG09, kye.fig09),
-    "fig10": pictures("fig10", fig10, kye.fig10),
-    "fig11": pictures("fig11", fig11, kye.fig11),
+    "fig10": pictures("fig10", FIG10, kye.fig10),
+    "fig11": pictures("fig11", FIG11, kye.fig11),
     "fig12": pictures("fig12", FIG12, kye.fig12),
     "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13),
     "chae_fig6": pictures("chae_fig6", chae_fig6, chae.chae_fig6, resolution=256),
     "kim_fig6": kim_fig6,
     "kim_fig8": pictures("kim_fig8", KIM, kim_fig8, resolution=360),
-    "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, size=320),
+    "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, size=320, data=True),
     "lee_fig_steps": pictures("lee_fig_steps", STEPS, lee_steps.lee_fig_steps, resolution=96),
     "lee_fig4": pictures("lee_fig4", EAR, lee.lee_fig4, resolution=96),
     "lee_fig5": pictures("lee_fig5", HAND, lee.lee_fig5, size=512),
     "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=512),
-    "gallery": pictures("gallery", "Kinds of light", lee.gallery, resolution=128),
+    "gallery": pictures("gallery", "Kinds of light", lee.gallery, resolution=128, data=True),
 }
 """By the name of what is written."""

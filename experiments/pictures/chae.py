@@ -21,8 +21,7 @@ GREEN = (0.0, 0.7, 0.05)
 def chae_fig6(chosen: Namespace) -> Panels:
     """A part of the image without leaping, and under growing cells. Below, wrong pixels are green."""
     side, size = chosen.size, round(chosen.size * WHOLE)
-    make = minimum_distance.airway if chosen.data else minimum_distance.colon
-    scene = make(chosen.data, size, **({} if chosen.data else {"resolution": chosen.resolution}))
+    scene = minimum_distance.colon(None, size, chosen.resolution)
     left, top = (round(middle * size - side / 2) for middle in MIDDLE)
     part = slice(top, top + side), slice(left, left + side)
     reference = frame(scene, minimum_distance.march(scene, None))

@@ -53,12 +53,6 @@ def camera(volume: jv.Volume, chosen: Namespace, direction: tuple, up: tuple = (
 
 def head(chosen: Namespace) -> View:
     """The crown is cut off."""
-    if chosen.data:  # z grows towards the chin
-        volume = jv.load(chosen.data / "cthead_256x256x113_uint16le.raw.gz", spacing=(1, 1, 2))
-        volume = cropped(volume, (0, 0, 0.35), (1, 1, 1))
-        seen = camera(volume, chosen, (-0.5, -1, -0.75), (0, 0, -1)).zoom(1.4)
-        transfer = jv.preset("ct_skin_bone", clim=(0, 4000), unit_distance=0.1)
-        return View(Scene(volume, transfer, seen, 1.5), 3.3, (0.4, 0.45))
     volume = cropped(jv.phantom("head", chosen.resolution), (0, 0, 0), (1, 1, 0.62))
     seen = camera(volume, chosen, (0.5, -1, 0.75)).zoom(1.7, (0.52, 0.46))
     transfer = jv.TransferFunction.from_points(SKIN, unit_distance=0.03)
@@ -66,12 +60,7 @@ def head(chosen: Namespace) -> View:
 
 
 def heart(chosen: Namespace) -> View:
-    """An engine, cut open; with real data, bones of a chest, whose faces all cut tissue."""
-    if chosen.data:
-        file = chosen.data / "lidc0314_airway_256x192x200_int16le.raw.gz"
-        volume = jv.load(file, spacing=(0.78125, 0.78125, 1))
-        seen = camera(volume, chosen, (0.4, -1, -0.6)).zoom(1.4)
-        return View(Scene(volume, jv.preset("ct_bone", unit_distance=0.2), seen, 1.5), 3.5, (0.5, 0.4))
+    """An engine, cut open."""
     volume = cropped(jv.phantom("engine", chosen.resolution), (0, 0, 0), (0.6, 1, 1))
     seen = camera(volume, chosen, (1, -0.8, 0.5)).zoom(1.4)
     transfer = jv.TransferFunction.from_points(METAL, unit_distance=0.03)
@@ -79,11 +68,7 @@ def heart(chosen: Namespace) -> View:
 
 
 def kidney(chosen: Namespace) -> View:
-    """A colon in soft tissue, cut across; with real data, an engine."""
-    if chosen.data:
-        volume = cropped(jv.load(chosen.data / "engine_256x256x128_uint8.raw.gz"), (0, 0.3, 0), (1, 1, 1))
-        seen = camera(volume, chosen, (0.5, -1, -0.7), (0, 0, -1)).zoom(1.4)
-        return View(Scene(volume, jv.preset("engine", unit_distance=0.2), seen, 1.5), 4, (0.45, 0.5))
+    """A colon in soft tissue, cut across."""
     volume = cropped(jv.phantom("colon", chosen.resolution), (0, 0, 0), (1, 1, 0.6))
     seen = camera(volume, chosen, (0.4, -0.8, 1)).zoom(1.3)
     transfer = jv.TransferFunction.from_points(TISSUE, unit_distance=0.03)
@@ -91,12 +76,7 @@ def kidney(chosen: Namespace) -> View:
 
 
 def vessels(chosen: Namespace) -> View:
-    """The lower face cuts their root; with real data, the arteries of an aneurism."""
-    if chosen.data:
-        volume = cropped(jv.load(chosen.data / "aneurism_256x256x256_uint8.raw.gz"), (0, 0, 0.35), (1, 1, 1))
-        seen = camera(volume, chosen, (0.5, -1, 0.6)).zoom(1.5)
-        transfer = jv.TransferFunction.from_points(CONTRAST, 2.0)
-        return View(Scene(volume, transfer, seen, 2.0), 6, (0.5, 0.84))
+    """The lower face cuts their root."""
     volume = jv.phantom("vessels", chosen.resolution)
     seen = camera(volume, chosen, (0.5, -1, 0.6)).zoom(1.5, (0.5, 0.52))
     transfer = jv.TransferFunction.from_points(CONTRAST, unit_distance=0.03)

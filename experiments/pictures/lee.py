@@ -199,8 +199,6 @@ def lee_fig6(chosen: Namespace) -> Panels:
         "the head phantom": head(chosen.size, chosen.resolution),
         "a frog": frog(chosen.size, chosen.resolution),
     }
-    if chosen.data:
-        subjects["CT of a head"] = ct_head(chosen.data, chosen.size)
     columns: dict[str, Any] = {
         "unlit": None,
         "hard, one of 8 for each pixel": {"occlusion": "hard"},
