@@ -66,12 +66,11 @@ def settings(there: dict[str, str]) -> dict[tuple[str, float], Any]:
 def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
     made: dict[Any, Program] = {key: make(Case(scene)) for key, make in settings(there).items()}
     rows = programs.measured(made, programs.converged(scene, FINER), repetitions)
-    found: Rows = {name: {} for name in STYLES if any(of == name for of, _ in made)}
-    for (name, setting), each in made.items():
-        row = found[name][str(setting)] = rows[name, setting]
+    for key, each in made.items():
         if each.samples is not None:
-            row["samples"] = round(each.samples(), 2)
-    return {name: dict(sorted(by.items(), key=lambda item: float(item[0]))) for name, by in found.items()}
+            rows[key]["samples"] = round(each.samples(), 2)
+    found = {name: {str(s): rows[of, s] for of, s in sorted(rows) if of == name} for name in STYLES}
+    return {name: by_setting for name, by_setting in found.items() if by_setting}
 
 
 def at_error(rows: dict[str, dict[str, Any]], error: float, what: str) -> float | None:
@@ -103,17 +102,16 @@ def against_uniform(rows: Rows) -> dict[str, dict[str, float | None]]:
 def time_to_accuracy(rows: Rows) -> dict[str, dict[str, float]]:
     """By peer and error, how many times longer than ours the peer takes to an image of this error, each by
     its best setting: VTK at its own error at one voxel; Dr.Jit at three errors, where both reach them."""
-    our, theirs = (ADAPTIVE, *QUADRATURES), (f"{DRJIT}, left", f"{DRJIT}, midpoint")
-    found: dict[str, dict[str, float]] = {VTK: {}, DRJIT: {}}
+    compared = [(DRJIT, f"{error:g}", error) for error in ERRORS]
     if VTK in rows:
-        drawn = rows[VTK]["1.0"]
-        taken = least(rows, our, drawn["rmse"], "seconds")
-        if taken is not None:
-            found[VTK][f"{drawn['rmse']:.4f}"] = drawn["seconds"] / taken
-    for error in ERRORS:
-        mine, their = (least(rows, names, error, "seconds") for names in (our, theirs))
-        if mine is not None and their is not None:
-            found[DRJIT][f"{error:g}"] = their / mine
+        error = rows[VTK]["1.0"]["rmse"]
+        compared.append((VTK, f"{error:.4f}", error))
+    found: dict[str, dict[str, float]] = {VTK: {}, DRJIT: {}}
+    for peer, name, error in compared:
+        theirs = (VTK,) if peer == VTK else (f"{DRJIT}, left", f"{DRJIT}, midpoint")
+        our, their = (least(rows, n, error, "seconds") for n in ((ADAPTIVE, *QUADRATURES), theirs))
+        if our is not None and their is not None:
+            found[peer][name] = their / our
     return found
 
 

@@ -6,8 +6,8 @@ scenes, beside VTK and Dr.Jit. Settings are timed in turn with the scene's base;
 ratio to the base, times the base's median time over the whole scene. Errors are those of linear RGB over
 white against a converged image, whose own error is estimated (`pareto_measure`).
 
-Ctrl-C stops at the scenes that are finished. `--scene` measures some scenes again and keeps what the record
-says of the others, with the commit that they are of. `--point` renders one point of one scene again, times it
+`--scene` measures some scenes again and keeps what the record says of the others, with the commit that they are
+of. `--point` renders one point of one scene again, times it
 and saves its picture beside its error. The record is `pareto.json`, the chart `pareto.png`, the page
 `pareto.html` (see `pareto_page`), the pictures that it shows are in the folder `pareto/`.
 
@@ -48,17 +48,11 @@ Point: TypeAlias = tuple[float, float]
 
 def front(points: Sequence[Point]) -> list[int]:
     """Numbers of the points of which none other is better in one and as good in both, by growing error. Of
-    points that are equal in both, all are kept.
-
-    **Raises:** `ValueError` for points that are not pairs of numbers, and for NaN.
-    """
-    at = np.asarray(points, float).reshape(-1, 2) if len(points) == 0 else np.asarray(points, float)
-    if at.ndim != 2 or at.shape[1] != 2 or np.isnan(at).any():
-        raise ValueError(f"points must be pairs of numbers, (error, time), without NaN; got {points!r}.")
+    points that are equal in both, all are kept."""
     found: list[int] = []
-    for i in np.lexsort((at[:, 1], at[:, 0])):
-        if not found or at[i, 1] < at[found[-1], 1] or (at[i] == at[found[-1]]).all():
-            found.append(int(i))
+    for i in sorted(range(len(points)), key=lambda i: points[i]):
+        if not found or points[i][1] < points[found[-1]][1] or points[i] == points[found[-1]]:
+            found.append(i)
     return found
 
 
@@ -184,25 +178,13 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
         return None
 
     options = [f"--{n}={getattr(chosen, n)}" for n in ("size", "resolution", "repetitions", "seed")]
-    made = {
-        "commit": record.commit(),
-        "command": shlex.join(["python", "-m", *chosen.command]),
-    }
+    made = {"commit": record.commit(), "command": shlex.join(["python", "-m", *chosen.command])}
     scenes: dict[str, Any] = {}
-    try:
-        for name in names:
-            few = pareto_points.few if chosen.quick else dict
-            found = pareto_measure.scene(
-                name, folder / slug(name), sizes, few(pareto_points.of(ROWS[name], present))
-            )
-            scenes[name] = {
-                "measured": made,
-                **concluded(name, found, ["--quick"] if chosen.quick else options),
-            }
-    except KeyboardInterrupt:
-        print(f"interrupted after {len(scenes)} scenes")
-        if not scenes:
-            return None
+    for name in names:
+        settings = pareto_points.of(ROWS[name], present)
+        settings = pareto_points.few(settings) if chosen.quick else settings
+        found = pareto_measure.scene(name, folder / slug(name), sizes, settings)
+        scenes[name] = {"measured": made, **concluded(name, found, ["--quick"] if chosen.quick else options)}
     same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
     scenes |= recorded(chosen, "scenes", [name for name in ROWS if name not in scenes], same)
     scenes = {name: scenes[name] for name in ROWS if name in scenes}

@@ -21,7 +21,7 @@ import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -45,19 +45,12 @@ THIN = 0.1
 """Part of the mean density below which the bijection bends. With 1, low densities change too slowly."""
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
 FBP, SART, OURS = "FBP", "SART", "jaxvol"
+STEP, STEP_OF_VIEWS = 0.5, 1 / 6
+"""Of the fit, and of the views, in voxels."""
 
 Rays = tuple[Float[Array, "views columns slices 3"], Float[Array, "views columns slices 3"]]
 Sinogram = Float[Array, "views columns slices"]
 Density = Float[np.ndarray, "n n n"]
-
-
-class Setting(NamedTuple):
-    """Numbers of iterations, and the renderer's steps in voxels."""
-
-    sweeps: int
-    evaluations: int
-    step: float = 0.5
-    step_of_views: float = 1 / 6
 
 
 def angles(views: int) -> np.ndarray:
@@ -98,10 +91,9 @@ class Difference(eqx.Module):
     rays: Rays
     measured: Sinogram
     unit: Float[Array, ""]
-    step: float = eqx.field(static=True)
 
     def __call__(self, density: Array) -> Array:
-        return (line_integrals(density, self.rays, self.step) - self.measured) / self.unit
+        return (line_integrals(density, self.rays, STEP) - self.measured) / self.unit
 
 
 class Progress:
@@ -122,7 +114,7 @@ class Progress:
         self.begun = time.perf_counter()
 
 
-def filtered(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+def filtered(sinogram: np.ndarray, truth: Density) -> tuple[Progress, str]:
     """FBP with each filter."""
     progress = Progress(truth)
     for name in FILTERS:
@@ -132,10 +124,10 @@ def filtered(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Pr
     return progress, f"the filter {FILTERS[best]}"
 
 
-def algebraic(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+def algebraic(sinogram: np.ndarray, truth: Density, sweeps: int) -> tuple[Progress, str]:
     """SART, one sweep over all views after the other."""
     progress, slices = Progress(truth), [None] * sinogram.shape[2]
-    for _ in range(setting.sweeps):
+    for _ in range(sweeps):
         slices = [
             iradon_sart(one.T, angles(len(one)), image=image, clip=(0, np.inf))
             for one, image in zip(np.moveaxis(sinogram, 2, 0), slices, strict=True)
@@ -144,13 +136,13 @@ def algebraic(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[P
     return progress, "sweeps over all views"
 
 
-def fitted(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+def fitted(sinogram: np.ndarray, truth: Density, evaluations: int) -> tuple[Progress, str]:
     """L-BFGS from a flat and thin density: `THIN` times the mean density, estimated from the views."""
     views, n, _ = sinogram.shape
     thin = THIN * float(sinogram.mean()) / n
     # the loss has a curvature of about 1 where all densities change alike: a first step has the right length
     unit = jnp.float32(thin * np.sqrt(views * n))
-    residual = Difference(rays(n, views), jnp.asarray(sinogram), unit, setting.step)
+    residual = Difference(rays(n, views), jnp.asarray(sinogram), unit)
 
     def fit(evaluations: int, look: Callable[[Any], None]) -> jv.Fit:
         return jv.fit(
@@ -165,19 +157,23 @@ def fitted(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Prog
 
     fit(2, lambda density: None)  # compiles before the clock starts
     progress = Progress(truth)
-    fit(setting.evaluations, progress.look)
+    fit(evaluations, progress.look)
     return progress, "evaluations with gradient"
 
 
-METHODS = {FBP: filtered, SART: algebraic, OURS: fitted}
+METHODS = FBP, SART, OURS
 
 
-def measure(truth: Density, views: int, photons: float | None, setting: Setting, seed: int) -> dict[str, Any]:
+def measure(truth: Density, photons: float | None, chosen: Namespace) -> dict[str, Any]:
     """The error of each method; the slice to be drawn is kept under `"slice"`."""
-    exact = np.array(line_integrals(truth, rays(len(truth), views), setting.step_of_views))
-    sinogram, middle, rows = counted(exact, photons, seed), truth.shape[2] // 2, {}
-    for name, method in METHODS.items():
-        progress, counts = method(sinogram, truth, setting)
+    exact = np.array(line_integrals(truth, rays(len(truth), chosen.views), STEP_OF_VIEWS))
+    sinogram, middle, rows = counted(exact, photons, chosen.seed), truth.shape[2] // 2, {}
+    found = {
+        FBP: filtered(sinogram, truth),
+        SART: algebraic(sinogram, truth, chosen.sweeps),
+        OURS: fitted(sinogram, truth, chosen.evaluations),
+    }
+    for name, (progress, counts) in found.items():
         nearest, last = min(progress.rows, key=lambda row: row["rmse"]), progress.rows[-1]
         assert progress.nearest is not None
         rows[name] = {
@@ -240,11 +236,10 @@ def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> N
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     truth = np.asarray(jv.phantom("head", chosen.resolution).data, np.float32) / 255 * DENSEST
-    setting = Setting(chosen.sweeps, chosen.evaluations)
     found: dict[str, Any] = {}
     for photons in (None, *chosen.photons):
         name = "no noise" if photons is None else f"{photons:g} photons a ray"
-        found[name] = measure(truth, chosen.views, photons, setting, chosen.seed)
+        found[name] = measure(truth, photons, chosen)
     pictures(found, truth, chosen.output / "tomography.png")
     for row in (row for rows in found.values() for row in rows.values()):
         del row["slice"]
@@ -253,7 +248,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "voxels": list(truth.shape),
         "views": chosen.views,
         "densest": float(truth.max()),
-        "steps": {"views": setting.step_of_views, "fit": setting.step},
+        "steps": {"views": STEP_OF_VIEWS, "fit": STEP},
         "photons": found,
     }
 
