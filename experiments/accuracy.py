@@ -213,7 +213,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "scenes": scenes,
         "peaks": peaks,
     }
-
-
-if __name__ == "__main__":
-    main()

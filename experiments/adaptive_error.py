@@ -118,7 +118,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         scenes[name] = {"outside": measure(scene), "inside": measure(inside(scene, chosen.size))}
         show(scenes[name], name)
     return {"pixels": chosen.size, "summary": summary(scenes), "scenes": scenes}
-
-
-if __name__ == "__main__":
-    main()

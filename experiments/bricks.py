@@ -164,18 +164,8 @@ class Scan(NamedTuple):
 
     path: Path
     source: VoxelSource
-    probe: jv.ToroidalMap
     transfer: jv.TransferFunction
-
-    @property
-    def step(self) -> float:
-        """Of rays, in mm: two samples of a beam."""
-        first, last = self.probe.gamma_range
-        return 2 * float(last - first) / (self.source.shape[2] - 1)
-
-    @property
-    def march(self) -> jv.March:
-        return jv.March(self.step, (self.probe,))
+    march: jv.March
 
 
 def phantom(
@@ -193,11 +183,17 @@ def camera(view: str, size: int) -> jv.Camera:
     )
 
 
+def marching(scan: jv.ToroidalMap, volume: jv.Volume) -> jv.March:
+    """By steps of two samples of a beam."""
+    first, last = scan.gamma_range
+    return jv.March(2 * float(last - first) / (volume.shape[2] - 1), (scan,))
+
+
 def stored(folder: Path, resolution: int) -> Scan:
     volume, scan = phantom(resolution)
     path = folder / "fetus.npy"
     np.save(path, np.asarray(volume.data))
-    return Scan(path, source_of(path), scan, jv.TransferFunction.from_points(BODY))
+    return Scan(path, source_of(path), jv.TransferFunction.from_points(BODY), marching(scan, volume))
 
 
 def forget(path: Path) -> None:
@@ -207,12 +203,6 @@ def forget(path: Path) -> None:
     with path.open("rb") as file:
         os.fsync(file.fileno())
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
-def frame(scan: Scan, view: jv.Camera, split: Split, method: str) -> jv.Rendering:
-    forget(scan.path)
-    how = {"bricks": split, "method": METHODS[method], "outputs": "rgba"}
-    return jv.render_bricks(scan.source, scan.transfer, view, scan.march, **how)
 
 
 def whole(scan: Scan, view: jv.Camera) -> jv.Rendering:
@@ -228,7 +218,9 @@ def compared(
     found: dict[str, jv.Rendering] = {}
 
     def run(method: str) -> Any:
-        found[method] = frame(scan, view, split, method)
+        forget(scan.path)
+        how = {"bricks": split, "method": METHODS[method], "outputs": "rgba"}
+        found[method] = jv.render_bricks(scan.source, scan.transfer, view, scan.march, **how)
         return found[method].rgba
 
     programs: dict[str, Callable[[], Any]] = {method: partial(run, method) for method in METHODS}
@@ -322,7 +314,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
         for name, split in splits.items():
-            overlap = overlap_of(scan.probe, grid(scan.source.shape, split))
+            overlap = overlap_of(scan.march.transforms[0], grid(scan.source.shape, split))
             rows[name] = {
                 "paper": TABLE[split]._asdict(),
                 "formula": round(printed_overlap(split), 3),
@@ -333,7 +325,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
         about = {
             "image": [chosen.size] * 2,
             "voxels": list(scan.source.shape),
-            "step, mm": round(scan.step, 5),
+            "step, mm": round(float(scan.march.step), 5),
         }
     others = [name for name in map(named, TABLE) if name not in rows]
     rows |= recorded(chosen, "splits", others, about)
@@ -345,7 +337,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "splits": {name: rows[name] for name in map(named, TABLE) if name in rows},
         FROM: views,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -198,7 +198,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
     show(mean, "geometric means")
     sizes = {"size": chosen.size, "repetitions": chosen.repetitions}
     return {**sizes, "geometric means": mean, "programs": found}
-
-
-if __name__ == "__main__":
-    main()

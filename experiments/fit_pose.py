@@ -101,7 +101,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
     }
     show(result["reached"], "share of starts that lead back")
     return result
-
-
-if __name__ == "__main__":
-    main()

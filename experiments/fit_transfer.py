@@ -10,7 +10,7 @@ import time
 import warnings
 from argparse import Namespace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,15 +28,12 @@ HELD_OUT = ((1, -0.2, 0.6), (-0.5, 1, -0.2), (-0.3, -1, -0.6))
 KNOWN, EVEN = "points of the truth", "32 even points"
 
 
-class Scene(NamedTuple):
-    volume: jv.Volume
-    truth: jv.TransferFunction
-    march: jv.March
+Scene = tuple[jv.Volume, jv.TransferFunction, jv.March]
 
 
 def _scene(volume: jv.Volume, points: list[Any], unit_distance: float) -> Scene:
     march = jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(),), "midpoint")
-    return Scene(volume, jv.TransferFunction.from_points(points, unit_distance), march)
+    return volume, jv.TransferFunction.from_points(points, unit_distance), march
 
 
 def head(folder: Path | None, resolution: int) -> Scene:
@@ -146,7 +143,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
             scenes[name] = measure(make(folder, chosen.resolution), chosen.size)
             show(scenes[name], name)
     return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "goal": GOAL, "scenes": scenes}
-
-
-if __name__ == "__main__":
-    main()

@@ -90,7 +90,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         scenes[name] = measure(scene._replace(volume=volume), chosen.methods, chosen.seed)
         show(scenes[name], name)
     return {"size": chosen.size, "goal": 1e-4, "scenes": scenes}
-
-
-if __name__ == "__main__":
-    main()

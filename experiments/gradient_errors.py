@@ -16,7 +16,7 @@ the larger of the two, over several weightings of the image and directions of ea
 from argparse import Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,7 +33,7 @@ from .harness import experiment
 
 STEP = 0.11
 WIDTHS = {1e-5: 1, 0.1: 8, 1.0: 48}
-"""Half the lengths of moves, in the units of `Leaf` (which move samples by about a step), and the number of
+"""Half the lengths of moves, in the units of `LEAVES` (which move samples by about a step), and the number of
 points of a move at which the gradient is taken."""
 WRONG = 0.1
 """Error from which a gradient counts as wrong. Correct gradients have kinks, and err by less."""
@@ -45,31 +45,25 @@ CUT = " + AlphaCorrection"
 Scene = tuple[jv.Volume, Any, jv.Camera, jv.March]
 
 
-class Leaf(NamedTuple):
-    """A part of the scene, and a change of it that moves samples by about a step."""
-
-    where: Callable[[Scene], Array]
-    unit: Callable[[Array], Any]
-
-
 def functions(scene: Scene) -> jv.TransferFunction:
     """The transfer function, or those of all labels."""
     transfer = scene[1]
     return transfer.stacked if isinstance(transfer, jv.LabelTransferFunction) else transfer
 
 
-LEAVES = {
-    "position": Leaf(lambda s: s[2].position, lambda x: STEP),
-    "focal point": Leaf(lambda s: s[2].focal_point, lambda x: STEP),
-    "view angle": Leaf(lambda s: s[2].view_angle, lambda x: 3.0),
-    "spacing": Leaf(lambda s: s[0].spacing, lambda x: STEP / 8),
-    "origin": Leaf(lambda s: s[0].origin, lambda x: STEP),
-    "step": Leaf(lambda s: s[3].step, lambda x: STEP / 24),
-    "colours": Leaf(lambda s: functions(s).colors, lambda x: 0.1),
-    # an extinction of 0 stays 0: that it may grow is a matter of leaps, not of jumps
-    "extinction": Leaf(lambda s: functions(s).extinction, lambda x: 0.1 * x),
-    "voxels": Leaf(lambda s: s[0].data, lambda x: 0.02),
+LEAVES: dict[str, tuple[Callable[[Scene], Array], Any]] = {
+    "position": (lambda s: s[2].position, STEP),
+    "focal point": (lambda s: s[2].focal_point, STEP),
+    "view angle": (lambda s: s[2].view_angle, 3.0),
+    "spacing": (lambda s: s[0].spacing, STEP / 8),
+    "origin": (lambda s: s[0].origin, STEP),
+    "step": (lambda s: s[3].step, STEP / 24),
+    "colours": (lambda s: functions(s).colors, 0.1),
+    # relative: an extinction of 0 stays 0; that it may grow is a matter of leaps, not of jumps
+    "extinction": (lambda s: functions(s).extinction, None),
+    "voxels": (lambda s: s[0].data, 0.02),
 }
+"""Parts of the scene, and a change of each that moves samples by about a step."""
 
 ALONE: dict[str, tuple[jv.Transform, ...]] = {
     "ray casting": (),
@@ -81,13 +75,13 @@ ALONE: dict[str, tuple[jv.Transform, ...]] = {
 }
 
 
-def marches() -> dict[str, tuple[jv.Transform, ...]]:
-    """Each transform alone, and with cells cut at the exit."""
-    pairs: dict[str, tuple[jv.Transform, ...]] = {}
-    for name, transforms in ALONE.items():
-        pairs[name] = transforms
-        pairs[name + CUT] = (*transforms, jv.AlphaCorrection())
-    return pairs | {f"labels{CUT}(labels)": (jv.AlphaCorrection(labels=True),)}
+MARCHES = {
+    name + cut: (*transforms, *aligned)
+    for name, transforms in ALONE.items()
+    for cut, aligned in (("", ()), (CUT, (jv.AlphaCorrection(),)))
+}
+"""Each transform alone, and with cells cut at the exit."""
+MARCHES[f"labels{CUT}(labels)"] = (jv.AlphaCorrection(labels=True),)
 
 
 def scene_of(name: str, quadrature: str, size: int) -> Scene:
@@ -105,7 +99,7 @@ def scene_of(name: str, quadrature: str, size: int) -> Scene:
     camera = jv.Camera(
         (3.9, -3.3, 3.1), np.asarray(volume.center) + 0.05, (0.1, 0, 1), 35.0, size=(size, size)
     )
-    march = jv.March(STEP, marches()[name], quadrature, max_samples=64)
+    march = jv.March(STEP, MARCHES[name], quadrature, max_samples=64)
     return jax.tree.map(_doubled, (volume, transfer, camera, march))
 
 
@@ -146,7 +140,8 @@ def measure(
     for leaf in leaves:
         where, unit = LEAVES[leaf]
         moves = [
-            jnp.asarray(rng.normal(size=where(scene).shape)) * unit(where(scene)) for _ in range(DIRECTIONS)
+            jnp.asarray(rng.normal(size=where(scene).shape)) * (0.1 * where(scene) if unit is None else unit)
+            for _ in range(DIRECTIONS)
         ]
         found[leaf] = [
             _relative(*zip(*(changes(where, width * move, points) for move in moves), strict=True))
@@ -192,7 +187,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
 @experiment(
     draw,
     size=6,
-    names=tuple(marches()),
+    names=tuple(MARCHES),
     leaves=tuple(LEAVES),
     quadratures=("left", "midpoint"),
     widths=tuple(WIDTHS.items()),
@@ -226,7 +221,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "wrong": wrong,
         "relative errors": found,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -117,7 +117,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
         show(found[along], along)
     return {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found}
-
-
-if __name__ == "__main__":
-    main()

@@ -91,7 +91,7 @@ def experiment(
 ) -> Callable[[Callable[[Namespace], Any]], Main]:
     """Decorator that makes an experiment's `main` of a function from its options to its result: it writes the
     record and draws the chart. A result of None writes nothing. Both files have the module's name, and the
-    question is how its docstring begins.
+    question is how its docstring begins. Stands last in its file: as `python -m MODULE`, it runs at once.
 
     - `draw`: draws the chart; None if a chart cannot be drawn from the record alone.
     - `quick`: options and constants under `--quick`.
@@ -119,6 +119,8 @@ def experiment(
             if draw is not None:
                 draw(record.read(chosen.path)["result"], chosen.path.with_suffix(".png"))
 
+        if measure.__module__ == "__main__":
+            main()
         return main
 
     return made

@@ -170,7 +170,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         for row in result[name]:
             show(row, name)
     return {"note": f"{NOTE} {compared(result)}", **result}
-
-
-if __name__ == "__main__":
-    main()

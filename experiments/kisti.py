@@ -225,7 +225,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "both, shaded, over the report's": over,
         "ended rays are looked for every so many samples": every,
     }
-
-
-if __name__ == "__main__":
-    main()

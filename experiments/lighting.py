@@ -246,7 +246,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
     }
     pictures(chosen.many // 2, chosen.seed, chosen.output / "lit.png", *chosen.picture)
     return result
-
-
-if __name__ == "__main__":
-    main()

@@ -210,7 +210,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "three materials": three_materials(size, resolution),
         "one ball": one_ball(size, resolution, chosen.paths, chosen.thicknesses, chosen.seed),
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -151,7 +151,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "cells": chosen.cells,
         "scenes": scenes,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -230,7 +230,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "goal": f"the truth in {GOAL} of 10 trials with noise, and never more without",
         "problems": problems,
     }
-
-
-if __name__ == "__main__":
-    main()

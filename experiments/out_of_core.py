@@ -267,7 +267,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
     result["compared"] = compared(result, large, fitting)
     show(result["compared"])
     return result
-
-
-if __name__ == "__main__":
-    main()

@@ -105,7 +105,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
             )
         conditions[said] = {"goal": condition.goal, "both, geometric means": means, "volumes": volumes}
     return {"sizes": chosen.sizes, "repetitions": chosen.repetitions, "conditions": conditions}
-
-
-if __name__ == "__main__":
-    main()

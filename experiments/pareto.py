@@ -6,10 +6,10 @@ scenes, beside VTK and Dr.Jit. Settings are timed in turn with the scene's base;
 ratio to the base, times the base's median time over the whole scene. Errors are those of linear RGB over
 white against a converged image, whose own error is estimated (`pareto_measure`).
 
-`--scene` measures some scenes again and keeps what the record says of the others, with the commit that they are
-of. `--point` renders one point of one scene again, times it
-and saves its picture beside its error. The record is `pareto.json`, the chart `pareto.png`, the page
-`pareto.html` (see `pareto_page`), the pictures that it shows are in the folder `pareto/`.
+`--scene` measures some scenes again and keeps what the record says of the others, with the commit that they
+are of. `--point` renders one point of one scene again, times it and saves its picture beside its error. The
+record is `pareto.json`, the chart `pareto.png`, the page `pareto.html` (see `pareto_page`), the pictures
+that it shows are in the folder `pareto/`.
 
 Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
 distance to our image, up to 3 / 255, is that and not an error.
@@ -196,7 +196,3 @@ def there(file: str | None) -> bool:
     """Whether a scene's volume is there."""
     folder = harness.data()
     return file is None or (folder is not None and (folder / file).is_file())
-
-
-if __name__ == "__main__":
-    main()

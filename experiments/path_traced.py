@@ -128,7 +128,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
     show(rows)
     pictures(rows, images, chosen.output / "path_traced.webp")
     return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows}
-
-
-if __name__ == "__main__":
-    main()

@@ -322,7 +322,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         show(rows[-1]["plans"], number, scene.name)
     jax.clear_caches()
     return {"pixels": chosen.size, "summary": summary(rows, costs), "planning": costs, "scenes": rows}
-
-
-if __name__ == "__main__":
-    main()

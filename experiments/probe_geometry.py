@@ -254,7 +254,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "recovered": dict(zip(starts, rows, strict=True)),
         "left open": answers,
     }
-
-
-if __name__ == "__main__":
-    main()

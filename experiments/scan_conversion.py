@@ -149,7 +149,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "spacings": chosen.spacings,
         "scenes": scenes,
     }
-
-
-if __name__ == "__main__":
-    main()

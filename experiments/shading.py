@@ -82,7 +82,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         if all(key in row for row in scenes.values())
     }
     return {"image": [chosen.size] * 2, "goals": GOALS, "geometric means": means, "scenes": scenes}
-
-
-if __name__ == "__main__":
-    main()

@@ -279,7 +279,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "volumes": volumes,
         "gradients": slopes,
     }
-
-
-if __name__ == "__main__":
-    main()

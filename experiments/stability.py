@@ -64,7 +64,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         show({name: found["edge"]})
     entries |= recorded(chosen, "entries", [name for name in ENTRIES if name not in entries])
     return {"entries": {name: entries[name] for name in ENTRIES if name in entries}}
-
-
-if __name__ == "__main__":
-    main()

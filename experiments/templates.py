@@ -93,7 +93,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
     show(tables)
     packets = {"one packet": 1, "four packets": 4}
     return {"tables": tables, "grown": {name: grown(n, chosen.seed) for name, n in packets.items()}}
-
-
-if __name__ == "__main__":
-    main()

@@ -251,7 +251,3 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "steps": {"views": STEP_OF_VIEWS, "fit": STEP},
         "photons": found,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -9,7 +9,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from ..bricks import each_at_once, grid, phantom, probe
+from ..bricks import each_at_once, grid, marching, phantom, probe
 from . import BLACK, Panels, panel
 
 
@@ -33,8 +33,7 @@ ORDERS: dict[str, Any] = {"wrong order: no overlap": each_at_once, "right order:
 def kim_fig8(chosen: Namespace) -> Panels:
     """A fetus in translucent tissue, cut into bricks along the beams; the right column is the difference."""
     volume, scan = phantom(chosen.resolution, "uint8", speckle=False)
-    first, last = scan.gamma_range
-    march = jv.March(2 * float(last - first) / (volume.shape[2] - 1), (scan,))
+    march = marching(scan, volume)
     scene = volume, jv.TransferFunction.from_points(POINTS)
     whole = jv.Camera(BESIDE, (0, 0, 100), (0, 0, 1), 19.0, size=(chosen.size,) * 2)
     side = chosen.size / ZOOM
