@@ -152,6 +152,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
     pareto_page.write(file, file.parent / "pareto", path.with_suffix(".html"))
 
 
+def there(file: str | None) -> bool:
+    """Whether a scene's volume is there."""
+    folder = harness.data()
+    return file is None or (folder is not None and (folder / file).is_file())
+
+
 @experiment(
     draw,
     repetitions=5,
@@ -190,9 +196,3 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
     scenes = {name: scenes[name] for name in ROWS if name in scenes}
     show(summary(scenes))
     return {**same, "threads": THREADS, "peers": present, "summary": summary(scenes), "scenes": scenes}
-
-
-def there(file: str | None) -> bool:
-    """Whether a scene's volume is there."""
-    folder = harness.data()
-    return file is None or (folder is not None and (folder / file).is_file())
