@@ -164,6 +164,7 @@ class Scan(NamedTuple):
 
     path: Path
     source: VoxelSource
+    probe: jv.ToroidalMap
     transfer: jv.TransferFunction
     march: jv.March
 
@@ -193,7 +194,7 @@ def stored(folder: Path, resolution: int) -> Scan:
     volume, scan = phantom(resolution)
     path = folder / "fetus.npy"
     np.save(path, np.asarray(volume.data))
-    return Scan(path, source_of(path), jv.TransferFunction.from_points(BODY), marching(scan, volume))
+    return Scan(path, source_of(path), scan, jv.TransferFunction.from_points(BODY), marching(scan, volume))
 
 
 def forget(path: Path) -> None:
@@ -314,7 +315,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
         for name, split in splits.items():
-            overlap = overlap_of(scan.march.transforms[0], grid(scan.source.shape, split))
+            overlap = overlap_of(scan.probe, grid(scan.source.shape, split))
             rows[name] = {
                 "paper": TABLE[split]._asdict(),
                 "formula": round(printed_overlap(split), 3),

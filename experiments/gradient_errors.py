@@ -75,7 +75,7 @@ ALONE: dict[str, tuple[jv.Transform, ...]] = {
 }
 
 
-MARCHES = {
+MARCHES: dict[str, tuple[jv.Transform, ...]] = {
     name + cut: (*transforms, *aligned)
     for name, transforms in ALONE.items()
     for cut, aligned in (("", ()), (CUT, (jv.AlphaCorrection(),)))

@@ -161,12 +161,14 @@ def measure(path: Path, voxels: int, pixels: int, memory: int) -> dict[str, Any]
 
     for name, factor in SCENES.items():
         transfer = jv.TransferFunction(opaque.values, opaque.colors, factor * opaque.extinction)
-        seconds, before = [], 0.0
+        rendering, seconds, before = None, [], 0.0
         for _ in range(1 + REPETITIONS):
             begun, before = time.perf_counter(), read()
             rendering = jax.block_until_ready(image(transfer))
             seconds.append(round(time.perf_counter() - begun, 3))
-        row = found[name] = {"first seconds": seconds[0], "seconds": seconds[1:]}
+        assert rendering is not None
+        row: dict[str, Any] = {"first seconds": seconds[0], "seconds": seconds[1:]}
+        found[name] = row
         row["peak"] = round(peak() - found["before"], 1)
         row["mean"] = np.mean(np.asarray(rendering.rgba, np.float64), (0, 1)).tolist()
         if whole is not None:
