@@ -15,7 +15,7 @@ import math
 import os
 import tempfile
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.ticker import NullFormatter
 
 import jaxvol as jv
-from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of, share, source_of
+from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of, source_of
 from jaxvol.bricks.cells import Visit
 from jaxvol.bricks.traversal import Load, Traversal
 
@@ -109,7 +109,13 @@ def printed_overlap(split: Split) -> float:
         return 0.0
     scan = jv.ToroidalMap(0.0, near, beta, sigma, (0.0, DEEP))
     voxel = DEEP / (SHAPE[2] - 1)
-    return 100 * sum(math.ceil(k * voxel) for k in overlap_of(scan, grid(SHAPE, split))) / SHAPE[2]
+    return share([k * voxel for k in overlap_of(scan, grid(SHAPE, split))], SHAPE[2])
+
+
+def share(overlaps: Iterable[float], nodes: int) -> float:
+    """The part of a volume of so many voxels along γ that is read twice, in percent: whole layers at each
+    face."""
+    return 100 * sum(map(math.ceil, overlaps)) / nodes
 
 
 # -- the naive order ----------------------------------------------------------------------------------------
@@ -319,7 +325,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
             rows[name] = {
                 "paper": TABLE[split]._asdict(),
                 "formula": round(printed_overlap(split), 3),
-                "formula, of these voxels": round(100 * share(overlap, scan.source.shape[2]), 3),
+                "formula, of these voxels": round(share(overlap, scan.source.shape[2]), 3),
                 **measure(split, VIEW),
             }
         views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits.values()}

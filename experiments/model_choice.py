@@ -140,7 +140,7 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
     names = [row.name for row in choice.candidates]
     held_out = [row.held_out_loss for row in choice.candidates]
-    keys = ("name", "numbers", "training_loss", "held_out_loss", "standard_error", "excess", "excess_error")
+    keys = "name", "numbers", "determined", "held_out_loss", "standard_error", "bic"
     return {
         "seed": seed,
         "truth": truth,
@@ -148,7 +148,7 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
         "bic": names.index(choice.by_bic),
         "least": int(np.argmin(held_out)),
         "candidates": [
-            {key: getattr(row, key) for key in (*keys, "bic", "ended", "undetermined")}
+            {key: getattr(row, key) for key in keys} | {"training_loss": row.fit.loss}
             for row in choice.candidates
         ],
     }

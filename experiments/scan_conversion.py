@@ -79,9 +79,11 @@ def measure(scene: Scene, spacings: tuple[float, ...], repetitions: int) -> dict
     """Errors, times and sizes: as acquired, and by the spacing of the grid."""
     grids, rows = {DIRECT: scene.volume}, {DIRECT: {"spacing": None, "convert seconds": 0.0}}
     for spacing in spacings:
-        for dtype in (None, "float32") if spacing == FLOAT else (None,):
-            name = f"{spacing:g}" + (f", {dtype}" if dtype else "")
-            convert = partial(jv.scan_convert, scene.volume, scene.probe, spacing * scene.sample, dtype=dtype)
+        acquired = {f"{spacing:g}": scene.volume}
+        if spacing == FLOAT:
+            acquired[f"{spacing:g}, float32"] = jv.Volume(scene.volume.data.astype("float32"))
+        for name, volume in acquired.items():
+            convert = partial(jv.scan_convert, volume, scene.probe, spacing * scene.sample)
             jax.block_until_ready(convert().data)  # compiles it
             begin = time.perf_counter()
             grids[name] = jax.block_until_ready(convert())

@@ -104,23 +104,18 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
         a_h = Σ w (e - mean_w(e)) exp(-2πi h f·x) / Σ w,    energy = Σ_h 2 |a_h|²,  h = 1 … harmonics.
 
     Frequencies are exact, not FFT bins: a wave `A cos(2π h f·x + φ)` has energy A²/2 at any frequency.
-    Harmonics above Nyquist are measured at their aliases. Harmonics that cannot be separated are left out:
-    those within two bins (2/width, 2/height) of 0, of their own mirror image, or of an earlier harmonic.
-    White noise of variance v adds 2.25 v · 2 harmonics / pixels. `frequency` should be accurate to half a
-    bin, at which 28 % is lost.
+    Harmonics above Nyquist are measured at their aliases; those within two bins (2/width, 2/height) of 0, of
+    their own mirror image, or of an earlier harmonic are left out. White noise of variance v adds
+    2.25 v · 2 harmonics / pixels. A `frequency` that is wrong by half a bin loses 28 %.
 
     **Without `frequency`**, for any scene: the energy in a few peaks of local spectra, beyond what noise
     has there by chance. Blocks of `BLOCK` pixels overlap by half; each is taken minus its windowed mean and
     under a Hann window w. Its periodogram |F|² / (BLOCK² Σ w²), over frequencies of at least `SLOWEST` cycles
     per block (slower errors are shading), has the total E, and its `PEAKS` largest values have the sum T.
-    In white noise the N periodogram values are exponentially distributed, and the m largest hold on average
-    the share q = Σ_{i ≤ m} Σ_{i ≤ j ≤ N} 1 / (j N). The energy is the mean over blocks of
-
-        (T - q E) / (1 - q),
-
-    which is E for waves and averages 0 for white noise (so one noise image gives slightly more or less than
-    0). Noise added to waves lowers the result by up to 0.13 of its own energy, since it also raises the part
-    attributed to chance. An edge counts as structure, a single pixel does not.
+    In white noise the m largest of N values hold on average the share q = Σ_{i ≤ m} Σ_{i ≤ j ≤ N} 1 / (j N).
+    The energy is the mean over blocks of (T - q E) / (1 - q), which is E for waves and averages 0 for white
+    noise. Noise added to waves lowers the result by up to 0.13 of its own energy. An edge counts as
+    structure, a single pixel does not.
 
     **Arguments:**
 

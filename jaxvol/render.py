@@ -49,8 +49,7 @@ def render(
     - `camera`: makes one ray for each pixel.
     - `march`: step and transforms; or `"auto"`: those of `plan`, which is called for each image,
       without transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
-      `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render `found.volume` by
-      `found.march` with `found.lighting`.
+      `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render by `found.march`.
     - `tolerance`: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
     - `compositing`: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or `"average"`,
       the projections of VTK (`Maximum` and its siblings take a `thickness`); an `Isosurface(value)`; or
@@ -104,7 +103,7 @@ def render(
         found = plan(volume, transfer, camera, given, compositing=compositing, lighting=lighting)
         if not found.within:
             warnings.warn(f"the image may not be within the tolerance: {found}", stacklevel=2)
-        volume, march, lighting = found.volume, found.march, found.lighting
+        march = found.march
     elif tolerance is not None:
         raise ValueError(f'tolerance goes with march="auto"; got {tolerance!r} with {described(march)}.')
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)

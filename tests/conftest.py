@@ -111,12 +111,6 @@ def programs_of_this_session():
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
-@pytest.fixture(autouse=True)
-def no_progress(monkeypatch):
-    """No lines on stderr of what takes long, which depends on how busy the machine is."""
-    monkeypatch.setattr("jaxvol.app.commands.progress.PATIENCE", 1e6)
-
-
 @pytest.fixture
 def volume_file(tmp_path):
     """A raw file of a small volume, whose name tells its shape and type."""

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla.memory import gather
-from .piecewise_linear import Range, points_below, run_maxima
+from .piecewise_linear import Range, covering_runs, points_below, run_maxima
 from .vec3 import Scalar
 
 
 def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, "..."], Scalar]:
-    """The interval in which a value lies, and which part of it lies below the value: 0 below the first line,
-    1 from the last one on. NaN stays NaN."""
+    """The interval in which a value lies, and the part of it below the value, in [0, 1]. NaN stays NaN."""
     lines = jax.lax.stop_gradient(lines)
     index = jnp.clip(points_below(lines, value) - 1, 0, lines.shape[0] - 2)
     start, end = gather(lines, index), gather(lines, index + 1)
@@ -39,8 +38,7 @@ def corner_rows(table: Float[Array, "n m columns"]) -> Float[Array, "cells corne
 
 
 def interpolate_corners(row: tuple[Scalar, ...], along: Scalar, across: Scalar) -> tuple[Scalar, ...]:
-    """The entries at these parts of a cell. Means of what is at its corners, also when rounded: 0 between
-    zeros, and nowhere negative between positive numbers."""
+    """The entries at these parts of a cell: 0 between zeros, and positive between positive numbers."""
 
     def mix(part: Scalar, a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
         return tuple(p * (1 - part) + q * part for p, q in zip(a, b, strict=True))
@@ -65,19 +63,8 @@ def any_between(marked: Bool[Array, "n m"], rows: Range, columns: Range) -> Bool
 
 
 def greatest_between(table: Float[Array, "n m"], rows: Range, columns: Range) -> Float[Array, "*blocks"]:
-    """The greatest entry where these lines cross: four look-ups in tables of the maxima of all rectangles
-    whose sides are powers of two."""
+    """The greatest entry where these lines cross, by the maxima of all rectangles of powers of two."""
     maxima = jnp.stack([jnp.stack(run_maxima(wide, 1)) for wide in run_maxima(table, 0)])
-
-    def starts(lines: Range, levels: int) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], ...]]:
-        """Two runs that cover some lines: the level of their length, and where they begin."""
-        first, last = lines
-        level = sum(
-            ((last - first + 1 >= 2**k).astype(jnp.int32) for k in range(1, levels)), jnp.zeros_like(first)
-        )
-        return level, (first, last + 1 - 2**level)
-
-    (wide, begins), (long, others) = (
-        starts(lines, maxima.shape[axis]) for axis, lines in enumerate((rows, columns))
-    )
+    wide, begins = covering_runs(rows, maxima.shape[0])
+    long, others = covering_runs(columns, maxima.shape[1])
     return jnp.max(jnp.stack([maxima[wide, long, i, j] for i in begins for j in others]), axis=0)

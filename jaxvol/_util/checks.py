@@ -55,15 +55,11 @@ def shortened(value: Any) -> str:
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """Return `value` after checking that `holds(value, *others)` is true everywhere.
+    """Return `value` after checking that `holds(value, *others)` is true everywhere. Use what is returned:
+    without it, the check on a traced value vanishes.
 
-    **Arguments:**
-
-    - `holds`: called with NumPy arrays if the values are concrete, else with traced ones; so it uses only
-        operators and methods that both have.
-    - `message`: the error message; `{got}` in it is replaced by the value.
-
-    **Returns:** the value. Use the returned value: without it, the check on a traced value vanishes.
+    `holds` gets NumPy arrays if the values are concrete, else traced ones. `{got}` in `message` becomes the
+    value.
 
     **Raises:** `ValueError` at once for a concrete value, an Equinox runtime error for a traced one. Inside
     `jax.shard_map`, where Equinox's errors do not work, a traced value becomes NaN instead.
@@ -99,8 +95,9 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
         if isinstance(value, jax.Array):
             given = value
         else:  # a sequence may hold traced numbers
-            given = jnp.asarray(value) if is_traced(value) else _numbers(value)
-        if jnp.issubdtype(given.dtype, jnp.complexfloating):
+            given = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+        # V: JAX's own 8- and 16-bit floats; keys of `jax.random` have no kind
+        if getattr(given.dtype, "kind", "O") not in "biufV":
             raise TypeError
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             cast = given.astype(jnp.result_type(float)) if isinstance(given, np.ndarray) else given
@@ -117,14 +114,6 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
         beyond = f" in {array.dtype}" if np.all(finite(given)) else ""
         raise ValueError(f"{name} must be finite{beyond}; got {given}.")
     return require(array, finite, f"{name} must be finite; got {{got}}.")
-
-
-def _numbers(value: Arrayable) -> np.ndarray:
-    """`value` as a NumPy array of real numbers. **Raises** `TypeError` or `ValueError` if it is none."""
-    array = np.asarray(value)
-    if array.dtype.kind not in "biufV":  # V: JAX's own 8- and 16-bit floats
-        raise TypeError
-    return array
 
 
 def number(
@@ -160,8 +149,7 @@ def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) ->
 
 
 def integer(name: str, value: Any, least: int, most: int | None = None, *, otherwise: str = "") -> int:
-    """`value` as an integer from `least` to `most`, inclusive; `otherwise`: an alternative that the message
-    names."""
+    """`value` as an integer from `least` to `most`, inclusive. `otherwise`: what else may come."""
     whole = None
     if not is_flag(value):
         with contextlib.suppress(TypeError):
@@ -193,9 +181,7 @@ def power_of_two(name: str, value: Any, most: int) -> int:
 
 
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
-    """Check that the file `path` can be written, before a long computation. `whole_file` makes its folder.
-
-    **Raises:** `ValueError` if it cannot be written."""
+    """**Raises** `ValueError` if the file `path` cannot be written. `whole_file` makes its folder."""
     path = Path(path)
     try:
         if path.is_dir():
@@ -213,8 +199,7 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
 
 
 def check_answer(owner: Any, method: str, answer: PyTree, expected: PyTree) -> None:
-    """Raise `ValueError` if what a method of a user's class returned has other shapes or types of numbers
-    than expected."""
+    """**Raises** `ValueError` if a method of a user's class returned other shapes or types than expected."""
 
     def kinds(tree: PyTree) -> PyTree:
         return jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), tree)

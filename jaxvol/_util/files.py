@@ -6,8 +6,9 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import IO, Literal, TypeAlias
 
 import numpy as np
 
@@ -15,32 +16,14 @@ import numpy as np
 CHUNK = 2**20
 LONGEST_REASON = 200  # letters
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
+MOST_COMPRESSED = (
+    2000  # bytes of pixels per byte of a compressed file: a header that says more is not believed
+)
 # RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
-
-@runtime_checkable
-class Stream(Protocol):
-    """Bytes read piece by piece: of a file, of a gzip stream, of a member of a zip archive."""
-
-    def read(self, size: int = -1, /) -> bytes: ...
-
-    def tell(self) -> int: ...
-
-
-class Header(NamedTuple):
-    """Shape and type of a file's voxels as passed to `load`, unchecked; None if not given."""
-
-    shape: Sequence[int] | Any | None
-    dtype: str | Any | None
-
-    def refuse(self, path: Path) -> None:
-        """Raise an error if either is given; for readers of files that have their own header."""
-        if any(value is not None for value in self):
-            raise ValueError(
-                f"shape and dtype are for raw files; {path} has its own, but got shape={self.shape} and "
-                f"dtype={self.dtype} as well. Leave them out."
-            )
+Stream: TypeAlias = BufferedIOBase | IO[bytes]
+"""Of a file, of gzip, of a member of a zip archive."""
 
 
 def file_size(path: Path) -> int:
@@ -57,26 +40,28 @@ def file_size(path: Path) -> int:
 def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
     """All bytes of a stream, which must be `expected`; at most one more is read."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing
-    for chunk in chunks(stream, expected + 1):
+    while chunk := stream.read(min(expected + 1 - len(content), CHUNK)):
         content += chunk
     check_size(path, len(content), expected)
     return content
 
 
-def chunks(stream: Stream, limit: int) -> Iterator[bytes]:
-    """Yield at most `limit` bytes of a stream, piece by piece."""
-    while limit > 0 and (chunk := stream.read(min(limit, CHUNK))):
-        limit -= len(chunk)
-        yield chunk
-
-
-def check_size(path: Path, size: int, expected: int) -> None:
-    """Check that a file holds as many bytes of voxels as its header says."""
-    if size != expected:
+def check_size(path: Path, size: int, expected: int, *, more: bool = False) -> None:
+    """Check that a file holds as many bytes of voxels as its header says; or `more`, where others follow."""
+    if size < expected or (size > expected and not more):
         fault = f"cut short: it holds {size}" if size < expected else f"oversized: it holds {size} or more"
         raise ValueError(
             f"path: {path} is {fault} bytes of voxels where its header (shape and dtype) says {expected}. "
             "Check the header, or fetch the file again."
+        )
+
+
+def check_pixels(path: Path, expected: int, *, compressed: bool) -> None:
+    """Check that a file is large enough for so many bytes of pixels."""
+    size = path.stat().st_size
+    if size * (MOST_COMPRESSED if compressed else 1) < expected:
+        raise ValueError(
+            f"path: {path} is cut short: it has {size} bytes, and its header announces pixels of {expected}."
         )
 
 

@@ -8,8 +8,7 @@ import jax
 
 
 def require_room(wanted: int, of: str) -> None:
-    """**Raises** `ValueError` if the device has less than `wanted` bytes. `of`: which arguments require them,
-    and what to do."""
+    """**Raises** `ValueError` if the device has less than the bytes `wanted` by these arguments (`of`)."""
     if wanted > (room := memory_of_device()):
         raise ValueError(f"{of}: asks for {_spelled(wanted)} of memory, and the device has {_spelled(room)}.")
 

@@ -5,10 +5,6 @@ from typing import Any
 import numpy as np
 
 
-UNEVEN = 1e-3
-"""How far a coordinate may be from evenly spaced ones, in steps: coordinates in files are often rounded."""
-
-
 def is_named(value: Any) -> bool:
     """Whether a value is an array with named axes, like xarray's `DataArray`; xarray is not imported."""
     return all(hasattr(value, name) for name in ("dims", "coords", "transpose", "to_numpy"))
@@ -22,27 +18,20 @@ def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
     **Raises:** `ValueError` for coordinates that are not evenly spaced numbers.
     """
-    names = [str(name).lower() for name in value.dims]
-    if sorted(names) == ["x", "y", "z"]:
-        value = value.transpose(*(value.dims[names.index(name)] for name in "xyz"))
+    if sorted(map(str, value.dims)) == ["x", "y", "z"]:
+        value = value.transpose("x", "y", "z")
     data, spacing, origin = value.to_numpy(), np.ones(3), np.zeros(3)
-    if data.ndim != 3 or not any(name in value.coords for name in value.dims):
+    named = [(axis, name) for axis, name in enumerate(value.dims) if name in value.coords]
+    if data.ndim != 3 or not named:
         return data, {}
-    for axis, name in enumerate(value.dims):
-        if name not in value.coords:
-            continue
+    for axis, name in named:
         at = np.asarray(value.coords[name])
-        if at.dtype.kind not in "iuf" or at.size < 2:
+        even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" else np.zeros(2)
+        step = even[1] - even[0] if at.size > 1 else 0.0
+        if not (step and np.abs(at - even).max() <= 1e-3 * abs(step)):  # NaN, too
             raise ValueError(
-                f"data has coordinates {name!r} that are not numbers; got {at.dtype}. Drop them."
-            )
-        at = at.astype(np.float64)
-        step = (at[-1] - at[0]) / (at.size - 1)
-        away = np.abs(at - np.linspace(at[0], at[-1], at.size)).max()
-        if not (abs(step) > 0 and away <= UNEVEN * abs(step)):  # NaN, too
-            raise ValueError(
-                f"data must have evenly spaced coordinates; got {name!r} from {at[0]:g} to {at[-1]:g}, up to "
-                f"{away:.3g} away from even ones. Interpolate to even ones first (DataArray.interp)."
+                f"data must have evenly spaced numbers as coordinates; got others along {name!r}. "
+                "Interpolate to even ones first (DataArray.interp), or drop them."
             )
         if step < 0:
             data, at = np.flip(data, axis), at[::-1]

@@ -17,13 +17,8 @@ Word: TypeAlias = UInt32[Array, "..."]
 
 
 def seed_word(seed: int | Any) -> UInt32[Array, ""]:
-    """The 32-bit word of a seed.
-
-    **Arguments:** `seed`: an integer in [0, 2³²), which is its own word; a traced one, of any integer type,
-    is taken modulo 2³². Or a key of `jax.random`, from which the word is drawn.
-
-    **Raises:** `ValueError` for anything else.
-    """
+    """The 32-bit word of a seed: an integer in [0, 2³²), which if traced is taken modulo 2³², or a key of
+    `jax.random`. **Raises** `ValueError` for anything else."""
     if is_key(seed):
         return jax.random.bits(seed, (), jnp.uint32)
     if is_traced(seed):
@@ -92,9 +87,8 @@ def _unit(word: Word, dtype: Any) -> Float[Array, "..."]:
 def _blue_ranks(side: int = 128, sigma: float = 1.9) -> np.ndarray:
     """Ranks 0 … side² - 1 on a torus, with neighbours far apart in rank: void and cluster (Ulichney 1993).
 
-    Each rank goes to the largest void: the pixel farthest, in the sense of a Gaussian of `sigma` pixels, from
-    those taken so far. The initial pattern is evened out by moving the point in its tightest cluster into its
-    largest void until it stays there.
+    Each rank goes to the largest void: the pixel farthest, by a Gaussian of `sigma` pixels, from those taken
+    so far. At first, points in the tightest clusters are moved there.
     """
     distance = np.minimum(np.arange(side), side - np.arange(side))
     bell = np.exp(-(distance**2) / (2 * sigma**2)).astype(np.float32)

@@ -2,39 +2,43 @@
 
 import math
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from .files import CORRUPT, MOST_VOXELS, Header, Stream, as_array, check_size, decoding, file_size, read_all
+from .files import CORRUPT, MOST_VOXELS, Stream, as_array, check_size, decoding, file_size, read_all
 
 
 VOLUME = ("data", "spacing", "origin", "direction", "labels")
 """Arguments of `Volume` that a `.npz` file may hold."""
 
 
-def read_npy(path: Path, header: Header) -> dict[str, Any]:
+def read_npy(path: Path) -> dict[str, np.ndarray]:
     """Reader for `.npy`: one array, the data."""
-    header.refuse(path)
     size = file_size(path)
     with decoding(path), path.open("rb") as stream:
-        return {"data": _npy_array(path, stream, size)}
+        return {"data": _array(path, stream, size)}
 
 
-def read_npz(path: Path, header: Header) -> dict[str, Any]:
+def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
-    header.refuse(path)
     names = npz_names(path)
     if "data" in names:
-        return read_arrays(path, [name for name in VOLUME if name in names])
-    if len(names) == 1:
-        return {"data": read_arrays(path, names)[names[0]]}
-    raise ValueError(
-        f"path: {path} must hold an array called data, or one array; got {sorted(names)}. "
-        "Save it with np.savez(path, data=...)."
-    )
+        arguments = {name: name for name in VOLUME if name in names}
+    elif len(names) == 1:
+        arguments = {"data": names[0]}
+    else:
+        raise ValueError(
+            f"path: {path} must hold an array called data, or one array; got {sorted(names)}. "
+            "Save it with np.savez(path, data=...)."
+        )
+    arrays = {}
+    with decoding(path), zipfile.ZipFile(path) as archive:
+        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
+        for argument, name in arguments.items():
+            with archive.open(members[name]) as stream:
+                arrays[argument] = _array(path, stream, members[name].file_size)
+    return arrays
 
 
 def npz_names(path: Path) -> list[str]:
@@ -42,19 +46,6 @@ def npz_names(path: Path) -> list[str]:
     file_size(path)
     with decoding(path), zipfile.ZipFile(path) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
-
-
-def read_arrays(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """The arrays of these names from an `.npz` file. **Raises** `ValueError` if one is missing."""
-    if missing := set(names) - set(npz_names(path)):
-        raise ValueError(f"path: {path} must hold arrays {', '.join(names)}; {sorted(missing)} is missing.")
-    arrays = {}
-    with decoding(path), zipfile.ZipFile(path) as archive:
-        members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        for name in names:
-            with archive.open(members[name]) as stream:
-                arrays[name] = _npy_array(path, stream, members[name].file_size)
-    return arrays
 
 
 def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -75,7 +66,7 @@ def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dt
     return shape, fortran, dtype
 
 
-def _npy_array(path: Path, stream: Stream, size: int) -> np.ndarray:
+def _array(path: Path, stream: Stream, size: int) -> np.ndarray:
     shape, fortran, dtype = npy_header(path, stream)
     if not 0 < math.prod(shape) <= MOST_VOXELS or min(shape, default=1) < 0:
         raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")

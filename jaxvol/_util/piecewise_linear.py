@@ -66,8 +66,7 @@ def points_below(
 def points_around(
     values: Float[Array, " n"], low: Float[Array, "*blocks"], high: Float[Array, "*blocks"]
 ) -> Range:
-    """The control points on which a function depends from `low` to `high`: those within, and the next ones
-    around."""
+    """The control points from `low` to `high`, and the next ones around."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     first = jnp.maximum(points_below(values, low) - 1, 0)
     # the first point at or above `high`; the second of two points at `high`
@@ -120,9 +119,8 @@ def upper_bound_between(
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
 ) -> Float[Array, "*blocks"]:
-    """Upper bound of the piecewise linear extinction from `low` to `high`, rounding included.
-
-    Such a function is greatest at an end of the range, or at a control point inside it."""
+    """Upper bound of the piecewise linear extinction from `low` to `high`, rounding included: it is greatest
+    at an end of the range, or at a control point inside it."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     ends = jnp.maximum(jnp.interp(low, values, extinction), jnp.interp(high, values, extinction))
     first, end = points_below(values, low, strictly=True), points_below(values, high)
@@ -177,7 +175,7 @@ def variation_between(
 def _interval(
     values: Float[Array, " n"], value: Float[Array, "*batch"], below: Int[Array, "*batch"]
 ) -> tuple[Int[Array, "*batch"], Float[Array, "*batch"]]:
-    """In which interval a value lies that has so many points at or below it, and which part of it."""
+    """In which interval a value lies that has so many points at or below it, and the part of it below."""
     i = jnp.clip(below - 1, 0, values.shape[0] - 2)
     start, end = gather(values, i), gather(values, i + 1)
     gap = end - start
@@ -188,16 +186,21 @@ def _interval(
 def _maximum_of_range(
     entries: Float[Array, " n"], first: Int[Array, "*batch"], end: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Maximum of the entries from `first` to before `end`; 0 where there are none. Two look-ups in a table of
-    the maxima of all runs whose length is a power of two."""
-    runs = run_maxima(entries, 0)
-    table, n = jnp.stack(runs), entries.shape[0]
-    count = end - first
-    level = sum((count >= 2**k).astype(jnp.int32) for k in range(1, len(runs)))
-    level = jnp.broadcast_to(level, count.shape)
-    left = table[level, jnp.clip(first, 0, n - 1)]
-    right = table[level, jnp.clip(end - 2**level, 0, n - 1)]
-    return jnp.where(count > 0, jnp.maximum(left, right), 0)
+    """Maximum of the entries from `first` to before `end`; 0 where there are none."""
+    table = jnp.stack(run_maxima(entries, 0))
+    begin = jnp.minimum(first, entries.shape[0] - 1)
+    level, (left, right) = covering_runs((begin, jnp.maximum(end - 1, begin)), len(table))
+    return jnp.where(end > first, jnp.maximum(table[level, left], table[level, right]), 0)
+
+
+def covering_runs(
+    entries: Range, levels: int
+) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]]:
+    """Two runs of 2**k entries that cover these ones: k, and where they begin."""
+    first, last = entries
+    reached = ((last - first + 1 >= 2**k).astype(jnp.int32) for k in range(1, levels))
+    level = sum(reached, jnp.zeros_like(first))
+    return level, (first, last + 1 - 2**level)
 
 
 def run_maxima(table: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:

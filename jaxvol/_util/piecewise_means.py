@@ -17,14 +17,9 @@ from .vec3 import Scalar, Vec3
 
 
 class Span(NamedTuple):
-    """One row of `span_rows`.
-
-    - `start`, `end`: values between which it lies. The first and the last span reach farther.
-    - `from_start`: colour (r, g, b) and extinction at its start. `slopes`: how they grow with the value.
-    - `to_start`, `to_end`: integrals of emission and extinction over the value, from the first point on; and
-      the part of each that is lost when it is rounded, so that differences are exact however dense it is in
-      front of the two spans.
-    """
+    """One row of `span_rows`: the values between which it lies; colour (r, g, b) and extinction at its start,
+    and how they grow with the value; integrals of emission and extinction from the first point on, and the
+    part of each that is lost in rounding, so that differences are exact."""
 
     start: Scalar
     end: Scalar
@@ -85,10 +80,8 @@ def span_index(rows: Float[Array, "spans 26"], value: Array) -> Int[Array, "..."
 def mean_by_rows(
     a: Row, b: Row, front: Scalar, back: Scalar, same: Bool[Array, "..."]
 ) -> tuple[Vec3, Scalar]:
-    """Mean colour and extinction between two values, of which either may be the larger. `a`, `b`: the rows of
-    their spans. `same`: whether these are one.
-
-    Rounding: relative to the greatest extinction between the two, some 1e-7 times the number of spans."""
+    """Mean colour and extinction between two values in the spans of rows `a` and `b`, maybe the `same`;
+    rounded by some 1e-7 of the greatest extinction between the two, times the number of spans."""
     here, there = Span.of(a), Span.of(b)
     at_front, at_back = here.at(front), there.at(back)
     rise = tuple(v - u for u, v in zip(at_front, at_back, strict=True))
@@ -118,15 +111,15 @@ def mean_by_rows(
 
 @jax.custom_jvp
 def mean_by_spans(rows: Float[Array, "spans 26"], front: Scalar, back: Scalar) -> tuple[Vec3, Scalar]:
-    """The same, by a sum over all spans, which takes less time while there are few. Its derivatives are those
-    of `mean_by_rows`, which do not divide by the difference of values where these are near each other."""
+    """The same, by a sum over all spans: faster while there are few. Its derivatives are those of
+    `mean_by_rows`, which do not divide by a small difference of values."""
     spans = [Span.of(tuple(row)) for row in rows]
     up = back > front
     low, high = jnp.where(up, front, back), jnp.where(up, back, front)
     rise = high - low
     inverse = 1 / jnp.where(rise > 0, rise, 1)
-    # How far from one value to the other each span begins. Weights that sum to 1 whatever is rounded: XLA may
-    # compute a value twice, and round it differently, so that no sum may be divided by a difference.
+    # How far from one value to the other each span begins. The weights sum to 1 whatever is rounded: XLA may
+    # compute a value twice, rounded differently, so that no sum may be divided by a difference.
     begins = [
         jnp.where(span.start <= low, 0, jnp.where(span.start >= high, 1, (span.start - low) * inverse))
         for span in spans[1:]
@@ -153,8 +146,8 @@ def _(primals: tuple[Array, Scalar, Scalar], tangents: tuple[Any, Any, Any]) -> 
 
 
 def _linear_means(middle: Sequence[Array], rise: Sequence[Array]) -> tuple[Array, ...]:
-    """Mean emission and extinction over a stretch on which colour and extinction are linear, from those in
-    its middle, and from how much they grow over it."""
+    """Mean emission and extinction where colour and extinction are linear, from those in the middle, and from
+    how much they grow."""
     *colors, extinction = middle
     *of_colors, of_extinction = rise
     emission = (extinction * c + of_extinction * d / 12 for c, d in zip(colors, of_colors, strict=True))

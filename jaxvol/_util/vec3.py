@@ -1,9 +1,8 @@
 """Points, directions and colours as tuples of three scalars: arithmetic, frames, and even directions.
 
-Batched over rays, three arrays of length n run 3 to 5 times faster in a loop than one of shape
-(n, 3), whose components XLA must extract and recombine at every step. Functions of a single point
-or direction on the march's path therefore take and return triples; what a user holds (a camera's
-position, an image) is stacked.
+Batched over rays, three arrays of length n run 3 to 5 times faster in a loop than one of shape (n, 3), whose
+components XLA must extract and recombine at every step. So what is on the march's path takes and returns
+triples; what a user holds (a camera's position, an image) is stacked.
 """
 
 import math
@@ -93,11 +92,7 @@ def golden_spiral(n: int) -> Float[np.ndarray, "n 3"]:
 
 
 class Frame(eqx.Module):
-    """A Cartesian frame of coordinates, in world length.
-
-    - `origin`: the world point that has coordinates 0.
-    - `axes`: world directions of its axes: unit vectors that are orthogonal to each other.
-    """
+    """A Cartesian frame: the world point that has coordinates 0, and its orthonormal axes in the world."""
 
     origin: Vec3
     axes: tuple[Vec3, Vec3, Vec3]

@@ -14,11 +14,9 @@ _UNFINISHED: dict[Path, list[Path]] = {}
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path of the same name, in a temporary folder of its own, to write a file to.
-
-    When the context ends, the file replaces `path`, whose folder is made; after an error nothing has changed.
-    What a link points to is replaced; a pipe or a device is written to.
-    """
+    """A path of the same name, in a temporary folder, to write a file to. When the context ends, the file
+    replaces `path`, whose folder is made; after an error nothing has changed. What a link points to is
+    replaced; a pipe or a device is written to."""
     name, path = path.name, path.resolve()
     special = path.exists() and not (path.is_file() or path.is_dir())
     with _temporary_folder(Path(tempfile.gettempdir()) if special else path.parent) as folder:

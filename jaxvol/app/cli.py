@@ -6,25 +6,25 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from importlib import metadata
 
 import jax
 
 from .._util.whole_files import remove_unfinished
-from ..xla.persistent_cache import SHORTEST
-from .commands.animate import ANIMATE
-from .commands.datasets import DATASETS
-from .commands.demo import DEMO
-from .commands.figures import FIGURES
-from .commands.fit import FIT
-from .commands.info import INFO
-from .commands.parsing import Parser, add_commands, parsed
-from .commands.plan import PLAN
-from .commands.recorded import own_version
-from .commands.render import RENDER
-from .commands.view import VIEW
+from ..xla.persistent_cache import SHORTEST, default_programs
+from .commands.animate import add_animate
+from .commands.datasets import add_datasets
+from .commands.demo import add_demo
+from .commands.figures import add_figures
+from .commands.fit import add_fit
+from .commands.info import add_info
+from .commands.parsing import Parser, parsed
+from .commands.plan import add_plan
+from .commands.render import add_render
+from .commands.view import add_view
 
 
-COMMANDS = DEMO, RENDER, ANIMATE, PLAN, FIT, FIGURES, INFO, DATASETS, VIEW
+COMMANDS = add_demo, add_render, add_animate, add_plan, add_fit, add_figures, add_info, add_datasets, add_view
 
 EXAMPLES = """\
 examples:
@@ -57,11 +57,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     program = " ".join(["jaxvol", *words[:1]])
     options = argparse.Namespace()
     try:
-        command, options = parsed(parser_of_all(), words)
-        jax.config.update("jax_compilation_cache_dir", str(options.programs))
+        options = parsed(parser_of_all(), words)
+        jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
-        ThreadPoolExecutor(1).submit(command.run, options).result()
+        ThreadPoolExecutor(1).submit(options.execute, options).result()
         sys.stdout.flush()
     except BrokenPipeError:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end
@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def parser_of_all() -> argparse.ArgumentParser:
+def parser_of_all() -> Parser:
     """The parser of the command and its subcommands."""
     parser = Parser(
         prog="jaxvol",
@@ -94,7 +94,12 @@ def parser_of_all() -> argparse.ArgumentParser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    version = f"%(prog)s {own_version()} (jax {jax.__version__})"
-    parser.add_argument("--version", action="version", version=version)
-    add_commands(parser, COMMANDS)
+    try:
+        version = metadata.version("jaxvol")
+    except metadata.PackageNotFoundError:  # run from a checkout
+        version = "(not installed)"
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version} (jax {jax.__version__})")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add in COMMANDS:
+        add(commands)
     return parser

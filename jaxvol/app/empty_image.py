@@ -13,7 +13,7 @@ from ..compositing.isosurface import Isosurface
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import Rendering
-from ..scene.space import Affine, Ray, Space, enter
+from ..scene.space import Ray, Space, enter
 from ..scene.transfer import Transfer, TransferFunction
 from ..scene.volume import Volume
 
@@ -40,44 +40,25 @@ def why_empty(
         return None
     hit, values = _values_along(volume, camera, march.locate(volume))
     if not hit.any():
-        low, high = (", ".join(f"{c:g}" for c in np.asarray(corner)) for corner in volume.corners)
-        extends = f"the volume, which extends from ({low}) to ({high})"
-        if _values_along(volume, camera, Affine(volume))[0].any():
-            return f"no ray of the camera meets what the clip leaves of {extends}. Change its box or planes."
-        return f"no ray of the camera meets {extends}. Point it at the center, as Camera.looking_at does."
+        bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
+        return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
     if opacity > 0:
-        return (
-            f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, which raises the "
-            "extinction, or higher opacities."
-        )
+        return f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, or higher opacities."
     low, high = float(np.nanmin(values[hit])), float(np.nanmax(values[hit]))
     where = f"the volume's values along the rays run from {low:g} to {high:g}"
     if isinstance(compositing, Isosurface):
         return f"{where}, and none crosses the isosurface's value, {float(compositing.value):g}."
     if not isinstance(transfer, TransferFunction):
-        return (
-            f"{where}, and the transfer function shows none of them, or only under another label or gradient."
-        )
-    ranges = " or ".join(_visible_ranges(transfer))
-    if not ranges:
+        return f"{where}, and the transfer function shows none of them."
+    seen = np.flatnonzero(np.asarray(transfer.extinction) > 0)
+    if not seen.size:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
-    advice = f" A clim from {low:g} to {high:g} would show something." if low < high else ""
-    return f"{where}, and the transfer function shows values {ranges}.{advice}"
-
-
-def _visible_ranges(transfer: TransferFunction) -> list[str]:
-    """Ranges of values that are not transparent. The opacity of a point extends to its neighbours, that of
-    the first and the last to infinity."""
-    positive = np.concatenate([[False], np.asarray(transfer.extinction) > 0, [False]])
-    values = np.concatenate([[-np.inf], np.asarray(transfer.values), [np.inf]])
-    found = []
-    for first, last in np.flatnonzero(positive[1:] != positive[:-1]).reshape(-1, 2):
-        low, high = values[first], values[last + 1]
-        if high == np.inf:
-            found.append(f"from {low:g} on" if low > -np.inf else "of any kind")
-        else:
-            found.append(f"from {low:g} to {high:g}" if low > -np.inf else f"up to {high:g}")
-    return found
+    # the opacity of a point extends to its neighbours, that of the first and the last to infinity
+    at = [-np.inf, *np.asarray(transfer.values), np.inf]
+    return (
+        f"{where}, and the transfer function shows values between {at[seen[0]]:g} and {at[seen[-1] + 2]:g}. "
+        f"A clim from {low:g} to {high:g} would show something."
+    )
 
 
 def _values_along(

@@ -1,10 +1,9 @@
 """Which cells of each ray lie in a brick?
 
 A cell belongs to the brick in which it begins, if samples were not moved. In a grid with straight rays each
-ray meets a brick once, and its cells there follow from where it enters and leaves. Where rays are curved, a
-ray may come back to a brick that it has left. Bricks are then visited one after the other, and a ray goes on
-while it is in this one, or in one that was visited before: those cells are read with the brick, which is the
-overlap of Kim, Kwon and Shin 2008.
+ray meets a brick once. Where rays are curved, a ray may come back to a brick that it has left. Bricks are
+then visited one after the other, and a ray goes on while it is in this one, or in one that was visited
+before: those cells are read with the brick, which is the overlap of Kim, Kwon and Shin 2008.
 """
 
 from typing import NamedTuple
@@ -18,7 +17,6 @@ from .._util.vec3 import Vec3
 from ..engine.rays import vmap_rays
 from ..engine.wavefront import CellRange
 from ..march.march import March
-from ..march.strides import longest_run
 from ..ray import Progress
 from ..scene.space import Ray, Straight, slab_interval
 from .grid import BrickGrid
@@ -32,20 +30,9 @@ CHUNK = 8
 """Cells of a ray that are tested at a time."""
 
 
-def reach(march: March, segment: int) -> int:
-    """Steps before and behind a brick's cells of a ray, in which its cells may read voxels."""
-    return SLACK + max(segment, longest_run(march))
-
-
 class Visit(eqx.Module):
-    """One brick, and where rays may go while it is in memory.
-
-    - `brick`: its number.
-    - `passable`: bricks through which rays go on from it, itself included.
-    - `empty`: bricks of which no voxel is needed, through which rays move to it.
-
-    The last two have an entry for each brick, and one more for what lies outside of the volume.
-    """
+    """A brick; through which bricks rays go on from it, itself included, while it is in memory; and which are
+    `empty`, so that rays move through them to it. Of all bricks, and of what lies outside of the volume."""
 
     brick: Int[Array, ""]
     passable: Bool[Array, " bricks"]
@@ -53,13 +40,8 @@ class Visit(eqx.Module):
 
 
 class BrickCells(NamedTuple):
-    """Cells of rays (tiles, groups, rays in a group) that are marched while a brick is in memory.
-
-    - `cells`: from the first to the last one, which lie in bricks that are passable.
-    - `reached`: index to which each ray has then come.
-    - `low`, `high`: a box of grid coordinates that holds all points of these cells.
-    - `any`: whether there are any cells.
-    """
+    """Cells of rays that are marched while a brick is in memory; the index that each ray has then `reached`;
+    a box of grid coordinates that holds all points of these cells; and whether there are any."""
 
     cells: CellRange
     reached: Int[Array, "*rays"]
@@ -78,12 +60,11 @@ def padded(cells: CellRange) -> CellRange:
 def straight_cells(
     grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], brick: Int[Array, ""]
 ) -> CellRange:
-    """The cells of straight rays in a brick, and those whose samples may be shifted into it; none of rays
-    that miss it, or are not alive."""
+    """The cells of `alive` straight rays in a brick, and those whose samples may be shifted into it."""
     near, far, hit = _within(grid, march, rays, brick)
     first, until = jnp.ceil(near).astype(jnp.int32) - SLACK, jnp.floor(far).astype(jnp.int32) + 1 + SLACK
-    none, hit = jnp.zeros_like(first), alive & hit
-    return CellRange(jnp.where(hit, jnp.maximum(first, 0), none), jnp.where(hit, until, none))
+    hit &= alive
+    return CellRange(jnp.where(hit, jnp.maximum(first, 0), 0), jnp.where(hit, until, 0))
 
 
 def first_behind(
@@ -131,27 +112,24 @@ def curved_cells(
 
     - `at`: where the march has come to. `reached`: to which cell of each ray its bricks have been found.
     - `beyond`: steps before and behind its cells that `low` and `high` are to hold, too."""
-    alive = ~at.finished
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
-    returns = [_End.of(rays, back) for _, back in rays.gaps]
-    returned_to = [grid.brick_of(end.coordinate) for end in returns]
+    # A ray may come back into the volume and leave it before the next of these points: this counts, too.
+    returns = [_Return.of(grid, rays, back) for _, back in rays.gaps]
+    number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
         depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
-        one = vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))
-        return jax.vmap(jax.vmap(one, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        return jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
 
     def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
         coordinate, inside = points(index)
         found = jnp.where(inside, grid.brick_of(coordinate), grid.number)
-        # A ray that comes back into the volume may leave it before the next of these points: where it comes
-        # back counts, too.
         more = [
-            jnp.where(end.within(index, offset, march.step), brick, grid.number)
-            for end, brick in zip(returns, returned_to, strict=True)
+            jnp.where(back.within(index, offset, march.step), back.brick, grid.number)
+            for back in returns
             for offset in fronts
         ]
         return jnp.concatenate([found, jnp.stack(more)]) if more else found
@@ -159,8 +137,6 @@ def curved_cells(
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
         front = index.astype(rays.length.dtype) * march.step
         return (front < (rays.length + march.step)[None]) & (index < march.most_samples)
-
-    number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
     def while_in(allowed: Bool[Array, " bricks"], index: Array, going: Array) -> tuple[Array, Array]:
         """Moves rays on while they are in these bricks; and the index behind the last cell on the way that
@@ -180,24 +156,23 @@ def curved_cells(
         index, last, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), more, start)
         return index, last
 
-    first, _ = while_in(visit.empty, reached, alive)
+    first, _ = while_in(visit.empty, reached, ~at.finished)
     here = jnp.any(bricks(first[None])[:, 0] == visit.brick, axis=0)
     # where its points lie in several bricks, the first one that is visited takes the cell
-    enters = alive & here & ahead(first[None])[0]
+    enters = ~at.finished & here & ahead(first[None])[0]
     _, until = while_in(visit.passable, first, enters)
     until = jnp.maximum(until, first + 1)
-    cells = CellRange(jnp.where(enters, first, 0), jnp.where(enters, until, 0))
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        index, low, high = state
-        index_ = index[None] + number
-        coordinate, inside = points(index_)
-        counts = enters[None] & (index_ <= (until + beyond)[None]) & (index_ >= 0)
+        start, low, high = state
+        index = start[None] + number
+        coordinate, inside = points(index)
+        counts = enters[None] & (index <= (until + beyond)[None]) & (index >= 0)
         low, high = _around(low, high, coordinate, inside & counts[None])
-        for end in returns:
-            held = [end.within(index_, offset, march.step) & counts for offset in fronts]
-            low, high = _around(low, high, end.coordinate, jnp.any(jnp.stack(held), axis=(0, 1)))
-        return index + CHUNK, low, high
+        for back in returns:
+            held = [back.within(index, offset, march.step) & counts for offset in fronts]
+            low, high = _around(low, high, back.coordinate, jnp.any(jnp.stack(held), axis=(0, 1)))
+        return start + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)
     _, low, high = jax.lax.while_loop(
@@ -205,22 +180,29 @@ def curved_cells(
         widen,
         (first - beyond, nothing, -nothing),
     )
+    cells = CellRange(jnp.where(enters, first, 0), jnp.where(enters, until, 0))
     return BrickCells(cells, jnp.where(enters, until, first), low, high, jnp.any(enters))
 
 
-class _End(NamedTuple):
-    """Where rays come back into the volume: the depth, the grid coordinate there, and whether they do."""
+def _located(rays: Ray, depth: Float[Array, "*rays"]) -> tuple[Vec3, Bool[Array, "*rays"]]:
+    """Grid coordinates of points on rays, and whether these lie in the volume."""
+    return vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)
+
+
+class _Return(NamedTuple):
+    """Where rays come back into the volume: depth, grid coordinate and brick, and whether they do."""
 
     depth: Float[Array, "*rays"]
     coordinate: Vec3
+    brick: Int[Array, "*rays"]
     there: Bool[Array, "*rays"]
 
     @classmethod
-    def of(cls, rays: Ray, depth: Float[Array, "*rays"]) -> "_End":
+    def of(cls, grid: BrickGrid, rays: Ray, depth: Float[Array, "*rays"]) -> "_Return":
         known = jnp.isfinite(depth)
         depth = jnp.where(known, depth, 0)
-        coordinate, inside = vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)
-        return cls(depth, coordinate, known & inside)
+        coordinate, inside = _located(rays, depth)
+        return cls(depth, coordinate, grid.brick_of(coordinate), known & inside)
 
     def within(
         self, index: Int[Array, "cells *rays"], offset: Float[Array, "*rays"], step: Float[Array, ""]

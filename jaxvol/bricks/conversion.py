@@ -1,5 +1,4 @@
-"""Of which type are the voxels of a source once they are read? As in a `Volume`, but decided before any is
-read."""
+"""Of which type are the voxels of a source once they are read? As in a `Volume`, but decided before that."""
 
 from typing import TypeAlias
 
@@ -15,13 +14,10 @@ Box: TypeAlias = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 
 def voxel_type(stored: np.dtype) -> np.dtype:
-    """The type in which voxels stored as `stored` are read: one of `Volume`'s types, in native byte order.
+    """The type in which voxels stored as `stored` are read: one of `Volume`'s, in native byte order.
 
-    Booleans become uint8. Integers of 32 and 64 bits become float32, which holds them exactly up to 2**24.
-    float64 is kept if JAX's 64-bit types are enabled, and becomes float32 otherwise.
-
-    **Raises:** `ValueError` for a type that no volume has, such as a complex one.
-    """
+    Booleans become uint8, integers of 32 and 64 bits float32. float64 stays where JAX's 64-bit types are
+    enabled. **Raises** `ValueError` for a type that no volume has, such as a complex one."""
     check_type(stored)
     if stored.kind == "b":
         return np.dtype(np.uint8)
@@ -43,31 +39,26 @@ def range_of(voxels: np.ndarray) -> tuple[float, float]:
 
 
 def converted(voxels: np.ndarray, box: Box, axes: Axes, name: str) -> np.ndarray:
-    """Voxels as `voxel_type` says, and C-contiguous. `box`: where they were read. `axes`: of the array.
+    """Voxels as `voxel_type` says, and C-contiguous. `box`, `axes`, `name`: where they were read.
 
-    **Raises:** `ValueError` for NaN, infinity, and integers that float32 does not hold exactly, with the
-    place of the first.
-    """
-    dtype = voxel_type(voxels.dtype)
+    **Raises:** `ValueError` for NaN, infinity, and integers that float32 does not hold exactly."""
+    dtype, place = voxel_type(voxels.dtype), f"in the box {box[0]} to {box[1]}"
     if dtype == np.float32 and voxels.dtype.kind in "iu":
         least, most = WHOLE["float32"]
         low, high = int(voxels.min()), int(voxels.max())
         if low < least or high > most:
             raise ValueError(
                 f"{name}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds exactly; "
-                f"got {voxels.dtype} from {low} to {high} in the box {box[0]} to {box[1]}. Subtract an "
-                "offset, or rescale them."
+                f"got {voxels.dtype} from {low} to {high} {place}."
             )
     with np.errstate(over="ignore"):  # overflow to infinity is rejected below
         voxels = np.ascontiguousarray(voxels, dtype)
-    if dtype.kind in "iu":
-        return voxels
-    if not np.all(np.isfinite(range_of(voxels))):
+    if dtype.kind not in "iu" and not np.all(np.isfinite(range_of(voxels))):
         wrong = ~(abs(voxels) < np.inf)
-        first = np.unravel_index(np.argmax(wrong), voxels.shape)
-        place = tuple(start + int(first[axes.index(axis)]) for axis, start in enumerate(box[0]))
+        first = np.argwhere(wrong)[0]
+        at = tuple(start + int(first[axes.index(axis)]) for axis, start in enumerate(box[0]))
         raise ValueError(
-            f"{name}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite in the "
-            f"box {box[0]} to {box[1]}, the first at {place}. Replace them first."
+            f"{name}: voxels must be finite in {dtype}; got {np.sum(wrong)} that are NaN or infinite "
+            f"{place}, the first at {at}. Replace them first."
         )
     return voxels

@@ -1,14 +1,12 @@
 """Bricks distributed over devices: each device reads and renders its own, of all rays, and the partial images
 are combined front to back.
 
-Devices get consecutive bricks of the order front to back. Where rays are straight, each ray meets them in
-this order, and so passes from the bricks of the first device to those of the second, and never back. Where it
-does follows from its geometry alone. So each device marches its cells as if nothing lay in front, and the
-operator "over", which is associative, joins them. All devices take a brick each at a time, in one program.
+Devices get consecutive bricks of the order front to back, which straight rays meet in this order. Each device
+marches its cells as if nothing lay in front, and the operator "over", which is associative, joins them. All
+devices take a brick each at a time, in one program.
 """
 
-from collections.abc import Iterator
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator
 from itertools import pairwise, zip_longest
 from typing import Any, TypeAlias
 
@@ -31,17 +29,17 @@ from ..scene.volume import part_of, with_voxels
 from ..xla.compiling import compiled
 from ..xla.trees import PyTree
 from .cells import first_behind, straight_cells
-from .grid import BrickGrid, Node
-from .traversal import Traversal
+from .grid import BrickGrid
+from .traversal import Load, Traversal
 
 
-Reading: TypeAlias = dict[int, tuple[Node, "Future[np.ndarray]"]]
-"""By device, the first node and the voxels of the brick that this process reads for it."""
+Loads: TypeAlias = dict[int, Load]
+"""By device, the brick that this process reads for it."""
 
 
 class Share(eqx.Module):
-    """What a device marches of an image: all rays, and which of their cells lie in its bricks. Arrays of many
-    shares have one more axis in front, which is sharded."""
+    """What a device marches: all rays, and which of their cells are its own. Arrays of many shares have one
+    more axis in front, which is sharded."""
 
     underway: RayStates
     own: CellRange
@@ -59,23 +57,22 @@ def render_distributed(traversal: Traversal, mesh: Mesh) -> Rendering:
     """The image of a traversal's scene. Rays are straight, and nothing that shows on a ray depends on what
     lies in front but by its transmittance."""
     scene, options, grid = traversal.scene, traversal.options, traversal.grid
-    share = _set_out(mesh, scene, options)
+    share = _begin(mesh, (scene, options), jnp.arange(mesh.size))
     every = jnp.broadcast_to(jnp.arange(grid.number, dtype=jnp.int32), (mesh.size, grid.number))
-    in_view = np.asarray(_met(mesh, grid, scene, share, every))[0]
-    wanted = traversal.visible & in_view
+    wanted = traversal.visible & np.asarray(_met(mesh, (grid, scene), share, every))[0]
     bounds = bounds_of(wanted[traversal.order], mesh.size)
     order = jnp.asarray(traversal.order, jnp.int32)
-    share = _divided(mesh, grid, scene, share, order, jnp.asarray(bounds, jnp.int32))
+    share = _divided(mesh, (grid, scene, order), share, jnp.asarray(bounds, jnp.int32))
     own = [[brick for brick in traversal.order[i:j] if wanted[brick]] for i, j in bounds]
     remaining = zip_longest(*own, fillvalue=-1)
-    load = _next_load(traversal, mesh, share, remaining)
-    while load is not None:
+    following = _next_loads(traversal, mesh, share, remaining)
+    while following is not None:
         jax.block_until_ready(share)  # or two bricks, and what is made of both, would be in memory
-        placed, number = _placed(traversal, mesh, *load), len(load[1])
-        load = _next_load(traversal, mesh, share, remaining)
-        share = _march(mesh, grid, scene, options, share, *placed)
+        placed, number = _placed(traversal, mesh, *following), len(following[1])
+        following = _next_loads(traversal, mesh, share, remaining)
+        share = _march(mesh, (grid, scene, options), share, *placed)
         traversal.finish(number, int(wanted.sum()))
-    return _join(mesh, scene, options, share)
+    return _join(mesh, (scene, options), share)
 
 
 def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[int, int]]:
@@ -85,38 +82,31 @@ def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[in
     return list(pairwise([0, *ends, len(wanted)]))
 
 
-def _next_load(
+def _next_loads(
     traversal: Traversal, mesh: Mesh, share: Share, remaining: Iterator[tuple[int, ...]]
-) -> tuple[np.ndarray, Reading] | None:
-    """The next brick of each device, -1 where none of its rays needs one, and the voxels as they are read.
-    `remaining`: bricks of the devices that are still to come, one of each at a time."""
-    here = jax.process_index()
+) -> tuple[np.ndarray, Loads] | None:
+    """The next brick of each device, -1 where none of its rays needs one. `remaining`: those to come."""
     for each in remaining:
         bricks = np.asarray(each, np.int32)
-        met = _met(mesh, traversal.grid, traversal.scene, share, jnp.asarray(bricks)[:, None])
-        needed = np.asarray(met)[:, 0]
-        local = [d for d, device in enumerate(mesh.devices) if device.process_index == here and needed[d]]
+        met = _met(mesh, (traversal.grid, traversal.scene), share, jnp.asarray(bricks)[:, None])
+        needed, loads = np.asarray(met)[:, 0], {}
+        for d, device in enumerate(mesh.devices):
+            if device.process_index == jax.process_index() and needed[d]:
+                loads[d] = traversal.load(each[d], None, *traversal.around(each[d]))
         if needed.any():
-            reading = {d: traversal.read(each[d], *traversal.around(each[d])) for d in local}
-            return np.where(needed, bricks, -1), reading
+            return np.where(needed, bricks, -1), loads
     return None
 
 
-def _placed(
-    traversal: Traversal, mesh: Mesh, bricks: np.ndarray, reading: Reading
-) -> tuple[Array, Array, Array]:
+def _placed(traversal: Traversal, mesh: Mesh, bricks: np.ndarray, loads: Loads) -> tuple[Array, Array, Array]:
     """The bricks, their first nodes and their voxels, each on its device."""
     shape = permuted(traversal.stored, traversal.source.order)
-    nothing, first = np.zeros(shape, traversal.source.dtype), np.zeros((mesh.size, 3), np.int32)
-    voxels = []
+    nothing, first, voxels = np.zeros(shape, traversal.source.dtype), np.zeros((mesh.size, 3), np.int32), []
     for d, device in enumerate(mesh.devices):
-        if device.process_index != jax.process_index():
-            continue
-        part = nothing
-        if d in reading:
-            first[d], coming = reading[d]
-            part = coming.result()
-        voxels.append(jax.device_put(part[None], device))
+        if device.process_index == jax.process_index():
+            first[d] = loads[d].first if d in loads else 0
+            part = loads[d].voxels.result() if d in loads else nothing
+            voxels.append(jax.device_put(part[None], device))
     sharding = NamedSharding(mesh, SHARDED)
     return (
         jnp.asarray(bricks),
@@ -125,94 +115,73 @@ def _placed(
     )
 
 
-def _on_each(mesh: Mesh, one: Any, *shares: PyTree, whole: bool = False) -> PyTree:
-    """`one` of each device's own part of arrays. `whole`: it returns the same on all devices."""
+def _on_each(*, whole: bool = False) -> Callable[[Callable[..., PyTree]], Callable[..., Any]]:
+    """Decorator: `one(*given, *parts)` becomes a program `run(mesh, given, *shares)`, where each device has
+    its own part of each share. `whole`: it returns the same on all devices."""
 
-    def own(*parts: PyTree) -> PyTree:
-        found = one(*jax.tree.map(lambda leaf: leaf[0], parts))
-        return found if whole else jax.tree.map(lambda leaf: leaf[None], found)
+    def decorate(one: Callable[..., PyTree]) -> Callable[..., Any]:
+        def run(mesh: Mesh, given: tuple[Any, ...], *shares: PyTree) -> PyTree:
+            def own(*parts: PyTree) -> PyTree:
+                found = one(*given, *jax.tree.map(lambda leaf: leaf[0], parts))
+                return found if whole else jax.tree.map(lambda leaf: leaf[None], found)
 
-    out = REPLICATED if whole else SHARDED
-    return jax.shard_map(own, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
+            out = REPLICATED if whole else SHARDED
+            return jax.shard_map(own, mesh=mesh, in_specs=SHARDED, out_specs=out, check_vma=False)(*shares)
+
+        return compiled(run)
+
+    return decorate
 
 
-@compiled
-def _set_out(mesh: Mesh, scene: Scene, options: RenderOptions) -> Share:
+@_on_each()
+def _begin(scene: Scene, options: RenderOptions, _: Array) -> Share:
     """All rays at their entries, and all of their cells."""
-
-    def one(_: Array) -> Share:
-        underway = begin_rays(scene, options)
-        none = jnp.zeros(underway.rays.length.shape, jnp.int32)
-        return Share(underway, CellRange(none, jnp.full_like(none, jnp.iinfo(jnp.int32).max)))
-
-    return _on_each(mesh, one, jnp.arange(mesh.size))
+    underway = begin_rays(scene, options)
+    none = jnp.zeros(underway.rays.length.shape, jnp.int32)
+    return Share(underway, CellRange(none, jnp.full_like(none, jnp.iinfo(jnp.int32).max)))
 
 
-@compiled
-def _met(
-    mesh: Mesh, grid: BrickGrid, scene: Scene, share: Share, bricks: Int[Array, "devices n"]
-) -> Bool[Array, "devices n"]:
+@_on_each(whole=True)
+def _met(grid: BrickGrid, scene: Scene, share: Share, bricks: Int[Array, " n"]) -> Bool[Array, "devices n"]:
     """Whether any ray of a device needs each of its bricks: the answers of all devices."""
 
-    def one(share: Share, bricks: Int[Array, " n"]) -> Bool[Array, "devices n"]:
-        def met(brick: Int[Array, ""]) -> Bool[Array, ""]:
-            cells = share.of_brick(grid, scene, brick)
-            return jnp.any(cells.until > cells.first)
+    def met(brick: Int[Array, ""]) -> Bool[Array, ""]:
+        cells = share.of_brick(grid, scene, brick)
+        return jnp.any(cells.until > cells.first)
 
-        return jax.lax.all_gather(jax.lax.map(met, bricks), AXIS)
-
-    return _on_each(mesh, one, share, bricks, whole=True)
+    return jax.lax.all_gather(jax.lax.map(met, bricks), AXIS)
 
 
-@compiled
+@_on_each()
 def _divided(
-    mesh: Mesh,
-    grid: BrickGrid,
-    scene: Scene,
-    share: Share,
-    order: Int[Array, " bricks"],
-    bounds: Int[Array, "devices 2"],
+    grid: BrickGrid, scene: Scene, order: Int[Array, " bricks"], share: Share, bounds: Int[Array, "2"]
 ) -> Share:
     """Each device's own cells. `bounds`: its first brick in the order, and the one behind its last."""
-
-    def one(share: Share, bounds: Int[Array, "2"]) -> Share:
-        rays = share.underway.rays
-        first, until = (first_behind(grid, scene.march, rays, order, end) for end in bounds)
-        return Share(share.underway, CellRange(first, until))
-
-    return _on_each(mesh, one, share, bounds)
+    rays = share.underway.rays
+    first, until = (first_behind(grid, scene.march, rays, order, end) for end in bounds)
+    return Share(share.underway, CellRange(first, until))
 
 
-@compiled
+@_on_each()
 def _march(
-    mesh: Mesh,
     grid: BrickGrid,
     scene: Scene,
     options: RenderOptions,
     share: Share,
-    bricks: Int[Array, " devices"],
-    first: Int[Array, "devices 3"],
-    voxels: Shaped[Array, "devices x y z"],
+    brick: Int[Array, ""],
+    first: Int[Array, "3"],
+    voxels: Shaped[Array, "x y z"],
 ) -> Share:
     """Each device's rays behind its brick."""
-
-    def one(share: Share, brick: Array, first: Array, voxels: Array) -> Share:
-        part = part_of(with_voxels(scene.volume, voxels), first, grid.shape)
-        acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
-        cells, here = share.of_brick(grid, scene, brick), scene._replace(volume=part)
-        after = march_brick(here, options, acceleration, share.underway, cells, exact=True)
-        return Share(after, share.own)
-
-    return _on_each(mesh, one, share, bricks, first, voxels)
+    part = part_of(with_voxels(scene.volume, voxels), first, grid.shape)
+    acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
+    cells, here = share.of_brick(grid, scene, brick), scene._replace(volume=part)
+    return Share(march_brick(here, options, acceleration, share.underway, cells, exact=True), share.own)
 
 
-@compiled
-def _join(mesh: Mesh, scene: Scene, options: RenderOptions, share: Share) -> Rendering:
+@_on_each(whole=True)
+def _join(scene: Scene, options: RenderOptions, share: Share) -> Rendering:
     """The whole image, on all devices."""
-
-    def one(share: Share) -> Rendering:
-        at = jax.lax.all_gather(share.underway.at, AXIS)
-        rays = jax.tree.map(lambda leaf: leaf[None], share.underway.rays)
-        return finish_image(scene, options, join_segments(scene, RayStates(rays, at)))
-
-    return _on_each(mesh, one, share, whole=True)
+    at = jax.lax.all_gather(share.underway.at, AXIS)
+    rays = jax.tree.map(lambda leaf: leaf[None], share.underway.rays)
+    return finish_image(scene, options, join_segments(scene, RayStates(rays, at)))

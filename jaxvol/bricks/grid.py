@@ -19,8 +19,7 @@ Node = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class BrickGrid:
-    """Bricks of equally many cells; the last ones along an axis may have fewer. Bricks are numbered in
-    row-major order.
+    """Bricks of equally many cells, numbered in row-major order; the last ones along an axis may have fewer.
 
     - `shape`: nodes of the volume. `size`: cells of a brick.
     """
@@ -59,9 +58,9 @@ class BrickGrid:
         """All bricks, front to back, by the depth of their centers.
 
         Where rays are straight in the grid, depth is the sum of the distances along the three axes, counted
-        in bricks. None of the three falls along a ray, so that no ray meets a brick after one that is behind
-        it. Where rays are curved, depth is the distance from the camera, as in the paper, and a ray may meet
-        bricks in another order."""
+        in bricks: none of the three falls along a ray, so that no ray meets a brick after one behind it.
+        Where rays are curved, it is the distance from the camera, as in the paper, and a ray may meet bricks
+        in another order."""
         index = np.stack(np.unravel_index(np.arange(self.number), self.counts), axis=-1)
         centers = (index + 0.5) * self.size
         eye, (_, _, forward) = camera.position, axes_of(camera)
@@ -91,13 +90,12 @@ def is_straight(space: Space) -> bool:
 def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     """By how much bricks must overlap at their curved faces along γ, so that each ray meets each brick once.
 
-    A ray may enter a brick, pass through the one that lies nearer to the probe, and come back. If the farther
-    brick includes the cap between the curved face and its chord, it need not be rendered again. At a face at
-    the distance l from the apex the cap has the height K = l - l cos(θ/2), where θ is the angle of a brick's
-    fan; along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger
-    counts. It suffices where the brick beyond a face is rendered before the one within, and rays from side to
-    side of a brick need all of it: with less, they are blended in the wrong order. `render_bricks` does not
-    use it: how far each brick is read is found from the rays.
+    A ray may enter a brick, pass through the one nearer to the probe, and come back. If the farther brick
+    includes the cap between the curved face and its chord, it need not be rendered again. At a face at the
+    distance l from the apex the cap has the height K = l - l cos(θ/2), where θ is the angle of a brick's fan;
+    along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger counts.
+    With less, rays from side to side of a brick are blended in the wrong order. `render_bricks` does not use
+    it for what it reads, which follows from the rays.
 
     **Arguments:** `probe`: of the volume. `grid`: how it is divided into bricks.
 
@@ -116,13 +114,3 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
     from_apex, from_axis = float(probe.b) + at, float(probe.a) + float(probe.b) + at
     height = np.maximum(from_apex * (1 - np.cos(fan / 2)), from_axis * (1 - np.cos(sweep / 2)))
     return (np.maximum(height, 0) * cells[2] / np.ptp(gamma)).tolist()
-
-
-def share(overlaps: list[float], nodes: int) -> float:
-    """What the overlap adds to a volume: whole layers at each face.
-
-    **Arguments:** `overlaps`: of each face, from `overlap_of`. `nodes`: of the volume along γ.
-
-    **Returns:** the part of the volume that is read twice.
-    """
-    return sum(math.ceil(overlap) for overlap in overlaps) / nodes

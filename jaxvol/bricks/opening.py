@@ -10,14 +10,13 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described
-from .._util.files import Header, check_size, decoding, file_size
+from .._util.files import check_size, decoding, file_size
 from .._util.named_axes import along_xyz, is_named
 from .._util.npy import npy_header
-from .._util.voxels import check_shape
 from ..io.formats.raw import raw_header
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume
-from .sources import VoxelSource
+from .sources import VoxelSource, check_is_array
 from .zarr import METADATA, is_zarr_array, ome_zarr_levels, zarr_array
 
 
@@ -25,7 +24,6 @@ Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 """A source, a volume, the path of a file or folder, or an array."""
 
 OF_RAW, OF_ARRAY, OF_ZARR = ("shape", "dtype"), ("axes", "index"), ("axes", "index", "missing")
-OPTIONS = *OF_RAW, *OF_ZARR
 
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:
@@ -64,16 +62,14 @@ def levels_of(
       | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
       | path of a `.npy` file, data[x, y, z] | by `np.load(mmap_mode="r")` |
       | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
-      | a `Volume` without labels and field | in place |
-      | a `VoxelSource` | as it says |
+      | a `Volume` without labels and field, or a `VoxelSource` | as it is |
 
     - `spacing`, `origin`: as in `Volume`, of the finest level; by default what the source says.
     - `shape`, `dtype`: of a raw file, as in `jv.load`.
     - `axes`, `index`: of arrays, .npy files and Zarr; see `VoxelSource`. By default Zarr's own
-      (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS`).
+      (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in version 2).
     - `missing`: what it means if a chunk of a path's Zarr array is not there. `"error"`: that the data are
-      incomplete. `"fill"`: that all its voxels have the fill value, which is why many programs leave out such
-      chunks (zarr and tensorstore among them, unless they are told otherwise).
+      incomplete. `"fill"`: that all its voxels have the fill value, as where programs leave out such chunks.
 
     **Returns:** a source for each level.
 
@@ -86,76 +82,60 @@ def levels_of(
     place: dict[str, Any] = {"spacing": spacing, "origin": origin}
     if isinstance(thing, str | os.PathLike) and str(thing):
         return _of_path(Path(thing), options, place)
-    if isinstance(thing, VoxelSource | Volume):
-        _refuse(described(thing), options, ())
-        source = VoxelSource.of_volume(thing) if isinstance(thing, Volume) else thing
-        if any(value is not None for value in place.values()):
-            raise ValueError(
-                f"spacing and origin are those of {described(thing)}; got {place} as well. Leave them out."
-            )
-        return (source,)
     if is_named(thing):
         _refuse(described(thing), options, ())
         thing, own = along_xyz(thing)
         return (VoxelSource(thing, **_with_own(place, own)),)
-    _refuse(described(thing), options, OF_ARRAY)
-    return (VoxelSource(thing, **options, **place),)
+    if not isinstance(thing, VoxelSource | Volume):
+        _refuse(described(thing), options, OF_ARRAY)
+        return (VoxelSource(thing, **options, **place),)
+    _refuse(described(thing), options | {k: v for k, v in place.items() if v is not None}, ())
+    return (thing if isinstance(thing, VoxelSource) else _of_volume(thing),)
+
+
+def _of_volume(volume: Volume) -> VoxelSource:
+    check_is_array(volume)
+    for part in ("labels", "field"):
+        if getattr(volume, part) is not None:
+            raise ValueError(f"source must hold voxels alone; got a Volume with {part}. Use jv.render.")
+    return VoxelSource(volume.data, volume.spacing, volume.origin, direction=volume.direction, name="volume")
 
 
 def _of_path(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tuple[VoxelSource, ...]:
     if not path.exists():
-        raise ValueError(
-            f"path: there is no file {path} (working directory {Path.cwd()}). Check the spelling."
-        )
+        raise ValueError(f"path: there is no file {path} (working directory {Path.cwd()}).")
     if path.is_dir():
         return _of_folder(path, options, place)
-    name = path.name.lower()
-    if name.endswith(".raw"):
+    if path.suffix.lower() == ".raw":
         _refuse(str(path), options, OF_RAW)
-        return (_raw(path, Header(options.get("shape"), options.get("dtype")), place),)
-    if name.endswith(".npy"):
+        size, stored, own = raw_header(path, options.get("shape"), options.get("dtype"), 48)
+        check_size(path, file_size(path), math.prod(size) * stored.itemsize)
+        mapped = np.memmap(path, stored, "r", shape=size, order="F")
+        return (VoxelSource(mapped, **_with_own(place, own), name=str(path)),)
+    if path.suffix.lower() == ".npy":
         _refuse(str(path), options, OF_ARRAY)
-        return (_npy(path, **options, **place),)
-    if name.endswith(".raw.gz"):
-        raise ValueError(
-            f"path: {path} is compressed, so that no part of it can be read alone. Decompress it: "
-            f"gunzip -k {path}."
-        )
+        whole = file_size(path)
+        with decoding(path), path.open("rb") as stream:
+            size, _, stored = npy_header(path, stream)
+            check_size(path, whole - stream.tell(), math.prod(size) * stored.itemsize)
+        return (VoxelSource(np.load(path, mmap_mode="r"), **options, **place, name=str(path)),)
     raise ValueError(
-        f"path: {path} is not of a kind that is read in parts: .raw, .npy, or the folder of a Zarr array or "
-        "an OME-Zarr image. If it fits into memory, pass jv.load(path), or for ultrasound the volume and "
-        "the map that jv.load_ultrasound(path) returns; of HDF5, the array h5py.File(path)[name]."
+        f"path: {path} is not of a kind that is read in parts: .raw (uncompressed: gunzip -k), .npy, or the "
+        "folder of a Zarr array or an OME-Zarr image. Pass what fits into memory as jv.load(path) or "
+        "jv.load_ultrasound(path), and of HDF5 the array h5py.File(path)[name]."
     )
-
-
-def _raw(path: Path, header: Header, place: dict[str, Any]) -> VoxelSource:
-    size, stored, own = raw_header(path, header, 48)
-    check_size(path, file_size(path), math.prod(size) * stored.itemsize)
-    check_shape(size)
-    mapped = np.memmap(path, stored, "r", shape=size, order="F")
-    return VoxelSource(mapped, **_with_own(place, own), name=str(path))
-
-
-def _npy(path: Path, **options: Any) -> VoxelSource:
-    size = file_size(path)
-    with decoding(path), path.open("rb") as stream:
-        shape, _, stored = npy_header(path, stream)
-        start = stream.tell()
-    check_size(path, size - start, math.prod(shape) * stored.itemsize)
-    return VoxelSource(np.load(path, mmap_mode="r"), name=str(path), **options)
 
 
 def _of_folder(path: Path, options: dict[str, Any], place: dict[str, Any]) -> tuple[VoxelSource, ...]:
     if not any((path / name).is_file() for name in METADATA):
         raise ValueError(
-            f"path: {path} is a folder without Zarr in it: it has none of {', '.join(METADATA)}. Give the "
-            "folder of an array or of an OME-Zarr image; for a DICOM series, pass jv.load(path)."
+            f"path: {path} is a folder without Zarr in it: it has none of {', '.join(METADATA)}. For a DICOM "
+            "series, pass jv.load(path)."
         )
-    _refuse(str(path), options, OF_ZARR)
     if is_zarr_array(path):
+        _refuse(str(path), options, OF_ZARR)
         return (zarr_array(path, **options, **place),)
-    if "axes" in options:
-        raise ValueError(f"axes: the metadata of the OME-Zarr image {path} name its axes. Leave it out.")
+    _refuse(f"the OME-Zarr image {path}, whose metadata name its axes,", options, OF_ZARR[1:])
     return ome_zarr_levels(path, **options, **place)
 
 
@@ -166,10 +146,8 @@ def _with_own(place: dict[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 def _refuse(what: str, options: dict[str, Any], allowed: tuple[str, ...]) -> None:
     if unused := [name for name in options if name not in allowed]:
-        raise ValueError(
-            f"{', '.join(unused)}: {what} takes no such option; {', '.join(OF_RAW)} belong to raw files, "
-            f"{', '.join(OF_ARRAY)} to arrays and .npy files, {', '.join(OF_ZARR)} to paths of Zarr arrays."
-        )
+        expected = f"only {', '.join(allowed)}" if allowed else "none"
+        raise ValueError(f"{', '.join(unused)}: {what} takes no such option; expected {expected}.")
 
 
 def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:

@@ -1,14 +1,12 @@
 """Renders a volume that need not fit into memory, brick by brick."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 
 from .._util.checks import Arrayable, described, integer, shortened
 from .._util.memory import memory_of_device
@@ -18,8 +16,6 @@ from ..compositing.selection import Selection
 from ..engine.acceleration import VolumeAcceleration
 from ..engine.brick_march import (
     NO_ACCELERATION,
-    RayStates,
-    ReplayState,
     begin_rays,
     begin_vjp,
     finish_image,
@@ -28,12 +24,11 @@ from ..engine.brick_march import (
     resolve_brick,
     vjp_of_brick,
 )
-from ..engine.devices import Devices, check_not_sharded, mesh_of, number_of, on_all
-from ..engine.gradients import Sums, of_all_outputs, of_perturbed
+from ..engine.devices import Devices, check_not_sharded, mesh_of, on_all
+from ..engine.gradients import of_all_outputs, of_perturbed
 from ..engine.image import RenderOutputs
 from ..engine.resolve import resolve_image
-from ..engine.tiling import RenderOptions, Tiling
-from ..engine.wavefront import CellRange
+from ..engine.tiling import RenderOptions
 from ..lighting.shading import Lighting
 from ..march.march import March
 from ..march.strides import stride_control
@@ -47,21 +42,16 @@ from ..scene.volume import Volume, part_of
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
-from ..xla.trees import PyTree, strong
+from ..xla.trees import strong
 from .distributed import render_distributed
 from .grid import Node, is_straight
-from .opening import OPTIONS, level_for, levels_of
+from .opening import level_for, levels_of
 from .sources import VoxelSource
-from .traversal import Method, Request, Traversal
+from .traversal import METHODS, Method, Request, Traversal
 
-
-METHODS = "overlap", "reload"
 
 Own = Literal["rays", "bricks"]
 """What may be dealt out to devices."""
-
-BATCH = 72
-"""`Tiling.batch` on a CPU. Few rays meet a brick, and the last batch takes as long as its longest ray."""
 
 
 def render_bricks(
@@ -88,80 +78,66 @@ def render_bricks(
 
     The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
     is read. A brick that no ray needs is not read: one in which nothing is visible, outside of the view, or
-    behind what is opaque. The image is that of `render`, lit or not, whatever the bricks: in float32,
-    colours, opacity and the components of a normal agree to 2e-5, and depth to 1e-6 of itself (by `Maximum`,
-    under a transfer function that rises within an eightieth of the values, 3e-5). `samples` may be others,
-    since what is empty is left out by bricks. So may `exhausted`, where a `max_samples` is too small, and
-    `error`, which is another estimate of the same error.
+    behind what is opaque. The image is that of `render`, whatever the bricks: in float32, colours, opacity
+    and the components of a normal agree to 2e-5, and depth to 1e-6 of itself (by `Maximum`, under a transfer
+    function that rises within an eightieth of the values, 3e-5). `samples`, `error`, and `exhausted` where a
+    `max_samples` is too small, may differ.
 
     **Arguments:** `transfer`, `camera`, `march`, `compositing`, `outputs`: as for `render`; all transforms
     but `SpaceLeaping("min_distance")`.
 
-    - `source`: anything with `shape`, `dtype` and `source[box]`, data[x, y, z]; the path of a raw, .npy, Zarr
-      or OME-Zarr file; a `Volume`; a `bricks.VoxelSource`. See `bricks.levels_of`, which also takes `options`
-      (`shape` and `dtype` of a raw file, and `axes`, `index` and `missing`). One pass over all voxels finds
-      their ranges before the first image. A `VoxelSource` of a file keeps them for the next: open it once, by
-      `bricks.source_of`. An array in memory has the pass in each image.
+    - `source`, and `options` for it (`shape`, `dtype`, `axes`, `index`, `missing`): see `bricks.levels_of`.
+      One pass over all voxels finds their ranges before the first image. A `bricks.VoxelSource` of a file
+      keeps them for the next: open it once, by `bricks.source_of`.
     - `spacing`, `origin`: as in `Volume`; by default what the source says.
-    - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one. Beside
-      them an image takes some 550 bytes for each pixel, compiled programs some 300 MiB, the ranges of values
-      2 / 16³ of the voxels, and Zarr 16 MiB of decoded chunks for each level that is read. By default a
-      quarter of the device's memory. Where rays are curved in the grid, more may be read of a later brick
-      than of those before, which compiles programs again.
-    - `bricks`: number of bricks along x, y and z, in place of those that fit into `memory` and of which least
-      is read. There are fewer along an axis of too few voxels, and no more than 65 536 in all. What these
-      bricks take may exceed `memory`.
+    - `memory`: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
+      default a quarter of the device's. Beside them an image takes some 550 bytes for each pixel, compiled
+      programs some 300 MiB, the ranges of values 2 / 16³ of the voxels, and Zarr 16 MiB for each level.
+    - `bricks`: number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
+      may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
     - `method`: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
-      left. `"overlap"`: bricks are read larger than they are, so that each is read once; one that would not
-      fit into `memory` then is read again for the rays that come back. `"reload"`: bricks are read again for
-      them. Or a function that chooses the next brick (`bricks.traversal.Schedule`).
+      left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as `memory`
+      goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
+      (`bricks.traversal.Schedule`).
     - `lighting`: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
       (`Lighting.farthest_read`).
     - `level`: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
-      are no larger than a pixel at the volume's nearest corner (`bricks.level_for`); under a `ToroidalMap`
-      the finest, 0, whose nodes its ranges are of.
+      are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
     - `progress`: called after each brick, with the numbers of bricks rendered so far and of those that hold
-      anything visible. The former may end below the latter, where bricks are not needed, or above it, where
-      they are read again. The pass over all voxels before does not call it; `bricks.summary_of` does.
+      anything visible, some of which may not be needed, or be read again.
     - `devices`: as for `render`. `memory` is that of each device.
     - `own`: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
-      is read once (in each process) and copied to all. `"bricks"`: each device has its own bricks, marches
-      all rays through them, and the partial images are combined front to back. No voxel goes to two devices
-      or processes, but for what is read around bricks; so where reading takes longest, and for several
-      processes. Rays must be straight in the grid (no `ToroidalMap`), and what a ray shows must not depend on
-      what lies in front but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by
-      `"over"`). An `EarlyTermination` sees what is in front on the same device alone: up to `opacity_left` of
-      the colours behind are added, and depth changes with them. Without it, depth agrees to 1e-5 of itself.
-      Each device keeps some 300 bytes for each pixel. No gradients.
+      is read once and copied to all. `"bricks"`: each device reads its own bricks, marches all rays through
+      them, and the partial images are combined front to back: where reading takes longest, and for several
+      processes. Rays must be straight in the grid, and what a ray shows must not depend on what lies in front
+      but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`; compositing by `"over"`). An
+      `EarlyTermination` sees what is in front on the same device alone: up to `opacity_left` of the colours
+      behind are added, and depth changes with them. Without it, depth agrees to 1e-5 of itself. Each device
+      keeps some 300 bytes for each pixel. No gradients.
 
     **Returns:** as `render`, and in `Rendering.bricks` what it took.
 
     Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
-    spacing and origin: a second march reads the bricks again. Where the march does not leap, that one reads
-    bricks of no extinction, too, whose gradient need not be 0. Where it leaps, the derivative by the
+    spacing and origin: a second march reads the bricks again. Where the march leaps, the derivative by the
     extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other parts
     of it. There is no gradient to the voxels, none of modes that choose a sample or resolve (`"maximum"`,
     `"average"`, `Isosurface`), none in forward mode (`jax.jvp`) or of second order, and none inside `jax.jit`
     or `jax.vmap`.
 
     **Raises:** `ValueError`, naming the argument, as `render`; for a source that is truncated, damaged or
-    unknown; for voxels outside of the ranges of values found before, which tell that it changed; for less
-    memory than the smallest bricks take; for what needs the whole volume at once (labels,
-    baked or deferred light); and for what cannot be had with `own="bricks"`. Nothing is written.
+    unknown, or that changed after its ranges of values were found; for less memory than the smallest bricks
+    take; for what needs the whole volume at once (labels, baked or deferred light); and for what cannot be
+    had with `own="bricks"`. Nothing is written.
 
     Where it fails, and where not: `experiments/stability.py`, "wrong order".
 
     Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3. Ranges of values, by which empty bricks
     are not read, are their future work. Unlike there, how far bricks overlap follows from the rays of the
-    image, so that it suffices for all faces and from everywhere; `bricks.overlap_of` has their formula.
+    image; `bricks.overlap_of` has their formula.
     """
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    _check(march, transfer, lighting, method, outputs, own)
-    if unknown := sorted(options.keys() - {*OPTIONS}):
-        raise TypeError(f"render_bricks has no arguments {', '.join(unknown)}; see its docstring.")
-    if progress is not None and not callable(progress):
-        raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
+    _check(march, transfer, lighting, method, outputs, own, progress)
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
@@ -175,19 +151,16 @@ def render_bricks(
     chosen = _level(levels, level, camera, march)
     scene = _scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
     check_not_sharded(mesh, scene)
-    scene, deals_bricks = on_all(mesh, scene), own == "bricks"
-    request = Request(chosen, room, _counts(bricks), method, progress, number_of(mesh) if deals_bricks else 1)
-    job = _Job(request, outputs, mesh, deals_bricks, [])
-    if deals_bricks:
+    scene = on_all(mesh, scene)
+    request = Request(chosen, room, _counts(bricks), method, progress, outputs, mesh, own == "bricks")
+    if request.deals_bricks:
         _check_distributed(scene, method)
     if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
         raise ValueError(
-            "render_bricks has gradients in reverse mode (jax.grad, jax.vjp), of first order, and none in "
-            'forward mode (jax.jvp, jax.jacfwd): use jv.render(..., adjoint="forward") on a volume in '
-            'memory, or adjoint="direct" for higher derivatives.'
+            "render_bricks has gradients in reverse mode, but none in forward mode (jax.jvp) or of 2nd order."
         )
-    rendering = _differentiable(scene, job) if is_traced(scene) else _image(scene, job)
-    report = job.traversals[0].report()
+    rendering = _differentiable(scene, request) if is_traced(scene) else _image(scene, request)
+    report = request.traversals[0].report()
     return Rendering(rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=report))
 
 
@@ -209,9 +182,9 @@ def bricks_of(
     lighting: Lighting | None = None,
 ) -> Traversal:
     """The bricks by which `render_bricks` would render a source, none of them read; with the same errors."""
-    _check(march, transfer, lighting, "overlap", "all", "rays")
+    _check(march, transfer, lighting)
     scene = _scene_of(source, transfer, camera, march, compositing, lighting)
-    return _Job(Request(source, memory), "all", None, False, []).traversal(_marched(scene), scene, "all")
+    return Traversal(Request(source, memory), _marched(scene), scene, "all")
 
 
 def _scene_of(
@@ -241,61 +214,29 @@ def _marched(scene: Scene) -> Scene:
     return scene._replace(transfer=transfer, march=march, lighting=None)
 
 
-@dataclass(frozen=True)
-class _Job:
-    """How a scene is rendered.
-
-    - `devices`: over which rays are dealt out, or bricks, if `deals_bricks`.
-    - `traversals`: filled while the scene is rendered. A gradient has a second one."""
-
-    request: Request
-    outputs: RenderOutputs
-    devices: Mesh | None
-    deals_bricks: bool
-    traversals: list[Traversal]
-
-    def options(self, outputs: Any) -> RenderOptions:
-        """What is computed, and how rays are divided."""
-        tiling = Tiling.of_backend(self.devices)
-        if not tiling.turns:  # on a CPU
-            tiling = tiling._replace(batch=BATCH)
-        return RenderOptions(outputs, tiling._replace(devices=None) if self.deals_bricks else tiling)
-
-    def traversal(self, marched: Scene, shown: Scene, outputs: Any) -> Traversal:
-        """The bricks of a scene, as rays are marched, and as they are shown."""
-        known = self.traversals[0].summary if self.traversals else None
-        found = Traversal.of(self.request, marched, shown, self.options(outputs), known)
-        self.traversals.append(found)
-        return found
-
-
 _set_out, _march_part, _arrive = map(compiled, (begin_rays, march_brick, finish_image))
 _resolve_part, _resolve = map(compiled, (resolve_brick, resolve_image))
 _start_pull, _pull_part, _end_pull = map(compiled, (begin_vjp, vjp_of_brick, finish_vjp))
 
 
-def _image(scene: Scene, job: _Job) -> Rendering:
-    mode, outputs = scene.compositing, job.outputs
+def _image(scene: Scene, request: Request) -> Rendering:
+    mode, outputs = scene.compositing, request.outputs
     marched, selects = _marched(scene), isinstance(mode, Selection)
-    traversal = job.traversal(marched, scene, "depth" if mode.resolves and outputs == "rgba" else outputs)
+    found = "depth" if mode.resolves and outputs == "rgba" else outputs
+    traversal = Traversal(request, marched, scene, found)
     options = traversal.options
-    if job.deals_bricks:
-        assert job.devices is not None
-        return render_distributed(traversal, job.devices)
-    exact = callable(job.request.method)
-
-    def march_brick(
-        brick: Volume, cells: CellRange, state: tuple[RayStates, PyTree]
-    ) -> tuple[RayStates, PyTree]:
-        underway, pixels = state
-        after = _march_part(*_on(brick, marched, options), underway, cells, exact)
+    if request.deals_bricks:
+        assert request.mesh is not None
+        return render_distributed(traversal, request.mesh)
+    underway, pixels = _set_out(marched, options), None
+    for brick, cells in traversal.bricks(underway.rays, underway.at):
+        before, restart = underway.at, callable(request.method)
+        underway = _march_part(*_on(brick, marched, options), underway, cells, restart)
         if selects:
-            pixels = _resolve_part(*_on(brick, scene, options), marched.march, underway.at, after, pixels)
-        return after, pixels
-
-    underway = _set_out(marched, options)
-    state = traversal.through(underway.rays, (underway, None), lambda state: state[0].at, march_brick)
-    underway, pixels = state
+            pixels = _resolve_part(*_on(brick, scene, options), marched.march, before, underway, pixels)
+            jax.block_until_ready(pixels)
+        traversal.at = underway.at
+        del brick
     rendering = _arrive(marched, options, underway)
     if not mode.resolves:
         return rendering
@@ -311,51 +252,42 @@ def _image(scene: Scene, job: _Job) -> Rendering:
 
 
 @eqx.filter_custom_vjp
-def _differentiable(scene: Scene, job: _Job) -> Rendering:
+def _differentiable(scene: Scene, request: Request) -> Rendering:
     if is_traced(scene):
         raise ValueError(
-            "render_bricks reads its source while it runs, and so not inside jax.jit, jax.vmap or forward "
-            "mode: call it outside of them, or jv.render on a volume in memory."
+            "render_bricks reads its source while it runs, so not inside jax.jit, jax.vmap or forward mode."
         )
-    return _image(scene, job)
+    return _image(scene, request)
 
 
 @_differentiable.def_fwd
-def _(perturbed: Any, scene: Scene, job: _Job) -> tuple[Rendering, Rendering]:
+def _(perturbed: Any, scene: Scene, request: Request) -> tuple[Rendering, Rendering]:
     mode = scene.compositing
     if mode.resolves:
-        raise ValueError(
-            f"compositing by {type(mode).__name__} has no gradient through bricks; use jv.render on a volume "
-            "in memory."
-        )
-    if callable(job.request.method):
+        raise ValueError(f"compositing by {type(mode).__name__} has no gradient through bricks.")
+    if callable(request.method):
         raise ValueError('method: a schedule of your own has no gradient; use "overlap".')
-    rendering = _differentiable(scene, job)
+    rendering = _differentiable(scene, request)
     return rendering, rendering
 
 
 @_differentiable.def_bwd
-def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, job: _Job) -> Any:
+def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, request: Request) -> Any:
     if is_traced(cotangent):
         raise ValueError(
             "the gradient by bricks reads its source while it is computed, and so not inside jax.jit, "
             "jax.vmap or jax.jacrev: call what jax.vjp returns outside of them, once for each cotangent."
         )
-    traversal, whole = job.traversal(scene, scene, job.outputs), of_all_outputs(rendering, cotangent)
-    options = traversal.options
+    traversal = Traversal(request, scene, scene, request.outputs)
+    options, whole = traversal.options, of_all_outputs(rendering, cotangent)
     if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
-
-    def pull_brick(
-        brick: Volume, cells: CellRange, state: tuple[Sums, ReplayState]
-    ) -> tuple[Sums, ReplayState]:
-        here, options_, acceleration = _on(brick, scene, options)
-        return _pull_part(here, perturbed, options_, acceleration, *state, cells)
-
-    state = _start_pull(scene, perturbed, options, rendering, whole)
-    rays = state[1].states.rays
-    state = traversal.through(rays, state, lambda state: state[1].states.at, pull_brick)
-    found = _end_pull(scene, perturbed, options, *state, rendering, whole)
+    sums, replay = _start_pull(scene, perturbed, options, rendering, whole)
+    for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
+        sums, replay = _pull_part(*_on(brick, scene, options), perturbed, sums, replay, cells)
+        traversal.at = replay.states.at
+        del brick
+    found = _end_pull(scene, perturbed, options, sums, replay, rendering, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 
@@ -371,22 +303,13 @@ def _level(
     levels: tuple[VoxelSource, ...], level: int | Literal["auto"] | Any, camera: Camera, march: March
 ) -> VoxelSource:
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
+    most = 0 if mapped else len(levels) - 1  # a map's ranges are those of the finest level
     if level != "auto":
-        chosen = integer("level", level, 0, len(levels) - 1, otherwise=', or "auto"')
-        if mapped and chosen:
-            raise ValueError(
-                "level must be 0 under a ToroidalMap, whose ranges are those of the finest level; got "
-                f"{level}."
-            )
-        return levels[chosen]
-    if len(levels) == 1 or mapped:
-        return levels[0]
-    if is_traced(camera):
-        raise ValueError(
-            f"level must be one of 0 to {len(levels) - 1} where gradients are taken; got 'auto', which "
-            "depends on what is differentiated."
-        )
-    return levels[level_for(levels, camera)]
+        otherwise = ', or "auto" under a ToroidalMap' if mapped else ', or "auto"'
+        return levels[integer("level", level, 0, most, otherwise=otherwise)]
+    if most and is_traced(camera):
+        raise ValueError(f"level must be one of 0 to {most} where gradients are taken; got 'auto'.")
+    return levels[level_for(levels, camera) if most else 0]
 
 
 def _counts(bricks: Any) -> Node | None:
@@ -397,33 +320,34 @@ def _counts(bricks: Any) -> Node | None:
         return integer("x", x, 1), integer("y", y, 1), integer("z", z, 1)
     except (TypeError, ValueError) as fault:
         raise ValueError(
-            "bricks must be three numbers of bricks, along x, y and z, each an integer of at least 1, such "
-            f"as (2, 2, 1); got {shortened(bricks)}."
+            f"bricks must be three numbers of bricks, each an integer of at least 1; got {shortened(bricks)}."
         ) from fault
 
 
 def _check(
-    march: March, transfer: Transfer, lighting: Lighting | None, method: Any, outputs: Any, own: Any
+    march: March,
+    transfer: Transfer,
+    lighting: Lighting | None,
+    method: Any = "overlap",
+    outputs: Any = "all",
+    own: Any = "rays",
+    progress: Any = None,
 ) -> None:
-    words = (("outputs", outputs, get_args(RenderOutputs)), ("own", own, get_args(Own)))
-    for name, given, known in (*words, *(() if callable(method) else (("method", method, METHODS),))):
+    """Raises for arguments that are no such, and for what needs the whole volume."""
+    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, get_args(Own))]
+    words += [] if callable(method) else [("method", method, tuple(METHODS))]
+    for name, given, known in words:
         if not isinstance(given, str) or given not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     if isinstance(transfer, LabelTransferFunction):
-        raise ValueError(
-            "transfer must be of values: bricks have no labels. Use jv.render for labelled volumes."
-        )
+        raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
-        raise ValueError(
-            'SpaceLeaping("min_distance") starts rays at what is visible first in the whole volume; use '
-            '"hierarchy", "distance" or "beam" with bricks.'
-        )
-    if lighting is not None and (lighting.farthest_read is None):
-        raise ValueError(
-            "lighting must say how far around a sample it reads (Lighting.farthest_read), and light samples; "
-            f"{type(lighting).__name__} needs the whole volume here. Phong does not, and neither do "
-            "ScattererTemplates that are not baked."
-        )
+        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
+    if lighting is not None and lighting.farthest_read is None:
+        what = f"{type(lighting).__name__} needs the whole volume here"
+        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); {what}.")
 
 
 def _check_distributed(scene: Scene, method: Method) -> None:

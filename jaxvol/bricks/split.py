@@ -1,21 +1,12 @@
-"""How large may bricks be, how much is read around them, and which split of a volume takes the least time?
-
-Where rays are straight, any split shows the same image. Bricks that follow the shape of what is visible leave
-out more of what is not; rows of a file that are cut are read with their gaps; and each brick takes time for
-all rays.
-"""
+"""How large may bricks be, and how much is read around them?"""
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
 
-from .._util.checks import integer
 from .._util.files import MOST_VOXELS
 from .._util.vec3 import Vec3
 from ..march.march import March
@@ -26,9 +17,8 @@ from ..ray import Scene
 from ..scene.occupancy import BLOCK
 from ..scene.space import Space
 from ..xla.compiling import compiled
-from .cells import reach
+from .cells import SLACK
 from .grid import BrickGrid, Node, is_straight, overlap_of
-from .sources import VoxelSource
 
 
 EDGE = 16
@@ -39,15 +29,8 @@ MOST_BRICKS = 2**16
 
 COPIES = 2.5
 """Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of
-blocks takes, less than half. Voxels that are stored in another type take `sources.AT_ONCE` bytes more while
-they are read, or a layer of chunks, if that is more."""
-
-PER_RAY = 100
-"""Bytes that can be read in the time that a brick takes for a ray that misses it: on a CPU, of 512 x 512
-rays."""
-
-MORE = 2
-"""How many times as many bricks are tried as fit into memory."""
+blocks takes, less than half. Voxels of another type take `sources.AT_ONCE` bytes more, or a layer of chunks,
+while they are read."""
 
 
 class TooLittleMemory(ValueError):
@@ -58,14 +41,11 @@ class TooLittleMemory(ValueError):
 class Margin:
     """What is read around a brick.
 
-    - `cells`: along each axis, on both sides, and for any brick: as far as cells that begin in the brick may
-      reach, and what is read around these.
-    - `steps`: how far these cells may reach, in steps along a ray. `length`: the same as a world length.
+    - `cells`: along each axis, on both sides, around any brick.
+    - `steps`, `length`: how far cells that begin in the brick may reach along a ray, and in the world.
     - `light`: world length around a sample within which light is looked for.
-    - `around`: nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`.
-    - `slopes`: whether the gradient is read.
-    - `straight`: whether rays are straight in the grid.
-    - `probe`: whose bricks overlap. None if bricks do not.
+    - `around`: nodes more, for interpolation, `slopes`, and the windows of `AdaptiveSampling`.
+    - `straight`: whether rays are straight in the grid. `probe`: whose bricks overlap, if they do.
     """
 
     cells: Node
@@ -82,7 +62,7 @@ class Margin:
         """That of a march in a grid of this shape, which takes `segment` cells of a ray at a time. `shown`:
         what is measured and lit there."""
         transfer, lighting, straight = shown.transfer, shown.lighting, is_straight(space)
-        steps = reach(march, segment)
+        steps = SLACK + max(segment, longest_run(march))
         # where rays are curved, a brick's own cells are found by points that may lie four steps apart
         length = (steps + (0 if straight else 4)) * float(march.step)
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
@@ -110,9 +90,9 @@ class Margin:
 
 
 def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, length: float) -> np.ndarray:
-    """Nodes along each axis, on both sides of a box of a grid of this shape, that hold everything within a
-    world length of it. Where rays are curved they follow from the least distances between nodes in the box
-    and in these nodes themselves, also beyond the grid, through which a ray may come to other nodes of it."""
+    """Nodes along each axis, on both sides of a box, that hold everything within a world length of it. Where
+    rays are curved they follow from the least distances between nodes in the box and in these nodes
+    themselves, also beyond the grid, through which a ray may come to other nodes of it."""
     nodes = np.zeros(3)
     while length > 0:
         distances = _distances(space, low - nodes, high + nodes)
@@ -166,8 +146,8 @@ def check_stored(stored: Node) -> None:
     """**Raises** `ValueError` if a brick of this shape has more voxels than a volume may have."""
     if math.prod(stored) > MOST_VOXELS:
         raise ValueError(
-            "bricks must be so many, and steps so short, that a brick and what is read around it have fewer "
-            f"than 2**31 voxels; got {' x '.join(map(str, stored))} along x, y and z."
+            "bricks must be so many that fewer than 2**31 voxels are read for each; got "
+            f"{' x '.join(map(str, stored))}."
         )
 
 
@@ -180,90 +160,33 @@ def divided(shape: Node, counts: Node) -> BrickGrid:
     if grid.number > MOST_BRICKS:
         raise ValueError(
             f"bricks must be no more than {MOST_BRICKS} in all; got {counts}, which divide "
-            f"{' x '.join(map(str, shape))} voxels into {grid.number}. Ask for bricks of {EDGE} cells or "
-            "more along each side."
+            f"{' x '.join(map(str, shape))} voxels into {grid.number}."
         )
     return grid
 
 
 def split(shape: Node, dtype: Any, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
-    """Few bricks that fit into so many bytes, and have fewer than 2**31 voxels: there is one more along the
-    axis where they are longest, until they do; first among the axes along which the smallest bricks, with
-    what is read around them, are shorter than the volume. There are at least as many as `devices`, unless
-    they would be smaller than bricks are.
+    """The fewest bricks of about cubic shape, and at least as many as `devices` if these are not too small,
+    that fit into so many bytes: there is one more along the axis where they are longest, until they do. Axes
+    along which even the smallest bricks would be read whole are split last.
 
     **Raises:** `TooLittleMemory` if the smallest ones do not fit."""
-    memory = integer("memory", memory, 1)
     cells = [n - 1 for n in shape]
     x, y, z = (min(EDGE, c) for c in cells)
     short = np.less(stored_of(BrickGrid(shape, (x, y, z)), margin), shape).tolist()
     counts = [1, 1, 1]
     while True:
-        size = [_rounded(-(-c // count), c) for c, count in zip(cells, counts, strict=True)]
-        grid = BrickGrid(shape, (size[0], size[1], size[2]))
+        x, y, z = (min(-(-c // (count * EDGE)) * EDGE, c) for c, count in zip(cells, counts, strict=True))
+        grid = BrickGrid(shape, (x, y, z))
         stored = stored_of(grid, margin)
-        divisible = [axis for axis in range(3) if size[axis] > min(EDGE, cells[axis])]
+        divisible = [axis for axis in range(3) if grid.size[axis] > min(EDGE, cells[axis])]
         if fits(stored, dtype, margin, memory) and (grid.number >= devices or not divisible):
             return grid
         if not divisible:
             check_stored(stored)
             raise TooLittleMemory(
                 f"memory must be at least {bytes_of(stored, dtype, margin)} bytes, for bricks of "
-                f"{' x '.join(map(str, size))} cells and what is read around them, less for a "
+                f"{' x '.join(map(str, grid.size))} cells and what is read around them, less for a "
                 f"shorter step; got {memory}."
             )
-        counts[max(divisible, key=lambda axis: (short[axis], size[axis]))] += 1
-
-
-def cheapest(
-    grid: BrickGrid,
-    source: VoxelSource,
-    visible: Callable[[BrickGrid], Bool[np.ndarray, " bricks"]],
-    margin: Margin,
-    memory: int,
-    rays: int,
-    devices: int = 1,
-) -> BrickGrid:
-    """The split of the volume that takes the least time to read and to march, as far as that is known, among
-    those into no more than MORE times as many bricks as `grid` has that fit into `memory`.
-
-    - `visible`: tells for each brick of a grid whether anything may be visible in it.
-    - `devices`: how many take a brick each at a time, and the least number of bricks."""
-
-    def cost(other: BrickGrid) -> int:
-        stored = stored_of(other, margin)
-        each = source.bytes_touched(stored) + math.prod(stored) * source.dtype.itemsize + PER_RAY * rays
-        return each * -(-int(visible(other).sum()) // devices)
-
-    fitting = _fitting(grid.shape, source.dtype, margin, memory, MORE * grid.number)
-    return min([grid, *(other for other in fitting if other.number >= devices)], key=cost)
-
-
-def _fitting(shape: Node, dtype: Any, margin: Margin, memory: int, most: int) -> Iterator[BrickGrid]:
-    """Splits into at most so many bricks that fit: of any sizes along two axes, and of the largest that fits
-    along the third."""
-    sizes = [_sizes(n - 1) for n in shape]
-    seen = set[Node]()
-    for third in range(3):
-        a, b = (axis for axis in range(3) if axis != third)
-        for along_a, along_b in product(sizes[a], sizes[b]):
-            for along_third in sizes[third]:
-                by_axis = {a: along_a, b: along_b, third: along_third}
-                grid = BrickGrid(shape, (by_axis[0], by_axis[1], by_axis[2]))
-                if grid.number > most or grid.size in seen:
-                    break
-                if fits(stored_of(grid, margin), dtype, margin, memory):
-                    seen.add(grid.size)
-                    yield grid
-                    break
-
-
-def _sizes(cells: int) -> list[int]:
-    """Sizes of bricks along an axis of so many cells, one for each number of bricks, the largest first."""
-    counts = range(1, max(1, -(-cells // EDGE)) + 1)
-    return sorted({_rounded(-(-cells // count), cells) for count in counts}, reverse=True)
-
-
-def _rounded(size: int, cells: int) -> int:
-    """Cells of a brick along an axis of so many, at least `size`."""
-    return min(-(-size // EDGE) * EDGE, cells)
+        counts[max(divisible, key=lambda axis: (short[axis], grid.size[axis]))] += 1

@@ -1,10 +1,10 @@
 """Takes an image's rays through all bricks, while the next brick is read."""
 
-import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar
+from functools import partial
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -15,25 +15,23 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.memory import give_back
 from ..engine import devices
-from ..engine.tiling import RenderOptions
+from ..engine.tiling import RenderOptions, Tiling
 from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..ray import Progress, Scene
 from ..scene.camera import Camera
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import BrickReport
-from ..scene.space import Ray, Space
+from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
 from .cells import BrickCells, Visit, curved_cells, padded, straight_cells
 from .conversion import range_of
 from .grid import BrickGrid, Node
-from .sources import VoxelSource, in_background
-from .split import Margin, bytes_of, cheapest, check_stored, divided, fits, split, stored_of, stored_shape
-from .summary import Summary, summary_of
+from .sources import READERS, VoxelSource
+from .split import Margin, bytes_of, check_stored, divided, fits, split, stored_of, stored_shape
+from .summary import summary_of
 
-
-State = TypeVar("State")
 
 Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 """Which brick is read next, and for which cells of each ray. Bricks are planned one ahead of the march:
@@ -45,24 +43,29 @@ BEAMS = 32
 """Beams whose cells are looked for at a time, where rays are curved: it takes as long as the longest of their
 rays."""
 
+BATCH = 72
+"""`Tiling.batch` on a CPU. Few rays meet a brick, and the last batch takes as long as its longest ray."""
+
 KEPT = 64 * 2**20
 """Bytes that are read before freed memory is given back to the system, which takes some 8 ms."""
 
 
 class Load(NamedTuple):
-    """A brick that is being read, and the cells that are marched in it."""
+    """A brick that is being read, its first node, and the cells that are marched in it."""
 
     brick: int
-    cells: CellRange
+    cells: CellRange | None
     first: Node
     voxels: "Future[np.ndarray]"
 
 
-class Request(NamedTuple):
-    """How bricks are chosen, as `render_bricks` was asked to.
+@dataclass(frozen=True)
+class Request:
+    """What `render_bricks` was asked for.
 
-    - `counts`: along x, y and z, in place of those chosen to fit into `memory`.
-    - `devices`: how many take a brick each at a time.
+    - `counts`: bricks along x, y and z, in place of those chosen to fit into `memory`.
+    - `mesh`: devices over which rays are dealt out, or bricks, if `deals_bricks`.
+    - `traversals`: filled while the scene is rendered. A gradient has a second one.
     """
 
     source: VoxelSource
@@ -70,10 +73,12 @@ class Request(NamedTuple):
     counts: Node | None = None
     method: Method = "overlap"
     progress: Callable[[int, int], Any] | None = None
-    devices: int = 1
+    outputs: Any = "all"
+    mesh: Mesh | None = None
+    deals_bricks: bool = False
+    traversals: "list[Traversal]" = field(default_factory=list)
 
 
-@dataclass
 class Traversal:
     """An image's rays on their way through all bricks.
 
@@ -82,101 +87,70 @@ class Traversal:
     - `stored`: nodes along each axis that are read at a time. `min_stored`: as many as any single brick
       needs. `memory`: bytes that these may take.
     - `rays`, `at`: the rays, and how far they have been marched.
-    - `done`: bricks that were rendered. `loads`: those whose reading has begun.
+    - `done`: number of bricks that were rendered. `loads`: bricks whose reading has begun.
     """
 
-    request: Request
-    summary: Summary
-    scene: Scene
-    options: RenderOptions
-    space: Space
-    grid: BrickGrid
-    margin: Margin
-    order: list[int]
-    visible: Bool[np.ndarray, " bricks"]
-    min_stored: Node
-    stored: Node
-    memory: int
-    rays: Ray = field(init=False)
-    at: Progress = field(init=False)
-    done: int = 0
-    loads: list[int] = field(default_factory=list)
-    bytes_read: int = 0
+    rays: Ray
+    at: Progress
 
-    @classmethod
-    def of(
-        cls,
-        request: Request,
-        marched: Scene,
-        shown: Scene,
-        options: RenderOptions,
-        summary: Summary | None = None,
-    ) -> "Traversal":
-        """That of a scene: as its rays are marched, and as it is `shown`. `summary`: of the source, if it is
-        known already."""
+    def __init__(self, request: Request, marched: Scene, shown: Scene, outputs: Any):
+        """Of a scene as its rays are marched, and as it is `shown`."""
         assert isinstance(marched.source, Camera)
-        source, memory, counts, method, _, least = request
-        march, camera, shape = marched.march, marched.source, source.shape
-        space = march.locate(marched.volume)
-        margin = Margin.of(march, space, shape, options.tiling.cells, shown)
-        grid = divided(shape, counts) if counts else split(shape, source.dtype, memory, margin, least)
-        if method != "overlap":
-            margin = replace(margin, probe=None)
-        check_stored(stored_of(grid, margin))
-        # only now, since it may read the whole source
-        summary = summary_of(source, memory=memory) if summary is None else summary
-        occupied = eqx.Partial(marched.compositing.occupied, marched.transfer)
-        visible = summary.bricks_with(summary.where(occupied))
-        if counts is None and margin.straight:
-            grid = cheapest(grid, source, visible, margin, memory, math.prod(camera.size), least)
-        stored = min_stored = stored_of(grid, margin)
-        if not margin.straight and isinstance(
-            method, str
-        ):  # what is read follows from the rays: begin with less
-            middle = (np.asarray(shape) - 1) / 2
-            stored = stored_of(grid, replace(margin, cells=margin.of_box(space, shape, middle, middle)))
-        memory = max(memory, bytes_of(min_stored, source.dtype, margin))
-        order, place = grid.order(space, camera), (space, grid, margin)
-        return cls(
-            request, summary, marched, options, *place, order, visible(grid), min_stored, stored, memory
+        self.request, self.source, self.scene = request, request.source, marched
+        source, memory, counts = request.source, request.memory, request.counts
+        tiling = Tiling.of_backend(request.mesh)
+        if not tiling.turns:  # on a CPU
+            tiling = tiling._replace(batch=BATCH)
+        self.options = RenderOptions(
+            outputs, tiling._replace(devices=None) if request.deals_bricks else tiling
         )
+        self.done, self.bytes_read = 0, 0
+        self.loads: list[int] = []
+        self.space, shape = marched.march.locate(marched.volume), source.shape
+        margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
+        least = devices.number_of(request.mesh) if request.deals_bricks else 1
+        self.grid = divided(shape, counts) if counts else split(shape, source.dtype, memory, margin, least)
+        self.margin = margin if request.method == "overlap" else replace(margin, probe=None)
+        self.stored = self.min_stored = stored_of(self.grid, self.margin)
+        check_stored(self.stored)
+        if not self.margin.straight and not callable(request.method):
+            # what is read follows from the rays: begin with less
+            middle = (np.asarray(shape) - 1) / 2
+            cells = self.margin.of_box(self.space, shape, middle, middle)
+            self.stored = stored_of(self.grid, replace(self.margin, cells=cells))
+        self.memory = max(memory, bytes_of(self.min_stored, source.dtype, self.margin))
+        self.order = self.grid.order(self.space, marched.source)
+        # last, since it may read the whole source
+        known = request.traversals
+        self.summary = known[0].summary if known else summary_of(source, memory=memory)
+        known.append(self)
+        occupied = self.summary.where(eqx.Partial(marched.compositing.occupied, marched.transfer))
+        self.visible = self.summary.bricks_with(occupied, self.grid)
 
-    @property
-    def source(self) -> VoxelSource:
-        return self.request.source
-
-    def through(
-        self,
-        rays: Ray,
-        state: State,
-        where: Callable[[State], Progress],
-        march: Callable[[Volume, CellRange, State], State],
-    ) -> State:
-        """The state after `march(brick, cells, state)` of all bricks. `where`: how far rays have come in a
-        state."""
-        self.rays, self.at, given_back = rays, where(state), self.bytes_read
-        schedule = self._schedule()
+    def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
+        """Each brick that rays need, and their cells there, while the next one is read. Before this one is
+        asked for, `at` is set to where rays have come, and the brick dropped."""
+        self.rays, self.at, given_back = rays, at, self.bytes_read
+        method = self.request.method
+        if not callable(method):
+            method = in_order if self.margin.straight else METHODS[method]
+        schedule = method(self)
         load = next(schedule, None)
         while load is not None:
-            jax.block_until_ready(state)  # or two bricks, and what is made of both, would be in memory
+            jax.block_until_ready(self.at)  # or two bricks, and what is made of both, would be in memory
             if self.bytes_read - given_back >= KEPT:
                 give_back()
                 given_back = self.bytes_read
-            brick, cells = self._brick(load), load.cells
-            load = None  # and with it the voxels as they were read
-            following = next(schedule, None)
-            state = march(brick, cells, state)
+            # on a CPU, voxels are not copied if aligned (`empty_array`)
+            brick = with_voxels(self.scene.volume, jax.device_put(load.voxels.result()))
+            brick = part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
+            cells = load.cells
+            assert cells is not None
+            del load  # and with it the voxels as they were read
+            load = next(schedule, None)
+            yield brick, cells
             del brick, cells
-            self.at = where(state)
             self.finish(1, int(self.visible.sum()))
-            load = following
-        return state
-
-    def _schedule(self) -> Iterator[Load]:
-        method = self.request.method
-        if callable(method):
-            return method(self)
-        return in_order(self) if self.margin.straight else until_all_left(self, overlap=method == "overlap")
 
     def finish(self, bricks: int, of: int) -> None:
         """Reports that so many more bricks are rendered, `of` all that hold anything visible."""
@@ -196,25 +170,19 @@ class Traversal:
             bytes_of(self.stored, self.source.dtype, self.margin),
         )
 
-    def _brick(self, load: Load) -> Volume:
-        """A brick of the volume, once it is read."""
-        volume = self.scene.volume
-        voxels = jax.device_put(load.voxels.result())  # on a CPU, not copied if aligned (`empty_array`)
-        return part_of(with_voxels(volume, voxels), jnp.asarray(load.first, jnp.int32), self.grid.shape)
-
     def cells_of(
         self, brick: int, passable: set[int], reached: Array, *, over_empty: bool = True
     ) -> BrickCells | None:
         """The cells of curved rays in a brick and in those through which they go on from it. `over_empty`:
         and in those that are empty."""
         empty = np.append(~self.visible, True)
-        on = empty.copy() if over_empty else np.zeros_like(empty)
+        on = empty & over_empty
         on[list(passable)] = True
         visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(on), jnp.asarray(empty))
         return self.cells_in(visit, reached, self.margin.steps)
 
     def cells_in(self, visit: Visit, reached: Array, beyond: int = 0) -> BrickCells | None:
-        """The cells of `curved_cells`, by the device; None if there are none."""
+        """The cells of `curved_cells`; None if there are none."""
         mesh, march = self.options.tiling.devices, self.scene.march
         found = _curved(mesh, self.grid, beyond, march, self.rays, self.at, reached, visit)
         return found if bool(found.any) else None
@@ -225,41 +193,36 @@ class Traversal:
         cells = self.margin.cells  # where rays are straight, of any box
         if not self.margin.straight:
             cells = self.margin.of_box(self.space, self.grid.shape, low, high)
-        margin = np.asarray(cells)
-        return low - margin, high + margin
+        return low - cells, high + cells
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray]:
         """The box that is read for these cells."""
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
         around = self.margin.of_points(self.space, self.grid.shape, low, high)
-        return np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
+        low, high = np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
+        return np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
 
     def make_room(self, found: BrickCells) -> bool:
         """Whether the box of these cells fits into what is read at a time, which is enlarged for it as far as
         memory goes: so far that any single brick still fits."""
         low, high = self.box_of(found)
-        low, high = np.maximum(low, 0), np.minimum(high, np.asarray(self.grid.shape) - 1)
         wanted = stored_shape(self.grid.shape, tuple((high - low + 1).tolist()))
         x, y, z = map(max, wanted, self.stored)
         nx, ny, nz = map(max, (x, y, z), self.min_stored)
-        if not fits((nx, ny, nz), self.source.dtype, self.margin, self.memory):
-            return False
-        self.stored = x, y, z
-        return True
+        room = fits((nx, ny, nz), self.source.dtype, self.margin, self.memory)
+        self.stored = (x, y, z) if room else self.stored
+        return room
 
-    def load(self, brick: int, cells: CellRange, low: np.ndarray, high: np.ndarray) -> Load:
-        """Starts to read a brick, for these cells."""
-        return Load(brick, cells, *self.read(brick, low, high))
-
-    def read(self, brick: int, low: np.ndarray, high: np.ndarray) -> tuple[Node, "Future[np.ndarray]"]:
-        """Starts to read a brick: a box that begins at a multiple of BLOCK and holds these nodes."""
+    def load(self, brick: int, cells: CellRange | None, low: np.ndarray, high: np.ndarray) -> Load:
+        """Starts to read a brick, for these cells: a box that begins at a multiple of BLOCK and holds these
+        nodes."""
         shape, stored = np.asarray(self.grid.shape), np.asarray(self.stored)
         first = np.minimum(np.maximum(low, 0) // BLOCK * BLOCK, shape - stored)
         assert np.all(np.minimum(high, shape - 1) < first + stored), (low, high, first, stored)
         x, y, z = first.tolist()
         self.loads.append(brick)
         self.bytes_read += int(stored.prod()) * self.source.dtype.itemsize
-        return (x, y, z), in_background(self._read, first, first + stored)
+        return Load(brick, cells, (x, y, z), READERS.submit(self._read, first, first + stored))
 
     def _read(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """The voxels of a box, whose range tells whether they are those of the summary."""
@@ -267,9 +230,8 @@ class Traversal:
         (least, most), (lowest, highest) = self.summary.range_of(low, high), range_of(voxels)
         if lowest < least or highest > most:
             raise ValueError(
-                f"{self.source.name} changed since the ranges of its values were found: they are {least} to "
-                f"{most} in the box {tuple(low.tolist())} to {tuple(high.tolist())}, and now {lowest} to "
-                f"{highest}. Open it again."
+                f"{self.source.name} changed since the ranges of its values were found: {least} to {most} "
+                f"then, and {lowest} to {highest} now, in the box from {tuple(low.tolist())}. Open it again."
             )
         return voxels
 
@@ -302,6 +264,12 @@ def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
                 going, reached = True, found.reached
                 yield traversal.load(brick, padded(found.cells), *traversal.box_of(found))
         going &= not bool(jnp.all(traversal.at.finished))
+
+
+METHODS: dict[str, Schedule] = {
+    "overlap": partial(until_all_left, overlap=True),
+    "reload": partial(until_all_left, overlap=False),
+}
 
 
 @compiled

@@ -8,7 +8,6 @@ https://ngff.openmicroscopy.org/0.5/. A voxel's position is that of its centre.
 import json
 import math
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,11 +23,10 @@ METADATA = "zarr.json", ".zarray", ".zgroup", ".zattrs"
 LARGE, BEYOND = 2**26, 8
 """Bytes that a chunk may always have, and how many times those of the array."""
 
-DECODED = 2**24
-"""Bytes of decoded chunks that are kept, for boxes that share them."""
+CACHE = 2**24
+"""Bytes of decoded chunks and indices of shards that are kept, for boxes that share them."""
 
-DECODERS = min(os.cpu_count() or 1, 8)
-"""Threads that read files, and threads that decode them."""
+INSTALL = 'which tensorstore and yaozarrs read: pip install "jaxvol[bricks]".'
 
 
 def is_zarr_array(path: Path) -> bool:
@@ -39,13 +37,7 @@ def is_zarr_array(path: Path) -> bool:
 
 
 def zarr_array(
-    path: Path,
-    *,
-    axes: Any = None,
-    index: Mapping[str, int] | None = None,
-    missing: Literal["error", "fill"] | Any = "error",
-    spacing: Arrayable | None = None,
-    origin: Arrayable | None = None,
+    path: Path, *, axes: Any = None, missing: Literal["error", "fill"] | Any = "error", **how: Any
 ) -> VoxelSource:
     """The array in a folder. Arguments and errors as for `levels_of`."""
     if missing not in ("error", "fill"):
@@ -53,22 +45,15 @@ def zarr_array(
     try:
         import tensorstore
     except ImportError as fault:
-        raise ImportError(
-            f'{path} is a Zarr array, which tensorstore reads; it is missing: pip install "jaxvol[bricks]".'
-        ) from fault
-    second = (path / ".zarray").is_file()
+        raise ImportError(f"{path} is a Zarr array, {INSTALL}") from fault
     spec = {
-        "driver": "zarr" if second else "zarr3",
+        "driver": "zarr" if (path / ".zarray").is_file() else "zarr3",
         "kvstore": {"driver": "file", "path": f"{path.resolve()}{os.sep}"},
         "fill_missing_data_reads": missing == "fill",
-    }
-    context = {
-        "cache_pool": {"total_bytes_limit": DECODED},
-        "data_copy_concurrency": {"limit": DECODERS},
-        "file_io_concurrency": {"limit": DECODERS},
+        "context": {"cache_pool": {"total_bytes_limit": CACHE}},
     }
     try:
-        store = tensorstore.open(spec, open=True, read=True, context=tensorstore.Context(context)).result()
+        store = tensorstore.open(spec, open=True, read=True).result()
     except ValueError as fault:
         raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
     _check_chunks(path, store)
@@ -78,23 +63,15 @@ def zarr_array(
             'A chunk is missing or damaged. Fetch it again; or pass missing="fill", if chunks were left out '
             "because all their voxels have the fill value."
         )
-    axes = _named_axes(path, second=second) if axes is None else axes
-    return VoxelSource(store, spacing, origin, axes=axes, index=index, name=str(path), hint=hint)
+    return VoxelSource(store, axes=axes or _named_axes(path, store), name=str(path), hint=hint, **how)
 
 
-def _named_axes(path: Path, *, second: bool) -> list[str] | None:
+def _named_axes(path: Path, store: Any) -> list[str] | None:
     """The names of the axes in the array's metadata, if x, y and z are among them."""
-    names: Any = None
-    if second and (path / ".zattrs").is_file():
+    names: Any = list(store.domain.labels)  # Zarr 3
+    if (path / ".zattrs").is_file():  # xarray's in Zarr 2
         names = _read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS")
-    elif not second:
-        metadata = _read_json(path / "zarr.json")
-        names, attributes = metadata.get("dimension_names"), metadata.get("attributes")
-        if names is None and isinstance(attributes, dict):
-            names = attributes.get("_ARRAY_DIMENSIONS")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        return None
-    names = [name.lower() for name in names]
+    names = [str(name).lower() for name in names] if isinstance(names, list) else []
     return names if {*SPACE} <= {*names} else None
 
 
@@ -112,22 +89,18 @@ def _check_chunks(path: Path, store: Any) -> None:
 def ome_zarr_levels(
     path: Path, *, spacing: Arrayable | None = None, origin: Arrayable | None = None, **options: Any
 ) -> tuple[VoxelSource, ...]:
-    """The levels of the first image in an OME-Zarr group, finest first, with their spacing and origin in the
-    unit of the file. A given `spacing` and `origin` are those of the finest, and others are scaled and moved
-    with it. `options`: as for `zarr_array`.
+    """The levels of the first image in an OME-Zarr group, finest first, in the unit of the file. A given
+    `spacing` and `origin` are those of the finest; others are scaled and moved with it. `options`: as for
+    `zarr_array`.
 
-    **Raises:** `ValueError` for a group without `multiscales` of version 0.4 or 0.5, for metadata that do not
-    follow them, such as levels in another order, and for axes of different units; `ImportError` without
-    yaozarrs.
-    """
+    **Raises:** `ValueError` for metadata that do not follow OME-Zarr 0.4 or 0.5, and for axes of different
+    units; `ImportError` without yaozarrs."""
     image = _first_image(path)
     names = [axis.name for axis in image.axes]
-    if not {*SPACE} <= {*names}:
-        raise ValueError(f"path: {path}: a volume has the axes x, y and z; got {names}.")
     units = {axis.name: getattr(axis, "unit", None) for axis in image.axes if axis.name in SPACE}
-    if len({*units.values()}) > 1:
-        raise ValueError(f"path: {path}: x, y and z must have the same unit; got {units}.")
-    places = []
+    if len(units) < 3 or len({*units.values()}) > 1:
+        raise ValueError(f"path: {path} must have axes x, y and z of the same unit; got {names}, {units}.")
+    at, places = [names.index(axis) for axis in SPACE], []
     for dataset in image.datasets:
         scale, offset = np.ones(len(names)), np.zeros(len(names))
         for described_by in (dataset, image):  # those of all levels come last
@@ -136,54 +109,43 @@ def ome_zarr_levels(
                     scale, offset = scale * each.scale, offset * each.scale
                 else:
                     offset = offset + each.translation
-        at = [names.index(axis) for axis in SPACE]
         places.append((scale[at], offset[at]))
-    for name, given in (("spacing", spacing), ("origin", origin)):
-        if given is not None:
-            finite_array(name, given, (3,))
     finest, start = places[0]
-    factor = 1.0 if spacing is None else np.asarray(spacing, float) / finest
-    first = start if origin is None else np.asarray(origin, float)
+    factor, first = 1.0, start
+    if spacing is not None:
+        factor = np.asarray(finite_array("spacing", spacing, (3,)), float) / finest
+    if origin is not None:
+        first = np.asarray(finite_array("origin", origin, (3,)), float)
     levels = []
     for dataset, (scale, offset) in zip(image.datasets, places, strict=True):
-        array = (path / dataset.path).resolve()
-        if not array.is_relative_to(path.resolve()) or not is_zarr_array(array):
+        if not is_zarr_array(path / dataset.path):
             raise ValueError(f"path: {path}: {dataset.path} is no Zarr array within the group.")
         place = {"spacing": scale * factor, "origin": first + (offset - start) * factor}
-        levels.append(zarr_array(array, axes=names, **place, **options))
+        levels.append(zarr_array(path / dataset.path, axes=names, **place, **options))
     return tuple(levels)
 
 
 def _first_image(path: Path) -> Any:
     """The first entry of `multiscales`, which is the one to show if nothing else is asked for."""
     try:
-        from pydantic import ValidationError
         from yaozarrs import v04, v05
     except ImportError as fault:
-        raise ImportError(
-            f'{path} may be an OME-Zarr image, whose metadata yaozarrs reads: pip install "jaxvol[bricks]".'
-        ) from fault
+        raise ImportError(f"{path} may be an OME-Zarr image, {INSTALL}") from fault
     third = (path / "zarr.json").is_file()
     file = path / ("zarr.json" if third else ".zattrs")
     metadata: Any = _read_json(file) if file.is_file() else {}
-    if third:
-        attributes = metadata.get("attributes")
-        metadata = attributes.get("ome") if isinstance(attributes, dict) else None
+    for key in ("attributes", "ome") if third else ():
+        metadata = metadata.get(key) if isinstance(metadata, dict) else None
     if not isinstance(metadata, dict) or "multiscales" not in metadata:
-        several = isinstance(metadata, dict) and "bioformats2raw.layout" in metadata
-        hint = "Give the path of an image, or of an array in it."
-        if several:
-            hint = "It holds several images: give the path of one, such as its folder 0."
         raise ValueError(
-            f"path: {path} is a Zarr group without the multiscales of OME-Zarr 0.4 or 0.5. {hint}"
+            f"path: {path} is a Zarr group without the multiscales of OME-Zarr 0.4 or 0.5. Give the path of "
+            "an image or of an array in it, such as its folder 0."
         )
     try:
         return (v05 if third else v04).Image.model_validate(metadata).multiscales[0]
-    except ValidationError as fault:
-        said = "; ".join(f"{'.'.join(map(str, each['loc']))}: {each['msg']}" for each in fault.errors())
-        raise ValueError(
-            f"path: {path} does not follow OME-Zarr {'0.5' if third else '0.4'}: {said}."
-        ) from fault
+    except ValueError as fault:
+        version, said = "0.5" if third else "0.4", " ".join(str(fault).split())
+        raise ValueError(f"path: {path} does not follow OME-Zarr {version}: {said}") from fault
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -1,8 +1,7 @@
 """Marches an image through one brick of a volume after the other, and pulls it back in a second march.
 
-A volume that does not fit into memory is marched brick by brick. Of each ray, it is kept where it has come
-to; in each brick it marches those of its cells that lie there (`CellRange`), from where the brick before left
-off. What is computed from voxels, the packed copy, ranges of blocks and windows, is computed for each brick.
+Of each ray, it is kept where it has come to; in each brick it marches those of its cells that lie there
+(`CellRange`), from where the brick before left off.
 """
 
 from dataclasses import replace
@@ -61,27 +60,24 @@ def march_brick(
     exact: bool = False,
 ) -> RayStates:
     """Marches each ray through `ranges`. `scene`: with a brick of the volume, which holds what rays meet
-    there, and in a segment more.
-
-    `restart`: ignore where rays have come to, unless they are opaque. `exact`: rays take no cell behind their
-    range."""
+    there, and in a segment more. `restart`: from where their ranges begin, unless they are opaque. `exact`:
+    rays take no cell behind their range."""
     tiles = RayTiles.of(scene.source, options.tiling)
     index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
     prepared = acceleration.prepared(scene)
 
     def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
         number, states, range_ = each
-        rays, at = states.rays, states.at
+        rays, start = states.rays, states.at
         beams = Beams.of(tiles, scene.source, rays, number, range_)
-        start = at
         if restart:
-            over = opaque(prepared, at) | (range_.until <= range_.first)
-            start = with_fields(at, index=range_.first, finished=over)
+            over = opaque(prepared, start) | (range_.until <= range_.first)
+            start = with_fields(start, index=range_.first, finished=over)
         after, _ = march_rays(
             prepared, index, beams, options.tiling, options.outputs, resumed=start, exact=restart or exact
         )
         # where it was restarted, a ray may go back
-        over = opaque(prepared, after) if restart else at.finished | ended(prepared, rays, after)
+        over = opaque(prepared, after) if restart else start.finished | ended(prepared, rays, after)
         return RayStates(rays, with_fields(after, finished=over))
 
     return tiles.map(one, states, ranges)
@@ -112,14 +108,11 @@ def resolve_brick(
     sample than the one chosen `before`. `march`: of the rays."""
     tiles = RayTiles.of(scene.source, options.tiling)
     rendering = _assembled(scene._replace(march=march), tiles, after)
-    changed = jnp.zeros(after.rays.length.shape, bool)
-    for old, new in zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True):
-        changed |= old != new
-    changed = tiles.assemble(changed)
-    rgba = rendering.rgba * changed[..., None].astype(rendering.rgba.dtype)
-    found = rgba, rendering.depth, rendering.details.selected
+    states = zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True)
+    changed = tiles.assemble(jnp.any(jnp.stack([old != new for old, new in states]), axis=0))[..., None]
+    found = rendering.rgba * changed, rendering.depth, rendering.details.selected
     resolved = resolve_pixels(scene, options, acceleration, found)
-    return resolved if pixels is None else jnp.where(changed[..., None], resolved, pixels)
+    return resolved if pixels is None else jnp.where(changed, resolved, pixels)
 
 
 def _assembled(scene: Scene, tiles: RayTiles, states: RayStates) -> Rendering:
@@ -134,16 +127,17 @@ def join_segments(scene: Scene, parts: RayStates) -> RayStates:
     prepared = scene._replace(lighting=None).prepared()
 
     def join(front: Progress, back: Progress) -> Progress:
+        stats = None
+        if front.stats is not None and back.stats is not None:
+            samples = front.stats.samples + back.stats.samples
+            stats = replace(front.stats, samples=samples, aligned=front.stats.aligned | back.stats.aligned)
         both = replace(
             front,
             index=jnp.maximum(front.index, back.index),
             composite=scene.compositing.joined(front.composite, back.composite),
             finished=front.finished & back.finished,
+            stats=stats,
         )
-        if front.stats is not None and back.stats is not None:
-            samples = front.stats.samples + back.stats.samples
-            aligned = front.stats.aligned | back.stats.aligned
-            both = replace(both, stats=replace(front.stats, samples=samples, aligned=aligned))
         stops = stopped(prepared, front.composite)
         return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
 
@@ -168,11 +162,8 @@ def _passed(march: March, at: Progress) -> Progress:
 
 
 class ReplayState(eqx.Module):
-    """The second march of an image, underway, of (tiles, groups, rays in a group).
-
-    - `given`: cotangents of the rays.
-    - `carry`: what the samples so far are worth. `of_rays`: what they gave the rays.
-    """
+    """The second march of an image: cotangents `given` to the rays, what the samples so far are worth
+    (`carry`), and what they gave the rays; (tiles, groups, rays in a group)."""
 
     states: RayStates
     given: Cotangents
@@ -203,9 +194,9 @@ def begin_vjp(
 @on_devices("both", sharded=("replayed", "ranges"))
 def vjp_of_brick(
     scene: Scene,
-    perturbed: Any,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
+    perturbed: Any,
     sums: Sums,
     replayed: ReplayState,
     ranges: CellRange,

@@ -1,8 +1,5 @@
-"""Shades the samples of a segment: those of positive weight, gathered in chunks; or all, inline.
-
-Shading a sample costs many times as much as fetching it, and few samples are visible. Inline, the light's one
-term is computed for all samples in a branch of its own; colours are then elementwise.
-"""
+"""Shades the samples of a segment: those of positive weight, gathered in chunks, as they are few and shading
+costs much; or, by a shader of one cheap term, all of them inline."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -41,7 +38,7 @@ def inline_shader(scene: Scene) -> Shader | None:
 def light_terms(
     shader: Shader, scene: Scene, live: Bool[Array, ""], ray: Ray, cells: Callable[[], tuple[Cell, ...]]
 ) -> list[PyTree]:
-    """The terms of all samples of cells, arrays (cells, rays), in memory. `live`: see `in_memory`."""
+    """The terms of all samples of cells, arrays (cells, rays), in memory."""
     shading, around = shader
     volume = around.volume
 
@@ -66,7 +63,7 @@ def light_terms(
 def lit_colors(
     shader: Shader, scene: Scene, ray: Ray, cells: list[Cell], colors: list[Vec3], terms: list[PyTree]
 ) -> list[Vec3]:
-    """The shaded colours of all samples of cells, arrays (cells, rays), from their colours and terms."""
+    """The shaded colours of all samples of cells, from their colours and terms."""
     shading, around = shader
 
     def one(ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
@@ -78,7 +75,7 @@ def lit_colors(
 
 
 def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
-    """Where a sample is. What it shows is not told (to pass it on took 13 % of a frame): NaN."""
+    """Where a sample is. What it shows is not told, which would take time: NaN."""
     depth, unknown = scene.march.sample(cell), jnp.full_like(cell.front, jnp.nan)
     point, color = along(ray.entry, ray.direction, depth), (unknown, unknown, unknown)
     return Sample(point, ray.direction, (), color, unknown, jnp.ones_like(unknown), ray.pixel)
@@ -88,8 +85,8 @@ def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
 
 
 class Weights(NamedTuple):
-    """Of samples, arrays (cells, rays), one for each piece of a cell: the weight of each, the opacity
-    composited before it and with it, and whether the ray was finished before."""
+    """Of samples, arrays (cells, rays), one for each piece of a cell: their weight, the opacity before and
+    with them, and whether the ray was finished before."""
 
     weight: list[Scalar]
     before: list[Scalar]
@@ -98,7 +95,6 @@ class Weights(NamedTuple):
 
 
 def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
-    """The weights of consecutive cells, from the opacities of their pieces."""
     compositing = scene.compositing
     assert isinstance(compositing, Weighting)
     composite, finished = Composite(at.composite.opacity), at.finished
@@ -112,11 +108,6 @@ def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
         finished |= jax.vmap(partial(stopped, scene))(composite)
     each = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in found]
     return Weights(*(list(values) for values in zip(*each, strict=True)))
-
-
-def visible(weights: Weights, chunk: int) -> Chosen:
-    """The samples of positive weight."""
-    return Chosen.of([weight > 0 for weight in weights.weight], chunk)
 
 
 def samples_of(
@@ -174,8 +165,7 @@ def _without_terms(
     measured: list[Measured],
     weights: Weights,
 ) -> tuple[list[Vec3], list[Bool[Array, "cells rays"]]]:
-    """The colours of a segment's samples without any term of light, and which of them need none: behind the
-    first few samples most do not, and cost much less here than gathered."""
+    """The colours of a segment's samples without any term of light, and which of them need none."""
     shading, around = light
     thresholds = shading.thresholds()
     assert thresholds is not None

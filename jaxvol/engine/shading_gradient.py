@@ -1,7 +1,4 @@
-"""VJP of shading the visible samples of a segment: `replay` calls it for scenes with lighting.
-
-Shades each sample again, as `shading.shaded_colors` did in the first march.
-"""
+"""VJP of shading the visible samples of a segment: `replay` calls it for scenes with lighting."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,15 +14,15 @@ from ..ray import Scene
 from ..scene.space import Ray
 from ..scene.volume import read_as
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from ..xla.compaction import Chosen
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added
 from .segment import Samples
-from .shading import Weights, samples_of, visible
+from .shading import Weights, samples_of
 
 
 class ShadingTotal(NamedTuple):
-    """Gradients summed over all samples: of what shades them, of the transfer function, and of the voxels;
-    None for what is not asked for."""
+    """Gradients summed over all samples; None for what is not asked for."""
 
     shader: PyTree
     transfer: PyTree | None
@@ -33,8 +30,7 @@ class ShadingTotal(NamedTuple):
 
 
 class ShadingVjp(NamedTuple):
-    """Shaded colours of samples, arrays (cells, rays); and the cotangents of their unshaded colour,
-    extinction and value, and of their world points and directions. 0 for invisible samples."""
+    """Shaded colours of samples, arrays (cells, rays), and cotangents; 0 for invisible samples."""
 
     color: Vec3
     of_color: Vec3
@@ -53,9 +49,8 @@ def shading_vjp(
     chunk: int,
     total: ShadingTotal,
 ) -> tuple[list[ShadingVjp], ShadingTotal]:
-    """Pulls back the shading of a segment's samples, and adds to the total. `cotangents`: of each piece's
-    shaded colour."""
-    chosen = visible(weights, chunk)
+    """Pulls back the `cotangents` of the shaded colours of a segment's samples, and adds to the total."""
+    chosen = Chosen.of([weight > 0 for weight in weights.weight], chunk)
     size = sum(weight.size for weight in weights.weight)
 
     def one(
@@ -78,8 +73,8 @@ def shading_vjp(
 
 
 class _ShadingInputs(NamedTuple):
-    """What shaded colours are differentiated by, or the cotangents of that: shader and transfer function; the
-    samples; and what all terms of a sample share."""
+    """What shaded colours are differentiated by (shader and transfer function; samples; what all terms of a
+    sample share), or its cotangents."""
 
     leaves: PyTree
     samples: PyTree
@@ -89,10 +84,8 @@ class _ShadingInputs(NamedTuple):
 def _chunk_vjp(
     shader: Shader, samples: Sample, cotangent: Vec3, total: ShadingTotal
 ) -> tuple[Vec3, PyTree, ShadingTotal]:
-    """The shaded colours of many samples, the cotangents of the samples, and the new total.
-
-    A colour depends on the sum of its terms, so that each term has the cotangent of their sum: the terms are
-    pulled back one by one, in their order, and nothing is kept of them."""
+    """The shaded colours of many samples, the cotangents of the samples, and the new total. Each term has the
+    cotangent of the terms' sum: they are pulled back one by one, and nothing is kept of them."""
     (leaves, fixed_leaves), (moving, fixed) = (
         eqx.partition(tree, eqx.is_inexact_array)
         for tree in ((shader.leaves, shader.around.transfer), samples)

@@ -12,7 +12,6 @@ from .candidates import (
     Candidate as Candidate,
     nested_materials as nested_materials,
     nested_points as nested_points,
-    refined as refined,
 )
 from .choice import Choice as Choice, Evidence as Evidence, choose as choose
 from .coarse_to_fine import fit_coarse_to_fine as fit_coarse_to_fine
@@ -20,4 +19,4 @@ from .driver import Fit as Fit, Outcome as Outcome, fit as fit
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
 from .probe_geometry import ProbeGeometry as ProbeGeometry
 from .residuals import ImageResidual as ImageResidual
-from .starts import flat_grey as flat_grey
+from .starts import flat_grey as flat_grey, refined as refined

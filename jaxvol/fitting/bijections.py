@@ -2,9 +2,6 @@
 
 A solver moves the free variables, `free`; what is rendered is `forward(free)`, so no step can leave the
 allowed range. Free variables are of order 1 whatever the parameter's units, which suits a damped step.
-
-No library of transforms is used (paramax, NumPyro's): the maps are one line each, and what takes the lines,
-ranges named in errors, starts at an end of them and a camera's pose, none of them has.
 """
 
 from abc import abstractmethod
@@ -178,8 +175,7 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula). Smooth at 0.
 
-    Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts, and
-    jaxlie would bring its dataclasses and a parser of command lines (tyro) for this one function.
+    Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts.
     """
     square = jnp.sum(turn**2)
     small = square < 1e-6

@@ -22,10 +22,8 @@ def fit_coarse_to_fine(
     """Fit parameters to images blurred less and less, each time from where the last fit ended.
 
     A derivative describes only features that move by less than their own size. In blurred images features are
-    large, so that a pose or a geometry is found from farther away; sharp images at last make it exact. What
-    it takes of the march: steps of a voxel or shorter. Under longer ones, fine texture (noise, speckle) is
-    sampled too sparsely, the derivative of a pixel is that of single voxels, and blurring does not make up
-    for it: fits stall although the loss falls all the way to the truth
+    large, so that a pose or a geometry is found from farther away; sharp images at last make it exact. Steps
+    must be of a voxel or shorter: under longer ones, fine texture is sampled too sparsely, and fits stall
     (`experiments/results/README.md`, "The geometry of a probe").
 
     **Arguments:**

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 from typing import Any, Literal, TypeAlias, get_args
 
 import equinox as eqx
@@ -38,6 +37,9 @@ UNDETERMINED = ".*directions are not determined"
 
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
+
+SELDOM = 9
+"""Times as long as a checkpoint took, until the next one."""
 
 
 class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
@@ -98,9 +100,7 @@ def fit(
     patience: int | Any | None = None,
     max_jacobian: int | Any = 2**30,
     callback: Callable[[int, PyTree, float], Any] | None = None,
-    progress: bool = False,
     checkpoint: str | PathLike[str] | None = None,
-    checkpoint_seconds: float = 60.0,
 ) -> Fit:
     """Fit parameters to make a residual small: the loss is half the sum of its squares.
 
@@ -131,14 +131,11 @@ def fit(
     - `patience`: number of steps after which a fit has stalled if the loss has not fallen by more than
       `rtol`, relatively; by default 10, or 100 for Optax.
     - `max_jacobian`: bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
-      (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image. The result does
-      not depend on it, except for rounding.
+      (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image.
     - `callback`: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.
-    - `progress`: show a progress bar (`pip install "jaxvol[fit]"`).
-    - `checkpoint`: a file to which the state is written every `checkpoint_seconds`, at the end, and when the
-      fit is interrupted after its first step (Ctrl-C; `KeyboardInterrupt` is raised again, with a note).
-      Before the fit, it is checked that the file can be written. If it exists, the fit continues from it and
-      ends with the same parameters, bit for bit, as an uninterrupted fit (on the same machine).
+    - `checkpoint`: a file to which the state is written after steps, as often as takes a tenth of the time,
+      and when the fit ends or is interrupted. If it exists, the fit continues from it and ends with the same
+      parameters, bit for bit, as an uninterrupted fit (on the same machine).
 
     **Returns:** a `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success`, `Fit.message` and
     `Fit.solution.result` say so, and the parameters are the best ones found. A warning names directions that
@@ -150,9 +147,9 @@ def fit(
 
     **Raises:** `ValueError` for incompatible arguments, parameters that are not finite or out of bounds, a
     residual that is not finite at the start, a checkpoint that is damaged or of another fit, and one that
-    cannot be written; `ImportError` if Optax or the progress bar is requested but not installed.
+    cannot be written; `ImportError` if Optax is requested but not installed.
     """
-    for name, value in (("rtol", rtol), ("atol", atol), ("checkpoint_seconds", checkpoint_seconds)):
+    for name, value in (("rtol", rtol), ("atol", atol)):
         if not (isinstance(value, numbers.Real) and math.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must be a finite number of at least 0; got {value!r}.")
     check_residual(residual)
@@ -166,30 +163,36 @@ def fit(
     least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
     problem = Problem(residual, free, tile_entries(residual, y, max_jacobian, least_squares))
 
-    run = _Run.begin(solver, problem, y)
-    checkpointer = None if file is None else _Checkpointer(file, _about(solver, problem, run))
-    if checkpointer is not None:
-        run = checkpointer.resumed(run)
+    state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
+    run = _Run(y, state, y, y, None, done, optx.RESULTS.successful, [])
+    run = run.step(solver, problem)
+    if not math.isfinite(run.losses[0]):
+        raise ValueError(
+            "residual must be finite at the parameters that the fit starts from; half the sum of its squares "
+            f"is {run.losses[0]}."
+        )
+    kinds = [type(bijection).__name__ for bijection in free.bijections]
+    about = {
+        "solver": type(solver).__name__,
+        "parameters": [f"{path}: {kind}" for path, kind in zip(free.paths, kinds, strict=True)],
+        "number of residuals": residual.count(),
+        "loss at the start": run.losses[0],
+    }
+    if file is not None and (found := checkpoints.load(file, run, about)) is not None:
+        run = replace(found[0], losses=found[1]["losses"])
+    due = 0.0
     try:
-        with _bar(progress, max_steps) as show:
-            while run.ended(max_steps, patience, rtol) is None:
-                run = run.step(solver, problem)
-                show(run)
-                if callback is not None:
-                    callback(len(run.losses), problem.free.forward(run.evaluated), run.losses[-1])
-                if checkpointer is not None:
-                    checkpointer.save(run, checkpoint_seconds)
-    except KeyboardInterrupt as stop:
-        if checkpointer is not None:
-            checkpointer.save(run)
-            stop.add_note(
-                f"fit: stopped after {len(run.losses)} steps, saved in {file}; the same call continues from "
-                "there."
-            )
-        raise
-    if checkpointer is not None:
-        checkpointer.save(run)
-    return _report(run, problem, run.ended(max_steps, patience, rtol), max_steps)
+        while (result := run.ended(max_steps, patience, rtol)) is None:
+            run = run.step(solver, problem)
+            if callback is not None:
+                callback(len(run.losses), free.forward(run.evaluated), run.losses[-1])
+            if file is not None and (begun := time.monotonic()) >= due:
+                checkpoints.save(file, run, {**about, "losses": run.losses})
+                due = time.monotonic() + SELDOM * (time.monotonic() - begun)
+    finally:
+        if file is not None:
+            checkpoints.save(file, run, {**about, "losses": run.losses})
+    return _report(run, problem, result, max_steps)
 
 
 def _solver(solver: Any, rtol: float, atol: float) -> tuple[Any, int]:
@@ -228,20 +231,6 @@ class _Run(eqx.Module):
     done: Array
     result: Any
     losses: list[float] = eqx.field(static=True)
-
-    @classmethod
-    def begin(cls, solver: Any, problem: Problem, y: FreeVariables) -> "_Run":
-        """State after the first step, which evaluates the loss at the start."""
-        state = _init_state(solver, problem, y)
-        done = jnp.zeros((), bool)
-        run = cls(y, state, y, y, None, done, optx.RESULTS.successful, [])
-        run = run.step(solver, problem)
-        if not math.isfinite(run.losses[0]):
-            raise ValueError(
-                f"residual must be finite at the parameters that the fit starts from; half the sum of its "
-                f"squares is {run.losses[0]}."
-            )
-        return run
 
     def step(self, solver: Any, problem: Problem) -> "_Run":
         y, state, (loss, evaluated, triangle), done, result = _advance(solver, problem, self.y, self.state)
@@ -306,42 +295,6 @@ def _allow_promotion() -> Iterator[None]:
         yield
 
 
-class _Checkpointer:
-    """Writes checkpoints, and remembers which step was written when."""
-
-    def __init__(self, file: Path, about: dict[str, Any]):
-        self.file, self.about = file, about
-        self.step, self.time = 0, time.monotonic()
-
-    def resumed(self, run: _Run) -> _Run:
-        """The saved run, or `run` if none was saved."""
-        found = checkpoints.load(self.file, run, self.about)
-        if found is None:
-            return run
-        run, saved = found
-        self.step = len(saved["losses"])
-        return replace(run, losses=saved["losses"])
-
-    def save(self, run: _Run, seconds: float = 0) -> None:
-        """Save the run, unless it has not advanced or the last save was less than `seconds` ago."""
-        if len(run.losses) > self.step and time.monotonic() - self.time >= seconds:
-            checkpoints.save(self.file, run, {**self.about, "losses": run.losses})
-            self.step, self.time = len(run.losses), time.monotonic()
-
-
-def _about(solver: Any, problem: Problem, run: _Run) -> dict[str, Any]:
-    """What distinguishes one fit from another."""
-    free = problem.free
-    kinds = [type(b).__name__ for b in free.bijections]
-    return {
-        "solver": type(solver).__name__,
-        "parameters": [f"{path}: {kind}" for path, kind in zip(free.paths, kinds, strict=True)],
-        "state": [f"{x.dtype}{list(x.shape)}" for x in jax.tree.leaves(eqx.filter(run, eqx.is_array))],
-        "number of residuals": problem.residual.count(),
-        "loss at the start": run.losses[0],
-    }
-
-
 def _report(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     estimate = None
     if run.triangle is not None:
@@ -357,22 +310,3 @@ def _report(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     stats = {"num_steps": len(run.losses), "max_steps": max_steps}
     solution = optx.Solution(run.best, result, None, stats, run.state)
     return Fit(problem.free.forward(run.best), solution, np.asarray(run.losses), estimate)
-
-
-@contextmanager
-def _bar(progress: bool, max_steps: int) -> Iterator[Callable[[_Run], None]]:
-    """A progress bar; yields the function that updates it."""
-    if not progress:
-        yield lambda run: None
-        return
-    try:
-        from tqdm import tqdm
-    except ImportError as fault:
-        raise ImportError('progress=True needs tqdm: pip install "jaxvol[fit]".') from fault
-    with tqdm(total=max_steps, desc="fit", unit="step") as bar:
-
-        def show(run: _Run) -> None:
-            bar.n = len(run.losses)
-            bar.set_postfix(loss=f"{run.losses[-1]:.3e}")
-
-        yield show

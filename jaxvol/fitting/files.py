@@ -1,10 +1,10 @@
 """Reads views (pictures with their cameras) and transfer functions from picture and JSON files."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,11 +18,12 @@ from ..scene.transfer import TransferFunction
 
 
 CAMERA = ("position", "focal_point", "view_up", "view_angle", "parallel_scale", "window")
-"""Fields of a camera in a file; its size is that of the image."""
+"""Fields of a camera in a file, the first two of which are needed; its size is that of the image."""
 
 TRANSFER = ("values", "colors", "extinction")
 
 File = str | PathLike[str]
+T = TypeVar("T")
 
 
 def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Float[Array, "h w 3"]]]:
@@ -44,12 +45,11 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
         raise ValueError(f"{cameras} must hold a list of cameras; got {type(entries).__name__}.")
     if len(entries) != len(images):
         raise ValueError(
-            f"cameras: {cameras} must hold one camera for each of the {len(images)} images; "
-            f"got {len(entries)}."
+            f"{cameras} must hold one camera for each of the {len(images)} images; got {len(entries)}."
         )
     pictures = [_picture(path) for path in images]
     return [
-        (_camera(f"{cameras}: camera {number}", fields, picture.shape[1::-1]), picture)
+        (_made(Camera, f"{cameras}: camera {number}", fields, CAMERA, 2, size=picture.shape[1::-1]), picture)
         for number, (fields, picture) in enumerate(zip(entries, pictures, strict=True))
     ]
 
@@ -67,11 +67,7 @@ def read_transfer(path: File) -> TransferFunction:
 
 def transfer_of_fields(what: str, content: Any) -> TransferFunction:
     """The transfer function that `transfer_fields` wrote; `what` names its place in errors."""
-    fields = _fields(what, content, TRANSFER, TRANSFER)
-    try:
-        return TransferFunction(**fields)
-    except ValueError as fault:
-        raise ValueError(f"{what}: {fault}") from fault
+    return _made(TransferFunction, what, content, TRANSFER, len(TRANSFER))
 
 
 def transfer_fields(transfer: TransferFunction) -> dict[str, Any]:
@@ -100,25 +96,20 @@ def _json(path: File) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as fault:
         raise ValueError(f"{path} cannot be read ({fault.strerror}).") from fault
-    except UnicodeDecodeError as fault:
-        raise ValueError(f"{path} is not JSON: it is no text. Are files given in another order?") from fault
-    except (json.JSONDecodeError, RecursionError) as fault:
+    except (ValueError, RecursionError) as fault:  # of text that is not UTF-8, too
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 
-def _fields(what: str, content: Any, allowed: Sequence[str], needed: Sequence[str]) -> dict[str, Any]:
-    if not isinstance(content, dict) or not set(needed) <= set(content) <= set(allowed):
+def _made(
+    kind: Callable[..., T], what: str, content: Any, allowed: Sequence[str], needed: int, **more: Any
+) -> T:
+    """What `kind` makes of the fields of a JSON object, of which the first `needed` must be given."""
+    if not isinstance(content, dict) or not set(allowed[:needed]) <= set(content) <= set(allowed):
         got = ", ".join(content) if isinstance(content, dict) else f"a {type(content).__name__}"
-        others = [name for name in allowed if name not in needed]
-        optional = f", and perhaps {', '.join(others)}" if others else ""
-        raise ValueError(f"{what} must be an object with {', '.join(needed)}{optional}; got {got}.")
-    return content
-
-
-def _camera(what: str, content: Any, size: tuple[int, ...]) -> Camera:
-    fields = _fields(what, content, CAMERA, CAMERA[:2])
+        optional = f", and perhaps {', '.join(allowed[needed:])}" if allowed[needed:] else ""
+        raise ValueError(f"{what} must be an object with {', '.join(allowed[:needed])}{optional}; got {got}.")
     try:
-        return Camera(**fields, size=size)
+        return kind(**content, **more)
     except ValueError as fault:
         raise ValueError(f"{what}: {fault}") from fault
 

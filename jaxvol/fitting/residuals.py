@@ -12,7 +12,7 @@ exactly, for any solver; unlike JᵀJ, it does not square the condition number.
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -27,6 +27,7 @@ from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..lighting.shading import Lighting
 from ..march.march import March
+from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera, rows_of
 from ..scene.transfer import Transfer
@@ -44,7 +45,6 @@ class Tiles(NamedTuple):
 
     residual: Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]]
     items: PyTree
-    entries: int
 
 
 class Residual(eqx.Module):
@@ -99,7 +99,7 @@ class OwnResidual(Residual):
         def residual(parameters: PyTree, item: Any, adjoint: Adjoint) -> Array:
             return ravel_pytree(self.function(parameters))[0]
 
-        return [Tiles(residual, jnp.zeros(1), self.length)]
+        return [Tiles(residual, jnp.zeros(1))]
 
 
 class _Group(eqx.Module):
@@ -127,9 +127,8 @@ class ImageResidual(Residual):
     - `compositing`: as in `render`.
     - `blur`: compare blurred images: standard deviation of a Gaussian, in parts of the image's height.
       `fit_coarse_to_fine` finds a geometry whose start is off by more than the size of features. Whole
-      images are then differentiated at once. Pixels beyond the border do not count. The noise of blurred
-      pixels is not independent, as `Fit.uncertainty` supposes: its standard errors are too small, several
-      times under noise of single pixels. Those of a last fit without blur are right.
+      images are then differentiated at once. Pixels beyond the border do not count. Standard errors are too
+      small, since the noise of blurred pixels is not independent: take those of a last fit without blur.
 
     The residual is divided by the square root of the number of its entries, so that the loss, half the
     sum of squares, is half the mean squared error: an error of PSNR p dB has the loss 10^(-p/10) / 2.
@@ -150,7 +149,7 @@ class ImageResidual(Residual):
     def __init__(
         self,
         scene: SceneFunction | Any,
-        views: Sequence[tuple[Camera, Arrayable]] | Any,
+        views: Iterable[tuple[Camera, Arrayable]] | Any,
         background: Arrayable = (1.0, 1.0, 1.0),
         *,
         compositing: Mode | Compositing[Any] | Any = "over",
@@ -161,21 +160,21 @@ class ImageResidual(Residual):
         self.scene = cast(SceneFunction, scene)
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
-        self.blur = None if blur is None else _not_negative("blur", blur)
+        self.blur = None if blur is None else not_negative("blur", blur)
+        views = list(views) if isinstance(views, Iterable) else []
+        if not views:
+            raise ValueError("views must hold at least one pair (camera, image); got none.")
         by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
-        for number, view in enumerate(_pairs(views)):
-            camera, image = _view(number, *view)
+        for number, view in enumerate(views):
+            camera, image = _view(number, view)
             by_kind.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
         self.groups = [
-            _Group(
-                *(jax.tree.map(lambda *leaves: jnp.stack(leaves), *part) for part in zip(*group, strict=True))
-            )
-            for group in by_kind.values()
+            _Group(*jax.tree.map(lambda *leaves: jnp.stack(leaves), *group)) for group in by_kind.values()
         ]
 
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
-        sigma = None if blur is None else _not_negative("blur", blur)
+        sigma = None if blur is None else not_negative("blur", blur)
         return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
 
     def count(self) -> int:
@@ -229,28 +228,20 @@ class ImageResidual(Residual):
             return difference.reshape(-1)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
-        return Tiles(residual, (jnp.asarray(view), jnp.asarray(piece * rows)), rows * width * channels)
+        return Tiles(residual, (jnp.asarray(view), jnp.asarray(piece * rows)))
 
     def _scene(
         self, parameters: PyTree, group: _Group, view: Int[Array, ""]
     ) -> tuple[Volume, Transfer, Camera, March, Lighting | None]:
         of_view = jax.tree.map(lambda leaf: leaf[view], group.cameras)
         result = cast(Any, self.scene(parameters, of_view))
-        kinds = Volume, Transfer, Camera, March, Lighting | None
-        if not (
-            isinstance(result, tuple)
-            and len(result) in (4, 5)
-            and all(isinstance(thing, kind) for thing, kind in zip(result, kinds, strict=False))
-        ):
-            found = (
-                [type(thing).__name__ for thing in result]
-                if isinstance(result, tuple)
-                else type(result).__name__
-            )
+        if not isinstance(result, tuple) or len(result) not in (4, 5):
             raise ValueError(
-                "scene must return (volume, transfer, camera, march), and lighting if it is lit; "
-                f"got {found}."
+                "scene must return (volume, transfer, camera, march), and lighting if it is lit; got "
+                f"{described(result)}."
             )
+        names = "volume", "transfer", "camera", "march", "lighting"
+        check_arguments(f"({', '.join(names)})", **dict(zip(names, result, strict=False)))
         if result[2].size != of_view.size:
             raise ValueError(
                 f"scene must return a camera of its view's size {of_view.size}; got {result[2].size}."
@@ -258,7 +249,17 @@ class ImageResidual(Residual):
         return (*result, None) if len(result) == 4 else result
 
 
-def _not_negative(name: str, value: Arrayable) -> Float[Array, ""]:
+def cameras_of(residual: ImageResidual) -> list[Camera]:
+    """Cameras of all views of a residual."""
+    return [
+        jax.tree.map(lambda leaf, view=view: leaf[view], group.cameras)
+        for group in residual.groups
+        for view in range(len(group.images))
+    ]
+
+
+def not_negative(name: str, value: Arrayable) -> Float[Array, ""]:
+    """`value` as a number of at least 0."""
     message = f"{name} must not be negative; got {{got}}."
     return require(finite_array(name, value, ()), lambda sigma: sigma >= 0, message)
 
@@ -271,23 +272,11 @@ def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
     return jax.nn.softmax(-(away**2) / 2, axis=1)
 
 
-def _pairs(views: Any) -> list[tuple[Any, Any]]:
-    try:
-        pairs = [(camera, image) for camera, image in views]
-    except (TypeError, ValueError) as fault:
-        raise ValueError(f"views must be pairs (camera, image); got {type(views).__name__}.") from fault
-    if not pairs:
-        raise ValueError("views must hold at least one pair (camera, image); got none.")
-    return pairs
-
-
-def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
-    if not isinstance(camera, Camera):
-        raise ValueError(
-            f"views[{number}] must be a pair (camera, image); got {type(camera).__name__} first."
-        )
+def _view(number: int, view: Any) -> tuple[Camera, Array]:
+    if not isinstance(view, tuple | list) or len(view) != 2 or not isinstance(view[0], Camera):
+        raise ValueError(f"views[{number}] must be a pair (camera, image); got {described(view)}.")
+    camera, image = view[0], np.asarray(view[1])
     width, height = camera.size
-    image = np.asarray(image)
     if image.dtype.kind not in "fV":  # V: JAX's own 8- and 16-bit floats
         raise ValueError(
             f"views[{number}]: the image must be linear RGB, floats in [0, 1]; got {image.dtype}. Convert a "
@@ -299,11 +288,8 @@ def _view(number: int, camera: Any, image: Any) -> tuple[Camera, Array]:
             f"views[{number}]: the image must have shape {(height, width, 3)} or {(height, width, 4)}, "
             f"to match its camera of size {camera.size}; got {image.shape}."
         )
-    if not np.all(finite(image)):
-        bad = int(np.sum(~finite(image)))
-        raise ValueError(
-            f"views[{number}]: the image must be finite; {bad} of its numbers are NaN or infinite."
-        )
+    if bad := int(np.sum(~finite(image))):
+        raise ValueError(f"views[{number}]: the image must be finite; {bad} of its numbers are not.")
     return camera, jnp.asarray(image)
 
 
@@ -318,66 +304,52 @@ class Problem(eqx.Module):
     def loss(self, free: FreeVariables) -> Float[Array, ""]:
         """Half the sum of squares. Its gradient is summed tile by tile, in reverse mode."""
 
-        def add(tiles: Tiles, total: Array, item: Any) -> Array:
-            return total + self._loss_of(tiles, item, free)
-
-        def value_and_gradient(free: FreeVariables) -> tuple[Array, FreeVariables]:
-            def add(tiles: Tiles, total: Any, item: Any) -> Any:
-                one = jax.value_and_grad(lambda free: self._loss_of(tiles, item, free))(free)
-                return jax.tree.map(jnp.add, total, one)
-
-            return self._accumulate(add, (self._zero, jax.tree.map(jnp.zeros_like, free)))
+        def of_item(tiles: Tiles, item: Any, free: FreeVariables) -> Array:
+            return jnp.sum(tiles.residual(self.free.forward(free), item, "replay") ** 2) / 2
 
         @jax.custom_jvp
         def loss(free: FreeVariables) -> Array:
-            return self._accumulate(add, self._zero)
+            return self._accumulate(lambda tiles, sum, item: sum + of_item(tiles, item, free), jnp.zeros(()))
 
         @loss.defjvp
         def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Array, Array]:
-            value, gradient = value_and_gradient(*primal)
+            def add(tiles: Tiles, sums: Any, item: Any) -> Any:
+                both = jax.value_and_grad(lambda free: of_item(tiles, item, free))(*primal)
+                return jax.tree.map(jnp.add, sums, both)
+
+            zeros = jnp.zeros(()), jax.tree.map(jnp.zeros_like, primal[0])
+            value, gradient = self._accumulate(add, zeros)
             products = jax.tree.map(jnp.vdot, gradient, *tangent)
             return value, jnp.sum(jnp.stack(jax.tree.leaves(products)))
 
         return loss(free)
 
     def condensed(self, free: FreeVariables) -> Float[Array, "numbers numbers"]:
-        """The triangle, whose last column of n + 1 numbers replaces the residual, in value and derivative.
-        Forward mode."""
+        """The triangle [R c; 0 ρ], whose last column of n + 1 numbers replaces the residual, in value and
+        derivative. Forward mode."""
 
         @jax.custom_jvp
         def condensed(free: FreeVariables) -> Array:
-            return self._triangle(free)
+            flat, unravel = ravel_pytree(free)
+
+            def add(tiles: Tiles, triangle: Array, item: Any) -> Array:
+                def residual(flat: Array) -> Array:
+                    found = tiles.residual(self.free.forward(unravel(flat)), item, "forward")
+                    return found.astype(flat.dtype)
+
+                return jnp.linalg.qr(jnp.concatenate([triangle, _jacobian(residual, flat)]), mode="r")
+
+            triangle = self._accumulate(add, jnp.zeros((flat.size + 1, flat.size + 1), flat.dtype))
+            # QR's row signs are arbitrary; fixed here, so that they do not jump from step to step
+            return triangle * jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
 
         @condensed.defjvp
         def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Array, Array]:
-            triangle = self._triangle(*primal)
+            triangle = condensed(*primal)
             change = triangle[:, :-1] @ ravel_pytree(*tangent)[0]
             return triangle, jnp.zeros_like(triangle).at[:, -1].set(change)
 
         return condensed(free)
-
-    def _triangle(self, free: FreeVariables) -> Float[Array, "numbers numbers"]:
-        """The triangle [R c; 0 ρ] of the QR factorisation of [J r], with a non-negative diagonal."""
-        flat, unravel = ravel_pytree(free)
-        n = flat.size
-
-        def add(tiles: Tiles, triangle: Array, item: Any) -> Array:
-            def residual(flat: Array) -> Array:
-                return tiles.residual(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
-
-            rows = jnp.concatenate([triangle, _jacobian(residual, flat)])
-            return jnp.linalg.qr(rows, mode="r")
-
-        triangle = self._accumulate(add, jnp.zeros((n + 1, n + 1), flat.dtype))
-        # QR's row signs are arbitrary; fixed here, so that they do not jump from step to step
-        return triangle * jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
-
-    @property
-    def _zero(self) -> Float[Array, ""]:
-        return jnp.zeros(())
-
-    def _loss_of(self, tiles: Tiles, item: Any, free: FreeVariables) -> Float[Array, ""]:
-        return jnp.sum(tiles.residual(self.free.forward(free), item, "replay") ** 2) / 2
 
     def _accumulate(self, add: Callable[[Tiles, Any, Any], Any], total: Any) -> Any:
         """Accumulate `add` over all tiles, starting from `total`."""

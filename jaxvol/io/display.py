@@ -51,15 +51,14 @@ def save_image(
             + (" That is the image: the path comes first, as in save_png(path, image)." if swapped else "")
         )
     image = _numbers("linear", linear, "rendering.image() or rendering.rgba")
-    channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else None
-    ending = Path(path).suffix.lower()
-    allowed = CHANNELS.get(ending, (3, 4, 0))
-    if channels not in SHAPES or 0 in image.shape or (channels == 0 and channels not in allowed):
-        shapes = " or ".join(SHAPES[count] for count in allowed)
-        hint = " One channel is written as .tif or .npy; repeat it for a grey picture of three."
-        hint = hint if channels == 0 else ""
-        raise ValueError(f"image for a {ending} must have shape {shapes}; got {image.shape}.{hint}")
+    channels = image.shape[2] if image.ndim == 3 else 0 if image.ndim == 2 else -1
+    if channels not in (3, 4, 0) or 0 in image.shape:
+        raise ValueError(
+            "image must have shape (height, width, 3), (height, width, 4) or (height, width); got "
+            f"{image.shape}."
+        )
     path = image_file("path", path, channels)
+    ending = path.suffix.lower()
     bad = np.isnan(image) if channels == 0 else ~np.isfinite(image)
     if bad.any():
         raise ValueError(f"image must not be NaN or infinite; {bad.sum()} of its {image.size} values are.")
@@ -67,18 +66,27 @@ def save_image(
         if ending == ".npy":
             np.save(part, image)
         elif ending in (".tif", ".tiff"):
-            _save_tiff(part, image)
+            from tifffile import imwrite
+
+            kind = "minisblack" if channels == 0 else "rgb"
+            extra = ["assocalpha"] if channels == 4 else None
+            imwrite(part, image, photometric=kind, extrasamples=extra)
         else:
-            _save_display(part, image, text or {})
+            from PIL import Image
+            from PIL.PngImagePlugin import PngInfo
+
+            chunks = PngInfo()
+            for keyword, content in (text or {}).items():
+                chunks.add_itxt(keyword, content, zip=True)
+            options: dict[str, Any] = {"pnginfo": chunks} if ending == ".png" else {}
+            Image.fromarray(displayed(image)).save(part, **options)
     return path
 
 
 def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
     """`save_image` for a path that must end in `.png`.
 
-    **Arguments:** `path`: of the file; it comes first, unlike in `save`, of volumes. `linear`: RGB (height,
-    width, 3), which is written as 8-bit sRGB, or premultiplied RGBA (height, width, 4), which is written with
-    alpha.
+    **Arguments:** `path`, `linear`: as for `save_image`, with three or four channels.
 
     **Returns:** the path.
 
@@ -151,9 +159,6 @@ def _numbers(name: str, image: Any, instead: str) -> Float[np.ndarray, "..."]:
         ) from fault
 
 
-SHAPES = {3: "(height, width, 3)", 4: "(height, width, 4)", 0: "(height, width)"}
-"""Of images, by their number of channels; 0 means no channel axis."""
-
 CHANNELS: dict[str, tuple[int, ...]] = {
     ".png": (3, 4),
     ".jpg": (3,),
@@ -162,7 +167,7 @@ CHANNELS: dict[str, tuple[int, ...]] = {
     ".tiff": (3, 4, 0),
     ".npy": (3, 4, 0),
 }
-"""Numbers of channels that each format can hold."""
+"""Numbers of channels that each format can hold; 0: no axis of channels."""
 
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
@@ -174,13 +179,6 @@ def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
     return output_file(name, path)
 
 
-def _save_tiff(path: Path, image: Float[np.ndarray, "..."]) -> None:
-    from tifffile import imwrite
-
-    extra = ["assocalpha"] if image.shape[2:] == (4,) else None
-    imwrite(path, image, photometric="rgb" if image.ndim == 3 else "minisblack", extrasamples=extra)
-
-
 def displayed(
     image: Float[np.ndarray, "height width channels"],
 ) -> UInt8[np.ndarray, "height width channels"]:
@@ -190,19 +188,3 @@ def displayed(
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
     display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
     return np.asarray(jnp.round(display * 255)).astype(np.uint8)
-
-
-def _save_display(
-    path: Path, image: Float[np.ndarray, "height width channels"], text: Mapping[str, str]
-) -> None:
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
-    picture = Image.fromarray(displayed(image))
-    if path.suffix.lower() != ".png":
-        picture.save(path)
-        return
-    chunks = PngInfo()
-    for keyword, content in text.items():
-        chunks.add_itxt(keyword, content, zip=True)
-    picture.save(path, pnginfo=chunks)

@@ -3,7 +3,6 @@
 Rendering under a `ToroidalMap` needs no such conversion.
 """
 
-import contextlib
 import math
 from typing import Any
 
@@ -17,7 +16,6 @@ from .._util.checks import Arrayable, described, finite_array, integer, require
 from .._util.files import MOST_VOXELS
 from .._util.memory import require_room
 from .._util.vec3 import Scalar, apart
-from .._util.voxels import DTYPES
 from ..march.march import March
 from ..march.transforms import ToroidalMap
 from ..scene.volume import Volume
@@ -32,15 +30,14 @@ def scan_convert(
     shape: tuple[int, int, int] | Any | None = None,
     origin: Arrayable | None = None,
     fill_value: float | Any = 0,
-    dtype: str | Any | None = None,
 ) -> Volume:
     """Resample an ultrasound volume as acquired onto a Cartesian grid in the world of its probe.
 
     The value of a node is the trilinear interpolation of the acquired samples, in (β, σ, γ), at the place
     where the map puts it: exact for values linear in these between samples, and rounded to the type of the
-    voxels. Interpolating once more between the nodes, as rendering does, blurs what is smaller than the
-    spacing, and mixes `fill_value` into the sector's faces, over one spacing. What it does to images:
-    `experiments/scan_conversion.py`.
+    volume's voxels; convert them to float32 first to keep fractions. Interpolating once more between the
+    nodes, as rendering does, blurs what is smaller than the spacing, and mixes `fill_value` into the sector's
+    faces, over one spacing. What it does to images: `experiments/scan_conversion.py`.
 
     **Arguments:**
 
@@ -52,8 +49,6 @@ def scan_convert(
     - `shape`, `origin`: number of nodes along x, y, z, at least 2, and the world position of the first node;
       by default those of the grid that just encloses the sector, centered on it.
     - `fill_value`: value outside the swept sector, as SciPy's and SimpleITK's: by default 0, no echo.
-    - `dtype`: type of the voxels; by default the volume's own. Values are rounded to integers, and become
-      the least or greatest one of the type where they lie beyond it.
 
     **Returns:** a `Volume` with its spacing and origin. A grid node within rounding of a face counts as
     inside.
@@ -66,22 +61,26 @@ def scan_convert(
     face its value jumps, which the gradient does not see.
 
     **Raises:** `ValueError` for arguments of other kinds, a spacing that is not positive, a grid of 2**31
-    nodes or more or larger than the device's memory, a type that voxels cannot have, values that are
-    infinite in it (float16 ends at 65504), and a `fill_value` that the type does not hold.
+    nodes or more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.
     """
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a Volume; got {described(volume)}.")
     if not isinstance(probe, ToroidalMap):
         raise ValueError(f"probe must be a ToroidalMap; got {described(probe)}.")
-    kind = _voxel_type(volume, dtype)
-    fill = _fill(fill_value, kind)
-    steps = _spacing(volume, probe, spacing)
+    fill = _fill(fill_value, volume.data.dtype)
+    first, last = probe.gamma_range
+    wide: Any = (last - first) / (volume.shape[2] - 1) if spacing is None else spacing
+    steps = require(
+        finite_array("spacing", [wide] * 3 if np.ndim(wide) == 0 else wide, (3,)),
+        lambda steps: steps > 0,
+        "spacing must be positive along every axis; got {got}.",
+    )
     nodes, first = _grid(probe, steps, shape, origin)
-    itemsize = kind.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)
+    itemsize = volume.data.dtype.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)
     require_room(
         math.prod(nodes) * itemsize, f"a grid of {' x '.join(map(str, nodes))} nodes (spacing, shape)"
     )
-    data, labels = _resampled(volume, probe, first, steps, nodes, kind, fill)
+    data, labels = _resampled(volume, probe, first, steps, nodes, fill)
     return Volume(data, steps, first, labels)
 
 
@@ -92,7 +91,6 @@ def _resampled(
     origin: Float[Array, "3"],
     spacing: Float[Array, "3"],
     shape: tuple[int, int, int],
-    dtype: np.dtype,
     fill: float,
 ) -> tuple[Shaped[Array, "nx ny nz"], Shaped[Array, "nx ny nz"] | None]:
     """Voxels and labels at the nodes, plane by plane."""
@@ -103,6 +101,7 @@ def _resampled(
     )
     # the rounding of a face's place, in nodes
     slack = [64 * float(jnp.finfo(y.dtype).eps) * n for n in volume.shape]
+    dtype = volume.data.dtype
 
     def node(x: Scalar, y: Scalar, z: Scalar) -> tuple[Array, Array | None]:
         at = space.coordinate((x, y, z))
@@ -110,12 +109,10 @@ def _resampled(
         for c, n, more in zip(at, volume.shape, slack, strict=True):
             inside = inside & (c >= -more) & (c <= n - 1 + more)
         value = jnp.where(inside, volume.value(at), fill)
-        if dtype.kind in "ui":
-            limits = jnp.iinfo(dtype)
-            value = jnp.clip(jnp.rint(value), limits.min, limits.max)
+        value = (jnp.rint(value) if dtype.kind in "ui" else value).astype(dtype)
         if volume.labels is None:
-            return value.astype(dtype), None
-        return value.astype(dtype), jnp.where(inside, volume.label(at), 0).astype(volume.labels.dtype)
+            return value, None
+        return value, jnp.where(inside, volume.label(at), 0).astype(volume.labels.dtype)
 
     @jax.checkpoint  # else a gradient keeps the coordinates of all planes
     def plane(x: Scalar) -> tuple[Array, Array | None]:
@@ -124,38 +121,16 @@ def _resampled(
     return jax.lax.map(plane, x)
 
 
-def _voxel_type(volume: Volume, dtype: Any) -> np.dtype:
-    if dtype is None:
-        return volume.data.dtype
-    known = (*DTYPES, *(["float64"] if jax.config.jax_enable_x64 else []))  # pyright: ignore[reportAttributeAccessIssue]
-    with contextlib.suppress(TypeError):
-        if (kind := jnp.dtype(dtype)).name in known:
-            return kind
-    raise ValueError(f"dtype must be one of {', '.join(known)}; got {described(dtype)}.")
-
-
 def _fill(value: Any, kind: np.dtype) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError) as fault:
         raise ValueError(f"fill_value must be a number; got {described(value)}.") from fault
-    limits = np.iinfo(kind) if kind.kind in "ui" else jnp.finfo(kind)
-    whole = kind.kind not in "ui" or number.is_integer()
-    if not (whole and float(limits.min) <= number <= float(limits.max)):
-        raise ValueError(
-            f"fill_value must be a value of the voxels' type, {kind.name}; got {value!r}. "
-            'Give dtype="float32" to have others.'
-        )
+    whole = kind.kind in "ui"
+    limits = np.iinfo(kind) if whole else jnp.finfo(kind)
+    if not float(limits.min) <= number <= float(limits.max) or (whole and not number.is_integer()):
+        raise ValueError(f"fill_value must be a value of the voxels' type, {kind.name}; got {value!r}.")
     return number
-
-
-def _spacing(volume: Volume, probe: ToroidalMap, spacing: Arrayable | None) -> Float[Array, "3"]:
-    if spacing is None:
-        first, last = probe.gamma_range
-        return jnp.full(3, (last - first) / (volume.shape[2] - 1))
-    spacing = [spacing] * 3 if np.ndim(spacing) == 0 else spacing
-    message = "spacing must be positive along every axis; got {got}."
-    return require(finite_array("spacing", spacing, (3,)), lambda s: s > 0, message)
 
 
 def _grid(
@@ -171,17 +146,15 @@ def _grid(
         low, high = (np.asarray(corner, np.float64) for corner in probe.corners)
         # a sector that is a whole number of spacings wide gets no further node from rounding
         wide = np.ceil((high - low) / np.asarray(spacing, np.float64) - 1e-4)
-        nx, ny, nz = (int(min(n, MOST_VOXELS)) + 1 for n in np.maximum(wide, 1))
-    else:
-        if not isinstance(shape, tuple | list) or len(shape) != 3:
-            raise ValueError(f"shape must be three numbers of nodes, along x, y and z; got {shape!r}.")
-        nx, ny, nz = (integer("shape", n, 2) for n in shape)
-    nodes = nx, ny, nz
+        shape = [int(min(n, MOST_VOXELS)) + 1 for n in np.maximum(wide, 1)]
+    if not isinstance(shape, tuple | list) or len(shape) != 3:
+        raise ValueError(f"shape must be three numbers of nodes, along x, y and z; got {shape!r}.")
+    nodes = nx, ny, nz = tuple(integer("shape", n, 2) for n in shape)
     if math.prod(nodes) > MOST_VOXELS:
         raise ValueError(
             "spacing must be so wide, or shape so small, that the grid has fewer than 2**31 nodes; got "
             f"{nodes}."
         )
     if origin is None:
-        return nodes, probe.center - (jnp.asarray(nodes, spacing.dtype) - 1) * spacing / 2
-    return nodes, finite_array("origin", origin, (3,))
+        return (nx, ny, nz), probe.center - (jnp.asarray(nodes, spacing.dtype) - 1) * spacing / 2
+    return (nx, ny, nz), finite_array("origin", origin, (3,))

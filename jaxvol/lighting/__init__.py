@@ -8,12 +8,12 @@ from .lights import (
     Light as Light,
     PointLight as PointLight,
 )
-from .materials import Material as Material, material as material
+from .materials import Material as Material
 from .phong import Phong as Phong
 from .shading import Lighting as Lighting, Shading as Shading
-from .template import ScattererTemplate as ScattererTemplate
-from .template_lighting import ScattererTemplates as ScattererTemplates
-from .template_simulation import (
+from .template import (
+    ScattererTemplate as ScattererTemplate,
     scatterer_template as scatterer_template,
     scatterer_templates as scatterer_templates,
 )
+from .template_lighting import ScattererTemplates as ScattererTemplates

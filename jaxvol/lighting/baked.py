@@ -1,8 +1,4 @@
-"""Baked lighting: computed once on a grid of its own, then fetched.
-
-Apart from what depends on the view, the effect of light on a sample is the ratio of its lit colour to its
-colour: three numbers, which vary more slowly than the colour does. They are computed on a grid and fetched.
-"""
+"""Baked lighting: the ratios of lit colours to colours, computed once on a grid of its own, then fetched."""
 
 from typing import Any
 
@@ -30,18 +26,15 @@ DILATION = 2
 """Nodes by which the ratios are extended around the visible nodes, since samples lie between nodes."""
 
 BYTES_PER_NODE = 96
-"""Memory per node while its light is computed: its ratios, whether they are known, and the sums over the
-neighbouring nodes."""
+"""Memory per node while its light is computed."""
 
 
 class BakedLighting(Shading):
-    """Lighting computed in advance by `bake`.
+    """Lighting computed in advance by `bake`, without a gradient.
 
     - `words`: the ratios of lit colour to colour, 10 bits for each of red, green and blue, at each node of a
       grid that spans the volume's grid.
     - `highest`: for each channel, the ratio that the largest 10-bit number stands for.
-
-    It is a snapshot: it has no gradient, and does not follow changes of the volume or the transfer function.
     """
 
     words: UInt32[Array, " nodes"]
@@ -73,9 +66,7 @@ class BakedLighting(Shading):
 
 
 def nodes_for(volume: Volume, resolution: int) -> tuple[int, int, int]:
-    """Shape of a grid with `resolution` nodes along the volume's longest side, and the others in proportion.
-
-    **Raises:** `ValueError` if computing light on it would not fit into memory."""
+    """Shape of a grid with `resolution` nodes along the volume's longest side; `ValueError` if too large."""
     longest = max(volume.shape)
     nx, ny, nz = (max(2, round(resolution * n / longest)) for n in volume.shape)
     require_room(

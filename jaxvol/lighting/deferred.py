@@ -1,8 +1,4 @@
-"""Deferred lighting: each ray is shaded once, at the mean depth of what it sees.
-
-Light varies more slowly than what it falls on, and the samples that make up a surface lie close together. So
-they can share the light of one place, at a fraction of the cost.
-"""
+"""Deferred lighting: each ray is shaded once, at the mean depth of what it sees."""
 
 from typing import Any
 
@@ -21,15 +17,14 @@ class Deferred(Lighting):
     Rays are marched without light. What lies at a ray's mean depth is then shaded as one sample of colour C /
     A that nothing hides, where C is the ray's colour and A its opacity.
 
-    This is right where a ray sees one surface, whose samples are closer together than light varies. Where it
-    sees several, one through the other, the mean depth lies between them, perhaps where there is no material
-    at all, and then the pixel stays unlit. Baked light shows its grid as faint rings, which are not averaged
-    over the samples of a ray. `experiments/lighting.py` measures the error on an opaque and on a translucent
-    head: `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))` is the cheapest that is as
-    near as all photons of a template on all samples.
+    This is right where a ray sees one surface. Where it sees several, one through the other, the mean depth
+    lies between them, perhaps where there is no material, and then the pixel stays unlit. Baked light shows
+    its grid as faint rings. `experiments/lighting.py` measures the error:
+    `Deferred(ScattererTemplates(..., templates=2, blend=True, photons=8))` is the cheapest that is as near as
+    all photons of a template on all samples.
 
-    Gradients are those of the image that it makes. The gradient of voxels takes an array of their size for
-    each place where light is looked up, for each chunk of 2048 pixels: slow for large volumes.
+    The gradient of voxels takes an array of their size for each place where light is looked up, for each
+    chunk of 2048 pixels: slow for large volumes.
 
     **Arguments:**
 
@@ -60,8 +55,7 @@ class Deferred(Lighting):
         rgba: Float[Array, "4"],
         depth: Scalar,
     ) -> Float[Array, "4"]:
-        """The premultiplied colour and opacity of a ray, as shaded, from those without light and its mean
-        depth. `classification.light` shades samples."""
+        """The shaded colour and opacity of a ray (premultiplied), from those without light and its depth."""
         light = classification.light
         assert light is not None
         opacity = rgba[3]

@@ -1,8 +1,5 @@
-"""Light sources, and how much of their light arrives at a point. Names and units are Mitsuba's.
-
-Irradiance is power per area, radiance power per area and solid angle, each in linear RGB. Images by
-`path_trace`, and by `ScattererTemplates` wherever there is a material, are radiance in the same unit.
-"""
+"""Light sources, and how much of their light arrives at a point. Names and units are Mitsuba's: irradiance is
+power per area, radiance power per area and solid angle, each in linear RGB."""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple
@@ -17,12 +14,8 @@ from .._util.vec3 import Scalar, Vec3, apart
 
 
 class Arriving(NamedTuple):
-    """Light that arrives at a point from one direction.
-
-    - `toward`: unit direction to the light. `distance`: to the light, world length; infinite for parallel
-      light.
-    - `irradiance`: (r, g, b) on a plane that faces the light, without occlusion.
-    """
+    """Light at a point from one direction: toward the light, its distance (infinite for parallel light), and
+    the irradiance on a plane that faces it, without occlusion."""
 
     toward: Vec3
     distance: Scalar
@@ -64,7 +57,7 @@ class DirectionalLight(LocatedLight):
         self.irradiance = _power("irradiance", irradiance)
 
     def at(self, point: Vec3) -> Arriving:
-        # its largest component first, so that no square overflows or underflows
+        # scaled first, so that no square overflows or underflows
         direction = self.direction / jax.lax.stop_gradient(jnp.max(jnp.abs(self.direction)))
         x, y, z = apart(-direction / jnp.linalg.norm(direction))
         zero = jnp.zeros_like(point[0])
@@ -102,7 +95,6 @@ class PointLight(LocatedLight):
 
 class HeadLight(Light):
     """A light at the camera: each ray brings its own parallel light, which travels along it. For `Phong`.
-    (VTK's fixed-point ray caster lets the light of all rays travel along the camera's axis.)
 
     **Arguments:**
 
@@ -137,19 +129,16 @@ def lights_of(
     lights: Light | tuple[Light, ...] | Any,
     kinds: tuple[type[Light], ...] = (LocatedLight, ConstantLight),
 ) -> tuple[Light, ...]:
-    """One or several lights of some kinds, as a tuple. **Raises** `ValueError` for no lights and for other
-    objects."""
+    """One or several lights of some kinds, as a tuple; `ValueError` for anything else."""
     several = (lights,) if isinstance(lights, Light) else lights
     if not isinstance(several, tuple | list) or not several:
         raise ValueError(f"lights must be a light or a tuple of lights; got {lights!r}.")
     for light in several:
         if not isinstance(light, kinds):
-            known = ", ".join(each.__name__ for each in CLASSES if issubclass(each, kinds))
+            classes = (DirectionalLight, PointLight, HeadLight, ConstantLight)
+            known = ", ".join(each.__name__ for each in classes if issubclass(each, kinds))
             raise ValueError(f"lights must hold jaxvol lights, here {known}; got {light!r}.")
     return tuple(several)
-
-
-CLASSES = (DirectionalLight, PointLight, HeadLight, ConstantLight)
 
 
 def _power(name: str, value: Arrayable) -> Float[Array, "3"]:

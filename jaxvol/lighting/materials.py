@@ -42,15 +42,14 @@ class Material(eqx.Module):
     - `opacity`: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
       Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
       tracing. Scatterer templates need an opacity above 0, see their `threshold`.
-    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0. Of n scatterers per
-      volume, each of effective area σ, it is 1 / (√2 n σ), as between the particles of a Maxwell–Boltzmann
-      gas.
+    - `mean_free_path`: λ, the mean distance between scatterings, world length, > 0.
     - `refractive_index`: > 0; 1 in air.
     - `values`: (low, high), the range of volume values that are this material, low < high; or
     - `label`: the volume's label for this material. Give one of the two to say where the material is;
       without either, it is everywhere.
 
-    All but `values` and `label` are differentiable.
+    All but `values` and `label` are differentiable. For instance, in mm and chosen for appearance: skin
+    `Material(0.5, 0.7, 1.39)`, muscle `Material(0.6, 1.4, 1.37)`, bone `Material(0.8, 0.6, 1.55)`.
 
     **Raises:** `ValueError` for numbers out of these ranges, and if both `values` and `label` are given.
     """
@@ -90,33 +89,8 @@ class Material(eqx.Module):
         return Optics(self.opacity, self.mean_free_path, self.refractive_index)
 
 
-PRESETS = {"skin": (0.5, 0.7, 1.39), "muscle": (0.6, 1.4, 1.37), "bone": (0.8, 0.6, 1.55)}
-"""Opacity, mean free path in mm, refractive index. The lengths are transport mean free paths, after which
-light has lost its direction (1 / μs′ of soft tissue and bone in red light). The opacities are chosen for
-appearance: tissue absorbs far less at each scattering than templates of a few dozen photons can represent."""
-
-
-def material(name: str, *, millimetre: float = 1.0, **where: Arrayable) -> Material:
-    """A material of `PRESETS`: "skin", "muscle" or "bone".
-
-    **Arguments:**
-
-    - `name`: of the material.
-    - `millimetre`: length of 1 mm in world units, if these are not mm.
-    - `where`: `values` or `label`, as for `Material`.
-
-    **Returns:** the `Material`, its mean free path in world length.
-
-    **Raises:** `ValueError` for any other name, and as `Material` does.
-    """
-    if name not in PRESETS:
-        raise ValueError(f"name must be one of {', '.join(PRESETS)}; got {name!r}.")
-    opacity, path, index = PRESETS[name]
-    return Material(opacity, path * number("millimetre", millimetre, above=0), index, **where)
-
-
 def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
-    """One or several materials as a tuple. **Raises** `ValueError` for no materials and for other objects."""
+    """One or several materials as a tuple; `ValueError` for anything else."""
     several = (materials,) if isinstance(materials, Material) else tuple(materials)
     if not several:
         raise ValueError("materials must hold at least one Material; got none.")
@@ -134,15 +108,9 @@ def optics_of(materials: Sequence[Material]) -> Optics:
 def shares(
     materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
 ) -> tuple[Scalar, ...]:
-    """Share of each material at a point: 1 for the first that is present and 0 for all others; or, where
-    materials meet softly, shares that sum to at most 1.
-
-    **Arguments:**
-
-    - `value`: of the volume at the grid coordinate.
-    - `edge`: 0 for sharp edges. Above 0, the fraction of its value range over which a material fades in and
-      out; labels are then looked up trilinearly. So shares are continuous and differentiable.
-    """
+    """Share of each material at a grid coordinate with this value: 1 for the first that is present, 0 for all
+    others. With an `edge` above 0, the fraction of its value range over which a material fades, shares are
+    continuous and sum to at most 1; labels are then looked up trilinearly."""
     remaining, each = jnp.ones_like(value), []
     for one in materials:
         if one.label is not None:

@@ -1,11 +1,11 @@
 """Surface shading: how bright a sample is by the angle between the light and the gradient of the values."""
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
-from .._util.checks import Arrayable, finite_array, require
+from .._util.checks import Arrayable, finite_array, number, require
 from .._util.vec3 import Vec3, apart, dot, plus, scaled, times
 from ..scene.space import world_gradient
 from ..xla.memory import packed_pair, unpacked_pair
@@ -13,12 +13,8 @@ from .lights import HeadLight, Light, LocatedLight, lights_of
 from .shading import Sample, Shading, Surroundings
 
 
-class _Lit(NamedTuple):
-    """Light that arrives at a sample: the direction to it, and its irradiance."""
-
-    toward: Vec3
-    irradiance: Vec3
-
+_Lit: TypeAlias = tuple[Vec3, Vec3]
+"""The direction to a light, and the irradiance that arrives."""
 
 Angles: TypeAlias = Float[Array, "..."] | Complex[Array, "..."]
 """How a light falls on a sample: of a head light n·v; of others the pair n·l and n·v, packed in one array."""
@@ -33,14 +29,12 @@ class Phong(Shading):
     where r = 2 (n·l) n - l is the direction in which the light is reflected. A light on the far side, with
     n·l ≤ 0, adds nothing.
 
-    - The normal is the world gradient of the value (`space.world_gradient` with central differences), of unit
-      length. It is turned to the viewer, so that both sides of a surface are lit, as by VTK.
+    - The normal is the world gradient of the value by central differences, of unit length. It is turned to
+      the viewer, so that both sides of a surface are lit, as by VTK.
     - Where the gradient is 0 there is no normal, and only ambient light, as in VTK; the same where the square
       of its length leaves the range of floats: in float32, below 1e-19 and above 1e19 value units per length.
-    - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: a white surface
-      that scatters the irradiance E diffusely has the radiance E / π, and here, with `diffuse=1`, the
-      colour E. So lights of irradiance π E here are those of irradiance E for `ScattererTemplates` and
-      `path_trace`.
+    - A light of irradiance 1 is VTK's light of colour 1. Phong's colours are no radiances: lights of
+      irradiance π E here are those of irradiance E for `ScattererTemplates` and `path_trace`.
     - VTK's fixed-point ray caster computes its highlight from the vector half-way between l and v. It is as
       wide as Phong's of a quarter of the power. VTK's ray caster on GPUs has Phong's.
 
@@ -81,11 +75,7 @@ class Phong(Shading):
         self.ambient = _coefficient("ambient", ambient)
         self.diffuse = _coefficient("diffuse", diffuse)
         self.specular = _coefficient("specular", specular)
-        self.specular_power = require(
-            finite_array("specular_power", specular_power, ()),
-            lambda power: power > 0,
-            "specular_power must be positive; got {got}.",
-        )
+        self.specular_power = number("specular_power", specular_power, above=0)
 
     @property
     def reads_gradient(self) -> bool:
@@ -114,26 +104,26 @@ class Phong(Shading):
         # then repeats the fetches.
         scale = 1 / jnp.sqrt(jnp.where(exists, squared, 1))
 
-        def angles(light: Light, lit: _Lit) -> Angles:
-            if isinstance(light, HeadLight):
-                return side * toward_viewer * scale
-            return packed_pair(side * dot(gradient, lit.toward), side * toward_viewer, scale)
-
-        return tuple(angles(*each) for each in zip(self.lights, shared, strict=True))
+        return tuple(
+            side * toward_viewer * scale
+            if isinstance(light, HeadLight)
+            else packed_pair(side * dot(gradient, toward), side * toward_viewer, scale)
+            for light, (toward, _) in zip(self.lights, shared, strict=True)
+        )
 
     def color(self, sample: Sample, shared: tuple[_Lit, ...], sums: tuple[Angles, ...]) -> Vec3:
         zero = jnp.zeros_like(sample.extinction)
         diffuse, specular = (zero, zero, zero), (zero, zero, zero)
-        for lit, angles in zip(shared, sums, strict=True):
+        for (toward, irradiance), angles in zip(shared, sums, strict=True):
             if jnp.iscomplexobj(angles):
                 facing, viewed = unpacked_pair(angles)
-                mirrored = 2 * facing * viewed + dot(lit.toward, sample.direction)
+                mirrored = 2 * facing * viewed + dot(toward, sample.direction)
             else:
                 facing, mirrored = angles, 2 * angles * angles - 1
             shines = (facing > 0) & (mirrored > 0)
             highlight = jnp.exp(self.specular_power * jnp.log(jnp.where(shines, mirrored, 1)))
-            diffuse = plus(diffuse, scaled(lit.irradiance, jnp.where(facing <= 0, 0, facing)))
-            specular = plus(specular, scaled(lit.irradiance, jnp.where(shines, highlight, 0)))
+            diffuse = plus(diffuse, scaled(irradiance, jnp.where(facing <= 0, 0, facing)))
+            specular = plus(specular, scaled(irradiance, jnp.where(shines, highlight, 0)))
         ambient = self.ambient
         factor = plus(scaled(diffuse, self.diffuse), (ambient, ambient, ambient))
         return plus(times(sample.color, factor), scaled(specular, self.specular))
@@ -148,7 +138,7 @@ def _coefficient(name: str, value: Arrayable) -> Float[Array, ""]:
 def _arriving(light: Light, sample: Sample) -> _Lit:
     if isinstance(light, HeadLight):
         x, y, z = sample.direction
-        return _Lit((-x, -y, -z), apart(light.irradiance))
+        return (-x, -y, -z), apart(light.irradiance)
     assert isinstance(light, LocatedLight)
     arriving = light.at(sample.point)
-    return _Lit(arriving.toward, arriving.irradiance)
+    return arriving.toward, arriving.irradiance

@@ -1,11 +1,4 @@
-"""What does each photon of a template add to the light of a sample?
-
-Each photon marks a place from which light is scattered to the sample: photons on the lit side that are not
-hidden make the sample bright, photons inside matter add the colour found there.
-
-Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
-volume rendering (2016), section 3.3. `ScattererTemplates` lists the steps.
-"""
+"""What does each photon of a template add to the light of a sample? `ScattererTemplates` lists the steps."""
 
 import functools
 import math
@@ -38,18 +31,13 @@ LIT_SIDE_COSINE = 0.25
 
 WHITE = 4 / (3 * math.pi)
 """Factor from irradiance to radiance, by which opaque white matter that absorbs nothing is as bright as the
-light around it. Of the photons around a sample on a flat face, half are outside, where the light comes from,
-and half are inside and add their colour: b = 1/2, s = c/2, and E b (c + s) = 3/4 π L c in light of
-radiance L."""
+light around it: half of the photons of a sample on its face are inside, so that E b (c + s) = 3/4 π L c."""
 
 
 class _Shared(NamedTuple):
-    """What is common to all photons of a sample.
-
-    - `shares`: of the materials. `mixture`: the same, normalized to sum to 1 if any is above 0.
-    - `optics`: of the sample's material. `template`: which of its templates; None if there is only one.
-    - `lights`: for each, the direction to it, its distance and irradiance. Direction None: from all sides.
-    """
+    """What is common to all photons of a sample: the materials' shares, and the same normalized to sum to 1;
+    its optics; which template it uses, if there are several; and of each light the direction to it (None:
+    from all sides), its distance and irradiance."""
 
     shares: tuple[Scalar, ...]
     mixture: tuple[Scalar, ...]
@@ -59,8 +47,8 @@ class _Shared(NamedTuple):
 
 
 class _Photon(NamedTuple):
-    """A photon of a sample. `inner`: the factor by which the colour at its place counts; `mean_free_path`:
-    there. None if they follow from what is read at its place."""
+    """A photon of a sample; where there are several materials, also the factor by which the colour at its
+    place counts, and the mean free path there."""
 
     offset: Vec3
     intensity: Scalar
@@ -71,13 +59,9 @@ class _Photon(NamedTuple):
 class PhotonShading(Shading):
     """Templates prepared for one image.
 
-    - `templates`: (materials, templates, photons). Where there are several for a material, each pixel uses
-      one, drawn by `seed`. `blended`: how many were blended into each; their photons are skipped as they
-      would be in their own templates.
-    - `optics`: of the materials.
+    - `templates`: (materials, templates, photons). `blended`: how many were blended into each; their photons
+      are skipped as they would be in their own templates.
     - `cutoff`: None: no photon is skipped.
-    - `given`: whether the templates are a user's own, in which an intensity of 0 may have a derivative. Of
-      those that were simulated, a photon that has faded out, and its derivative with it, is 0.
     """
 
     materials: tuple[Material, ...]
@@ -86,7 +70,6 @@ class PhotonShading(Shading):
     optics: Optics
     cutoff: Float[Array, ""] | None
     blended: int = eqx.field(static=True)
-    given: bool = eqx.field(static=True)
     occlusion: Occlusion = eqx.field(static=True)
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
@@ -99,10 +82,6 @@ class PhotonShading(Shading):
     def _soft(self) -> bool:
         return self.occlusion == "soft"
 
-    @property
-    def _one_material(self) -> bool:
-        return len(self.materials) == 1
-
     def thresholds(self) -> Float[Array, " photons"]:
         intensity = jax.lax.stop_gradient(self.templates.intensity)
         brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
@@ -110,7 +89,7 @@ class PhotonShading(Shading):
         if self.cutoff is not None:
             # a little less, so that rounding leaves out no photon that `_photon` does not skip
             least = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
-        return least if self.given else jnp.where(brightest <= 0, jnp.inf, least)
+        return jnp.where(brightest <= 0, jnp.inf, least)  # padding
 
     @property
     def skips_hidden(self) -> bool:
@@ -131,18 +110,18 @@ class PhotonShading(Shading):
                 lights.append(tuple(light.at(sample.point)))
         total = sum(material_shares)
         mixture = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
-        default = Optics(*(jnp.ones_like(total),) * 3)
-        optics = _blend(self.optics, mixture, default)
+        optics = _blend(self.optics, mixture, Optics(*(jnp.ones_like(total),) * 3))
         return _Shared(material_shares, mixture, optics, template, tuple(lights))
 
     def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
         # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
         # photon of a single template costs nothing, as it is the same for all samples.
-        if self._one_material and shared.template is None:
-            photon = self._photon(sample, shared, number)
-        else:
+        several = len(self.materials) > 1
+        if several or shared.template is not None:
             photon = around.stored(lambda: self._photon(sample, shared, number))
-        if not self._one_material:
+        else:
+            photon = self._photon(sample, shared, number)
+        if several:
             photon = self._refracted(around, sample, shared, photon)
 
         def places() -> list[Vec3]:
@@ -169,8 +148,7 @@ class PhotonShading(Shading):
         return red, green, blue
 
     def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> _Photon:
-        """A photon of the sample's material, or of several blended by their shares; of intensity 0 if it is
-        skipped."""
+        """A photon of the sample's materials, blended by their shares; of intensity 0 if it is skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
@@ -180,9 +158,8 @@ class PhotonShading(Shading):
             [*(of_sample(offset[m, :, number, i]) for i in range(3)), of_sample(light[m, :, number])]
             for m in range(len(self.materials))
         ]
-        if self._one_material:
-            x, y, z, intensity = each[0]
-        else:
+        x, y, z, intensity = each[0]
+        if len(each) > 1:
             x, y, z, intensity = (
                 _sum([share * one for share, one in zip(shared.mixture, several, strict=True)])
                 for several in zip(*each, strict=True)
@@ -223,11 +200,10 @@ class PhotonShading(Shading):
         if inner is None or path is None:
             shares = self._shares_at(around, points[0])
             inner, path = _sum(shares), _blend(self.optics, shares, shared.optics).mean_free_path
-        extinction = points[0].extinction
+        extinctions = [point.extinction for point in points]
         # soft: the opacity of one mean free path there
-        matter = -jnp.expm1(-extinction * path) if self._soft else step(extinction, 0.0)
-        visible = self._visible(photon.offset, [point.extinction for point in points])
-        return photon.intensity * visible, photon.intensity * inner * matter
+        matter = -jnp.expm1(-extinctions[0] * path) if self._soft else step(extinctions[0], 0.0)
+        return photon.intensity * self._visible(photon.offset, extinctions), photon.intensity * inner * matter
 
     def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
         edge = EDGE if self._soft else 0.0
@@ -266,7 +242,6 @@ def _displaced(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
 
 
 def _matter(shares: tuple[Scalar, ...]) -> Scalar:
-    """How far a sample is in any material."""
     return jnp.minimum(2 * sum(shares), 1)
 
 

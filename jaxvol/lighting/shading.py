@@ -1,7 +1,7 @@
 """How is a classified sample shaded? The interface of lightings.
 
-Shading comes between the transfer function and compositing. `render` takes a `Lighting`, which makes a
-`Shading` for each image; engines call the `Shader`, which adds up a sample's terms.
+`render` takes a `Lighting`, which makes a `Shading` for each image; engines call the `Shader`, which adds up
+a sample's terms.
 """
 
 import math
@@ -29,8 +29,7 @@ from ..xla.trees import PyTree
 T = TypeVar("T")
 
 TOGETHER = 8
-"""Most terms of many samples that are computed at a time. To launch a kernel on several threads takes longer
-than 2048 samples of one term take in it."""
+"""Most terms of many samples computed at a time, so that kernels do enough work for their launch."""
 
 
 class Sample(NamedTuple):
@@ -53,11 +52,8 @@ class Sample(NamedTuple):
 
 
 class ClassifiedPoint(NamedTuple):
-    """What is at a point of the world.
-
-    - `inside`: 1 in the volume, falling to 0 at one voxel outside, so that light does not jump at the
-      volume's faces. `extinction` is multiplied by it.
-    """
+    """What is at a point of the world. `inside`: 1 in the volume, falling to 0 at one voxel outside, so that
+    light does not jump at the volume's faces; `extinction` is multiplied by it."""
 
     inside: Scalar
     coordinate: Vec3
@@ -66,22 +62,14 @@ class ClassifiedPoint(NamedTuple):
 
 
 class Surroundings(eqx.Module):
-    """The scene around a sample.
-
-    - `live`: always true, but opaque to XLA: see `in_memory`. None: no branches, since fetches cannot be
-      recorded inside one.
-    - `tables`: the classification, if it was computed before.
-    """
+    """The scene around a sample. `live`: see `in_memory`; None: nothing is stored, since fetches cannot be
+    recorded inside a branch. `tables`: the classification, if it was computed before."""
 
     volume: Volume
     transfer: Transfer
     space: Space
     live: Bool[Array, ""] | None = None
     tables: Classification | None = None
-
-    def before_loop(self) -> "Surroundings":
-        """The same, with the transfer function's tables, which a loop would compute again each time."""
-        return replace(self, tables=self.classification)
 
     def in_memory_by(self, live: Bool[Array, ""], sample: Sample) -> "Surroundings":
         """The same, with what is `stored` for this sample put in memory."""
@@ -117,31 +105,30 @@ class Lighting(eqx.Module):
 
     @property
     def reads_gradient(self) -> bool:
-        """Whether samples read the volume's gradient, so that it is worth storing slopes. By default not."""
+        """Whether samples read the volume's gradient. By default not."""
         return False
 
     @property
     def farthest_read(self) -> float | None:
-        """Distance from a sample, world length, up to which its shading reads the volume: more than 0 must be
-        read around a brick. By default None: unknown, or unbounded."""
+        """Distance from a sample, world length, up to which its shading reads the volume. By default None:
+        unknown, or unbounded."""
         return None
 
     @abstractmethod
     def for_image(self, around: "Surroundings") -> "Shading":
-        """What shades the samples of one image. What does not depend on the sample is computed here, once."""
+        """What shades the samples of one image; here is computed what does not depend on the sample."""
 
 
 class Shading(Lighting):
     """A lighting that shades samples, by three methods, each of which sees one sample: `begin`, `term` and
     `color`, of which only the last one is required.
 
-    The light at a sample is a sum of `terms`, such as one for each light source, or for each place from which
-    light comes. Only `term` may read voxels: under replay, those that are read elsewhere get no gradient.
+    The light at a sample is a sum of `terms`, such as one for each light source. Only `term` may read voxels:
+    under replay, those that are read elsewhere get no gradient.
 
     If there is one term and all it reads is the gradient at the sample (`reads_gradient` is true and
-    `farthest_read` is 0), all samples are shaded where they are, since gathering the visible ones would cost
-    more. Of a sample, `begin` and `term` are then told where it is, and `color` also its colour; its
-    transmittance is 1, and all else NaN.
+    `farthest_read` is 0), all samples are shaded, also invisible ones. Of a sample, `begin` and `term` are
+    then told where it is, and `color` also its colour; its transmittance is 1, and all else NaN.
     """
 
     @property
@@ -156,8 +143,7 @@ class Shading(Lighting):
 
     @property
     def skips_hidden(self) -> bool:
-        """Whether, by its `thresholds`, a sample behind little transmittance may need no term at all: its
-        colour is then computed without gathering it. By default not."""
+        """Whether, by its `thresholds`, a sample behind little transmittance may need no term at all."""
         return False
 
     def for_image(self, around: "Surroundings") -> "Shading":
@@ -179,8 +165,7 @@ class Shading(Lighting):
 def lit_classification(
     volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None, *, integrated: bool = False
 ) -> Classification:
-    """Measuring, classifying and, where there is a lighting, shading the points of a volume, or also cells
-    that are `integrated`."""
+    """The classification of a volume, with the shader of its samples if there is a lighting."""
     classification = classification_of(transfer, volume, integrated=integrated)
     if lighting is None:
         return classification
@@ -196,7 +181,6 @@ class Shader(NamedTuple):
 
     @classmethod
     def of(cls, lighting: Lighting, around: Surroundings) -> "Shader":
-        """That of a lighting."""
         return cls(lighting.for_image(around), around)
 
     @property
@@ -212,17 +196,19 @@ class Shader(NamedTuple):
         return self.shading, self.around.space, without_voxels(plain)
 
     def with_leaves(self, leaves: PyTree, transfer: Transfer) -> "Shader":
-        """The same with these leaves, a transfer function, and the same voxels."""
         (shading, space, rest), volume = leaves, self.around.volume
         whole = with_fetch(with_voxels(rest, volume.data), volume.fetch)
         return Shader(shading, Surroundings(whole, transfer, space))
 
     def __call__(self, sample: Sample) -> Vec3:
-        """The shaded colour of a sample, or those of many along one axis."""
+        """The shaded colour of a sample, or those of many, without terms that none needs."""
+        shading, around = self
         if self.inline:
             sample = sample._replace(transmittance=jnp.ones_like(sample.transmittance))
-        shade = shade_sample if sample.extinction.ndim == 0 else shade_samples
-        return shade(self.shading, self.around, sample)
+        if sample.extinction.ndim == 0:
+            return shade_sample(shading, around, sample)
+        shared = jax.vmap(partial(shading.begin, around))(sample)
+        return jax.vmap(shading.color)(sample, shared, needed_terms(shading, around, sample, shared))
 
 
 def shade_sample(shading: Shading, around: Surroundings, sample: Sample) -> Vec3:
@@ -236,32 +222,23 @@ def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: P
     if shading.terms == 0:
         return None
 
-    # The backward pass computes each term again, so that memory holds the intermediate values of one term,
-    # not of all.
-    @jax.checkpoint
+    @jax.checkpoint  # so that the backward pass holds the intermediate values of one term, not of all
     def add(sums: PyTree, number: Int[Array, ""]) -> tuple[PyTree, None]:
         added = shading.term(looped.in_memory_by(number >= 0, sample), sample, shared, number)
         return jax.tree.map(jnp.add, sums, added), None
 
-    looped, none = around.before_loop(), no_terms(shading, around, sample, shared)
+    looped, none = replace(around, tables=around.classification), no_terms(shading, around, sample, shared)
     return jax.lax.scan(add, varying(none, sample), jnp.arange(shading.terms))[0]
-
-
-def shade_samples(shading: Shading, around: Surroundings, samples: Sample) -> Vec3:
-    """The shaded colours of samples along one axis. Terms that none of them needs are left out."""
-    shared = jax.vmap(partial(shading.begin, around))(samples)
-    sums = needed_terms(shading, around, samples, shared)
-    return jax.vmap(shading.color)(samples, shared, sums)
 
 
 @eqx.filter_custom_jvp
 def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared: PyTree) -> PyTree:
     """The sums of the terms that any of these samples needs; None where there are none. Their derivative is
-    that of all terms: a term of 0 may have one, and JAX cannot differentiate this loop in reverse."""
+    that of all terms, since JAX cannot differentiate this loop in reverse."""
     if shading.terms == 0:
         return None
 
-    looped = around.before_loop()
+    looped = replace(around, tables=around.classification)
     together = math.ceil(shading.terms / math.ceil(shading.terms / TOGETHER))
 
     def terms(first: Int[Array, ""]) -> PyTree:

@@ -5,7 +5,6 @@ Lee, Kwon and Shin: Scattered light representation in accordance with the materi
 volume rendering (2016), sections 3.3 and 3.4.
 """
 
-import math
 from collections.abc import Sequence
 from typing import Any, get_args
 
@@ -27,8 +26,7 @@ from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
 from .photons import Occlusion, PhotonShading
 from .shading import Lighting, Shading, Surroundings
-from .template import ScattererTemplate
-from .template_simulation import PacketTree, ThresholdOn, scatterer_templates
+from .template import PacketTree, ScattererTemplate, scatterer_templates
 
 
 class ScattererTemplates(Lighting):
@@ -51,18 +49,15 @@ class ScattererTemplates(Lighting):
     6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
-    inwards, a sample is lit entirely as that material, and keeps nothing of its own colour.
+    inwards, a sample is lit entirely as that material.
 
-    **Scale.** The paper's sum is E b (c + s), without a unit. Here the intensities of a template sum to 1
-    (except for `given` templates, which are used as they are), and k R turns the sum into radiance on the
-    scale of `path_trace`: k = 4 / (3π) is a constant, and R is the `Optics.reflectance` of the sample's
-    material, which falls from 1 to 0 as its opacity rises. So ratios between pixels of one material are the
-    paper's if its template held all energy before it was scaled; if the threshold cut some off, s weighs more
-    here. To get the paper's sum, divide by k R. A flat face of white matter, of which only the surface is
-    visible, has a radiance of R L under a `ConstantLight` of radiance L. White half-spaces have 0.9 to 1.6
-    times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For
-    darker colours, templates are too bright: in path tracing the colour darkens each of many scatterings, in
-    templates it darkens the sum once.
+    **Scale.** The paper's sum E b (c + s) has no unit. Here the intensities of a template sum to 1 (except
+    for `given` ones), and k R turns the sum into radiance on the scale of `path_trace`: k = 4 / (3π), and R
+    is the `Optics.reflectance` of the sample's material. So a flat face of white matter, of which only the
+    surface is visible, has a radiance of R L under a `ConstantLight` of radiance L. White half-spaces have
+    0.9 to 1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times
+    (`docs/methods.md`). For darker colours, templates are too bright: in path tracing the colour darkens each
+    of many scatterings, in templates it darkens the sum once.
 
     **Arguments:**
 
@@ -84,22 +79,21 @@ class ScattererTemplates(Lighting):
     - `cutoff`: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
       misses the photons that are skipped.
     - `seed`: of the templates, and of their choice for each pixel.
-    - `packets`, `threshold`, `threshold_on`: of the templates, see `scatterer_template`.
     - `baked`: False, or the number of nodes, along the volume's longest side, of a grid on which the light of
       all templates is computed once and then fetched, as long as volume, transfer function and lighting stay
       the same; if any of them is traced, it is computed for each image. It carries no gradient.
-    - `levels`: of the templates' trees; required if an opacity is traced.
-    - `given`: templates to use instead of simulated ones, with leading axes (materials, templates). Their
-      lengths and intensities are used as they are, so that nothing depends on the materials' mean free paths.
+    - `packets`, `threshold`, `levels`: of the templates, see `scatterer_template`.
+    - `given`: templates to use as they are instead of simulated ones, with leading axes (materials,
+      templates). Then nothing depends on the materials' mean free paths.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
-    show, since invisible points are not lit. Where it fails, and where not: `experiments/stability.py`, "long
-    mean free paths", "short mean free paths".
+    show, since invisible points are not lit. Where it fails: `experiments/stability.py`, "long mean free
+    paths", "short mean free paths".
 
     **Raises:** `ValueError` for invalid arguments, if `levels` are required but missing, for a material of
-    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for templates or
-    a grid that do not fit into memory.
+    which no photon is above the threshold (if its opacity is traced, the image is NaN), and for a grid that
+    does not fit into memory.
     """
 
     materials: tuple[Material, ...]
@@ -114,7 +108,6 @@ class ScattererTemplates(Lighting):
     seed: int = eqx.field(static=True)
     packets: int = eqx.field(static=True)
     threshold: float = eqx.field(static=True)
-    threshold_on: ThresholdOn = eqx.field(static=True)
     levels: int = eqx.field(static=True)
     baked: int = eqx.field(static=True)
 
@@ -133,7 +126,6 @@ class ScattererTemplates(Lighting):
         baked: int | bool | Any = False,
         packets: int = 4,
         threshold: float = 0.01,
-        threshold_on: ThresholdOn | Any = "photon",
         levels: int | None = None,
         given: ScattererTemplate | Any | None = None,
     ):
@@ -149,13 +141,19 @@ class ScattererTemplates(Lighting):
             self.cutoff = number("cutoff", cutoff, above=0, below=1)
         # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
-        tree = PacketTree.checked(packets, threshold, threshold_on)
-        self.packets, self.threshold, self.threshold_on = tree.packets, tree.threshold, threshold_on
+        tree = PacketTree.checked(packets, threshold)
+        self.packets, self.threshold = tree.packets, tree.threshold
         self.given = given
         if given is not None:
-            _check_given(given, len(self.materials))
-            self.templates, self.levels = given.intensity.shape[1], 0
-            available = given.intensity.shape[-1]
+            if not isinstance(given, ScattererTemplate):
+                raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")
+            shape = given.intensity.shape
+            if len(shape) != 3 or shape[0] != len(self.materials):
+                raise ValueError(
+                    f"given must hold templates of {len(self.materials)} materials, intensities of shape "
+                    f"(materials, templates, n); got {shape}."
+                )
+            self.templates, self.levels, available = shape[1], 0, shape[-1]
         else:
             self.levels = tree.levels_of(self.materials, levels)
             available = tree.capacity(self.levels)
@@ -189,7 +187,6 @@ class ScattererTemplates(Lighting):
                 count=self.templates,
                 packets=self.packets,
                 threshold=self.threshold,
-                threshold_on=self.threshold_on,
                 levels=self.levels,
             ).normalized()  # restores the energy that the threshold has cut off
         if not blend:
@@ -205,7 +202,6 @@ class ScattererTemplates(Lighting):
             optics_of(self.materials),
             cutoff,
             blended=self.templates if blend else 1,
-            given=self.given is not None,
             occlusion=self.occlusion,
             reach=self.reach,
             seed=self.seed,
@@ -213,24 +209,10 @@ class ScattererTemplates(Lighting):
 
 
 def _checked_reach(reach: Any) -> tuple[float, ...]:
-    fault = ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
-    try:
-        multiples = tuple(float(each) for each in reach)
-    except TypeError as other:
-        raise fault from other
-    if not all(b > a for a, b in zip((1.0, *multiples), (*multiples, math.inf), strict=True)):
-        raise fault
-    return multiples
-
-
-def _check_given(given: Any, materials: int) -> None:
-    if not isinstance(given, ScattererTemplate):
-        raise ValueError(f"given must be a ScattererTemplate; got {given!r}.")
-    if given.intensity.ndim != 3 or given.intensity.shape[0] != materials:
-        raise ValueError(
-            f"given must hold templates of {materials} materials, "
-            f"with intensities of shape (materials, templates, n); got {given.intensity.shape}."
-        )
+    multiples = np.asarray(reach, float)
+    if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
+        raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
+    return tuple(multiples.tolist())
 
 
 @eqx.filter_jit
@@ -253,7 +235,11 @@ def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, mar
         return lighting
     cache = memoized(volume.data, _bake_cache)
     entry = cache.get(tree)
-    if entry is None or not all(_same(a, b) for a, b in zip(entry[0], leaves, strict=True)):
+    # large leaves, such as labels, are the same only if they are the same array
+    if entry is None or not all(
+        a is b or (np.size(a) <= 2**16 and np.array_equal(np.asarray(a), np.asarray(b)))
+        for a, b in zip(entry[0], leaves, strict=True)
+    ):
         cache.clear()
         with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
             around = Surroundings(volume, transfer, march.locate(volume))
@@ -264,8 +250,3 @@ def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, mar
 def _bake_cache(_: Array) -> dict[Any, Any]:
     """Cache of a volume's baked light: the last one only, keyed by its other inputs."""
     return {}
-
-
-def _same(a: Any, b: Any) -> bool:
-    """Whether two leaves are certainly equal; large ones, such as labels, only if they are the same array."""
-    return a is b or (np.size(a) <= 2**16 and np.array_equal(np.asarray(a), np.asarray(b)))

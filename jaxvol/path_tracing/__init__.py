@@ -1,4 +1,3 @@
 """Unbiased path tracing of light that a volume scatters any number of times."""
 
-from .path_trace import path_trace as path_trace
-from .result import PathTraced as PathTraced
+from .path_trace import PathTraced as PathTraced, path_trace as path_trace

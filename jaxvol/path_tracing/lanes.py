@@ -1,9 +1,5 @@
-"""Path regeneration: walks run side by side in lanes, and a walk that ends makes room for the next.
-
-Walks differ in length by orders of magnitude. A lane whose walk has ended would idle until the longest has.
-So walks wait in a queue: once a quarter of the lanes is idle, the results of their walks are stored, and the
-next walks of the queue begin. When the queue is empty, the remaining walks are compacted into fewer lanes.
-"""
+"""Path regeneration: walks run side by side in lanes; once a quarter of the lanes is idle, the next walks of
+a queue begin there. When the queue is empty, the remaining walks are compacted into fewer lanes."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias

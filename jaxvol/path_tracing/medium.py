@@ -1,9 +1,5 @@
-"""The medium that a volume is: extinction and albedo at a point, and bounds of the extinction.
-
-Woodcock tracking is unbiased only if its majorant is nowhere below the extinction. So the bounds are proven:
-interpolation never leaves the range of a block's nodes, and a piecewise linear function is greatest at an end
-of a range of values, or at a control point inside. A margin for rounding is added.
-"""
+"""The medium that a volume is: extinction and albedo at a point, and proven bounds of the extinction, without
+which Woodcock tracking would be biased."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -44,8 +40,7 @@ class Majorants(eqx.Module):
     def of(
         cls, volume: Volume, blocks: Blocks, transfer: Transfer, materials: tuple[Material, ...] = ()
     ) -> "Majorants":
-        """Those of the medium that `Medium.of` makes of a volume, from the volume's blocks. **Raises**
-        `ValueError` for a transfer function without a majorant."""
+        """Those of the medium that `Medium.of` makes of a volume, from the volume's blocks."""
         bound = greatest_extinction(transfer, blocks, materials)
         distance = Affine(volume).occupancy(bound > 0).distance().astype(bound.dtype)
         table = jnp.where(bound > 0, bound, -distance.reshape(bound.shape))
@@ -55,7 +50,6 @@ class Majorants(eqx.Module):
         return cls(table.reshape(-1), (x, y, z), (nx, ny, nz))
 
     def at(self, block: Block) -> Scalar:
-        """Table entry of a block."""
         return gather(self.table, block)
 
     def block(self, x: Array, y: Array, z: Array) -> Block:
@@ -94,15 +88,11 @@ def _bits(count: int) -> int:
 def greatest_extinction(
     transfer: Transfer, blocks: Blocks, materials: tuple[Material, ...] = ()
 ) -> Float[Array, "bx by bz"]:
-    """Upper bound of the extinction in each block, 1/length; 0 where nothing is visible.
-
-    Each material that the block may hold contributes its 1/λ, and the transfer function comes last; whatever
-    comes after a material that fills the block is ignored. It carries no gradient.
-    """
+    """Upper bound of the extinction in each block, 1/length; 0 where nothing is visible. Whatever comes after
+    a material that fills the block is ignored. **Raises** `ValueError` for a transfer without a majorant."""
     if type(transfer).majorant is Transfer.majorant:
         raise ValueError(
-            f"transfer must have a majorant of its extinction; {type(transfer).__name__} does not override "
-            "Transfer.majorant."
+            f"transfer must have a majorant; {type(transfer).__name__} does not override Transfer.majorant."
         )
     blocks, transfer, materials = jax.lax.stop_gradient((blocks, transfer, materials))
     own = transfer.majorant(blocks)
@@ -144,11 +134,7 @@ class Medium(NamedTuple):
     def of(
         cls, volume: Volume, blocks: Blocks, transfer: Transfer, materials: tuple[Material, ...] = ()
     ) -> "Medium":
-        """Medium with the transfer function's extinction, at the trilinear value, and its colour as albedo.
-
-        Where the transfer function shows a material, the extinction is 1/λ instead, and the albedo is
-        colour · (1 - opacity). Where materials overlap, the first counts.
-        """
+        """The medium that `path_trace` describes."""
         classification = classification_of(transfer, volume)
 
         def measure(coordinate: Vec3) -> Measured:

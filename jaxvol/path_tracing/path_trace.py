@@ -1,9 +1,6 @@
-"""Path tracing of light that is scattered many times: the reference for cheaper lighting.
+"""Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
-It is unbiased: an image is the exact answer plus noise, whose size is reported, and which falls with the
-square root of the number of paths. It refuses to be differentiated.
-"""
-
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -11,10 +8,9 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.checks import Arrayable, all_finite, described, flag, integer, number
-from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4, is_key
 from .._util.vec3 import Scalar
 from ..engine.acceleration import with_words, words_of
@@ -30,7 +26,6 @@ from ..xla.compiling import compiled
 from ..xla.platform import is_traced
 from .lanes import walk_all
 from .medium import Medium
-from .result import PathTraced
 from .walks import Walk, WalkResult, WalkScene, Words, step
 
 
@@ -41,23 +36,74 @@ WALKS_PER_LANE = 128
 """Walks that each lane of a batch runs, one after the other."""
 
 MAX_SCATTERINGS = 2**20
-"""Scatterings that a walk may have by default. A path of albedo 1 leaves a medium of optical thickness τ
-after about τ² scatterings, so this limits only paths in media a thousand mean free paths thick."""
-
-BYTES_PER_WALK, BYTES_PER_RESULT = 2**10, 2**6
-"""Memory of a walk in its lane, and of its result until its batch is over."""
+"""Scatterings that a walk may have by default: enough for media a thousand mean free paths thick."""
 
 NOT_DIFFERENTIABLE = (
-    "path_trace has no derivative, but volume, transfer, camera, lights, materials or anisotropy carries a "
-    "tangent here (jax.grad, jax.jvp, jax.linearize). Differentiate scatterer templates instead: "
-    "render(..., lighting=lighting.ScattererTemplates(...)). To treat the path-traced image as a constant, "
-    "apply jax.lax.stop_gradient to its inputs."
+    "path_trace has no derivative, but an input carries a tangent here (jax.grad, jax.jvp). Differentiate "
+    "lighting.ScattererTemplates instead, or apply jax.lax.stop_gradient to the inputs."
 )
-"""Error message. Differentiating the walks would not give the image's derivative in any case: how often and
-where a path collides jumps with the extinction."""
+"""Error message: how often and where a path collides jumps with the extinction."""
 
 BEFORE_FIRST_STEP = np.uint32(2**32 - 1)
 """Used in place of a walk's step number for what is drawn before its first step."""
+
+
+class PathTraced(eqx.Module):
+    """A path-traced image, from the paths traced so far.
+
+    - `radiance`: linear RGB of the light that the volume scatters into the camera, mean over all paths,
+      without the background.
+    - `opacity`: the fraction of camera rays that met anything.
+    - `deviations`: sums of the squared deviations of each path's radiance from the mean.
+    - `exhausted`: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
+      contributed.
+    - `paths`: per pixel. `seed`: of all random numbers.
+    """
+
+    radiance: Float[Array, "height width 3"]
+    opacity: Float[Array, "height width"]
+    deviations: Float[Array, "height width 3"]
+    exhausted: Bool[Array, "height width"]
+    seed: UInt32[Array, ""]
+    paths: int = eqx.field(static=True)
+
+    @property
+    def standard_error(self) -> Float[Array, "height width 3"]:
+        """Standard error of `radiance`, from the variance of the pixel's paths; infinite for a single path.
+
+        If a pixel's few paths miss a rare bright one, the pixel is too dark and its error too small.
+        """
+        if self.paths < 2:
+            return jnp.full_like(self.deviations, jnp.inf)
+        return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
+
+    def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
+        """Linear RGB over a background: one colour (3,), or an image of the same shape. **Raises:**
+        `ValueError` for another shape."""
+        background = jnp.asarray(background, self.radiance.dtype)
+        if background.shape not in ((3,), self.radiance.shape):
+            shapes = f"(3,) or {self.radiance.shape}"
+            raise ValueError(f"background must have shape {shapes}; got {background.shape}.")
+        return self.radiance + (1 - self.opacity[..., None]) * jnp.broadcast_to(
+            background, self.radiance.shape
+        )
+
+    def joined(self, other: "PathTraced") -> "PathTraced":
+        """The result of this one's and another one's paths, of the same scene.
+
+        Source: Chan, Golub and LeVeque 1983.
+        """
+        paths = self.paths + other.paths
+        share = other.paths / paths
+        between = jnp.square(other.radiance - self.radiance) * (self.paths * share)
+        return PathTraced(
+            radiance=self.radiance + (other.radiance - self.radiance) * share,
+            opacity=self.opacity + (other.opacity - self.opacity) * share,
+            deviations=self.deviations + other.deviations + between,
+            exhausted=self.exhausted | other.exhausted,
+            seed=self.seed,
+            paths=paths,
+        )
 
 
 def path_trace(
@@ -79,7 +125,7 @@ def path_trace(
 
     The extinction is the transfer function's, at the trilinear value, and the single-scattering albedo is its
     colour, clipped to [0, 1]: an image corresponds to one by Mitsuba's `volpath` with a heterogeneous medium.
-    (`render` treats the colour as light that the medium emits. With albedo 0 the two agree on opacity.)
+    (`render` treats the colour as light that the medium emits.)
 
     The image is radiance, in the unit of `lights`: in a white furnace (albedo 1 under a `ConstantLight` of
     radiance L) it is L times the opacity. Under light of radiance L from all sides, a half-space of albedo ω
@@ -95,7 +141,7 @@ def path_trace(
     - `lights`: those with a position or a direction are sampled at every scattering, one of them at random;
       a `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
       unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-    - `paths`: per pixel, ≥ 1.
+    - `paths`: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once: for very many, use `onto`.
     - `key`: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
       and on the path's number.
     - `materials`: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
@@ -104,16 +150,15 @@ def path_trace(
     - `max_scatterings`: after which a path ends, ≥ 1. By default 2²⁰, so that only Russian roulette ends a
       path, with a probability that depends on its throughput. A smaller number gives an image of light
       scattered at most that many times, and `exhausted` marks the pixels that lack some.
-    - `onto`: an earlier result of the same scene, camera and key, to which these paths are added. The result
-      is that of all paths at once, up to rounding.
+    - `onto`: an earlier result of the same scene, camera and key, to which these paths are added.
     - `lanes`: paths that are traced side by side. Memory grows with it; the result does not change.
 
-    **Returns:** a `PathTraced` of leading shape (height, width), with the standard error of each pixel.
+    **Returns:** a `PathTraced`, with the standard error of each pixel.
 
     **Raises:** `ValueError` for arguments out of these ranges, no lights, a transfer function without
-    a majorant, labels where the volume has none, `onto` of another size or key, and lanes or paths that do
-    not fit into memory; `RuntimeError` if it is differentiated (grad or jvp) with respect to any of its
-    inputs. It may be called in a function that is differentiated with respect to something else.
+    a majorant, labels where the volume has none, and `onto` of another size or key; `RuntimeError` if it is
+    differentiated with respect to any of its inputs. It may be called in a function that is differentiated
+    with respect to something else.
 
     NaN or infinity in any input makes the whole image NaN, since any path may reach it.
 
@@ -133,44 +178,23 @@ def path_trace(
         raise ValueError("materials use labels, but this volume has none; give Volume(..., labels=...).")
     paths = integer("paths", paths, 1)
     anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
-    limit = MAX_SCATTERINGS
-    if max_scatterings is not None:
-        limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
+    if max_scatterings is None:
+        max_scatterings = MAX_SCATTERINGS
+    limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
-    options = _TraceOptions(paths, integer("lanes", lanes, 1), flag("antialias", antialias))
-    options.require_room(camera)
-    seed = _seed(key)
-    first = 0
+    lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
+    pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
     if onto is not None:
-        first = _checked(onto, camera, seed).paths
+        _check_earlier(onto, camera, seed)
+    first = 0 if onto is None else onto.paths
     blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
     traced = _trace(
         *(volume, words_of(volume), blocks, transfer, materials, lights, anisotropy),
-        *(jnp.asarray(limit, jnp.int32), camera, seed, jnp.asarray(first, jnp.uint32), options),
+        *(jnp.asarray(limit, jnp.int32), camera, seed, jnp.asarray(first, jnp.uint32)),
+        *(paths, lanes, pixels, antialias),
     )
     return traced if onto is None else onto.joined(traced)
-
-
-class _TraceOptions(eqx.Module):
-    """Static settings of the compiled program."""
-
-    paths: int = eqx.field(static=True)
-    lanes: int = eqx.field(static=True)
-    antialias: bool = eqx.field(static=True)
-
-    def pixels(self, camera: Camera) -> int:
-        """Number of pixels in one batch."""
-        return min(max(WALKS_PER_LANE * self.lanes // self.paths, 1), camera.size[0] * camera.size[1])
-
-    def require_room(self, camera: Camera) -> None:
-        """**Raises** `ValueError` if a batch would not fit into memory."""
-        walks = self.pixels(camera) * self.paths
-        require_room(
-            walks * BYTES_PER_RESULT + min(self.lanes, walks) * BYTES_PER_WALK,
-            f"lanes={self.lanes} and paths={self.paths}, {self.pixels(camera)} pixels at once; use fewer "
-            "lanes, which does not change the result, or fewer paths, and add more with `onto`",
-        )
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -184,17 +208,14 @@ def _seed(key: Any) -> UInt32[Array, ""]:
     return jax.random.bits(key, (), jnp.uint32)
 
 
-def _checked(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> PathTraced:
+def _check_earlier(onto: Any, camera: Camera, seed: UInt32[Array, ""]) -> None:
     if not isinstance(onto, PathTraced):
         raise ValueError(f"onto must be an earlier result of path_trace; got {onto!r}.")
-    width, height = camera.size
-    if onto.opacity.shape != (height, width):
-        raise ValueError(
-            f"onto must have the camera's size {(height, width)}; got size {onto.opacity.shape}."
-        )
+    size = camera.size[::-1]
+    if onto.opacity.shape != size:
+        raise ValueError(f"onto must have the camera's size {size}; got size {onto.opacity.shape}.")
     if not is_traced(onto.seed, seed) and onto.seed != seed:
         raise ValueError("onto must be of the same key, since otherwise other paths would be drawn again.")
-    return onto
 
 
 @compiled
@@ -210,10 +231,13 @@ def _trace(
     camera: Camera,
     seed: UInt32[Array, ""],
     first: UInt32[Array, ""],
-    options: _TraceOptions,
+    paths: int,
+    lanes: int,
+    pixels: int,
+    antialias: bool,
 ) -> PathTraced:
-    """Trace the pixels row by row, in batches that bound the memory. `words`: the volume's packed voxels.
-    `first`: number of each pixel's first path."""
+    """Trace the image in batches of `pixels`. `words`: the volume's packed voxels. `first`: number
+    of each pixel's first path."""
     volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
         _single, (volume, blocks, transfer, materials, lights, anisotropy, camera)
     )
@@ -225,23 +249,21 @@ def _trace(
     ranges = blocks if volume.field is None else None
     valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
     valid &= all_finite((materials, lights, anisotropy, camera))
-    pixels = options.pixels(camera)
-    batches = -(-width * height // pixels)
-    count = pixels * options.paths
+    batches, count = -(-width * height // pixels), pixels * paths
 
     def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
         def begin(index: Int[Array, " lanes"]) -> Walk:
-            pixel, path = number * pixels + index // options.paths, index % options.paths
+            pixel, path = number * pixels + index // paths, index % paths
             alive = valid & (index < count) & (pixel < width * height)
             words = (
                 pixel.astype(jnp.uint32),
                 first + path.astype(jnp.uint32),
                 jnp.broadcast_to(seed, index.shape),
             )
-            return jax.vmap(lambda *of_one: _begin(scene, camera, options, *of_one))(words, alive)
+            return jax.vmap(partial(_begin, scene, camera, antialias))(words, alive)
 
-        results = walk_all(begin, lambda walks: step(scene, walks), count, options.lanes)
-        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, options.paths), results))
+        results = walk_all(begin, partial(step, scene), count, lanes)
+        return _statistics(jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results))
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
@@ -250,7 +272,7 @@ def _trace(
     images = jax.tree.map(
         lambda leaf: jnp.where(valid, leaf, jnp.nan) if eqx.is_inexact_array(leaf) else leaf, images
     )
-    return PathTraced(*images, seed=seed, paths=options.paths)
+    return PathTraced(*images, seed=seed, paths=paths)
 
 
 def _single(leaf: Array) -> Array:
@@ -258,13 +280,11 @@ def _single(leaf: Array) -> Array:
     return leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf
 
 
-def _begin(
-    scene: WalkScene, camera: Camera, options: _TraceOptions, words: Words, alive: Bool[Array, ""]
-) -> Walk:
+def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
     """Start a walk where the camera's ray enters the volume."""
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
-    if options.antialias:
+    if antialias:
         x, y, *_ = hashed_uniforms_4(pixel, path, jnp.full_like(pixel, BEFORE_FIRST_STEP), seed)
         origin, direction = camera.ray(column.astype(x.dtype) + x - 0.5, row.astype(y.dtype) + y - 0.5)
     else:
@@ -280,5 +300,4 @@ def _statistics(results: WalkResult) -> tuple[Array, ...]:
     radiance = jnp.stack(results.radiance, axis=-1)
     mean = radiance.mean(axis=1)
     deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
-    met, scatterings = (leaf.astype(mean.dtype).mean(axis=1) for leaf in (results.met, results.scatterings))
-    return mean, met, deviations, scatterings, results.exhausted.any(axis=1)
+    return mean, results.met.astype(mean.dtype).mean(axis=1), deviations, results.exhausted.any(axis=1)

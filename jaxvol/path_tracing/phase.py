@@ -8,13 +8,8 @@ from .._util.vec3 import Scalar, Vec3, turned
 
 
 def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
-    """Density, per solid angle, of the direction after a scattering; it integrates to 1 over the sphere.
-
-    - `cosine`: of the angle between the directions of travel before and after.
-    - `anisotropy`: g in (-1, 1), the mean cosine: 0 for isotropic, above 0 for forward scattering.
-
-    Source: Henyey and Greenstein 1941.
-    """
+    """Density, per solid angle, of the direction after a scattering, by the cosine between the directions of
+    travel before and after. Source: Henyey and Greenstein 1941."""
     g = anisotropy
     # written so that it stays positive where g and the cosine are both near 1
     squared = (1 - g) * (1 - g) + 2 * g * (1 - cosine)
@@ -24,8 +19,7 @@ def phase(cosine: Scalar, anisotropy: Scalar) -> Scalar:
 def scattered_cosine(anisotropy: Scalar, uniform: Scalar) -> Scalar:
     """Draw a cosine from `phase` by inversion, from a uniform number in [0, 1).
 
-    This is the usual inverse, `(1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g`, multiplied out. It stays
-    accurate as g goes to 0, where the usual form divides rounding errors by g.
+    The usual inverse, `(1 + g² - ((1 - g²) / (1 - g + 2 g u))²) / 2 g`, multiplied out, for g near 0.
     """
     g, x = anisotropy, 2 * uniform - 1
     numerator = x + g * ((3 + x * x) / 2 + g * (x - g * (1 - x * x) / 2))

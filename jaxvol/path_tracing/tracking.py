@@ -1,11 +1,9 @@
 """Woodcock tracking of collisions along a flight, block by block of a volume.
 
 Within a block, collision candidates lie at exponentially distributed distances under the block's majorant.
-The caller decides what to do with a candidate: to accept it with probability extinction / majorant, which
-samples a path (delta tracking); or to pass it with the weight 1 - extinction / majorant, and the product of
-these weights is an unbiased estimate of the transmittance (ratio tracking). At the border of a block the
-distance is drawn again, since the exponential distribution is memoryless. Blocks have integer indices, so
-that a flight always arrives, however its coordinates are rounded.
+The caller accepts a candidate with probability extinction / majorant, which samples a path (delta tracking);
+or passes it with the weight 1 - extinction / majorant, and the product of these weights is an unbiased
+estimate of the transmittance (ratio tracking). At the border of a block the distance is drawn again.
 
 Sources: Woodcock et al. 1965; Novák et al., "Monte Carlo Methods for Volumetric Light Transport
 Simulation", 2018; Amanatides and Woo 1987 (from block to block).
@@ -23,8 +21,7 @@ from .medium import Block, Majorants
 
 
 CROSSINGS = 2
-"""Block borders that a flight may cross between two fetches of voxels; flights that arrive earlier wait."""
-
+"""Block borders that a flight may cross between two fetches of voxels."""
 
 TINY = 1e-20
 """Rates below this (grid coordinates per world length) count as 0."""
@@ -73,10 +70,7 @@ class Candidate(NamedTuple):
 
 
 def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, Candidate]:
-    """Advance a flight to its next candidate, to its end, or across CROSSINGS block borders.
-
-    `uniform`: a random number in [0, 1).
-    """
+    """Advance a flight to its next candidate, to its end, or across CROSSINGS block borders."""
 
     def cross(_: object, state: tuple[Flight, Scalar, Array, Array]) -> tuple[Flight, Scalar, Array, Array]:
         flight, optical, found, over = state
@@ -93,9 +87,8 @@ def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, 
 
 
 def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Flight, Scalar, Array, Array]:
-    """Advance a flight by an optical depth, or to the border of the box in which its majorant holds: a block,
-    or the empty space around it. Also returns the remaining optical depth, whether it is used up (a
-    candidate), and whether the flight ends."""
+    """Advance a flight by an optical depth, or to the border of the box in which its majorant holds. Also
+    returns the remaining optical depth, whether it is used up (a candidate), and whether the flight ends."""
     majorant, reach = jnp.maximum(flight.entry, 0), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
     axes = list(zip(flight.start, flight.rate, majorants.indices(flight.block), majorants.shape, strict=True))
     walls = [_wall(start, rate, index, reach, count) for start, rate, index, count in axes]
@@ -117,17 +110,15 @@ def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Fligh
 
 
 def _wall(start: Scalar, rate: Scalar, index: Array, reach: Array, count: int) -> Scalar:
-    """Depth at which a flight reaches the side of the box around its block, along one axis. Infinite for the
-    sides of the grid, where flights end."""
+    """Depth at which a flight reaches the box's side along one axis; infinite for the sides of the grid."""
     side = jnp.where(rate > 0, index + reach + 1, index - reach)
     inner = (side > 0) & (side < count)
     return jnp.where(inner, (BLOCK * side.astype(start.dtype) - start) / rate, jnp.inf)
 
 
 def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: int, leaves: Array) -> Array:
-    """Index, along one axis, of the flight's next block: the one behind the box if the flight `leaves` it on
-    this side, else the one that holds `coordinate`. It never turns back along the flight, so that rounding
-    cannot hold a flight where it is."""
+    """Index, along one axis, of the flight's next block. It never turns back along the flight, so that
+    rounding cannot hold a flight where it is."""
     ahead = rate > 0
     first, last = index - jnp.where(ahead, 0, reach), index + jnp.where(ahead, reach, 0)
     arrived = jnp.floor(coordinate / BLOCK).astype(jnp.int32)
@@ -136,5 +127,4 @@ def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: i
 
 
 def _nonzero(rate: Scalar) -> Scalar:
-    """The rate, or, if it is near 0, a negligible one with a finite inverse."""
     return jnp.where(jnp.abs(rate) < TINY, TINY, rate)

@@ -1,10 +1,10 @@
 """Random walks of light, traced backwards from the camera: flights, scatterings and next-event estimation.
 
-A walk is one path. It is always on one flight: its own, or one from its last scattering towards a light,
-which estimates how much of that light arrives. Both query the volume in the same way, so that walks at
-different stages run side by side, a step at a time, without waiting for each other.
+A walk is always on one flight: its own, or one from its last scattering towards a light. Both query the
+volume in the same way, so that walks at different stages run side by side, a step at a time.
 """
 
+from functools import partial
 from typing import NamedTuple, TypeAlias, TypeVar
 
 import jax
@@ -25,22 +25,14 @@ from .tracking import Candidate, Flight, fly
 T = TypeVar("T")
 
 ROULETTE = 0.25
-"""Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light. A value
-below it survives with a probability in proportion, and is then raised to the threshold."""
-
-MAX_STEPS = 2**24
-"""Steps after which a walk counts as exhausted, against walks that never end."""
+"""Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light."""
 
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
 """Key of all random numbers along a path: pixel, path, seed."""
 
-Uniforms: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
-"""Uniform random numbers in [0, 1)."""
-
 
 class WalkResult(NamedTuple):
-    """Of a path so far: the radiance that it gathered, whether the camera's ray met anything, the number of
-    scatterings, and whether the path was cut off."""
+    """Of a path: its radiance, whether the camera's ray met anything, its scatterings, whether it was cut."""
 
     radiance: Vec3
     met: Bool[Array, "..."]
@@ -85,10 +77,7 @@ class Walk(NamedTuple):
 
 
 class WalkScene(NamedTuple):
-    """The scene that walks travel through.
-
-    - `max_scatterings`: scatterings that a walk may have.
-    """
+    """The scene that walks travel through."""
 
     volume: Volume
     medium: Medium
@@ -115,8 +104,7 @@ class WalkScene(NamedTuple):
         return Flight.to(self.medium.majorants, start, self.space.own(direction), self.space.spacing, end)
 
     def light(self, coordinate: Vec3, uniform: Scalar) -> Arriving:
-        """Light that arrives at a grid coordinate from one of the located lights, chosen at random and
-        weighted to give that of all of them on average."""
+        """Light at a grid coordinate from one located light, chosen at random, weighted by their number."""
         x, y, z = self.space.point(coordinate)
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -127,10 +115,8 @@ class WalkScene(NamedTuple):
 
 
 class Scattering(NamedTuple):
-    """The outcome of a scattering: new values for fields of `Walk`, and the next flight.
-
-    - `toward`, `end`: world direction and length of the next flight.
-    """
+    """The outcome of a scattering: new values for fields of `Walk`, and the next flight `toward` (world) a
+    direction up to its `end`."""
 
     direction: Vec3
     throughput: Vec3
@@ -141,36 +127,26 @@ class Scattering(NamedTuple):
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
-    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome.
-
-    XLA recomputes a shared intermediate for each of its uses, unless a branch has put it in memory. So every
-    expensive computation is behind a branch.
-    """
+    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome. Whatever is
+    expensive is put in memory, since XLA would recompute it for each of its uses."""
     live = jnp.any(walks.alive)
-    first, second = (in_memory(live, jax.vmap(lambda w, i=i: _uniforms(w, i)), walks) for i in (0, 1))
+    first, second = (in_memory(live, jax.vmap(partial(_uniforms, stage=i)), walks) for i in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
     turn = in_memory(
         live, jax.vmap(sample_phase, in_axes=(None, 0, 0)), scene.anisotropy, first_turn, second_turn
     )
-    flight, candidate = in_memory(
-        live, jax.vmap(lambda flight, draw: fly(scene.medium.majorants, flight, draw)), walks.flight, draw
-    )
+    flight, candidate = in_memory(live, jax.vmap(partial(fly, scene.medium.majorants)), walks.flight, draw)
     measured = in_memory(live, jax.vmap(scene.medium.measure), candidate.coordinate)
     extinction, albedo = in_memory(live, jax.vmap(scene.medium.classify), measured)
     share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
     scattering = in_memory(
         live,
-        jax.vmap(lambda *of_one: _scatter(scene, *of_one)),
-        walks,
-        candidate.coordinate,
-        albedo,
-        turn,
-        choose,
-        survive,
+        jax.vmap(partial(_scatter, scene)),
+        *(walks, candidate.coordinate, albedo, turn, choose, survive),
     )
     candidate = candidate._replace(found=candidate.found & walks.alive, over=candidate.over & walks.alive)
     walks = walks._replace(flight=flight, steps=walks.steps + 1)
-    return jax.vmap(lambda *of_one: _advance(scene, *of_one))(walks, candidate, share, scattering, decide)
+    return jax.vmap(partial(_advance, scene))(walks, candidate, share, scattering, decide)
 
 
 def _advance(
@@ -178,12 +154,9 @@ def _advance(
 ) -> Walk:
     """The walk after a candidate, where `share` is extinction / majorant; or after the end of its flight."""
     advanced = _delta_tracking(scene, walk, candidate, share, scattering, decide)
-    if scene.located:
-        to_light = _ratio_tracking(scene, walk, candidate, share, decide)
-        advanced = _where(walk.to_light, to_light, advanced)
-    cut_off, result = advanced.alive & (advanced.steps >= MAX_STEPS), advanced.result
-    result = result._replace(exhausted=result.exhausted | cut_off)
-    return advanced._replace(alive=advanced.alive & ~cut_off, result=result)
+    if not scene.located:
+        return advanced
+    return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, share, decide), advanced)
 
 
 def _scatter(
@@ -266,7 +239,7 @@ def _after_roulette(throughput: Vec3, uniform: Scalar) -> Vec3:
     return scaled(throughput, jnp.where(small, jnp.where(survives, weight, 0), 1))
 
 
-def _uniforms(walk: Walk, stage: int) -> Uniforms:
+def _uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Four uniform random numbers for stage 0 or 1 of a walk's next step."""
     pixel, path, seed = walk.words
     return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)

@@ -1,3 +1,4 @@
-"""The cheapest march, lighting and storage whose image is accurate enough."""
+"""The cheapest march whose image is accurate enough."""
 
-from .plan import Part as Part, Plan as Plan, plan as plan
+from .plan import Plan as Plan, plan as plan
+from .search import Part as Part

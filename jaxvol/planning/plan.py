@@ -5,9 +5,10 @@ import time
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from jaxtyping import Array, Bool
 
-from .._util.checks import described, flag, integer
+from .._util.checks import flag, integer, number
 from ..bricks import VoxelSource, render_bricks
 from ..bricks.opening import Openable
 from ..compositing.blending import Compositing, Over
@@ -20,24 +21,13 @@ from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.rendering import BrickReport, Rendering
-from ..scene.space import median_node_distance
+from ..scene.space import Space, median_node_distance
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
-from .choices import (
-    LIT,
-    Part,
-    brightest_of,
-    cheapest_march,
-    has_variants,
-    proven_transforms,
-    seconds_of,
-    simplest_light,
-)
 from .memory import read_within, with_bricks
-from .probe import Probe, Setting
-from .storage import stored
-from .trials import COARSEST, Trials
+from .probe import Probe
+from .search import COARSEST, Part, Search
 
 
 MARGIN = 0.95
@@ -46,17 +36,19 @@ MARGIN = 0.95
 ENDS = 1 / 16
 """Part of it for rays that end early, whose error is at most the transmittance at which they end."""
 
-ROUNDED = 1 / 8
-"""Part of it that voxels of a smaller type may take, of what all else has left."""
-
 GRADIENTS_END = 1e-4
 """Transmittance at which rays may end where gradients count."""
 
 OPAQUE = 0.01
 """Part of the pixels that become opaque, below which there is nothing to end early."""
 
+EMPTY = 0.05
+"""Part of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
+
 DECIDED = AdaptiveSampling, EarlyTermination, SpaceLeaping
-"""Transforms that a plan decides on, besides `AlphaCorrection` at the exit."""
+"""Transforms that a scene cannot bring along, besides `AlphaCorrection` at the exit."""
+
+UNPROVEN = "not proven by a copy; kept"
 
 
 class Plan(NamedTuple):
@@ -66,13 +58,12 @@ class Plan(NamedTuple):
       `volume` is only the copy that was planned with.
     - `tolerance`: what was asked for. `error`: predicted, on the safe side, from a part of the pixels; where
       nothing could be proven to be within the tolerance, just above it.
-    - `seconds`: predicted for one image on this machine, once compiled, to within a factor of some 2.
-      `samples`: predicted for each pixel.
+    - `samples`: predicted for each pixel.
     - `parts`: what was kept or left out, and why.
     - `probed`: seconds that planning took, compilation included.
     - `source`, `memory`: the volume and the budget, bytes, if there was one.
-    - `stride`: of the copy of every n-th voxel that was planned with, to which `error`, `seconds` and
-      `samples` belong; 1 where the volume fits.
+    - `stride`: of the copy of every n-th voxel that was planned with, to which `error` and `samples`
+      belong; 1 where the volume fits.
     - `bricks`: what to expect of `render_bricks`, of which nothing is read yet: at most `needed` bricks will
       be, for this camera and others of as many pixels. None where the volume fits.
     """
@@ -82,7 +73,6 @@ class Plan(NamedTuple):
     lighting: Lighting | None
     tolerance: float
     error: float
-    seconds: float
     samples: float
     parts: tuple[Part, ...]
     probed: float
@@ -116,27 +106,25 @@ class Plan(NamedTuple):
         transforms = ", ".join(_written(each) for each in self.march.transforms) or "no transform"
         missed = "" if self.within else "NOT PROVEN TO BE WITHIN THE TOLERANCE: "
         rmse = f"RMSE {self.error:.2g} predicted" if self.within else "RMSE unknown"
-        head = (
-            f"{missed}step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}\n"
+        lines = [
+            f"{missed}step {float(self.march.step):.4g}, {self.march.quadrature}, {transforms}",
             f"{rmse}, {self.tolerance:.2g} asked for; {self.samples:.1f} samples a pixel; "
-            f"some {self.seconds * 1e3:.0f} ms an image; planned in {self.probed:.1f} s"
-        )
-        wide = max((len(part.name) for part in self.parts), default=0)
-        lines = [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
-        return "\n".join([*self._memory_lines(), head, *lines])
-
-    def _memory_lines(self) -> list[str]:
-        if self.source is None or self.memory is None:
-            return []
-        size, given = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
-        if self.bricks is None:
-            return [f"in memory: {size} of voxels, and what is made of them, fit into {given}"]
-        return [
-            f"{' x '.join(map(str, self.bricks.counts))} bricks: {size} of voxels, and what is made of them, "
-            f"do not fit into {given}; at most {self.bricks.needed} are read. Planned on a copy of one voxel "
-            f"in {self.stride} along each axis, at 1/{self.stride} of its step; error and time below are the "
-            "copy's"
+            f"planned in {self.probed:.1f} s",
         ]
+        wide = max((len(part.name) for part in self.parts), default=0)
+        lines += [f"  {'+' if part.kept else '-'} {part.name:{wide}}  {part.why}" for part in self.parts]
+        if self.source is None or self.memory is None:
+            return "\n".join(lines)
+        size, room = (f"{count / 2**20:.1f} MiB" for count in (self.source.nbytes, self.memory))
+        if self.bricks is None:
+            head = f"in memory: {size} of voxels, and what is made of them, fit into {room}"
+        else:
+            head = (
+                f"{' x '.join(map(str, self.bricks.counts))} bricks: {size} of voxels, and what is made of "
+                f"them, do not fit into {room}; at most {self.bricks.needed} are read. Planned on a copy of "
+                f"one voxel in {self.stride} along each axis, whose error is given below"
+            )
+        return "\n".join([head, *lines])
 
 
 def plan(
@@ -160,34 +148,26 @@ def plan(
     there:
 
     - **step**: the longest within the tolerance, between two of these.
-    - **quadrature and strides**: `"preintegrated"` and `AdaptiveSampling` are tried where rays take many
-      samples, and kept where they take so many fewer that they are faster, by what a sample costs on CPU
-      (`planning/trials.py`: `RAY`, `SAMPLE`).
+    - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule
+      takes more than 8 steps of a voxel; it is kept where it is faster, by what a sample costs on CPU
+      (`planning/search.py`: `RAY`, `SAMPLE`).
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
       0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces, and where a `Clip` cuts.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
-    - **voxels**: those of type float32 are rounded to integers of 8 or 16 bits, which are fetched faster, if
-      no voxel changes; or if the image changes by less than an eighth of the tolerance, and by less than all
-      other errors leave of it. If neither, to float16, on the same terms.
-    - **lighting**: one that has no simpler variants, such as `Phong`, is part of all these images. Of others,
-      the first of several cheaper ones, of what was given and of that without its noise that is within
-      the tolerance, compared with the last (as many templates as were given, blended: their own noise does
-      not count); the step is halved as long as that changes the lit image by more than what is left.
     - **bricks**: a volume that does not fit into `memory`, with what `render` makes of it (IN_MEMORY bytes
       for each byte of voxels), is rendered by `render_bricks`. The march is planned on a copy of every n-th
-      voxel along each axis, and its step divided by n. That is cautious where the volume is smooth, but the
-      error is that of the copy: detail finer than n voxels has been seen in samples only. A copy does not
-      prove what is empty, so that `AlphaCorrection` and `SpaceLeaping` are kept. Where the smallest bricks,
-      with what a ray may read around them, do not fit, the step is halved, up to four times.
+      voxel along each axis, and its step divided by n; the error is that of the copy: detail finer than n
+      voxels has been seen in samples only. A copy does not prove what is empty, so that `AlphaCorrection` and
+      `SpaceLeaping` are kept. Where the smallest bricks do not fit, the step is halved, up to four times.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater. It is an
     estimate: from a part of the pixels, and compared with images that are themselves wrong, by what the last
-    halvings of the step let expect. `Jitter` and `EmptySpaceJitter` are not chosen: they change the structure
-    of an error, not its size. Plans are for CPUs: on others, the errors hold, but what is cheapest was not
-    measured.
+    halvings of the step let expect. The noise of a lighting, such as `ScattererTemplates` without `blend`,
+    counts as an error. `Jitter` and `EmptySpaceJitter` are not chosen: they change the structure of an error,
+    not its size. On other devices than CPUs, the errors hold, but what is cheapest was not measured.
 
     **Arguments:**
 
@@ -199,14 +179,11 @@ def plan(
     - `transforms`: those that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
       kept.
     - `compositing`, `lighting`: as for `render`.
-    - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less, voxels keep
-      their type, and simpler lightings without a gradient are left out. The tolerance is that of the image
-      all the same. What is proven (empty space, faces) is proven for this transfer function only.
-    - `once`: whether the march is for a single image. What needs a program of its own, whose compilation
-      takes longer than it saves, is then tried only where nothing else is within the tolerance:
-      `"preintegrated"` and `AdaptiveSampling`.
-    - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene, except for
-      `seconds`.
+    - `gradients`: whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
+      (empty space, faces) is proven for this transfer function only.
+    - `once`: whether the march is for a single image. `"preintegrated"`, whose program takes longer to
+      compile than it saves, is then tried only where the midpoint rule is not within the tolerance.
+    - `seed`: of the choice of patches. With it, the plan depends on nothing but the scene.
 
     **Returns:** a `Plan`. If no step is proven to be within the tolerance, down to 1/64 of a voxel (which
     takes images of steps of 1/256), `Plan.within` is False and `Plan.parts` says so.
@@ -224,64 +201,45 @@ def plan(
     if memory is not None or not isinstance(volume, Volume):
         volume, source, room, stride = read_within(volume, memory)
     check_arguments(order, volume=volume)
-    scene = Setting(volume, transfer, compositing_of(compositing), lighting)
-    tolerance, given = _checked(tolerance, transforms, (scene, camera))
-    choice = lighting if lighting is not None and has_variants(lighting) else None
-    setting = scene if choice is None else scene._replace(lighting=None)
+    scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
+    tolerance, given = _checked(tolerance, transforms, scene)
     space = March(1.0, given).locate(volume)
-    visible = _occupied(setting, given)
+    visible = _occupied(scene, given)
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
-
-    over = isinstance(setting.compositing, Over)
     proven, parts = proven_transforms(visible, space, given, copy=stride > 1)
-    ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf) if over else 0.0
     voxel = float(median_node_distance(space, visible.shape))
 
-    def trials_of(ends: float, goal: float) -> Trials:
+    over = isinstance(scene.compositing, Over)
+    ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
+
+    def search(ends: float, goal: float) -> Search:
         own = (EarlyTermination(ends),) if over else ()
-        steps = goal if choice is None else goal * (1 - LIT)
-        return Trials(probe, setting, steps, tolerance, voxel, (*given, *proven, *own))
+        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own))
 
     # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
     # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
-    seen = trials_of(ends, tolerance).image(COARSEST, "midpoint")
+    seen = search(ends, tolerance).image(COARSEST, "midpoint")
     opaque = probe.mean(seen.rgba[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
-    goal = MARGIN * tolerance - share
-    trials = trials_of(ends / brightest_of(seen), goal)
-    chosen, truth = cheapest_march(trials, parts, lit=lighting is not None, once=once)
-    brightest, lit, light_error, light_seconds = brightest_of(truth.image), lighting, 0.0, 0.0
-    if choice is not None:
-        chosen, lit, light_error, light_seconds, brightest = simplest_light(
-            trials, chosen, choice, goal, parts, gradients=gradients
-        )
-    elif lighting is not None:
-        parts.append(Part("light: as given", True, "none is simpler; it is in the images that were compared"))
-    kept = tuple(each for each in chosen.march.transforms if not isinstance(each, EarlyTermination))
-    march, name = March(chosen.march.step, kept, chosen.march.quadrature), "EarlyTermination"
-    if share:
-        ending = EarlyTermination(share / brightest)
-        march, name = March(march.step, (*march.transforms, ending), march.quadrature), _written(ending)
+    within = search(ends / brightest_of(seen), MARGIN * tolerance - share)
+    chosen, truth, tried = within.cheapest(once=once)
+    ending = EarlyTermination(ends / brightest_of(truth.image))
+    kept = (*given, *proven, *((ending,) if share else ()))
+    march = March(chosen.march.step, kept, chosen.march.quadrature)
+    parts += tried
     if over:
+        name = _written(ending) if share else "EarlyTermination"
         parts.append(Part(name, bool(share), f"{opaque:.1%} of the pixels become opaque"))
-    error = chosen.error + light_error + share
-    rounding, said = 0.0, [(f"voxels as {volume.data.dtype}", True, "as they are given, for their gradient")]
-    if not gradients:
-        allowed = min(ROUNDED * tolerance, max(tolerance - error, 0))
-        setting, rounding, said = stored(probe, setting._replace(lighting=lit), chosen.march, allowed)
-    parts += [Part(*each) for each in said]
-    seconds = seconds_of(trials, chosen) + light_seconds
     bricks = None
     if source is not None and room is not None and stride > 1:
-        how = room, stride, scene.compositing, lit
+        how = room, stride, scene.compositing, lighting
         march, bricks = with_bricks(source, transfer, camera, march, *how)
     return Plan(
         march=march,
-        volume=setting.volume,
-        lighting=lit,
+        volume=volume,
+        lighting=lighting,
         tolerance=tolerance,
-        error=error + rounding,
-        seconds=seconds,
+        error=chosen.error + share,
         samples=chosen.samples,
         parts=tuple(parts),
         probed=time.perf_counter() - begun,
@@ -300,12 +258,7 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
             "plan looks at the numbers of a scene, which are traced here: call it outside of jax.jit, "
             "jax.vmap and jax.grad, and pass the march that it finds to render."
         )
-    try:
-        number = math.nan if isinstance(tolerance, str) else float(tolerance)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(f"tolerance must be a number; got {described(tolerance)}.") from fault
-    if isinstance(tolerance, bool) or not 0 < number < 1:
-        raise ValueError(f"tolerance must be above 0 and below 1; got {tolerance!r}.")
+    number("tolerance", tolerance, above=0, below=1)
     given = March(1.0, transforms).transforms  # checks them
     for each in given:
         if isinstance(each, DECIDED) or (isinstance(each, AlphaCorrection) and not each.labels):
@@ -313,15 +266,48 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
                 "transforms must be those that are part of the scene, such as a ToroidalMap; got "
                 f"{type(each).__name__}, on which the plan decides."
             )
-    return number, given
+    return float(tolerance), given
 
 
-def _occupied(setting: Setting, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
+def _occupied(scene: Scene, given: tuple[Transform, ...]) -> Bool[Array, "bx by bz"]:
     """The blocks that may change a pixel."""
-    volume, transfer, mode, _ = setting
+    transfer, mode = scene.transfer, scene.compositing
     if mode.resolves:
-        transfer, _ = mode.marched(transfer, March(1.0, given), volume)
-    return mode.occupied(transfer, Blocks.of(volume, slopes=transfer.reads_gradient))
+        transfer, _ = mode.marched(transfer, March(1.0, given), scene.volume)
+    return mode.occupied(transfer, Blocks.of(scene.volume, slopes=transfer.reads_gradient))
+
+
+def proven_transforms(
+    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...], *, copy: bool = False
+) -> tuple[tuple[Transform, ...], list[Part]]:
+    """Transforms that proofs decide on, from the blocks that may hold anything visible. `copy`: these are of
+    a copy, which does not prove that there is nothing in between."""
+    found: list[Transform] = []
+    at_faces = space.visible_at_faces(visible)
+    faces = sum(map(bool, at_faces))
+    aligned, why = True, "part of the scene"
+    if not any(isinstance(each, AlphaCorrection) for each in given):
+        aligned, why = bool(faces) or copy, "nothing is visible at the volume's faces: proven"
+        if faces:
+            cut = "" if len(at_faces) == 6 else " and cuts"
+            why = f"something may be visible at {faces} of the volume's {len(at_faces)} faces{cut}"
+        elif copy:
+            why = UNPROVEN
+        if aligned:
+            found.append(AlphaCorrection())
+    empty = float(np.mean(~np.asarray(visible)))
+    leaps = empty >= EMPTY or copy
+    if leaps:
+        found.append(SpaceLeaping())
+    kept = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
+    return tuple(found), [Part("AlphaCorrection", aligned, why), Part("SpaceLeaping", leaps, kept)]
+
+
+def brightest_of(image: Rendering) -> float:
+    """The brightest colour, 1 or more: by so much of what is left of a ray its early end may err."""
+    rgba = np.asarray(image.rgba, np.float64)
+    seen = rgba[:, 3] > 1e-3
+    return float(max(1.0, np.max(rgba[seen, :3] / rgba[seen, 3:], initial=0.0)))
 
 
 def _written(transform: Transform) -> str:
@@ -329,4 +315,4 @@ def _written(transform: Transform) -> str:
     name = type(transform).__name__
     if isinstance(transform, EarlyTermination):
         return f"{name}({float(transform.opacity_left):.2g})"
-    return f"{name}({float(transform.tolerance):.2g})" if isinstance(transform, AdaptiveSampling) else name
+    return name

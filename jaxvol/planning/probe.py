@@ -8,17 +8,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import along
-from ..compositing.blending import Compositing
 from ..engine.image import render_scene
-from ..lighting.shading import Lighting
 from ..march.march import March
 from ..ray import Scene
 from ..scene.camera import Camera, GivenRays
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
 from ..scene.space import Space
-from ..scene.transfer import Transfer
-from ..scene.volume import Volume
 
 
 SIDE = 8
@@ -43,15 +39,6 @@ ROUNDING = 1e-6
 """Differences of images that may be due to rounding."""
 
 
-class Setting(NamedTuple):
-    """A scene without its camera."""
-
-    volume: Volume
-    transfer: Transfer
-    compositing: Compositing[Any]
-    lighting: Lighting | None = None
-
-
 class Probe(NamedTuple):
     """Patches of an image: one of each stratum of neighbours, of those that may show anything.
 
@@ -72,26 +59,27 @@ class Probe(NamedTuple):
     def of(cls, camera: Camera, space: Space, visible: Bool[Array, "bx by bz"], seed: int) -> "Probe":
         """Some patches of a camera's image; all, if they are few. Without any ray that meets the volume,
         the first one. `visible`: blocks that may hold anything visible."""
+        from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
+
         width, height = camera.size
         across, down = -(-width // SIDE), -(-height // SIDE)
         hit = np.asarray(_hits(camera, space))
         hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
         hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
-        likely = hit & np.asarray(_passes(camera, space, visible)).reshape(-1)
+        near = jnp.asarray(maximum_filter(np.asarray(visible), 2 * NEAR + 1, mode="constant"))
+        likely = hit & np.asarray(_passes(camera, space, near)).reshape(-1)
         hit[0] |= not hit.any()
-        groups = [np.flatnonzero(likely), np.flatnonzero(hit & ~likely)]
-        most = [PATCHES - min(groups[1].size, round(PATCHES * (1 - LIKELY))), 0]
-        counts = [min(groups[0].size, most[0]), 0]
-        counts[1] = min(groups[1].size, PATCHES - counts[0])
-        random = np.random.default_rng(seed)
-        edges = [np.linspace(0, g.size, n + 1).astype(int) for g, n in zip(groups, counts, strict=True)]
-        picked = [
-            g[random.integers(e[:-1], e[1:])] if n else g[:0]
-            for g, e, n in zip(groups, edges, counts, strict=True)
-        ]
-        more = PATCHES - sum(counts)  # a fixed number of rays, so that images of all sizes share a program
-        chosen = np.pad(np.concatenate(picked), (0, more), mode="edge")
-        strata = np.pad(np.concatenate([np.diff(e) for e in edges]), (0, more)).astype(float)
+        groups = np.flatnonzero(likely), np.flatnonzero(hit & ~likely)
+        reserved = min(groups[1].size, round(PATCHES * (1 - LIKELY)))
+        first = min(groups[0].size, PATCHES - reserved)
+        random, chosen, strata = np.random.default_rng(seed), [], []
+        for group, count in zip(groups, (first, min(groups[1].size, PATCHES - first)), strict=True):
+            edges = np.linspace(0, group.size, count + 1).astype(int)
+            chosen.append(group[random.integers(edges[:-1], edges[1:])])
+            strata.append(np.diff(edges))
+        chosen, strata = np.concatenate(chosen), np.concatenate(strata).astype(float)
+        more = PATCHES - chosen.size  # a fixed number of rays, so that images of all sizes share a program
+        chosen, strata = np.pad(chosen, (0, more), mode="edge"), np.pad(strata, (0, more))
         y, x = np.divmod(np.arange(SIDE**2), SIDE)
         column, row = (chosen % across)[:, None] * SIDE + x, (chosen // across)[:, None] * SIDE + y
         inside = ((column < width) & (row < height)).astype(float)
@@ -99,13 +87,8 @@ class Probe(NamedTuple):
             jnp.asarray(np.minimum(part, last).reshape(-1), jnp.int32)
             for part, last in ((column, width - 1), (row, height - 1))
         )
-        first = np.arange(PATCHES) < counts[0]
-        return cls(_rays(camera, column, row), strata, first, inside, width * height)
-
-    @property
-    def share(self) -> float:
-        """Part of the image's pixels that may show anything."""
-        return self.mean(np.ones(self.inside.size))
+        rays = _rays(camera, column, row)
+        return cls(rays, strata, np.arange(PATCHES) < first, inside, width * height)
 
     def mean(self, of_pixels: Any) -> float:
         """Of a number of each pixel, over the whole image; 0 where nothing can be seen."""
@@ -114,11 +97,9 @@ class Probe(NamedTuple):
     def _totals(self, of_pixels: Any) -> Float[np.ndarray, " patches"]:
         return np.sum(np.asarray(of_pixels, np.float64).reshape(self.inside.shape) * self.inside, axis=1)
 
-    def render(self, setting: Setting, march: March) -> Rendering:
-        """These pixels of the image."""
-        volume, transfer, compositing, lighting = setting
-        scene = Scene(volume, transfer, self.source, march, compositing, lighting)
-        return render_scene(scene, "all", "replay")
+    def render(self, scene: Scene, march: March) -> Rendering:
+        """These pixels of the scene's image under another march."""
+        return render_scene(scene._replace(source=self.source, march=march), "all", "replay")
 
     def distance(self, image: Rendering, other: Rendering) -> float:
         """Root mean square difference of both images' colours, over the whole image: over black or over
@@ -182,14 +163,8 @@ def _hits(camera: Camera, space: Space) -> Bool[Array, "height width"]:
 
 
 @jax.jit
-def _passes(camera: Camera, space: Space, visible: Bool[Array, "bx by bz"]) -> Bool[Array, "down across"]:
-    """Whether the middle ray of each patch passes through or near a block that may be visible."""
-    near = visible
-    for axis in range(3):
-        ends = [(NEAR, NEAR) if i == axis else (0, 0) for i in range(3)]
-        padded, n = jnp.pad(near, ends), near.shape[axis]
-        for shift in range(2 * NEAR + 1):
-            near = near | jax.lax.slice_in_dim(padded, shift, shift + n, axis=axis)
+def _passes(camera: Camera, space: Space, blocks: Bool[Array, "bx by bz"]) -> Bool[Array, "down across"]:
+    """Whether the middle ray of each patch passes through one of the blocks."""
 
     def passes(column: Int[Array, ""], row: Int[Array, ""]) -> Bool[Array, ""]:
         middle = [SIDE * part.astype(camera.position.dtype) + (SIDE - 1) / 2 for part in (column, row)]
@@ -202,9 +177,9 @@ def _passes(camera: Camera, space: Space, visible: Bool[Array, "bx by bz"]) -> B
             coordinate = space.coordinate(along(*line, depth))
             i, j, k = (
                 jnp.clip(jnp.floor(c / BLOCK), 0, n - 1).astype(jnp.int32)
-                for c, n in zip(coordinate, near.shape, strict=True)
+                for c, n in zip(coordinate, blocks.shape, strict=True)
             )
-            return near[i, j, k]
+            return blocks[i, j, k]
 
         return (leave > entry) & jnp.any(jax.vmap(at)(depths))
 

@@ -30,12 +30,9 @@ def test_other_names_are_taken_as_they_come():
     np.testing.assert_array_equal(jv.Volume(xarray.DataArray(DATA)).spacing, (1, 1, 1))
 
 
-@pytest.mark.parametrize(
-    ("coordinate", "message"),
-    [([0, 1, 3], "evenly spaced"), ([0, np.nan, 2], "evenly spaced"), (["a", "b", "c"], "not numbers")],
-)
-def test_uneven_coordinates_are_refused(coordinate, message):
-    with pytest.raises(ValueError, match=message):
+@pytest.mark.parametrize("coordinate", [[0, 1, 3], [0, np.nan, 2], ["a", "b", "c"]])
+def test_uneven_coordinates_are_refused(coordinate):
+    with pytest.raises(ValueError, match="evenly spaced numbers as coordinates"):
         jv.Volume(xarray.DataArray(DATA, dims=("x", "y", "z"), coords={"z": coordinate}))
 
 

@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.app.automatic import (
-    FRONT,
-    framed,
-    front_of,
-    labels_shown,
-    transfer_by_copy,
-    upright,
-    visible_points,
-)
+from jaxvol.app.automatic import framed, labels_shown, transfer_by_copy, visible_points
 from jaxvol.app.automatic.framing import MARGIN
 from jaxvol.app.automatic.histogram import SAMPLED, is_body, thresholds
 from jaxvol.app.automatic.labels import INSIDE
+from jaxvol.app.commands.animate import turned
 from jaxvol.app.commands.data import copy_of, middle_of
-from jaxvol.app.commands.orbit import turned
 from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
 
@@ -153,7 +145,7 @@ def test_specks_far_away_do_not_count_and_parts_that_are_near_do():
     _, longer = extent(visible_points(jv.Volume(data), transfer))
     assert longer[0] >= size[0] + 5
     flat = np.full((9, 9, 9), 10, np.uint8)
-    flat[4] = 200  # in a plane, of which there is no hull of three dimensions
+    flat[4] = 200
     shown = jv.TransferFunction([10, 200], np.ones((2, 3)), [0, 99])
     np.testing.assert_array_equal(extent(visible_points(jv.Volume(flat), shown))[1], (2, 8, 8))
     hidden = jv.TransferFunction([0, 1], np.zeros((2, 3)), np.zeros(2))
@@ -195,30 +187,6 @@ def test_a_framed_camera_just_sees_all_points():
     found = framed(camera, points, [turned(camera, angle, (0, 0, 1)) for angle in angles])
     reach = [np.abs(in_picture(turned(found, angle, (0, 0, 1)), points)).max() for angle in angles]
     assert max(reach) == pytest.approx(1 / MARGIN, abs=1e-4)
-
-
-def standing(axis, end):
-    """A ball that one face of the grid cuts, at an end (0 or -1) of an axis."""
-    x = np.stack(np.meshgrid(*[np.linspace(-1, 1, 24)] * 3, indexing="ij"))
-    x[axis] -= 0.7 if end else -0.7
-    return jv.Volume((200 * ((x**2).sum(axis=0) < 0.5)).astype(np.uint8))
-
-
-def test_what_one_face_cuts_stands_on_it():
-    for axis in range(3):
-        for end in (0, -1):
-            up = upright(standing(axis, end))
-            assert up is not None
-            np.testing.assert_array_equal(up, np.eye(3)[axis] * (-1 if end else 1))
-            side = front_of(up)
-            assert side @ up == FRONT[2]  # from as far above
-            np.testing.assert_allclose(np.linalg.norm(side), np.linalg.norm(FRONT))
-            if axis == 2 and end == 0:
-                np.testing.assert_array_equal(side, FRONT)
-    # nothing is up where no face or two cut
-    assert upright(ball(0.6, 0.3)) is None
-    both = np.maximum(np.asarray(standing(1, 0).data), np.asarray(standing(1, -1).data))
-    assert upright(jv.Volume(both)) is None
 
 
 def test_borders_and_grain_between_thresholds_are_no_body():

@@ -16,15 +16,15 @@ NEVER = jv.TransferFunction([0, 1, 2], GRAY, [0, 0, 0])
 CASES = {
     "values above": (
         jv.TransferFunction([100, 110, 120], GRAY, [0, 0, 1]),
-        "shows values from 110 on. A clim",
+        "shows values between 110 and inf. A clim",
     ),
     "values below": (
         jv.TransferFunction([1, 2, 3], GRAY, [1, 0, 0]),
-        "shows values up to 2. A clim from 20 to",
+        "shows values between -inf and 2. A clim from 20 to",
     ),
-    "between": (jv.TransferFunction([1, 2, 3], GRAY, [0, 1, 0]), "shows values from 1 to 3. A clim"),
+    "between": (jv.TransferFunction([1, 2, 3], GRAY, [0, 1, 0]), "shows values between 1 and 3. A clim"),
     "no value": (NEVER, "the transfer function's opacity is 0 everywhere"),
-    "labels": (jv.LabelTransferFunction([NEVER]), "shows none of them, or only under another label"),
+    "labels": (jv.LabelTransferFunction([NEVER]), "shows none of them"),
 }
 
 

@@ -62,8 +62,6 @@ def test_the_command_writes_the_page_and_says_where_there_is_no_checkout(tmp_pat
     made = {path.name for path in (tmp_path / "made").iterdir()}
     assert made == {"fig12.webp", "index.html", "lee_fig1.webp"}
     assert str(tmp_path / "made" / "index.html") in capsys.readouterr().out
-    assert cli.main(["figures", "--quick"]) == 2
-    assert "--quick goes with --run" in capsys.readouterr().err
     monkeypatch.setattr(figures, "__file__", str(tmp_path / "site-packages/jaxvol/app/commands/figures.py"))
     monkeypatch.chdir(ROOT)
     assert figures.checkout() == ROOT

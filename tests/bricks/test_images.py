@@ -244,7 +244,7 @@ def test_bad_arguments_are_named_before_anything_is_read(changes, message):
         given["source"] = Unread(ARRAY)
     with pytest.raises((ValueError, OSError), match=message):
         jv.render_bricks(**given)
-    with pytest.raises(TypeError, match="no arguments beside"):
+    with pytest.raises(TypeError, match="beside"):
         jv.render_bricks(ARRAY, TRANSFER, CAMERA, PLAIN, beside=3)
 
 

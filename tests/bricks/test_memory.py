@@ -82,7 +82,7 @@ def test_voxels_outside_of_the_ranges_found_before_are_refused(value, tmp_path):
     traversal = bricks_of(source_of(data), TRANSFER, CAMERA, PLAIN, memory=10**6)
 
     def read():
-        return traversal.read(0, *traversal.around(0))[1].result()
+        return traversal.load(0, None, *traversal.around(0)).voxels.result()
 
     np.testing.assert_array_equal(read(), data)
     data[20, 20, 20] = value

@@ -76,22 +76,6 @@ def test_the_pass_is_kept_by_a_source_that_nobody_writes_to(tmp_path, monkeypatc
         summary_of(of_file)
 
 
-def test_a_pass_that_is_interrupted_is_begun_anew(tmp_path):
-    data = voxels("int16", SHAPE)
-    source = source_of(x_fastest(tmp_path / "data.raw", data), shape=SHAPE, dtype="int16")
-
-    def stop(done, of):
-        assert 0 < done < of == data.size
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        summary_of(source, memory=10_000, progress=stop)
-    told = []
-    assert_ranges(summary_of(source, memory=10_000, progress=lambda *numbers: told.append(numbers)), data)
-    assert told[-1] == (data.size, data.size)
-    assert len(told) > 3
-
-
 def test_a_plane_that_exceeds_the_memory_is_read_in_rows(monkeypatch):
     data, read, sizes = voxels("uint8", (3, 40, 500)), VoxelSource.read, []
 

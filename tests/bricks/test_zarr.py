@@ -103,10 +103,10 @@ def test_an_index_chooses_along_other_axes(tmp_path):
     source = source_of(path, index={"t": 1, "c": 2})
     assert_reads(source, data[1, 2].T)
     for index, message in (
-        (None, "index must choose one of the 2 entries .* along 't'"),
-        ({"t": 0}, "index must choose one of the 3 entries .* along 'c'"),
+        (None, r"index\['t'\] must be an integer from 0 to 1; got None"),
+        ({"t": 0}, r"index\['c'\] must be an integer from 0 to 2; got None"),
         ({"t": 2, "c": 0}, r"index\['t'\] must be an integer from 0 to 1; got 2"),
-        ({"t": 0, "c": 0, "z": 1}, "index must name axes .* other than x, y, z"),
+        ({"t": 0, "c": 0, "z": 1}, "index must name axes other than x, y, z"),
         ({"t": 0, "c": 0, "q": 1}, "index must name axes"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -134,7 +134,7 @@ def test_what_is_no_zarr_array_or_cannot_be_read_says_so(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="is a Zarr group without the multiscales"):
         source_of(tmp_path / "e")
     zarr.create_group(tmp_path / "f", attributes={"ome": {"bioformats2raw.layout": 3}})
-    with pytest.raises(ValueError, match="holds several images: give the path of one"):
+    with pytest.raises(ValueError, match="such as its folder 0"):
         source_of(tmp_path / "f")
 
 
@@ -207,8 +207,14 @@ UNITS = (("z", "meter"), ("y", "micrometer"), ("x", "micrometer"))
     [
         ({"axes": None}, "does not follow OME-Zarr"),
         ({"axes": ["z", "y", "x"]}, "does not follow OME-Zarr"),
-        ({"axes": [{"name": a, "type": "space"} for a in "abc"]}, "a volume has the axes x, y and z"),
-        ({"axes": [{"name": a, "unit": u, "type": "space"} for a, u in UNITS]}, "must have the same unit"),
+        (
+            {"axes": [{"name": a, "type": "space"} for a in "abc"]},
+            "must have axes x, y and z of the same unit",
+        ),
+        (
+            {"axes": [{"name": a, "unit": u, "type": "space"} for a, u in UNITS]},
+            "must have axes x, y and z of the same unit",
+        ),
         ({"datasets": []}, "does not follow OME-Zarr"),
         ({"datasets": [{"path": "../other"}]}, "does not follow OME-Zarr.*not a valid Zarr node name"),
         ({"datasets": [{"path": "5"}]}, "does not follow OME-Zarr"),

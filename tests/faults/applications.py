@@ -77,9 +77,9 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "viewer: a fine image is finished before a newer request is drawn",
-        "app.viewer.worker:Worker._draw",
-        lambda draw: lambda self, request: [self._coarse(request), *self._fine(request)][:0],
-        ("app/viewer/test_worker.py::test_a_newer_request_cancels_a_fine_image_between_two_parts",),
+        "app.viewer.model:Model._cancelled",
+        lambda _: lambda self, seconds: False,
+        ("app/viewer/test_requests.py::test_a_newer_request_cancels_a_fine_image_between_two_parts",),
     ),
     Fault(
         "viewer: pages of others may connect",

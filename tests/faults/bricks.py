@@ -71,8 +71,8 @@ FAULTS = [
     ),
     Fault(
         "bricks: a file that changed after it was opened is read",
-        "bricks.sources:_Map.check_unchanged",
-        lambda _: lambda self, name: None,
+        "bricks.sources:VoxelSource.check_unchanged",
+        lambda _: lambda self: None,
         ("bricks/test_sources.py::test_a_file_that_is_cut_or_written_to_after_opening_is_an_error[change1]",),
     ),
 ]

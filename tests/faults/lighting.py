@@ -41,10 +41,10 @@ FAULTS: list[Fault] = [
         (f"{SHADING}test_samples_shaded_together_are_shaded_as_each_alone[hard]",),
     ),
     Fault(
-        "light: photons fade out where the threshold is on whole levels",
-        "lighting.template_simulation:PacketTree.fades",
-        lambda f: property(lambda self: True),
-        ("lighting/test_template.py::test_a_threshold_on_levels_gives_the_papers_count",),
+        "light: photons below the threshold are kept",
+        "lighting.template:PacketTree.faded",
+        lambda f: lambda self, opacity, light: light,
+        ("lighting/test_template.py::test_a_conserving_template_holds_what_the_threshold_leaves",),
     ),
     Fault(
         "light: baked while something is traced, it is kept as tracers",

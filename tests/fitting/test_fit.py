@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import curve_fit
 
 import jaxvol as jv
-from jaxvol.fitting import Outcome, checkpoints
+from jaxvol.fitting import Outcome
 from jaxvol.fitting.bijections import Bijection
 from jaxvol.fitting.constraints import Free
 from jaxvol.fitting.residuals import Problem
@@ -295,14 +295,21 @@ def coarse_to_fine(residual=images, **how):
 HERE = Path(__file__).parent
 BAD = [
     (lambda: images(BLANK[:4]), r"views\[0\].*\(16, 20, 3\).*\(4, 20, 3\)"),
-    (lambda: images(BLANK * np.nan), r"views\[0\].*finite; 960"),
+    (lambda: images(BLANK * np.nan), r"views\[0\].*finite; 960 of"),
     (lambda: images(BLANK.astype(np.uint8)), r"views\[0\]: .*, floats .*; got uint8.*from_srgb"),
-    (lambda: images(view=1), r"views\[0\] must be a pair .*got int first"),
+    (lambda: images(view=1), r"views\[0\] must be a pair .*got a tuple"),
     (lambda: images(scene=3), "scene must be a function"),
     (lambda: images(blur=-0.1), "blur must not be negative"),
     (lambda: jv.ImageResidual(seen, []), "views must hold at least one pair"),
-    (lambda: jv.ImageResidual(seen, [BLANK]), "views must be pairs"),
-    (of_images(lambda t, c: (head(), t, c)), r"scene must return \(volume, .* if it is lit; got \['Volume'"),
+    (lambda: jv.ImageResidual(seen, [BLANK]), r"views\[0\] must be a pair"),
+    (
+        of_images(lambda t, c: (head(), t, c)),
+        r"scene must return \(volume, .* got a tuple of length 3",
+    ),
+    (
+        of_images(lambda t, c: (head(), c, t, MARCH)),
+        "transfer must be .* That is the camera",
+    ),
     (of_images(lambda t, c: seen(t, c.crop(0, 0, 2, 2))), r"view's size \(20, 16\); got \(2, 2\)"),
     (of_images(max_jacobian=THREE_ROWS, blur=0.1), "blurred images are not split: one has 960"),
     (of_images(max_jacobian=100), "max_jacobian must hold the triangle"),
@@ -384,16 +391,14 @@ def test_a_step_to_where_the_residual_is_not_finite_is_taken_back():
     assert np.all(result.uncertainty.covariance == np.inf)
 
 
-def test_progress_and_callback_tell_every_step(capfd):
-    pytest.importorskip("tqdm", reason="pip install -e '.[fit]'")
+def test_the_callback_is_told_every_step():
     calls = []
-    result = fitted(progress=True, callback=lambda *a: calls.append(a))
+    result = fitted(callback=lambda *a: calls.append(a))
     assert [step for step, _, _ in calls] == list(range(2, len(result.losses) + 1))
     assert [loss for _, _, loss in calls] == list(result.losses[1:])
     step = {name: np.asarray(value) for name, value in calls[-1][1].items()}
     residual = step["top"] * (1 - np.exp(-step["rate"] * X)) - DATA
     assert np.sum(residual**2) / 2 == pytest.approx(calls[-1][2], rel=1e-3)
-    assert "loss=" in capfd.readouterr().err
 
 
 # -- checkpoints ------------------------------------------------------------------------------------------
@@ -401,7 +406,7 @@ def test_progress_and_callback_tell_every_step(capfd):
 
 @pytest.mark.parametrize("solver", ["levenberg_marquardt", "bfgs"])
 def test_a_fit_that_is_interrupted_goes_on_to_the_same_bits(solver, tmp_path):
-    """By Ctrl-C, where it saves its last step; or by any other error, where it saved the step before."""
+    """By Ctrl-C, or by any other error."""
     stop = KeyboardInterrupt if solver == "bfgs" else RuntimeError
 
     def broken_off(step, parameters, loss):
@@ -410,13 +415,10 @@ def test_a_fit_that_is_interrupted_goes_on_to_the_same_bits(solver, tmp_path):
 
     file, steps, how = tmp_path / "folder" / "a", [], {"solver": solver, "max_steps": 30}
     whole = fitted(**how)
-    with pytest.raises(stop) as stopped:
-        fitted(checkpoint=file, checkpoint_seconds=0, callback=broken_off, **how)
-    if stop is KeyboardInterrupt:
-        told = f"fit: stopped after 4 steps, saved in {file}; the same call continues from there."
-        assert stopped.value.__notes__ == [told]
+    with pytest.raises(stop):
+        fitted(checkpoint=file, callback=broken_off, **how)
     again = fitted(checkpoint=file, callback=lambda *a: steps.append(a[0]), **how)
-    assert steps[0] == (5 if stop is KeyboardInterrupt else 4)  # the callback comes before the checkpoint
+    assert steps[0] == 5
     assert same(again, whole)
     # what has ended is not fitted again
     assert same(fitted(checkpoint=file, callback=lambda *a: steps.append(0), **how), whole)
@@ -426,7 +428,6 @@ def test_a_fit_that_is_interrupted_goes_on_to_the_same_bits(solver, tmp_path):
 DAMAGE = {
     "truncated": lambda content: content[: len(content) // 2],
     "empty": lambda content: b"",
-    "one byte": lambda content: content[:600] + bytes([content[600] ^ 1]) + content[601:],
     "another file": lambda content: b"not a checkpoint at all",
 }
 
@@ -452,8 +453,3 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path):
     }.items():
         with pytest.raises(ValueError, match=f"belongs to another fit: its {what} is"):
             fitted(checkpoint=file, **how)
-    # of lists, the first entry that differs is told
-    checkpoints.save(file, np.zeros(2), {"state": ["float32[]", "float32[3]"]})
-    differs = r"its state is of float32\[3\], where that of this fit is of float32\[2\]\. Choose"
-    with pytest.raises(ValueError, match=differs):
-        checkpoints.load(file, np.zeros(2), {"state": ["float32[]", "float32[2]"]})

@@ -62,15 +62,13 @@ def coordinates(probe, grid=GRID):
 
 
 @pytest.mark.parametrize("name", PROBES)
-@pytest.mark.parametrize("kinds", [("uint8", "uint8"), ("int16", "uint8"), ("float32", "float32")])
-def test_nodes_hold_what_scipy_interpolates_in_float64(name, kinds):
-    """Outside, the fill value. Values beyond an integer type become its ends; others are rounded, not cut."""
-    data, probe = acquired(kinds[0]), PROBES[name]
-    if kinds[0] == "int16":
-        data = data // 11
-    volume = labelled(data) if kinds[0] == "uint8" else jv.Volume(data)
-    found = jv.scan_convert(volume, jv.ToroidalMap(*probe), fill_value=7, dtype=kinds[1], **GRID)
-    assert found.data.dtype == kinds[1]
+@pytest.mark.parametrize("kind", ["uint8", "int16", "float32"])
+def test_nodes_hold_what_scipy_interpolates_in_float64(name, kind):
+    """Outside, the fill value. Integers are rounded, not cut."""
+    data, probe = acquired(kind), PROBES[name]
+    volume = labelled(data) if kind == "uint8" else jv.Volume(data)
+    found = jv.scan_convert(volume, jv.ToroidalMap(*probe), fill_value=7, **GRID)
+    assert found.data.dtype == kind
     np.testing.assert_allclose(found.spacing, GRID["spacing"])
     np.testing.assert_allclose(found.origin, GRID["origin"])
     at, outside = coordinates(probe)
@@ -82,9 +80,7 @@ def test_nodes_hold_what_scipy_interpolates_in_float64(name, kinds):
     assert np.all(values[~inside & sure] == 7)
     expected = map_coordinates(data.astype(np.float64), np.nan_to_num(np.moveaxis(at, -1, 0)), order=1)
     # half a unit for rounding to integers; 2e-5 of the range for the coordinates' rounding
-    tolerance = 2e-5 * float(np.ptp(data.astype(np.float64))) + (0.5 if kinds[1] == "uint8" else 0)
-    if kinds[1] == "uint8":
-        expected = np.clip(expected, 0, 255)
+    tolerance = 2e-5 * float(np.ptp(data.astype(np.float64))) + (0 if kind == "float32" else 0.5)
     assert np.abs(values - expected)[inside & sure].max() < tolerance
 
 
@@ -176,7 +172,7 @@ def test_gradients_are_central_differences():
 def test_memory_beside_the_result_is_that_of_a_plane():
     volume, probe = jv.Volume(np.zeros(SHAPE, np.uint8)), jv.ToroidalMap(*PROBE)
     shape = (256, 64, 64)
-    arguments = volume, probe, jnp.zeros(3), jnp.ones(3), shape, np.dtype("uint8"), 0.0
+    arguments = volume, probe, jnp.zeros(3), jnp.ones(3), shape, 0.0
     resampled: Any = scan_conversion._resampled
     compiled = resampled.lower(*arguments).compile().compiled
     assert compiled.memory_analysis().temp_size_in_bytes < 16 * 4 * shape[1] * shape[2]
@@ -194,11 +190,9 @@ BAD = [
     ({"shape": (2000, 2000, 2000)}, r"fewer than 2\*\*31 nodes"),
     ({"shape": (4, 4, 4), "origin": (0, 0, np.nan)}, "origin must be finite"),
     ({"fill_value": "black"}, "fill_value must be a number; got 'black'"),
-    ({"fill_value": -1}, r"fill_value must be .* uint8; got -1\. .*float32"),
+    ({"fill_value": -1}, r"fill_value must be .* uint8; got -1\."),
     ({"fill_value": 0.5}, "fill_value must be .* uint8; got 0.5"),
-    ({"fill_value": np.nan, "dtype": "float32"}, "fill_value must be .* float32; got nan"),
-    ({"dtype": "int32"}, "dtype must be one of uint8, .*got 'int32'"),
-    ({"dtype": "rgb"}, "dtype must be one of uint8"),
+    ({"fill_value": np.nan}, "fill_value must be .* uint8; got nan"),
     ({"spacing": 1.0, "shape": (200,) * 3}, r"200 x 200 x 200 nodes \(spacing, shape\): asks for"),
 ]
 

@@ -8,18 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.printed_templates import PrintedTree
+from experiments.printed_templates import LevelTree, PrintedTree
 from jaxvol.lighting import (
     DirectionalLight,
     Material,
     ScattererTemplate,
     ScattererTemplates,
-    material,
     scatterer_template,
     scatterer_templates,
 )
-from jaxvol.lighting.materials import PRESETS
-from jaxvol.lighting.template_simulation import FADES, PacketTree
+from jaxvol.lighting.template import FADES, PacketTree
 
 from ..scenes import in_float64
 
@@ -193,18 +191,19 @@ def test_many_templates_are_those_grown_one_by_one():
 def test_a_threshold_on_levels_gives_the_papers_count():
     """Six levels, of which the last one's brightest possible photon holds 0.5^6: a full tree of 63 photons,
     the most that the paper counts. Merging leaves 56 to 63."""
-    half, how = Material(0.5, 1.0, INDEX), {"packets": 1, "threshold": 0.01, "levels": 6}
-    whole = np.asarray(grow(half, KEY, threshold_on="level", merge=0, **how).intensity)
+    half, tree = Material(0.5, 1.0, INDEX), LevelTree(packets=1)
+    grown = jax.jit(lambda key, merge: tree.template(half.optics, key, 6, merge).intensity, static_argnums=1)
+    whole = np.asarray(grown(KEY, 0))
     assert np.sum(whole > 0) == 63
     assert whole.min() < 0.01 < 0.5**6
     np.testing.assert_allclose(whole.sum(), 1 - 0.5**6, rtol=1e-5)  # the rest goes on
-    merged = np.asarray(several(half, 8, threshold_on="level", **how).intensity)
-    counts = np.sum(merged > 0, axis=-1)
+    counts = np.array([np.sum(grown(key, 0.01) > 0) for key in jax.random.split(KEY, 8)])
     assert 56 <= counts.min() < 63
     assert counts.max() <= 63
     # at a threshold just above a level's brightest possible photon, that level is left out
     for threshold, photons in ((0.01, 63), (0.0157, 31)):
-        assert capacity(half, packets=1, threshold=threshold, threshold_on="level") == photons
+        tree = LevelTree(1, threshold)
+        assert tree.capacity(tree.levels(half)) == photons
     assert capacity(half, packets=1) == 63
 
 
@@ -239,8 +238,7 @@ def test_photons_that_coincide_add_also_by_way_of_others():
 
 def test_lighting_scales_templates_to_the_energy_of_all():
     sun = DirectionalLight((0, 0, 1))
-    how = {"packets": 1, "threshold_on": "level", "templates": 1}
-    lighting = ScattererTemplates(Material(0.5, 1.0, INDEX), sun, photons=7, **how)
+    lighting = ScattererTemplates(Material(0.5, 1.0, INDEX), sun, photons=7, packets=1, templates=1)
     found = jax.jit(lambda: lighting.simulated(blend=False))().intensity
     assert found.shape == (1, 1, 7)
     np.testing.assert_allclose(found.sum(), 1, rtol=1e-5)
@@ -287,15 +285,7 @@ def test_gradients_match_central_differences_and_photons_do_not_appear_at_once()
 
 
 def test_templates_take_no_memory_to_speak_of():
-    several = [material(name) for name in PRESETS] + [Material(0.5, 1.0)]
+    several = [Material(opacity, 1.0) for opacity in (0.5, 0.6, 0.8, 0.5)]
     grown = jax.eval_shape(lambda: scatterer_templates(several, 0, count=8))
     assert grown.intensity.shape[:2] == (4, 8)
     assert sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(grown)) < 64 * 1024
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_materials_in_units_of_ones_own(name):
-    one, other = material(name), material(name, millimetre=0.1, label=3)
-    np.testing.assert_allclose(other.mean_free_path, 0.1 * np.asarray(one.mean_free_path), rtol=1e-6)
-    assert other.label == 3
-    assert [float(x) for x in one.optics] == pytest.approx(PRESETS[name])

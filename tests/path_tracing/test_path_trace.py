@@ -196,7 +196,6 @@ def test_the_opacity_of_a_constant_volume_is_its_closed_form():
 def test_in_a_white_furnace_nothing_is_to_be_seen(anisotropy):
     white = spiky(10, np.ones((8, 3)))
     traced = trace(NOISE, white, around(NOISE), FURNACE, anisotropy=anisotropy)
-    assert np.max(traced.scatterings) > 3
     np.testing.assert_allclose(traced.image(), 1, atol=1e-5)
     assert not traced.exhausted.any()
 
@@ -251,18 +250,6 @@ def test_lights_add_up():
     variance = sum(np.asarray(image.standard_error) ** 2 for image in (*each, all_))
     assert abs(z_of_regions(difference, variance)).max() < 4
     np.testing.assert_array_equal(each[0].opacity, each[1].opacity)  # the primary rays are the same
-
-
-@pytest.mark.slow
-def test_the_error_of_an_image_counts_the_noise_of_its_background():
-    camera, background = around(NOISE), (0.5, 2.0, 0.0)
-    several = [trace(NOISE, spiky(), camera, lit(SUN, LAMP), key=key, max_scatterings=2) for key in range(24)]
-    images = np.stack([image.image(background) for image in several])
-    reported = np.stack([image.image_error(background) for image in several])
-    thick = np.mean([image.opacity for image in several], axis=0) > 0.3
-    assert thick.sum() > 50
-    ratio = images.var(axis=0, ddof=1)[thick].mean(axis=0) / (reported**2).mean(axis=0)[thick].mean(axis=0)
-    assert np.all(abs(ratio - 1) < 0.15)
 
 
 # ---------------------------------------------------------------- materials
@@ -359,7 +346,7 @@ def test_how_many_paths_go_on_side_by_side_does_not_show():
     # in two waves of pixels
     once = trace(volume, spiky(), camera, lights, key=jax.random.key(3), paths=2 * PATHS, lanes=250)
     assert more.paths == once.paths
-    for name in ("radiance", "opacity", "standard_error", "scatterings"):
+    for name in ("radiance", "opacity", "standard_error"):
         np.testing.assert_allclose(getattr(more, name), getattr(once, name), rtol=1e-3, atol=1e-5)
     assert float(abs(more.radiance - some.radiance).max()) > 1e-3
     # another key gives another image
@@ -408,15 +395,12 @@ def test_bad_arguments_are_named():
     fails("anisotropy", anisotropy=1.0)
     fails("max_scatterings", max_scatterings=0)
     fails("lanes", lanes=0)
-    fails("lanes=.* and paths=100000000000, .*asks for .* GiB of memory, and the device has", paths=10**11)
-    wide, deep = jv.Camera.looking_at(NOISE, size=(2**15, 2**15)), 2**31
-    fails(f"lanes={deep} and paths=16, ", NOISE, transfer, wide, FURNACE, lanes=deep)
     fails("materials", materials=())
     fails("materials", materials=Material(0.5, 1.0, label=1))
     fails("labels", NOISE, jv.LabelTransferFunction([transfer]), camera, FURNACE)
     fails("onto", onto=np.zeros((16, 20, 3)))
     flat, rgb = jnp.zeros((4, 4)), jnp.zeros((4, 4, 3))
-    earlier = jv.PathTraced(rgb, flat, rgb, flat, flat > 0, jnp.uint32(0), 2)
+    earlier = jv.PathTraced(rgb, flat, rgb, flat > 0, jnp.uint32(0), 2)
     fails("size", onto=earlier)
     fails("key", NOISE, transfer, jv.Camera.looking_at(NOISE, size=(4, 4)), FURNACE, onto=earlier)
     with pytest.raises(ValueError, match="background"):

@@ -11,8 +11,8 @@ import jaxvol as jv
 from jaxvol.bricks import source_of
 from jaxvol.compositing.blending import Over
 from jaxvol.metrics import rmse
-from jaxvol.planning.choices import proven_transforms
 from jaxvol.planning.memory import IN_MEMORY, read_within, with_bricks
+from jaxvol.planning.plan import proven_transforms
 from jaxvol.scene.space import Affine
 
 from ..scenes import around, scaled_phantom, soft_transfer
@@ -47,7 +47,7 @@ def test_bricks_are_planned_where_the_volume_does_not_fit(path):
     assert np.prod(bricks.counts) > 1
     assert float(finer.step) <= float(march.step) / 2
     assert finer.transforms == march.transforms
-    found = jv.Plan(finer, copy, None, TOLERANCE, 0.01, 0.1, 9.0, (), 0.0, Over(), source, room)
+    found = jv.Plan(finer, copy, None, TOLERANCE, 0.01, 9.0, (), 0.0, Over(), source, room)
     assert "in memory" in str(found)
     found = found._replace(stride=stride, bricks=bricks)
     assert f"at most {bricks.needed} are read" in str(found)
@@ -79,7 +79,7 @@ def test_a_plan_by_bricks_keeps_its_tolerance_and_its_memory(path):
 
 def test_a_plan_without_parts_is_printed_and_rendered():
     march = jv.March(0.1, max_samples=4)
-    found = jv.Plan(march, VOLUME, None, TOLERANCE, 0.01, 0.1, 9.0, (), 0.0)
+    found = jv.Plan(march, VOLUME, None, TOLERANCE, 0.01, 9.0, (), 0.0)
     assert "step 0.1" in str(found)
     given = soft_transfer(), around(VOLUME)
     image = jv.render(VOLUME, *given, march)

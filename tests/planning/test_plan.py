@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, Deferred, ScattererTemplates
 from jaxvol.metrics import rmse
-from jaxvol.planning import trials
-from jaxvol.planning.choices import proven_transforms
-from jaxvol.planning.lightings import smooth
-from jaxvol.planning.plan import _checked
+from jaxvol.planning import search
+from jaxvol.planning.plan import _checked, proven_transforms
 from jaxvol.scene.occupancy import Blocks
 from jaxvol.scene.space import Affine
 
@@ -69,7 +66,7 @@ def test_what_it_decides_follows_from_the_scene(planned):
     assert "SpaceLeaping" in transforms_of(planned)
     assert "AlphaCorrection" not in transforms_of(planned)
     assert all(part.why for part in planned.parts)
-    for word in ("AlphaCorrection", "SpaceLeaping", "EarlyTermination", "voxels as", "RMSE", "proven"):
+    for word in ("AlphaCorrection", "SpaceLeaping", "EarlyTermination", "RMSE", "proven"):
         assert word in str(planned)
 
 
@@ -86,14 +83,12 @@ def test_gradients_let_rays_end_later_only():
     found = plan_of(THICK, gradients=True)
     (ends,) = (each for each in found.march.transforms if isinstance(each, jv.EarlyTermination))
     assert ends.opacity_left == pytest.approx(1e-4)
-    assert found.volume.data.dtype == SPHERE.data.dtype
 
 
 def test_an_empty_image_is_planned():
     found = plan_of(uniform_transfer(0.0))
     assert found.within
     assert found.error < TOLERANCE / 4
-    assert found.seconds < 1
 
 
 def visible(volume=SPHERE):
@@ -230,8 +225,8 @@ def test_a_small_object_in_a_large_image_is_seen():
 
 @pytest.mark.slow
 def test_what_cannot_be_reached_is_said(monkeypatch):
-    monkeypatch.setattr(trials, "FINE", 0.5)  # of a voxel, with both quadratures
-    monkeypatch.setattr(trials, "FINEST", 0.5)
+    monkeypatch.setattr(search, "FINE", 0.5)  # of a voxel, with both quadratures
+    monkeypatch.setattr(search, "FINEST", 0.5)
     found = plan_of(tolerance=2e-4)
     assert not found.within
     assert "not proven to be within the tolerance" in str(found)
@@ -241,32 +236,8 @@ def test_what_cannot_be_reached_is_said(monkeypatch):
 
 
 @pytest.mark.slow
-def test_light_without_variants_is_in_the_error():
+def test_light_is_in_the_error():
     light = jv.lighting.Phong()
     found = plan_of(tolerance=TOLERANCE / 2, lighting=light, once=True)
     assert found.lighting is light
-    assert "light: as given" in str(found)
     assert TOLERANCE / 20 < error_of(found, finer=32, lighting=light) <= found.error <= TOLERANCE / 2
-
-
-@pytest.mark.slow
-def test_light_is_simpler_where_that_looks_the_same():
-    """Light that is nearly the same everywhere may be fetched from a grid, unless it is to be differentiated;
-    and the image is as far from that under all templates, blended, as the plan says."""
-    light = ScattererTemplates(jv.Material(0.3, 0.1, 1.4), ConstantLight((0.5, 0.5, 0.5)), templates=2)
-    found = plan_of(tolerance=0.05, lighting=light)
-    fine = jv.March(float(SPHERE.spacing.min()) / 8, (jv.AlphaCorrection(),), "midpoint")
-    truth = jv.render(SPHERE, soft_transfer(), CAMERA, fine, lighting=smooth(light))
-    image = jv.render(found.volume, soft_transfer(), CAMERA, found.march, lighting=found.lighting)
-    assert found.within
-    assert differ(image, truth) <= 0.05
-
-    def inner(lighting: Any):
-        while isinstance(lighting, Deferred):
-            lighting = lighting.lighting
-        assert isinstance(lighting, ScattererTemplates)
-        return lighting
-
-    assert isinstance(found.lighting, Deferred)
-    assert inner(found.lighting).baked
-    assert not inner(plan_of(tolerance=0.05, lighting=light, gradients=True).lighting).baked

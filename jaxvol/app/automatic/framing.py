@@ -1,4 +1,4 @@
-"""Where is what a transfer function shows, from how far does a camera see all of it, and which way is up?"""
+"""Where is what a transfer function shows, and from how far does a camera see all of it?"""
 
 import itertools
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from ...scene.camera import Camera, axes_of
 from ...scene.labels import LabelTransferFunction
 from ...scene.transfer import Transfer, TransferFunction
 from ...scene.volume import Volume
-from .histogram import faces, sampled, stride_of, thresholds, unit_of
+from .histogram import sampled, stride_of, unit_of
 from .labels import INSIDE
 
 
@@ -34,20 +34,13 @@ MARGIN = 1.06
 CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
 """Of the unit cube."""
 
-CUT_LEAST = 0.1
-"""Part of a face of the grid that an object covers from which on the face cuts it."""
-
-OTHERS_MOST = 0.25
-"""Part of that, at most, which it covers of any other face."""
-
 FRONT = (0.5, -1.0, 0.4)
 """From the volume to the camera, where z is up: to the right, in front, and higher."""
 
 
 def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3"]:
-    """Points in the world around what a transfer function shows, specks left out, which reach as far in each
-    direction; the corners of the volume where nothing is visible. Transfer functions are those made by
-    `automatic_transfer` and `labels_shown`."""
+    """Points in the world around what a transfer function of `automatic_transfer` or `labels_shown` shows,
+    specks left out; the corners of the volume where nothing is visible."""
     from scipy.ndimage import label, maximum_filter
     from scipy.spatial import ConvexHull, QhullError
 
@@ -64,9 +57,8 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     pieces = seen * found[0]
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
-    kept = sizes >= SPECK * sizes.max()
-    shown = kept[pieces]
-    rows = shown.any(axis=2)  # of voxels along z: only their ends can be farthest from the middle
+    shown = (sizes >= SPECK * sizes.max())[pieces]
+    rows = shown.any(axis=2)  # of voxels along z, of which only the ends count
     ends = shown.argmax(axis=2)[rows], shown.shape[2] - 1 - shown[..., ::-1].argmax(axis=2)[rows]
     voxels = np.concatenate([np.column_stack([*np.nonzero(rows), z]) for z in ends]).astype(np.float64)
     with suppress(QhullError):  # voxels in a plane have no hull, and all are kept
@@ -82,16 +74,11 @@ def _in_world(volume: Volume, grid: Float[np.ndarray, "n 3"]) -> Float[np.ndarra
 
 def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:
     """A camera with the directions, the angle and the size of another, placed so that the points just fill
-    its picture, the whole window.
+    its picture, the whole window; or those of all `views` of it, turned about the middle of the points.
 
-    From a perspective camera at distance D from its focal point f, a point that lies x to the right of f, and
-    z nearer to the camera than f, is in the picture if |x| <= t (D - z), where t is the tangent of half the
-    angle. So D must be at least the mean of max(x / t + z) and max(-x / t + z), if f is shifted so that both
-    sides are as free. For parallel rays, z does not count, and D is the half height of the view.
-
-    `views`: the camera turned about its focal point in all ways that are to show the points, by default as it
-    is. The focal point of several is the middle of the points, without a shift.
-    """
+    From a distance D, a point that lies x beside the focal point, and z nearer than it, is in the picture if
+    |x| <= t (D - z), where t is the tangent of half the angle. For parallel rays, z does not count, and D is
+    the half height of the view."""
     views = views or [camera]
     width, height = camera.size
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -130,28 +117,3 @@ def _centering(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) 
         return float(seen.max() + seen.min())
 
     return float(brentq(excess, across.min(), across.max()))  # pyright: ignore[reportArgumentType]
-
-
-def upright(volume: Volume) -> Float[np.ndarray, "3"] | None:
-    """The axis of the grid that is up, with its sign; None if nothing tells.
-
-    What a single face of the grid cuts, stands on that face: a head on its neck, a plant on its pot, a
-    machine on its plate. The object is what lies above the first of the histogram's two thresholds. It is a
-    guess: of 14 scans and simulations it was right for the five that one face cuts, and made none for the
-    others.
-    """
-    data = sampled(volume)
-    first, _ = thresholds(data.ravel().astype(np.float32))
-    covered = np.array([(face > first).mean() for face in faces(data)])
-    others, foot = np.sort(covered)[-2:]
-    if foot < CUT_LEAST or others > OTHERS_MOST * foot:
-        return None
-    axis, end = divmod(int(covered.argmax()), 2)
-    return np.eye(3)[axis] * (-1 if end else 1)
-
-
-def front_of(up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    """`FRONT`, turned with z to an axis that is up."""
-    into = np.array([0.0, 0.0, -up[1]]) if up[1] else np.array([0.0, 1.0, 0.0])
-    right, behind, above = FRONT
-    return right * np.cross(into, up) + behind * into + above * up

@@ -18,13 +18,11 @@ BINS = 256
 
 INSIDE_LEAST = 0.15
 """Part of the voxels between the thresholds whose six neighbours lie between them, too: of a body, at least.
-It is 0.38 to 0.92 in scans of heads, lungs, teeth and engines, 0.25 in a simulation, and 0.09 at most in
-angiograms, where only the rims of vessels lie between."""
+0.25 to 0.92 in scans and simulations, 0.09 at most in angiograms, where only the rims of vessels do."""
 
 ROUGH, NOISY = 0.7, 0.1
-"""Grain has second differences above this part of first differences over the same two steps (0.1 to 0.6 in
-most scans, 0.8 in ultrasound and in a noisy MR scan, 1.7 in white noise), and above this part of the distance
-of the thresholds."""
+"""Grain has second differences above this part of first differences over two steps (0.6 at most in scans, 0.8
+in ultrasound, 1.7 in white noise), and above this part of the distance of the thresholds."""
 
 
 def stride_of(shape: tuple[int, ...]) -> int:
@@ -47,14 +45,8 @@ def unit_of(volume: Volume) -> float:
     return float(np.linalg.norm(high - low)) / ACROSS
 
 
-def faces(data: Shaped[np.ndarray, "nx ny nz"]) -> list[Shaped[np.ndarray, "..."]]:
-    """The voxels of the six faces: of the first axis, at its low and its high end, and so on."""
-    return [data.take(end, axis) for axis in range(3) for end in (0, -1)]
-
-
 def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
-    """Otsu's two thresholds. Between classes that are far apart any threshold is as good: the middle of their
-    means is taken, where the border between them lies in a scan."""
+    """Otsu's two thresholds, moved to the middle of the means of the classes between which they lie."""
     from skimage.filters import threshold_multiotsu
 
     low, high = (float(end) for end in np.percentile(values, (0, 99.9)))
@@ -75,28 +67,26 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:
-    """Whether values between two thresholds fill a body that is worth to be shown, and are not only grain, or
-    the borders of what is dense. Of a large volume, every n-th voxel is compared with its neighbours."""
+    """Whether values between two thresholds fill a body, and are not only grain, or the borders of what is
+    dense. Of a large volume, every n-th voxel is compared with its neighbours."""
     if min(data.shape) < 3:
         return True
     stride = stride_of(data.shape)
+    inner = [np.arange(1, n - 1, stride) for n in data.shape]
 
     def shifted(axis: int, by: int) -> Shaped[np.ndarray, "mx my mz"]:
-        begins = [1 + by * (axis == each) for each in range(3)]
-        part = tuple(slice(begin, begin + n - 2, stride) for begin, n in zip(begins, data.shape, strict=True))
-        return data[part].astype(np.float32)
-
-    def between(values: Shaped[np.ndarray, "mx my mz"]) -> Shaped[np.ndarray, "mx my mz"]:
-        return (values > first) & (values <= second)
+        places = (places + by * (axis == each) for each, places in enumerate(inner))
+        return data[np.ix_(*places)].astype(np.float32)
 
     here = shifted(0, 0)
-    middle = between(here)
+    middle = (here > first) & (here <= second)
     if not middle.any():
         return True
     inside, bends, slopes = middle.copy(), 0.0, 0.0
     for axis in range(3):
         before, after = shifted(axis, -1), shifted(axis, 1)
-        inside &= between(before) & between(after)
+        for each in (before, after):
+            inside &= (each > first) & (each <= second)
         bends += float(np.abs(2 * here - before - after)[middle].mean(dtype=np.float64)) / 3
         slopes += float(np.abs(after - before)[middle].mean(dtype=np.float64)) / 3
     is_grain = bends > ROUGH * slopes and bends > NOISY * (second - first)

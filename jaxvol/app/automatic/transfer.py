@@ -11,7 +11,7 @@ from ..._util.srgb import from_srgb
 from ...scene.transfer import TransferFunction, extinction_of
 from ...scene.volume import Volume
 from ...xla.platform import is_traced
-from .histogram import faces, is_body, sampled, thresholds, unit_of
+from .histogram import is_body, sampled, thresholds, unit_of
 
 
 CUT = 0.25
@@ -23,13 +23,9 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
     Two thresholds part the values into three classes so that the variance within each is least (Otsu): what
     is around the object, the object, and what is dense in it. The border of the object is shown translucent,
-    what is dense in it nearly opaque. Where the volume's faces cut through the object, as through the body in
-    most CT scans, the object would be a block; where it is grain, as in ultrasound, it would be fog; and
-    where only the borders of what is dense have its values, as in angiograms, it would veil them. Only what
-    is dense is shown then, and its surroundings are faint.
-
-    It is a guess. Opacities refer to a part of the volume's diagonal, so that they do not depend on its
-    units.
+    what is dense in it nearly opaque. Where the volume's faces cut the object, as in most CT scans, where it
+    is grain, as in ultrasound, or only borders of what is dense, as in angiograms, it would hide what is
+    dense, which alone is shown then. It is a guess. Opacities do not depend on the volume's units.
 
     **Arguments:** `volume`: the `Volume`. Of more than 2 million voxels, every n-th is looked at.
 
@@ -51,15 +47,15 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
-    """The same for a volume of which there is a copy of every n-th voxel, in the same place, and a part as it
-    is: whether values are grain, a copy does not tell."""
+    """The same by a copy of every n-th voxel, and a part as it is, which tells what is grain."""
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
         points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
     else:
         first, second = thresholds(values)
-        outer = np.concatenate([face.ravel() for face in faces(np.asarray(copy.data))]).astype(np.float32)
+        data = np.asarray(copy.data)
+        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
         whole = np.mean(outer > first) < CUT and is_body(part, first, second)
         points = _shell(low, first, second, high) if whole else _dense(first, second, high)
     at, colors, opacities = zip(*points, strict=True)
@@ -73,23 +69,15 @@ DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 
 
 def _shell(low: float, first: float, second: float, high: float) -> list[tuple[float, Any, float]]:
-    w = min(first - low, second - first) / 3
-    d = (second - first) / 4
-    return [
-        (first - w, EDGE, 0.0),
-        (first, SKIN, 0.3),
-        (first + w, SKIN, 0.07),
-        (second - d, TISSUE, 0.04),
-        (second, DENSE, 0.45),
-        (max((second + high) / 2, second + d / 2), BRIGHT, 0.9),
-    ]
+    w, d = min(first - low, second - first) / 3, (second - first) / 4
+    border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, 0.07)]
+    return [*border, (second - d, TISSUE, 0.04), *_densest(second, d, high)]
 
 
 def _dense(first: float, second: float, high: float) -> list[tuple[float, Any, float]]:
     d = (second - first) / 4
-    return [
-        (second - 2 * d, EDGE, 0.0),
-        (second - d, TISSUE, 0.02),
-        (second, DENSE, 0.45),
-        (max((second + high) / 2, second + d / 2), BRIGHT, 0.9),
-    ]
+    return [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *_densest(second, d, high)]
+
+
+def _densest(second: float, d: float, high: float) -> list[tuple[float, Any, float]]:
+    return [(second, DENSE, 0.45), (max((second + high) / 2, second + d / 2), BRIGHT, 0.9)]

@@ -1,4 +1,4 @@
-"""`jaxvol animate`: a volume file seen from a camera that turns about it, as GIF, MP4 or a folder of PNGs."""
+"""`jaxvol animate`: a volume file seen from a camera that turns about it, as GIF or MP4."""
 
 import argparse
 import time
@@ -7,22 +7,25 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
 from ..._util.checks import integer, output_file
-from ..._util.whole_files import whole_file, whole_folder
-from ...io.display import displayed, save_image
+from ..._util.whole_files import whole_file
+from ...io.display import displayed
+from ...scene.camera import Camera
 from .frames import frames_of
-from .options import SCENE, Command, Option, output
-from .orbit import angles_of
-from .progress import show_progress
-from .recorded import checksum, text_of
-from .render import RENDER, orbit_views
-from .scene import Scene, scene_of
+from .options import add_command, add_output, add_scene, add_vector
+from .scene import scene_of
 
 
 Picture = UInt8[np.ndarray, "height width 3"]
+
+FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
+"""Views of an orbit, evenly spaced, in which all that is visible is to be in the picture, and for which its
+march is planned."""
 
 GIF_FPS = 50
 """Frames a second of a GIF, at most: browsers show those of less than 2/100 s for 10/100 s."""
@@ -30,68 +33,63 @@ GIF_FPS = 50
 
 def _animate(options: argparse.Namespace) -> None:
     count = integer("--frames", options.frames, 1)
-    if not 0 < options.fps <= 240:
-        raise ValueError(f"--fps must be above 0, and 240 at most; got {options.fps:g}.")
-    folder = options.output.is_dir()
-    output_file("--output", options.output / "frame_0000.png" if folder else options.output)
-    kind = "" if folder else options.output.suffix.lower()
-    if kind not in ("", ".gif", ".mp4"):
-        raise ValueError(f"--output: must end in .gif or .mp4, or be a folder; got {options.output}.")
-    if not kind and options.output.is_file():
-        raise ValueError(f"--output: {options.output} is a file, and no folder for frames.")
-    if kind == ".gif" and options.fps > GIF_FPS:
-        raise ValueError(
-            f"--fps: a .gif has {GIF_FPS} frames a second at most; got {options.fps:g}. Write an .mp4."
-        )
+    path = output_file("--output", options.output)
+    kind = path.suffix.lower()
+    if kind not in (".gif", ".mp4"):
+        raise ValueError(f"--output: must end in .gif or .mp4; got {path}.")
+    fastest = GIF_FPS if kind == ".gif" else 240
+    if not 0 < options.fps <= fastest:
+        raise ValueError(f"--fps of a {kind} must be above 0, and {fastest} at most; got {options.fps:g}.")
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        raise ImportError(
-            '--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]". Or write a .gif, or a '
-            "folder of PNGs."
-        )
-    if kind == ".mp4" and any(side % 2 for side in options.size):
-        width, height = options.size
-        raise ValueError(f"--size: an .mp4 has an even number of pixels on each side; got {width} {height}.")
-    scene = scene_of(options, orbit=options.degrees)
+        raise ImportError('--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]".')
+
+    def views(camera: Camera, count: int) -> list[Camera]:
+        axis = options.axis or options.view_up
+        return [turned(camera, angle, axis) for angle in angles_of(options.degrees, count)]
+
+    scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))
     begun = time.perf_counter()
-    with whole_folder(options.output) if not kind else whole_file(options.output) as part:
-        images = _images(options, scene, count, part if not kind else None)
-        if kind == ".gif":
-            _write_gif(part, images, options.fps, count)
-        elif kind == ".mp4":
-            _write_mp4(part, images, options.fps)
-        else:
-            for _ in images:
-                pass
+    frames = frames_of(options, scene, views(scene.camera, PLANNED_VIEWS))
+    images = (
+        displayed(np.asarray(frames.render(camera).image(scene.background), np.float32))
+        for camera in views(scene.camera, count)
+    )
+    with whole_file(path) as part:
+        write = _write_gif if kind == ".gif" else _write_mp4
+        write(part, images, options.fps)
     took = time.perf_counter() - begun
-    print(f"{options.output}: {count} frames of {' x '.join(map(str, options.size))} pixels in {took:.1f} s")
+    print(f"{path}: {count} frames of {' x '.join(map(str, options.size))} pixels in {took:.1f} s")
 
 
-def _images(options: argparse.Namespace, scene: Scene, count: int, folder: Path | None) -> Iterator[Picture]:
-    """The frames, one after the other; written into the folder if one is given, each with the options by
-    which `jaxvol render` makes it."""
-    frames = frames_of(options, scene, orbit_views(scene, options.degrees))
-    sha256 = checksum(options.file) if folder else None
-    with show_progress(f"rendering {options.output}, frames") as report:
-        for number, angle in enumerate(angles_of(options.degrees, count)):
-            image = frames.render(scene.view(angle)).image(scene.background)
-            if folder is not None:
-                settings = vars(options) | {"turn": angle, "orbit": options.degrees}
-                text = text_of(RENDER.options, settings, scene.transfer, sha256)
-                save_image(folder / f"frame_{number:04d}.png", image, text=text)
-            yield displayed(np.asarray(image, np.float32))
-            report(number + 1, count)
+def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
+    """The camera, turned about an axis through its focal point."""
+    from scipy.spatial.transform import Rotation
+
+    axis = np.asarray(axis, float)
+    if not np.isfinite(axis).all() or not axis.any():
+        raise ValueError(f"--axis must not be 0; got {' '.join(map(str, axis))}.")
+    rotation = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
+    position, focal, up = (
+        np.asarray(v, float) for v in (camera.position, camera.focal_point, camera.view_up)
+    )
+    place = jnp.asarray(focal + rotation.apply(position - focal)), jnp.asarray(rotation.apply(up))
+    return eqx.tree_at(lambda c: (c.position, c.view_up), camera, place)
 
 
-def _write_gif(path: Path, images: Iterator[Picture], fps: float, count: int) -> None:
-    """Each frame with 256 colours of its own; it is shown again and again."""
+def angles_of(degrees: float, frames: int) -> list[float]:
+    """Angles of the frames: evenly spaced from 0 on, to `degrees`; or, where that ends at the beginning, to
+    one frame before it."""
+    closed = degrees % 360 == 0
+    return [degrees * i / max(frames if closed else frames - 1, 1) for i in range(frames)]
+
+
+def _write_gif(path: Path, images: Iterator[Picture], fps: float) -> None:
+    """Each frame has 256 colours of its own, and lasts for whole hundredths of a second."""
     from PIL import Image
 
-    # frames last whole hundredths of a second: their ends are rounded, so that the whole lasts as it should
-    ends = np.round(np.arange(count + 1) * 100 / fps)
-    milliseconds = (10 * np.diff(ends)).astype(int).tolist()
     pictures = (Image.fromarray(image).quantize(256) for image in images)
-    first = next(pictures)
-    first.save(path, save_all=True, append_images=pictures, duration=milliseconds, loop=0, disposal=1)
+    how: dict[str, Any] = {"duration": 10 * round(100 / fps), "loop": 0, "disposal": 1}
+    next(pictures).save(path, save_all=True, append_images=pictures, **how)
 
 
 def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
@@ -104,17 +102,14 @@ def _write_mp4(path: Path, images: Iterator[Picture], fps: float) -> None:
         file.write(images, is_batch=True, fps=fps, ffmpeg_log_level="error", **how)
 
 
-_OUTPUT = "what to write: .gif, .mp4 (needs jaxvol[video]), or a folder, of one .png for each frame"
-
-ANIMATE = Command(
-    "animate",
-    "render a volume file from a camera that turns about it",
-    (
-        *SCENE,
-        output("orbit.gif", _OUTPUT),
-        Option("frames", "number of images", int, default=36),
-        Option("degrees", "angle that the camera turns about --axis", float, default=360.0),
-        Option("fps", "frames a second", float, default=12.0),
-    ),
-    _animate,
-)
+def add_animate(commands: Any) -> None:
+    text = "render a volume file from a camera that turns about it"
+    parser = add_command(commands, "animate", text, _animate)
+    add_scene(parser)
+    add_output(parser, "orbit.gif", "what to write: .gif, or .mp4, which needs jaxvol[video]")
+    text = "what the camera turns about, through its focal point (default: --view-up)"
+    add_vector(parser, "--axis", "X Y Z", text)
+    parser.add_argument("--frames", type=int, default=36, metavar="N", help="how many images (default: 36)")
+    text = "angle that the camera turns about --axis (default: 360)"
+    parser.add_argument("--degrees", type=float, default=360.0, metavar="ANGLE", help=text)
+    parser.add_argument("--fps", type=float, default=12.0, help="frames a second (default: 12)")

@@ -13,6 +13,10 @@ from ...scene.volume import Volume
 from ..automatic.histogram import SAMPLED
 
 
+MIDDLE = 128
+"""Voxels along each axis, at most, that are looked at as they are."""
+
+
 def volume_of(options: argparse.Namespace) -> Volume:
     """The volume in the file."""
     return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
@@ -27,20 +31,12 @@ def source_of(options: argparse.Namespace) -> VoxelSource:
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     """**Raises** `ValueError` if a file that is to be written (options of these names) is the volume, one of
     its slices, or one of the others."""
-    slices = files_of(options.file) if options.file.is_dir() else []
-    used = {"the volume": [options.file], "a slice of the volume": slices}
+    used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
     for name in names:
         path = getattr(options, name)
-        if path is None:
-            continue
-        for what, others in used.items():
-            if path.resolve() in [other.resolve() for other in others]:
-                raise ValueError(f"--{name}: {path} is {what}, which it would replace. Write another file.")
-        used[f"what --{name} writes"] = [path]
-
-
-MIDDLE = 128
-"""Voxels along each axis, at most, that are looked at as they are."""
+        if path is not None and path.resolve() in [other.resolve() for other in used]:
+            raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
+        used += [] if path is None else [path]
 
 
 def middle_of(source: VoxelSource) -> Shaped[np.ndarray, "nx ny nz"]:
@@ -50,8 +46,8 @@ def middle_of(source: VoxelSource) -> Shaped[np.ndarray, "nx ny nz"]:
 
 
 def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel, stretched to the bounds of the whole. It has those voxels by which
-    colours are chosen for the whole, if they fit into so many bytes, and fewer if not."""
+    """A copy of every n-th voxel, stretched to the bounds of the whole: of those by which colours are chosen
+    for the whole, if they fit into so many bytes, and of fewer if not."""
     most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
     stride = 1
     while math.prod(-(-n // stride) for n in source.shape) > most and min(source.shape) // (stride + 1) >= 2:

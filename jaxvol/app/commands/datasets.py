@@ -2,54 +2,31 @@
 
 import argparse
 import sys
+from typing import Any
 
 from ...io import datasets
-from .options import ARGUMENT, SHARED, Command, Option
-
-
-def _list() -> None:
-    for dataset in map(datasets.info, datasets.names()):
-        shape = " x ".join(map(str, dataset.shape))
-        print(f"{dataset.name:34} {shape:>20} {dataset.dtype:8} {_bytes(dataset.nbytes):>9}  {dataset.title}")
-
-
-def _fetch(options: argparse.Namespace) -> None:
-    where = {"folder": options.folder, "mirror": options.mirror}
-    path = datasets.fetch(options.name, **where, progress=sys.stderr.isatty())
-    print(path)  # nothing else on stdout, for "$(jaxvol datasets fetch engine)"
-    dataset = datasets.info(options.name)
-    print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}", file=sys.stderr)
-    spacing = " ".join(f"{step:g}" for step in dataset.spacing)
-    if dataset.spacing != (1, 1, 1):
-        print(f"jaxvol render {path} --spacing {spacing}", file=sys.stderr)
-
-
-def _bytes(number: float) -> str:
-    for unit in ("B", "kB", "MB", "GB"):
-        if number < 1000:
-            return f"{number:.3g} {unit}"
-        number /= 1000
-    return f"{number:.3g} TB"
+from .options import add_command
 
 
 def _datasets(options: argparse.Namespace) -> None:
     if options.action == "list":
-        _list()
-    elif options.name is None:
+        for dataset in map(datasets.info, datasets.names()):
+            shape, size = " x ".join(map(str, dataset.shape)), f"{dataset.nbytes / 1e6:.3g} MB"
+            print(f"{dataset.name:34} {shape:>20} {dataset.dtype:8} {size:>12}  {dataset.title}")
+        return
+    if options.name is None:
         raise ValueError("fetch needs a NAME: jaxvol datasets list prints them.")
-    else:
-        _fetch(options)
+    path = datasets.fetch(options.name, progress=sys.stderr.isatty())
+    print(path)  # nothing else on stdout, for "$(jaxvol datasets fetch engine)"
+    dataset = datasets.info(options.name)
+    print(f"{dataset.description} Acknowledgement: {dataset.acknowledgement}", file=sys.stderr)
+    if dataset.spacing != (1, 1, 1):
+        spacing = " ".join(f"{step:g}" for step in dataset.spacing)
+        print(f"jaxvol render {path} --spacing {spacing}", file=sys.stderr)
 
 
-DATASETS = Command(
-    "datasets",
-    "list the public Open SciVis volumes; or print the path of one, and download it first if need be",
-    (
-        *SHARED,
-        Option("action", "what to do", choices=("list", "fetch"), required=True, group=ARGUMENT),
-        Option("name", "of the volume to fetch, as listed", group=ARGUMENT),
-        Option("folder", "where to keep it (default: $JAXVOL_DATA, or a cache of the user's)"),
-        Option("mirror", "a server that has the files in place of klacansky.com", values="URL"),
-    ),
-    _datasets,
-)
+def add_datasets(commands: Any) -> None:
+    text = "list the public Open SciVis volumes; or print the path of one, downloaded if need be"
+    parser = add_command(commands, "datasets", text, _datasets)
+    parser.add_argument("action", choices=("list", "fetch"), help="what to do")
+    parser.add_argument("name", nargs="?", help="of the volume to fetch, as listed")

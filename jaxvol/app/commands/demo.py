@@ -3,14 +3,11 @@
 import argparse
 import html
 import inspect
-import time
-import warnings
 from pathlib import Path
+from typing import Any
 
-from ..._util.checks import integer, output_file
 from ..._util.whole_files import whole_folder
-from .options import SHARED, SIZE, Command, Option, output
-from .progress import show_progress
+from .options import add_command, add_output, add_size
 
 
 def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
@@ -22,7 +19,6 @@ def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
     import jaxvol as jv
 
     phantom = jv.phantom("head", resolution)
-    # 16 bits hold 128 levels for each of the phantom's
     smooth = gaussian_filter(128 * np.asarray(phantom.data, np.float32), 1.5)
     volume = jv.Volume(np.round(smooth).astype(np.uint16), phantom.spacing, phantom.origin)
     fast = (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination())
@@ -73,62 +69,24 @@ def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
         jv.save_png(folder / f"fit_{name}.png", image)
 
 
-SECTIONS = {
-    head: ("head",),
-    grain: ("before", "after"),
-    fit: ("fit_start", "fit_found", "fit_true"),
-}
-"""The functions, and the pictures that each writes, from left to right."""
-
-PAGE = """\
-<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>jaxvol demo</title><style>
-body { font-family: system-ui, sans-serif; line-height: 1.5; max-width: 72rem; margin: 2rem auto; padding: 0
-1rem } section { border-top: 1px solid #ddd; margin-top: 2rem; padding-top: 1rem }
-div { display: flex; gap: 1rem } img { min-width: 0; max-width: 32rem; flex: 0 1 auto; align-self: start }
-pre { background: #f5f5f5; padding: 0.8rem 1rem; overflow-x: auto; font-size: 0.85rem }
-</style></head><body>
-<h1>What jaxvol does</h1>
-<p>Made by <code>jaxvol demo</code>. To see a volume file of your own: <code>jaxvol render FILE</code>, and
-<code>jaxvol animate FILE</code>.</p>
-"""
+PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit_found", "fit_true")}
 
 
 def _demo(options: argparse.Namespace) -> None:
-    output_file("--output", options.output / "index.html")
-    width, height = (integer("--size", side, 1) for side in options.size)
-    resolution = integer("--resolution", options.resolution, 8)
-    page = PAGE
+    page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'
     with whole_folder(options.output) as folder:
-        for section, pictures in SECTIONS.items():
-            if section.__name__ not in options.only:
-                continue
-            begun = time.perf_counter()
-            with show_progress(f"compiling and rendering {section.__name__}"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # two images leave open what no image shows
-                section(folder, (width, height), resolution)
-            took = f"{time.perf_counter() - begun:.1f} s"
-            print(f"{options.output}: {', '.join(pictures)} in {took}")
-            images = "".join(f'<img src="{name}.png" alt="{name}">' for name in pictures)
-            code = html.escape(inspect.getsource(section))
-            text = html.escape(inspect.getdoc(section) or "")
-            page += f"<section><p>{text} {took}, compilation included.</p><div>{images}</div>"
-            page += f"<pre>{code}</pre></section>\n"
-        (folder / "index.html").write_text(f"{page}</body></html>\n", encoding="utf-8")
+        for section, pictures in PICTURES.items():
+            print(f"{options.output}: {', '.join(pictures)}", flush=True)
+            section(folder, tuple(options.size), options.resolution)
+            images = "".join(f'<img src="{name}.png" alt="{name}" width="32%"> ' for name in pictures)
+            page += f"{images}<pre>{html.escape(inspect.getsource(section))}</pre>\n"
+        (folder / "index.html").write_text(page, encoding="utf-8")
     print(f"open {options.output / 'index.html'}")
 
 
-_NAMES = tuple(section.__name__ for section in SECTIONS)
-
-DEMO = Command(
-    "demo",
-    "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them",
-    (
-        *SHARED,
-        output("jaxvol-demo", "where to write", "FOLDER"),
-        SIZE,
-        Option("resolution", "voxels per axis of the head", int, default=320),
-        Option("only", "some of the pictures", values="NAME...", default=_NAMES, choices=_NAMES),
-    ),
-    _demo,
-)
+def add_demo(commands: Any) -> None:
+    text = "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them"
+    parser = add_command(commands, "demo", text, _demo)
+    add_output(parser, "jaxvol-demo", "folder to write")
+    add_size(parser)
+    parser.add_argument("--resolution", type=int, default=320, metavar="N", help="voxels along the head")

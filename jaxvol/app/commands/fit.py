@@ -2,19 +2,19 @@
 
 import argparse
 import re
+import sys
 import warnings
 from pathlib import Path
-from typing import get_args
+from typing import Any
 
 from ..._util.checks import output_file
-from ...fitting import ImageResidual, fit, flat_grey, read_transfer, read_views, write_transfer
-from ...fitting.driver import UNDETERMINED, Solver
+from ...fitting import ImageResidual, fit, flat_grey, read_views, write_transfer
+from ...fitting.driver import UNDETERMINED
 from ...fitting.uncertainty import Uncertainty
 from ...march.march import March
 from .data import refuse_to_replace, volume_of
 from .frames import FAST
-from .options import CLIM, DATA, SAMPLING, Command, Option, grouped, output
-from .progress import show_progress
+from .options import add_clim, add_command, add_output, add_sampling, add_volume
 from .scene import background_of
 
 
@@ -23,25 +23,18 @@ def _fit(options: argparse.Namespace) -> None:
     output_file("--output", options.output)
     # these are checked before the volume is read
     views = read_views(options.images, options.cameras)
-    start = read_transfer(options.start) if options.start else None
     background = background_of(options)
-    with show_progress(f"reading {options.file}"):
-        volume = volume_of(options)
-    half_a_voxel = float(volume.spacing.min()) / 2
-    step = half_a_voxel if options.step is None else options.step
+    volume = volume_of(options)
+    step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     march = March(step, FAST, "midpoint")
-    if start is None:
-        start = flat_grey(volume, options.points, options.clim)
-    with show_progress("fitting, steps") as report, warnings.catch_warnings():
+    with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=UNDETERMINED)  # reported below, by point
         result = fit(
             ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
-            start,
-            solver=options.solver,
+            flat_grey(volume, options.points, options.clim),
             max_steps=options.max_steps,
             checkpoint=options.checkpoint,
-            checkpoint_seconds=0,  # Ctrl-C may come at any time, and a checkpoint is small
-            callback=lambda step, parameters, loss: report(step, options.max_steps),
+            callback=_show_step if sys.stderr.isatty() else None,
         )
     path = write_transfer(options.output, result.parameters)
     error = (2 * result.loss) ** 0.5
@@ -54,40 +47,30 @@ def _fit(options: argparse.Namespace) -> None:
         )
 
 
+def _show_step(step: int, parameters: Any, loss: float) -> None:
+    print(f"\rstep {step}, loss {loss:.4g}", end="", file=sys.stderr, flush=True)
+
+
 def _undetermined(found: Uncertainty | None) -> list[int]:
     """Points of a transfer function with numbers that the images do not determine."""
     names = [] if found is None else [name for each in found.undetermined for name in each]
     return sorted({int(index) for name in names for index in re.findall(r"\[(\d+)", name)})
 
 
-_CAMERAS = (
-    "a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
-    "parallel_scale, window"
-)
-
-_CHECKPOINT = "save every step here; resume from here after an interruption"
-
-FIT = Command(
-    "fit",
-    "fit a transfer function to images of a volume",
-    (
-        *DATA,
-        *SAMPLING,
-        Option("images", "sRGB, as PNG", Path, "IMAGE...", required=True),
-        Option("cameras", _CAMERAS, Path, "JSON", required=True),
-        output("transfer.json", "JSON to write"),
-        *grouped(
-            "start",
-            Option("start", "a transfer function written by this command", Path, "JSON"),
-            Option("points", "else, flat grey with this many points", int, default=8),
-            CLIM,
-        ),
-        *grouped(
-            "solver",
-            Option("solver", "how to minimise", default="levenberg_marquardt", choices=get_args(Solver)),
-            Option("max-steps", "at most", int, default=100),
-            Option("checkpoint", _CHECKPOINT, Path, "FILE"),
-        ),
-    ),
-    _fit,
-)
+def add_fit(commands: Any) -> None:
+    parser = add_command(commands, "fit", "fit a transfer function to images of a volume", _fit)
+    add_volume(parser)
+    add_sampling(parser)
+    parser.add_argument("--images", type=Path, nargs="+", metavar="IMAGE", help="sRGB, as PNG")
+    text = (
+        "a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
+        "parallel_scale, window"
+    )
+    parser.add_argument("--cameras", type=Path, metavar="JSON", help=text)
+    add_output(parser, "transfer.json", "JSON to write")
+    text = "of the transfer function, flat grey at first (default: 8)"
+    parser.add_argument("--points", type=int, default=8, metavar="N", help=text)
+    add_clim(parser)
+    parser.add_argument("--max-steps", type=int, default=100, metavar="N", help="at most (default: 100)")
+    text = "save every step here; resume from here after an interruption"
+    parser.add_argument("--checkpoint", type=Path, metavar="FILE", help=text)

@@ -17,7 +17,6 @@ from ...render import PLANNED, render
 from ...scene.camera import Camera
 from ...scene.rendering import Rendering
 from ...scene.volume import Volume
-from .progress import Report, show_progress
 from .scene import Scene
 
 
@@ -35,13 +34,13 @@ class Frames(NamedTuple):
     source: VoxelSource | None
     memory: int | None
 
-    def render(self, camera: Camera, report: Report | None = None) -> Rendering:
-        """One image. `report`: called with the numbers of bricks rendered and to render."""
+    def render(self, camera: Camera) -> Rendering:
+        """One image."""
         how = {"compositing": self.scene.compositing, "lighting": self.lighting}
         if self.source is None:
             found = render(self.volume, self.scene.transfer, camera, self.march, **how)
         else:
-            how |= {"memory": self.memory, "progress": report}
+            how["memory"] = self.memory
             found = render_bricks(self.source, self.scene.transfer, camera, self.march, **how)
         return jax.block_until_ready(found)
 
@@ -58,12 +57,7 @@ def plans_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camera
     if scene.source is not None:
         how["memory"] = options.memory
     tolerance = PLANNED if options.tolerance is None else options.tolerance
-    plans = []
-    with show_progress(f"planning how to render {options.file}") as report:
-        for camera in cameras:
-            plans.append(plan(what, scene.transfer, camera, tolerance, **how))
-            report(len(plans), len(cameras))
-    return plans
+    return [plan(what, scene.transfer, camera, tolerance, **how) for camera in cameras]
 
 
 def frames_of(options: argparse.Namespace, scene: Scene, cameras: Sequence[Camera]) -> Frames:

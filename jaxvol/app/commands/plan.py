@@ -1,9 +1,10 @@
 """`jaxvol plan`: the cheapest way to render a volume file within a tolerance, and why."""
 
 import argparse
+from typing import Any
 
 from .frames import plans_of
-from .options import SCENE, Command
+from .options import add_command, add_scene
 from .scene import scene_of
 
 
@@ -15,9 +16,6 @@ def _plan(options: argparse.Namespace) -> None:
     print(found)
 
 
-PLAN = Command(
-    "plan",
-    "show the cheapest way to render a volume file within a tolerance, and why",
-    SCENE,
-    _plan,
-)
+def add_plan(commands: Any) -> None:
+    text = "show the cheapest way to render a volume file within a tolerance, and why"
+    add_scene(add_command(commands, "plan", text, _plan))

@@ -3,55 +3,43 @@
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
 from ...io.display import image_file, save_image
-from ...scene.camera import Camera
 from ...scene.rendering import Rendering
 from ..empty_image import why_empty
 from .data import refuse_to_replace
 from .frames import Frames, frames_of
-from .options import SCENE, Command, Option, output
-from .orbit import angles_of
-from .progress import show_progress
+from .options import SWITCH, add_command, add_output, add_scene
 from .recorded import text_of
-from .scene import Scene, scene_of
+from .scene import scene_of
 
 
-PLANNED_VIEWS = 4
-"""Views of an orbit, evenly spaced, for which its march is planned."""
-
-
-def render_command(options: argparse.Namespace) -> None:
-    """Render an image, and write it."""
+def _render(options: argparse.Namespace) -> None:
     begun = time.perf_counter()
     refuse_to_replace(options, "output", "depth")
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
-    scene = scene_of(options, turn=options.turn, orbit=options.orbit)
-    camera = scene.view(options.turn)
-    views = [camera] if options.orbit is None else orbit_views(scene, options.orbit)
-    frames = frames_of(options, scene, views)
+    scene = scene_of(options)
+    frames = frames_of(options, scene, [scene.camera])
     ready = time.perf_counter()
-    with show_progress(f"compiling and rendering {options.output}") as report:
-        rendering = frames.render(camera, report)
+    rendering = frames.render(scene.camera)
     ended = time.perf_counter()
     before = "reading and planning" if options.step is None else "reading"
     steps = f"{before} {ready - begun:.2f} s, compiling and rendering {ended - ready:.2f} s"
     _print_facts(options.output, frames, rendering, f"{ended - begun:.2f} s ({steps})")
     image = rendering.rgba if options.transparent else rendering.image(scene.background)
-    text = {}
-    if options.output.suffix.lower() == ".png":
-        text = text_of(RENDER.options, vars(options), scene.transfer)
-    save_image(options.output, image, text=text)
+    is_png = options.output.suffix.lower() == ".png"
+    save_image(options.output, image, text=text_of(options, scene.transfer) if is_png else {})
     if options.depth:
         print(f"{save_image(options.depth, rendering.depth)}: distances, world length")
     if scene.source is None:
-        why = why_empty(frames.volume, scene.transfer, camera, frames.march, rendering, scene.compositing)
-        if why is not None:
+        what = frames.volume, scene.transfer, scene.camera, frames.march, rendering, scene.compositing
+        if (why := why_empty(*what)) is not None:
             print(f"{options.output}: nothing is seen: {why}")
 
 
@@ -69,42 +57,20 @@ def _print_facts(path: Path, frames: Frames, rendering: Rendering, spent: str) -
         bricks = rendering.bricks
         counts = " x ".join(map(str, bricks.counts))
         print(f"{path}: {bricks.loads} of {counts} bricks read, {bricks.bytes_read} bytes")
-        if frames.volume.shape != shape:
-            copy = " x ".join(map(str, frames.volume.shape))
-            what = "transfer function, view, step"
-            print(f"{path}: what was not given ({what}) was chosen by {copy} of the voxels")
     if np.any(rendering.exhausted):
-        print(
-            f"{path}: incomplete: rays used up their {frames.march.most_samples} samples; use a longer step"
-        )
+        most = frames.march.most_samples
+        print(f"{path}: incomplete: rays used up their {most} samples; use a longer step")
 
 
-def orbit_views(scene: Scene, degrees: float) -> list[Camera]:
-    """Views for which the march of an orbit is planned: the same for all of its frames."""
-    return [scene.view(angle) for angle in angles_of(degrees, PLANNED_VIEWS)]
-
-
-_OUTPUT = (
-    "image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32). A .png holds the options "
-    "that made it: see --like"
-)
-
-_TRANSPARENT = "write opacity instead of a background: .png (straight alpha), .tif or .npy (premultiplied)"
-
-_DEPTH = "also write depth, the (mean) distance to what is visible, else infinite: .npy or .tif, float32"
-
-_ORBIT = "plan for all of an orbit of so many degrees, as jaxvol animate does"
-
-RENDER = Command(
-    "render",
-    "render a volume file to an image",
-    (
-        *SCENE,
-        output("out.png", _OUTPUT),
-        Option("transparent", _TRANSPARENT, bool, default=False),
-        Option("depth", _DEPTH, Path, "FILE"),
-        Option("turn", "turn the camera about --axis", float, "DEGREES", 0.0),
-        Option("orbit", _ORBIT, float, "DEGREES"),
-    ),
-    render_command,
-)
+def add_render(commands: Any) -> None:
+    parser = add_command(commands, "render", "render a volume file to an image", _render)
+    add_scene(parser)
+    text = (
+        "image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32). A .png holds the "
+        "options that made it: see --like"
+    )
+    add_output(parser, "out.png", text)
+    text = "write opacity instead of a background: .png (straight alpha), .tif or .npy (premultiplied)"
+    parser.add_argument("--transparent", action=SWITCH, default=False, help=text)
+    text = "also write depth, the (mean) distance to what is visible, else infinite: .npy or .tif, float32"
+    parser.add_argument("--depth", type=Path, metavar="FILE", help=text)

@@ -1,6 +1,7 @@
 """What do the options of a scene mean? What is looked at, how it looks, from where, and what is cut away."""
 
 import argparse
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,6 @@ from ...compositing.isosurface import Isosurface
 from ...compositing.modes import MODES, compositing_of
 from ...compositing.projections import Average
 from ...fitting import read_transfer
-from ...io.formats import says_where_it_lies
 from ...lighting import Lighting, Phong
 from ...march.march import Transform
 from ...march.transforms.clip import Clip
@@ -20,28 +20,13 @@ from ...scene.camera import Camera
 from ...scene.presets import SHADED, colormap, preset
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from ..automatic import (
-    FRONT,
-    automatic_transfer,
-    framed,
-    front_of,
-    labels_shown,
-    transfer_by_copy,
-    upright,
-    visible_points,
-)
+from ..automatic import FRONT, automatic_transfer, framed, labels_shown, transfer_by_copy, visible_points
 from .data import copy_of, middle_of, source_of, volume_of
-from .orbit import angles_of, turned
-from .progress import show_progress
-
-
-FRAMED_VIEWS = 24
-"""Views of an orbit, evenly spaced, in which all that is visible is to be in the picture."""
 
 
 class Scene(NamedTuple):
     """What is looked at, and how. Of a volume that is read in bricks from `source`, `volume` is a copy of
-    every n-th voxel in the same place. `axis`: what the camera turns about."""
+    every n-th voxel in the same place."""
 
     volume: Volume
     transfer: Transfer
@@ -51,41 +36,33 @@ class Scene(NamedTuple):
     background: tuple[float, float, float]
     clip: tuple[Transform, ...]
     source: VoxelSource | None
-    axis: Any
-
-    def view(self, degrees: float) -> Camera:
-        """The camera, turned about the axis."""
-        return turned(self.camera, degrees, self.axis)
 
 
-def scene_of(options: argparse.Namespace, *, turn: float = 0.0, orbit: float | None = None) -> Scene:
-    """The scene that the options describe. The automatic camera shows all that is visible when it is turned
-    by `turn` degrees, or everywhere on an orbit of so many."""
+def scene_of(
+    options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Camera]] = lambda camera: [camera]
+) -> Scene:
+    """The scene that the options describe. `orbit`: the views of a camera that turns, in which the automatic
+    camera shows all that is visible."""
     mode, background, clip = _compositing(options), background_of(options), _clip(options)
-    automatic, source, points = is_automatic(options), None, None
-    with show_progress(f"reading {options.file}"):
-        if options.memory is None:
-            volume = volume_of(options)
-            shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
-            volume, transfer = shown
-        else:
-            source = source_of(options)
-            volume = copy_of(source, options.memory)
-            transfer = transfer_of(options, volume, middle_of(source) if automatic else None)
-        if automatic:
-            points = visible_points(volume, transfer)
+    automatic, source = is_automatic(options), None
+    if options.memory is None:
+        volume = volume_of(options)
+        shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
+        volume, transfer = shown
+    else:
+        source = source_of(options)
+        volume = copy_of(source, options.memory)
+        transfer = transfer_of(options, volume, middle_of(source) if automatic else None)
     camera = _camera(options, volume)
-    axis = next(v for v in (options.axis, options.view_up, camera.view_up) if v is not None)
-    if points is not None and options.camera is None:
-        angles = [turn] if orbit is None else angles_of(orbit, FRAMED_VIEWS)
-        camera = framed(camera, points, [turned(camera, angle, axis) for angle in angles])
+    if automatic and options.camera is None:
+        camera = framed(camera, visible_points(volume, transfer), orbit(camera))
     camera = camera.zoom(options.zoom)
-    return Scene(volume, transfer, camera, mode, _lighting(options, mode), background, clip, source, axis)
+    return Scene(volume, transfer, camera, mode, _lighting(options, mode), background, clip, source)
 
 
 def is_automatic(options: argparse.Namespace) -> bool:
     """Whether nothing is said of the transfer function."""
-    names = ("preset", "cmap", "transfer", "recorded_transfer", "opacity", "clim", "unit_distance")
+    names = ("preset", "cmap", "transfer", "recorded_transfer", "clim", "unit_distance")
     return options.compositing == "over" and all(getattr(options, name) is None for name in names)
 
 
@@ -142,23 +119,19 @@ def transfer_of(
         return preset(options.preset, options.clim, unit)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
-    return colormap(cmap, clim, options.opacity or "linear", unit)
+    return colormap(cmap, clim, unit_distance=unit)
 
 
 def _camera(options: argparse.Namespace, volume: Volume) -> Camera:
     """Where the volume is looked at from, all of it unless the position is given."""
-    up, side = options.view_up, options.direction
-    free = up is side is options.camera is None
-    if free and not says_where_it_lies(options.file) and (found := upright(volume)) is not None:
-        up, side = found, front_of(found)
     view: dict[str, Any] = {
-        "view_up": (0.0, 0.0, 1.0) if up is None else up,
+        "view_up": options.view_up,
         "view_angle": options.view_angle,
         "size": tuple(options.size),
     }
     if options.camera:
         return Camera(options.camera[:3], options.camera[3:], **view)
-    return Camera.looking_at(volume, FRONT if side is None else side, parallel=options.parallel, **view)
+    return Camera.looking_at(volume, options.direction or FRONT, parallel=options.parallel, **view)
 
 
 def _clip(options: argparse.Namespace) -> tuple[Transform, ...]:

@@ -3,10 +3,11 @@
 import argparse
 import threading
 import webbrowser
+from typing import Any
 
 from ..viewer import serve
 from .data import volume_of
-from .options import DATA, TRANSFER, Command, Option
+from .options import SWITCH, add_command, add_transfer, add_volume
 from .scene import is_automatic, transfer_of
 
 
@@ -20,15 +21,13 @@ def _view(options: argparse.Namespace) -> None:
     threading.Event().wait()
 
 
-VIEW = Command(
-    "view",
-    "look at a volume file in the browser; only this machine can connect, and Ctrl-C ends it",
-    (
-        *DATA,
-        *TRANSFER,
-        Option("shade", "with light at first", bool, default=True),
-        Option("port", "of the page, or the next free one", int, default=8080),
-        Option("browser", "open it", bool, default=True),
-    ),
-    _view,
-)
+def add_view(commands: Any) -> None:
+    text = "look at a volume file in the browser; only this machine can connect, and Ctrl-C ends it"
+    parser = add_command(commands, "view", text, _view)
+    add_volume(parser)
+    add_transfer(parser)
+    parser.add_argument("--shade", action=SWITCH, default=True, help="with light at first")
+    parser.add_argument(
+        "--port", type=int, default=8080, help="of the page (default: 8080, or the next free)"
+    )
+    parser.add_argument("--browser", action=SWITCH, default=True, help="open it")

@@ -39,22 +39,18 @@ def view(
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
-    return. Beside the image are window and level, the points of the transfer function in front of the
-    volume's histogram, or its labels, the step, and every transform and the light to be turned on and off.
-    While something changes, the image is as coarse as it must be to follow within some 150 ms; at rest it has
-    all pixels. Its time, its step and an estimate of its error are shown live. It needs
-    `pip install jaxvol[notebooks]`.
-
-    The first image, and the first one with another set of transforms, is compiled, which takes seconds;
-    compiled programs are kept for the next time, as by `keep_programs`.
+    return. Beside the image are window and level, the volume's histogram, the points of the transfer
+    function, or its labels, the step, and every transform and the light to be turned on and off. While
+    something changes, the image is as coarse as it must be to follow within some 150 ms; at rest it has all
+    pixels. Its time, its step and an estimate of its error are shown live. It needs
+    `pip install jaxvol[notebooks]`. Programs that are compiled are kept, as by `keep_programs`.
 
     **Arguments:**
 
     - `volume`: what is looked at.
-    - `transfer`: a `TransferFunction`, by default one that is found from the volume's values; one of 16
-      points or fewer can be edited point by point. A `TransferFunction2D` is moved and stretched along the
-      values. Labels of a `LabelTransferFunction` are hidden, and made fainter or denser; such a one is the
-      default for voxels that seem to be labels, each in its own colour.
+    - `transfer`: a `TransferFunction`, of which up to 16 points can be edited; a `LabelTransferFunction`,
+      whose labels can be hidden, and made fainter or denser; or a `TransferFunction2D`, which is not edited.
+      By default one that is found from the volume's values; voxels that seem to be labels get a colour each.
     - `camera`: by default one that sees the whole volume, or, without a transfer function, what is visible of
       it. Its size does not count.
     - `march`: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
@@ -69,9 +65,8 @@ def view(
     **Returns:** a widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a
     widget `v` renders what it shows.
 
-    **Raises:** `ValueError` as `render` does, for another kind of transfer function, an orthographic camera,
-    a step below 1/16 of a voxel or above 16 voxels, and a background that is not linear RGB; `ImportError` if
-    rendercanvas or ipywidgets are missing.
+    **Raises:** `ValueError` as `render` does, and for what it cannot show: another kind of transfer function,
+    an orthographic camera, other steps or backgrounds; `ImportError` without rendercanvas or ipywidgets.
     """
     try:
         from .notebook import NotebookView
@@ -101,9 +96,8 @@ def serve(
     What a browser sends are numbers and colors of controls; nothing of it is evaluated or used as a path. It
     needs `pip install jaxvol[view]`.
 
-    **Arguments:** as for `view`, except:
+    **Arguments:** as for `view`, and:
 
-    - `volume`, `transfer`, `camera`, `march`, `lighting`, `lit`, `compositing`, `background`: the same.
     - `port`: from 1 to 65535; if it is taken, the next free one.
     - `title`: of the page's panel.
 

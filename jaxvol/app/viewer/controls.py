@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ...scene.labels import LabelTransferFunction
+from ...scene.transfer2d import TransferFunction2D
 from . import editing
 from .model import Model
 from .state import MAX_STEP, MIN_STEP
@@ -17,57 +18,21 @@ MAX_LABEL_OPACITY = 4.0
 
 
 @dataclass(frozen=True)
-class Html:
-    """Something to look at. `get`: its text now."""
+class Control:
+    """Something to look at ("html") or to change.
 
-    get: Callable[[], str]
+    - `get`: what it shows now: a text, a number, True or False, or a color: sRGB, `#rrggbb`.
+    - `set`: changes the model; of buttons, called with the text of one.
+    - `limits`: of a slider, lowest and highest number and the step between two.
+    - `choices`: of a dropdown or buttons, the texts that there are now.
+    """
 
-
-@dataclass(frozen=True)
-class Buttons:
-    """Several in a row. `press`: called with the text of one."""
-
-    label: str
-    options: tuple[str, ...]
-    press: Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Field:
-    """A number, True or False, or a color: sRGB, `#rrggbb`. `get`: what it is now. `set`: changes it."""
-
-    kind: Literal["number", "checkbox", "color"]
-    label: str
-    get: Callable[[], Any]
-    set: Callable[[Any], None]
-
-
-@dataclass(frozen=True)
-class Slider:
-    """A number from `low` to `high`, in steps; `logarithmic` where the face has such sliders."""
-
-    label: str
-    get: Callable[[], float]
-    set: Callable[[float], None]
-    low: float
-    high: float
-    step: float
-    logarithmic: bool = False
-
-
-@dataclass(frozen=True)
-class Dropdown:
-    """One of some texts. `options`: those that there are now."""
-
-    label: str
-    get: Callable[[], str]
-    set: Callable[[str], None]
-    options: Callable[[], list[str]]
-
-
-Input = Field | Slider | Dropdown
-
-Control = Html | Buttons | Input
+    kind: Literal["html", "buttons", "number", "checkbox", "color", "slider", "log slider", "dropdown"]
+    label: str = ""
+    get: Callable[[], Any] = str
+    set: Callable[[Any], None] = lambda value: None
+    limits: tuple[float, float, float] = (0.0, 1.0, 0.001)
+    choices: Callable[[], list[str]] = list
 
 
 def controls_of(model: Model) -> dict[str, list[Control]]:
@@ -89,10 +54,11 @@ class _TransferControls:
     def controls(self) -> list[Control]:
         if isinstance(self.transfer, LabelTransferFunction):
             return self._label()
+        if isinstance(self.transfer, TransferFunction2D):
+            return [Control("html", get=lambda: "a function of value and gradient, not edited here")]
         if editing.has_editable_points(self.transfer):
             return [*self._range(), *self._point()]
-        points = " x ".join(map(str, self.transfer.extinction.shape))
-        return [*self._range(), Html(lambda: f"{points} points, not edited one by one")]
+        return self._range()
 
     @property
     def transfer(self) -> Any:
@@ -102,11 +68,11 @@ class _TransferControls:
         """Replace the transfer function by `change(transfer, *arguments)`."""
         self.model.apply(lambda state: replace(state, transfer=change(state.transfer, *arguments)))
 
-    def _choice(self, label: str, options: Callable[[], list[str]]) -> Dropdown:
-        def choose(option: str) -> None:
-            self.chosen = options().index(option)
+    def _choice(self, label: str, choices: Callable[[], list[str]]) -> Control:
+        def choose(choice: str) -> None:
+            self.chosen = choices().index(choice)
 
-        return Dropdown(label, lambda: options()[self.chosen], choose, options)
+        return Control("dropdown", label, lambda: choices()[self.chosen], choose, choices=choices)
 
     def _range(self) -> list[Control]:
         """The histogram behind the transfer function, and window and level."""
@@ -118,22 +84,20 @@ class _TransferControls:
             return editing.window_level(self.transfer)[index]
 
         return [
-            Html(lambda: histogram.plot(self.transfer, voxel)),
-            Slider(
+            Control("html", get=lambda: histogram.plot(self.transfer, voxel)),
+            Control(
+                "slider",
                 "window",
                 lambda: get(0),
                 lambda value: self.edit(editing.with_window_level, value, get(1)),
-                low=min(width / 100, window),
-                high=4 * width,
-                step=width / 100,
+                limits=(min(width / 100, window), 4 * width, width / 100),
             ),
-            Slider(
+            Control(
+                "slider",
                 "level",
                 lambda: get(1),
                 lambda value: self.edit(editing.with_window_level, get(0), value),
-                low=level - window / 2 - width,
-                high=level + window / 2 + width,
-                step=width / 100,
+                limits=(level - window / 2 - width, level + window / 2 + width, width / 100),
             ),
         ]
 
@@ -154,27 +118,25 @@ class _TransferControls:
 
         return [
             self._choice("point", names),
-            Field(
+            Control(
                 "number",
                 "value",
                 lambda: value(self.chosen),
                 lambda value: self.edit(editing.with_value, self.chosen, value),
             ),
-            Field(
+            Control(
                 "color",
                 "color",
-                lambda: editing.point_color(self.transfer, self.chosen),
+                lambda: editing.display_color(np.asarray(self.transfer.colors)[self.chosen]),
                 lambda color: self.edit(editing.with_color, self.chosen, color),
             ),
-            Slider(
+            Control(
+                "slider",
                 "opacity",
                 lambda: float(editing.opacities(self.transfer, voxel)[self.chosen]),
                 lambda opacity: self.edit(editing.with_opacity, self.chosen, opacity, voxel),
-                low=0.0,
-                high=1.0,
-                step=0.001,
             ),
-            Buttons("points", ("add behind", "remove"), add_or_remove),
+            Control("buttons", "points", set=add_or_remove, choices=lambda: ["add behind", "remove"]),
         ]
 
     def _label(self) -> list[Control]:
@@ -185,25 +147,27 @@ class _TransferControls:
             color = editing.label_color(self.transfer, labels[self.chosen])
             return f'<div style="background: {color}; height: 14px"></div>'
 
+        def get(name: str) -> float:
+            return float(np.asarray(getattr(self.transfer, name))[labels[self.chosen]])
+
         def change(function: Callable[..., Any]) -> Callable[[Any], None]:
             return lambda value: self.edit(function, {labels[self.chosen]: value})
 
         return [
             self._choice("label", lambda: [str(label) for label in labels]),
-            Html(swatch),
-            Field(
+            Control("html", get=swatch),
+            Control(
                 "checkbox",
                 "shown",
-                lambda: bool(np.asarray(self.transfer.shown)[labels[self.chosen]]),
+                lambda: bool(get("shown")),
                 change(LabelTransferFunction.with_visibility),
             ),
-            Slider(
+            Control(
+                "slider",
                 "opacity",
-                lambda: min(float(np.asarray(self.transfer.opacity)[labels[self.chosen]]), MAX_LABEL_OPACITY),
+                lambda: min(get("opacity"), MAX_LABEL_OPACITY),
                 change(LabelTransferFunction.with_opacity),
-                low=0.0,
-                high=MAX_LABEL_OPACITY,
-                step=0.05,
+                limits=(0.0, MAX_LABEL_OPACITY, 0.05),
             ),
         ]
 
@@ -211,22 +175,20 @@ class _TransferControls:
 def _march_controls(model: Model) -> list[Control]:
     """Step, transforms, light."""
 
-    def switch(name: str) -> Field:
+    def switch(name: str) -> Control:
         def turn(on: bool) -> None:
             enabled = model.state.enabled - {name}
             model.change(enabled=enabled | {name} if on else enabled)
 
-        return Field("checkbox", name, lambda: name in model.state.enabled, turn)
+        return Control("checkbox", name, lambda: name in model.state.enabled, turn)
 
-    step = Slider(
-        "step (voxels)",
-        lambda: model.state.step,
-        lambda step: model.change(step=min(max(step, MIN_STEP), MAX_STEP)),
-        low=MIN_STEP,
-        high=MAX_STEP,
-        step=MIN_STEP,
-        logarithmic=True,
-    )
-    light = Field("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
-    is_lightable = model.scene.lighting is not None
-    return [step, *map(switch, model.scene.transform_names), *([light] if is_lightable else [])]
+    def set_step(step: float) -> None:
+        model.change(step=min(max(step, MIN_STEP), MAX_STEP))
+
+    limits = (MIN_STEP, MAX_STEP, MIN_STEP)
+    step = Control("log slider", "step (voxels)", lambda: model.state.step, set_step, limits)
+    switches = [switch(type(transform).__name__) for transform in model.scene.transforms]
+    if model.scene.lighting is not None:
+        light = Control("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
+        switches.append(light)
+    return [step, *switches]

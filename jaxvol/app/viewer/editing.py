@@ -1,56 +1,42 @@
 """How do a viewer's controls change a transfer function?"""
 
 import math
-from typing import Any, TypeVar
+from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import to_hex, to_rgb
 
-from ..._util.checks import increasing
 from ..._util.srgb import from_srgb, to_srgb
 from ...scene.labels import LabelTransferFunction
 from ...scene.transfer import TransferFunction, extinction_of
-from ...scene.transfer2d import TransferFunction2D
 
 
 MAX_POINTS = 16
 """Control points that a viewer edits. All transfer functions of so many points or fewer are padded to it, so
 that one program renders them all."""
 
-EditableTransfer = TransferFunction | TransferFunction2D | LabelTransferFunction
-
-T = TypeVar("T", TransferFunction, TransferFunction2D)
+POINTS = "values", "colors", "extinction"
 
 
-def window_level(transfer: TransferFunction | TransferFunction2D) -> tuple[float, float]:
+def window_level(transfer: TransferFunction) -> tuple[float, float]:
     """Width and middle of the range of values between the first point and the last."""
-    values = np.asarray(transfer.values, np.float64)
-    low, high = float(values[0]), float(values[-1])
+    low, high = np.asarray(transfer.values, np.float64)[[0, -1]].tolist()
     return high - low, (low + high) / 2
 
 
-def with_window_level(transfer: T, window: float, level: float) -> T:
-    """The same function, its values moved and stretched to another range. Two values may have a window of 0,
-    a step; a wider one makes a ramp of it.
-
-    **Raises:** `ValueError` for a window that is not positive, or 0 for more than two values, and numbers
-    that are not finite."""
-    values = np.asarray(transfer.values, np.float64)
-    wide_enough = window >= 0 if len(values) == 2 else window > 0
-    if not (math.isfinite(level) and math.isfinite(window) and wide_enough):
-        raise ValueError(f"window must be above 0, and level a number; got {window} and {level}.")
+def with_window_level(transfer: TransferFunction, window: float, level: float) -> TransferFunction:
+    """The same function, its values moved and stretched to another range. **Raises** `ValueError` for a
+    window or a level that leaves no increasing, finite values."""
     old_window, old_level = window_level(transfer)
-    relative = (values - old_level) / old_window if old_window else np.array([-0.5, 0.5])
-    moved = increasing("values", level + window * relative)
-    return eqx.tree_at(lambda t: t.values, transfer, moved)
+    relative = (np.asarray(transfer.values, np.float64) - old_level) / (old_window or 1.0)
+    return _with_points(transfer, values=level + window * relative)
 
 
-def has_editable_points(transfer: EditableTransfer) -> bool:
-    """Whether its points can be edited one by one: it depends on the value alone, and has few of them."""
-    return isinstance(transfer, TransferFunction) and len(transfer.values) <= MAX_POINTS
+def has_editable_points(transfer: TransferFunction) -> bool:
+    """Whether it has few enough points to be edited one by one."""
+    return len(transfer.values) <= MAX_POINTS
 
 
 def opacities(transfer: TransferFunction, unit_distance: float) -> Float[np.ndarray, " n"]:
@@ -64,11 +50,6 @@ def display_color(linear: Float[np.ndarray, "3"]) -> str:
     return to_hex((r, g, b))
 
 
-def point_color(transfer: TransferFunction, index: int) -> str:
-    """sRGB at a point, `#rrggbb`."""
-    return display_color(np.asarray(transfer.colors)[index])
-
-
 def with_value(transfer: TransferFunction, index: int, value: float) -> TransferFunction:
     """With a point moved, no farther than to its neighbours."""
     values = np.array(transfer.values, np.float64)
@@ -76,25 +57,21 @@ def with_value(transfer: TransferFunction, index: int, value: float) -> Transfer
     low = values[index - 1] + gap if index else -math.inf
     high = values[index + 1] - gap if index + 1 < len(values) else math.inf
     values[index] = np.clip(value, low, high)
-    return eqx.tree_at(lambda t: t.values, transfer, increasing("values", values))
+    return _with_points(transfer, values=values)
 
 
 def with_color(transfer: TransferFunction, index: int, color: str) -> TransferFunction:
     """With another colour at a point: sRGB, as matplotlib takes it."""
-    colors = np.array(transfer.colors)
-    colors[index] = from_srgb(np.asarray(to_rgb(color)))
-    return eqx.tree_at(lambda t: t.colors, transfer, jnp.asarray(colors))
+    linear = jnp.asarray(from_srgb(np.asarray(to_rgb(color))))
+    return _with_points(transfer, colors=jnp.asarray(transfer.colors).at[index].set(linear))
 
 
 def with_opacity(
     transfer: TransferFunction, index: int, opacity: float, unit_distance: float
 ) -> TransferFunction:
-    """With another opacity at a point, of a layer of this thickness.
-
-    **Raises:** `ValueError` for one outside [0, 1]."""
-    extinction = np.array(transfer.extinction)
-    extinction[index] = np.asarray(extinction_of([opacity], unit_distance))[0]
-    return eqx.tree_at(lambda t: t.extinction, transfer, jnp.asarray(extinction))
+    """With another opacity in [0, 1] at a point, of a layer of this thickness."""
+    extinction = extinction_of([opacity], unit_distance)[0]
+    return _with_points(transfer, extinction=jnp.asarray(transfer.extinction).at[index].set(extinction))
 
 
 def with_point_after(transfer: TransferFunction, index: int) -> TransferFunction:
@@ -102,32 +79,28 @@ def with_point_after(transfer: TransferFunction, index: int) -> TransferFunction
 
     **Raises:** `ValueError` where there is no next point, or as many as there may be, and in a step."""
     values = np.asarray(transfer.values)
-    if index + 1 == len(values) or len(values) >= MAX_POINTS:
+    is_last = index + 1 == len(values)
+    if is_last or len(values) >= MAX_POINTS or values[index] == values[index + 1]:
         raise ValueError(f"there is no room for another of {MAX_POINTS} points behind point {index + 1}.")
-    if values[index] == values[index + 1]:
-        raise ValueError(
-            f"there is no room for another point in a step: two are at {values[index]:g} already."
-        )
-    points = map(np.asarray, _points(transfer))
+    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
     between = (np.insert(p, index + 1, (p[index] + p[index + 1]) / 2, axis=0) for p in points)
-    return _with_points(transfer, *between)
+    return TransferFunction(*between)
 
 
 def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
-    """Without a point.
-
-    **Raises:** `ValueError` where only two are left."""
+    """Without a point, of which at least two remain."""
     if len(transfer.values) <= 2:
         raise ValueError("a transfer function has at least 2 points.")
-    return _with_points(transfer, *(np.delete(np.asarray(p), index, axis=0) for p in _points(transfer)))
+    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
+    return TransferFunction(*(np.delete(p, index, axis=0) for p in points))
 
 
 def padded(transfer: Any) -> Any:
     """The same function by `MAX_POINTS` points where there are fewer: beyond the last one it is constant."""
-    if type(transfer) is not TransferFunction or not has_editable_points(transfer):
+    if not isinstance(transfer, TransferFunction) or not has_editable_points(transfer):
         return transfer
     missing = MAX_POINTS - len(transfer.values)
-    values, colors, extinction = map(np.asarray, _points(transfer))
+    values, colors, extinction = (np.asarray(getattr(transfer, name)) for name in POINTS)
     step = max(window_level(transfer)[0] or 1.0, 1e-3 * abs(float(values[-1])))
     return TransferFunction(
         np.append(values, values[-1] + step * np.arange(1, missing + 1)),
@@ -143,17 +116,9 @@ def labels_of(transfer: LabelTransferFunction) -> list[int]:
 
 def label_color(transfer: LabelTransferFunction, label: int) -> str:
     """sRGB of a label where it is densest, `#rrggbb`."""
-    colors, extinction = (
-        np.asarray(leaf)[label] for leaf in (transfer.stacked.colors, transfer.stacked.extinction)
-    )
-    return display_color(colors[np.argmax(extinction)])
+    densest = np.argmax(np.asarray(transfer.stacked.extinction)[label])
+    return display_color(np.asarray(transfer.stacked.colors)[label, densest])
 
 
-def _with_points(transfer: TransferFunction, values: Any, colors: Any, extinction: Any) -> TransferFunction:
-    """With other control points, once they are checked; of the same class."""
-    checked = TransferFunction(values, colors, extinction)
-    return eqx.tree_at(_points, transfer, _points(checked))
-
-
-def _points(transfer: TransferFunction) -> tuple[Any, Any, Any]:
-    return transfer.values, transfer.colors, transfer.extinction
+def _with_points(transfer: TransferFunction, **changed: Any) -> TransferFunction:
+    return TransferFunction(**{name: getattr(transfer, name) for name in POINTS} | changed)

@@ -15,7 +15,7 @@ from ...march.march import March
 from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from .controls import Buttons, Control, Dropdown, Field, Html, Input, controls_of
+from .controls import Control, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Scene, State
 from .tiles import Pixels
@@ -52,7 +52,7 @@ class NotebookView(ipywidgets.HBox):
         self.model = Model(scene, state, self._show, self._tell)
         self._first = state
         self._pointer: tuple[float, float] | None = None
-        self._widgets: list[tuple[Any, Html | Input]] = []
+        self._widgets: list[tuple[Any, Control]] = []
         self._updating = False
         self.children = (self.canvas, ipywidgets.VBox(self._controls(), layout={"margin": "0 0 0 12px"}))
         self.model.ask(state)
@@ -132,20 +132,17 @@ class NotebookView(ipywidgets.HBox):
         shown: list[ipywidgets.Widget] = [self._status]
         for heading, controls in controls_of(self.model).items():
             shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
-        reset = Buttons("", ("reset view",), self._reset)
-        return [*shown, self._widget(reset)]
+        return shown
 
     def _widget(self, control: Control) -> ipywidgets.Widget:
         """A widget that shows what a control describes, and changes the model."""
-        if isinstance(control, Buttons):
-            buttons = [ipywidgets.Button(description=text) for text in control.options]
+        if control.kind == "buttons":
+            buttons = [ipywidgets.Button(description=text) for text in control.choices()]
             for button in buttons:
-                button.on_click(lambda pressed: self._change(control.press, pressed.description))
+                button.on_click(lambda pressed: self._change(control.set, pressed.description))
             return ipywidgets.HBox(buttons)
-        if isinstance(control, Html):
-            widget = ipywidgets.HTML(control.get(), layout=WIDE)
-        else:
-            widget = _input_widget(control)
+        widget = _widget_of_value(control)
+        if control.kind != "html":
             widget.observe(lambda event: self._change(control.set, event["new"]), "value")
         self._widgets.append((widget, control))
         return widget
@@ -158,40 +155,37 @@ class NotebookView(ipywidgets.HBox):
         self._updating = True
         try:
             for widget, control in self._widgets:
-                if isinstance(control, Dropdown):
-                    widget.options = control.options()
+                if control.kind == "dropdown":
+                    widget.options = control.choices()
                 widget.value = control.get()
         finally:
             self._updating = False
 
 
-def _input_widget(control: Input) -> Any:
-    how: dict[str, Any] = {"value": control.get(), "description": control.label, "layout": WIDE}
-    if isinstance(control, Field) and control.kind == "checkbox":
+def _widget_of_value(control: Control) -> Any:
+    how: dict[str, Any] = {"value": control.get(), "layout": WIDE}
+    if control.kind == "html":
+        return ipywidgets.HTML(**how)
+    how["description"] = control.label
+    if control.kind == "checkbox":
         return ipywidgets.Checkbox(indent=False, **how)
     how["style"] = LABEL
-    if isinstance(control, Field):
-        return {"number": ipywidgets.FloatText, "color": ipywidgets.ColorPicker}[control.kind](**how)
-    if isinstance(control, Dropdown):
-        return ipywidgets.Dropdown(options=control.options(), **how)
-    if control.logarithmic:
-        low, high = math.log2(control.low), math.log2(control.high)
-        return ipywidgets.FloatLogSlider(base=2, min=low, max=high, step=0.25, **how)
-    limits = {"min": control.low, "max": control.high, "step": control.step}
-    return ipywidgets.FloatSlider(readout_format=".4g", **limits, **how)
+    low, high, step = control.limits
+    if control.kind == "dropdown":
+        return ipywidgets.Dropdown(options=control.choices(), **how)
+    if control.kind == "log slider":
+        return ipywidgets.FloatLogSlider(base=2, min=math.log2(low), max=math.log2(high), step=0.25, **how)
+    if control.kind == "slider":
+        return ipywidgets.FloatSlider(min=low, max=high, step=step, readout_format=".4g", **how)
+    return (ipywidgets.FloatText if control.kind == "number" else ipywidgets.ColorPicker)(**how)
 
 
 class PromptCanvas(RenderCanvas):
     """Calls handlers of events at once, and sends an image as soon as fewer than two wait for the browser.
 
-    rendercanvas does both at ticks of a scheduler, at most `max_fps` a second, and none while an image waits
-    for the browser: some 10 ms for the event, and as many for the image, of the 150 in which a coarse image
-    is to follow the pointer. It sends what has been shown for 0.3 s once more, without loss, and its
-    compression holds up events for 25 ms; here images are sent once, as JPEG, those that are to stay in a
-    better quality. Its browser's part keeps a move of the pointer back for 20 ms, to join it with those that
-    follow; there is no need for this, since a newer request replaces an older one.
-
-    `pixels`: of the next image.
+    rendercanvas does both at ticks of a scheduler, sends each image once more without loss, and its browser's
+    part keeps moves of the pointer back for 20 ms: too long for a coarse image that is to follow within
+    150 ms. `pixels`: of the next image.
     """
 
     _esm = RenderCanvas._esm.replace("setThrottle(20)", "setThrottle(0)")

@@ -14,7 +14,7 @@ import viser
 from matplotlib.colors import to_rgb
 from websockets.exceptions import ConnectionClosed
 
-from .controls import Buttons, Control, Dropdown, Html, Input, Slider, controls_of
+from .controls import Control, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .orbit import Orbit
 from .state import Scene, State
@@ -147,42 +147,40 @@ class _Panel:
         async def changed(event: Any) -> None:
             if event.client is None:  # changed by `_update`
                 return
-            if isinstance(control, Buttons):
-                control.press(widget.value)
-            elif isinstance(control, Input):
-                control.set(_from_viser(widget.value))
+            control.set(_from_viser(widget.value))
             for each in self._widgets:
                 _update(*each)
 
-        if isinstance(control, Buttons):
+        if control.kind == "buttons":
             widget.on_click(changed)
-        elif isinstance(control, Input):
+        elif control.kind != "html":
             widget.on_update(changed)
 
 
 def _widget(gui: viser.GuiApi, control: Control) -> Any:
-    if isinstance(control, Html):
+    if control.kind == "html":
         return gui.add_html(control.get())
-    if isinstance(control, Buttons):
-        return gui.add_button_group(control.label, control.options)
+    if control.kind == "buttons":
+        return gui.add_button_group(control.label, tuple(control.choices()))
     label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
     value = _to_viser(control.get())
-    if isinstance(control, Slider):
-        return gui.add_slider(label, control.low, control.high, control.step, value)
-    if isinstance(control, Dropdown):
-        return gui.add_dropdown(label, tuple(control.options()), initial_value=value)
+    if control.kind in ("slider", "log slider"):
+        return gui.add_slider(label, *control.limits, value)
+    if control.kind == "dropdown":
+        return gui.add_dropdown(label, tuple(control.choices()), initial_value=value)
     add = {"number": gui.add_number, "checkbox": gui.add_checkbox, "color": gui.add_rgb}[control.kind]
     return add(label, value)
 
 
 def _update(widget: Any, control: Control) -> None:
     """Let a widget show what the model has."""
-    if isinstance(control, Html):
-        widget.content = control.get()
-    if not isinstance(control, Input):
+    if control.kind == "buttons":
         return
-    if isinstance(control, Dropdown):
-        widget.options = control.options()
+    if control.kind == "html":
+        widget.content = control.get()
+        return
+    if control.kind == "dropdown":
+        widget.options = control.choices()
     value = _to_viser(control.get())
     # what only rounding has changed is not sent back, or a slider would lag behind in a drag
     if not (isinstance(value, float) and math.isclose(value, widget.value, rel_tol=1e-5)):

@@ -22,23 +22,24 @@ from ...march.transforms import (
 )
 from ...ray import check_arguments
 from ...scene.camera import Camera
+from ...scene.labels import LabelTransferFunction
 from ...scene.occupancy import BLOCK
 from ...scene.space import median_node_distance
+from ...scene.transfer import TransferFunction
+from ...scene.transfer2d import TransferFunction2D
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, framed, labels_shown, visible_points
-from .editing import EditableTransfer
 from .histogram import Histogram
 from .orbit import Orbit
 
 
-MIN_STEP, MAX_STEP = 1 / 16, 16.0
-"""Voxels."""
-
-DEFAULT_STEP = 0.5
-"""Voxels between the samples of a fine image where no march is given."""
+MIN_STEP, MAX_STEP, DEFAULT_STEP = 1 / 16, 16.0, 0.5
+"""Voxels; the last where no march is given."""
 
 ENABLED = AlphaCorrection, SpaceLeaping, EarlyTermination
 """Transforms that are applied where no march is given."""
+
+ViewedTransfer = TransferFunction | TransferFunction2D | LabelTransferFunction
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class State:
 
     orbit: Orbit
     size: tuple[int, int]
-    transfer: EditableTransfer
+    transfer: ViewedTransfer
     step: float
     enabled: frozenset[str]
     lit: bool
@@ -80,10 +81,6 @@ class Scene:
     background: tuple[float, float, float]
     histogram: Histogram
 
-    @property
-    def transform_names(self) -> tuple[str, ...]:
-        return tuple(type(transform).__name__ for transform in self.transforms)
-
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
         enabled = tuple(t for t in self.transforms if type(t).__name__ in state.enabled)
@@ -97,7 +94,7 @@ class Scene:
 
 def initial(
     volume: Volume | Any,
-    transfer: EditableTransfer | Any | None,
+    transfer: ViewedTransfer | Any | None,
     camera: Camera | Any | None,
     march: March | Any | None,
     *,
@@ -107,28 +104,18 @@ def initial(
     background: Any,
     size: tuple[int, int] | Any,
 ) -> tuple[Scene, State]:
-    """What is viewed, and how at first. Arguments as for `view`.
-
-    **Raises:** `ValueError` as `render` does, for a transfer function that is no `EditableTransfer`, an
-    orthographic camera, a march whose step is below `MIN_STEP` or above `MAX_STEP` voxels, and a background
-    that is not linear RGB."""
-    if not isinstance(transfer, EditableTransfer | None):
-        kinds = " or ".join(kind.__name__ for kind in get_args(EditableTransfer))
+    """What is viewed, and how at first. Arguments and errors as for `view`."""
+    if not isinstance(transfer, ViewedTransfer | None):
+        kinds = " or ".join(kind.__name__ for kind in get_args(ViewedTransfer))
         raise ValueError(f"the viewer shows a {kinds}; got {described(transfer)}.")
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
     seen: Any = whole if camera is None else camera
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
         seen = framed(seen, visible_points(volume, transfer)) if camera is None else seen
-    given = March(1.0) if march is None else march
-    check_arguments(
-        "view(volume, transfer, camera, march)",
-        volume=volume,
-        transfer=transfer,
-        camera=seen,
-        march=given,
-        lighting=lighting,
-    )
+    given = March(1.0, (), "midpoint") if march is None else march
+    names = {"volume": volume, "transfer": transfer, "camera": seen, "march": given, "lighting": lighting}
+    check_arguments("view(volume, transfer, camera, march)", **names)
     mode = compositing_of(compositing)
     mode.marched(transfer, given, volume)  # refuses what it cannot show
     can_be_lit = not isinstance(mode, Average)
@@ -137,37 +124,12 @@ def initial(
     r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = float(median_node_distance(given.locate(volume), blocks))
-    step = DEFAULT_STEP if march is None else float(march.step) / voxel
+    step = DEFAULT_STEP if march is None else float(given.step) / voxel
     if not MIN_STEP <= step <= MAX_STEP:
         raise ValueError(
             f"march must have a step from {MIN_STEP * voxel:.4g} to {MAX_STEP * voxel:.4g}, {MIN_STEP:g} to "
             f"{MAX_STEP:g} voxels, to be shown; got one of {float(given.step):.4g}, {step:.4g} voxels."
         )
-    scene = Scene(
-        volume,
-        transforms=_transforms(given),
-        lighting=Phong() if lighting is None and can_be_lit else lighting,
-        quadrature="midpoint" if march is None else given.quadrature,
-        max_samples=given.max_samples,
-        voxel=voxel,
-        compositing=mode,
-        background=(r, g, b),
-        histogram=Histogram.of(volume),
-    )
-    enabled = ENABLED if march is None else map(type, given.transforms)
-    state = State(
-        orbit=Orbit.of(seen),
-        size=whole.size,
-        transfer=transfer,
-        step=step,
-        enabled=frozenset(kind.__name__ for kind in enabled),
-        lit=lit and can_be_lit,
-    )
-    return scene, state
-
-
-def _transforms(march: March) -> tuple[Transform, ...]:
-    """Those of a march, and others that can be turned on."""
     # not a constant: their arrays are made on a device, and none may be in use before `jax.distributed`
     offered = (
         EmptySpaceJitter(seed=0),
@@ -177,5 +139,17 @@ def _transforms(march: March) -> tuple[Transform, ...]:
         SpaceLeaping(),
         EarlyTermination(1 / 256),
     )
-    own = {type(transform) for transform in march.transforms}
-    return (*march.transforms, *(transform for transform in offered if type(transform) not in own))
+    own = {type(transform) for transform in given.transforms}
+    scene = Scene(
+        volume,
+        transforms=(*given.transforms, *(each for each in offered if type(each) not in own)),
+        lighting=Phong() if lighting is None and can_be_lit else lighting,
+        quadrature=given.quadrature,
+        max_samples=given.max_samples,
+        voxel=voxel,
+        compositing=mode,
+        background=(r, g, b),
+        histogram=Histogram.of(volume),
+    )
+    enabled = frozenset(kind.__name__ for kind in (ENABLED if march is None else own))
+    return scene, State(Orbit.of(seen), whole.size, transfer, step, enabled, lit and can_be_lit)

@@ -89,6 +89,7 @@ class TileRenderer:
         self.march = scene.march(state, step_factor)
         self.lighting = scene.light(state)
         self.transfer = padded(state.transfer)
+        self.background = np.asarray(scene.background, np.float32)
 
     @property
     def program_key(self) -> tuple[Any, ...]:
@@ -98,7 +99,7 @@ class TileRenderer:
 
     def draw(self, pixels: Pixels, grid: Grid, column: int, row: int) -> None:
         """Draw a tile into its place in a `Grid.canvas`."""
-        drawn = np.asarray(_displayed(self.rgba(grid, column, row), self._background))
+        drawn = np.asarray(_displayed(self.rgba(grid, column, row), self.background))
         pixels[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE] = drawn
 
     def image(self, grid: Grid) -> Pixels:
@@ -112,7 +113,7 @@ class TileRenderer:
     def overview(self) -> Float[np.ndarray, "side side 3"]:
         """Linear colours of one tile that is stretched over the view."""
         rgba = np.asarray(self.rgba(Grid.coarse(self.state.size, 1), 0, 0))
-        return rgba[..., :3] + (1 - rgba[..., 3:]) * self._background
+        return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
 
     def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
         """A tile as `render` returns it."""
@@ -122,22 +123,13 @@ class TileRenderer:
         how = {"compositing": self.scene.compositing, "lighting": self.lighting, "outputs": "rgba"}
         return render(self.scene.volume, self.transfer, camera, self.march, **how).rgba
 
-    @property
-    def _background(self) -> Float[np.ndarray, "3"]:
-        return np.asarray(self.scene.background, np.float32)
-
 
 def estimated_error(
     image: Float[np.ndarray, "side side 3"], doubled: Float[np.ndarray, "side side 3"], quadrature: str
 ) -> float:
-    """How far linear colours are from the converged ones because of the step, as an RMSE: an estimate, from
-    an image and the same with steps of twice the length.
-
-    It takes the error to fall with the square of the step, and with the step under `quadrature="left"`; where
-    steps are longer than what is seen, it falls by other amounts. What `EarlyTermination` adds is not in it.
-    """
-    order = 1 if quadrature == "left" else 2
-    return float(rmse(image, doubled)) / (2**order - 1)
+    """RMSE of linear colours because of the step, estimated from an image and the same with steps of twice
+    the length: the error is taken to fall with the square of the step, or with the step under "left"."""
+    return float(rmse(image, doubled)) / (1 if quadrature == "left" else 3)
 
 
 @jax.jit

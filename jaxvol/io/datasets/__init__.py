@@ -72,20 +72,12 @@ class Dataset:
 def registry() -> dict[str, Dataset]:
     """All datasets, by name."""
     fields = json.loads(Path(__file__).with_name("open_scivis.json").read_text(encoding="utf-8"))["datasets"]
-    return {
-        name: Dataset(
-            name,
-            title=each["name"],
-            category=each["category"],
-            shape=tuple(each["size"]),
-            dtype=each["type"],
-            spacing=tuple(each["spacing"]),
-            sha512=each["sha512sum"],
-            description=each["description"],
-            acknowledgement=each["acknowledgement"],
-        )
-        for name, each in fields.items()
-    }
+    keys = ("name", "category", "size", "type", "spacing", "sha512sum", "description", "acknowledgement")
+
+    def value(field: Any) -> Any:
+        return tuple(field) if isinstance(field, list) else field
+
+    return {name: Dataset(name, *(value(each[key]) for key in keys)) for name, each in fields.items()}
 
 
 def names() -> list[str]:
@@ -142,16 +134,17 @@ def fetch(
     it; `ImportError` if a download needs pooch, and it is missing.
     """
     dataset = info(name)
-    if (own := _in_data_folder(dataset)) is not None:
-        return own
+    own = os.environ.get("JAXVOL_DATA")
+    for path in (Path(own, dataset.file), Path(own, f"{dataset.file}.gz")) if own else ():
+        if path.is_file():
+            return _of_right_size(path, dataset)
     try:
         import pooch
     except ImportError as fault:
         raise ImportError(f"fetching {dataset.name} needs pooch: pip install jaxvol[datasets]") from fault
     target = (Path(pooch.os_cache("jaxvol")) / "datasets" if folder is None else Path(folder)) / dataset.file
     if target.is_file():  # pooch would hash it each time, which takes minutes for many GB
-        check_size(target, target.stat().st_size, dataset.nbytes)
-        return target
+        return _of_right_size(target, dataset)
     url = dataset.url if mirror is None else f"{mirror.rstrip('/')}/{dataset.name}/{dataset.file}"
     pooch.get_logger().setLevel("WARNING")
     downloader: Any = pooch.HTTPDownloader(progressbar=progress, timeout=TIMEOUT)
@@ -197,13 +190,8 @@ def load(
     return load_file(path, shape=dataset.shape, dtype=dataset.dtype, spacing=dataset.spacing)
 
 
-def _in_data_folder(dataset: Dataset) -> Path | None:
-    """The dataset's file in `$JAXVOL_DATA`, if it is there. Of a packed one, `load` checks the size."""
-    folder = os.environ.get("JAXVOL_DATA")
-    for ending in ("", ".gz") if folder else ():
-        path = Path(str(folder)) / (dataset.file + ending)
-        if path.is_file():
-            if not ending:
-                check_size(path, path.stat().st_size, dataset.nbytes)
-            return path
-    return None
+def _of_right_size(path: Path, dataset: Dataset) -> Path:
+    """A dataset's file, after checking its size; of a packed one, `load` checks it."""
+    if path.suffix != ".gz":
+        check_size(path, path.stat().st_size, dataset.nbytes)
+    return path

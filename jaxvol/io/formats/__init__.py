@@ -6,36 +6,37 @@ memory is allocated for it.
 """
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from ..._util.checks import Arrayable, described
-from ..._util.files import Header
 from ..._util.npy import npz_names, read_npy, read_npz
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
 from .dicom import dicom_files, is_dicom, read_dicom, series_files
 from .kretz import read_kretz, refuse_kretz
-from .medical import nrrd_data, read_medical
+from .medical import nrrd_data, read_nifti, read_nrrd
 from .metaimage import metaimage_data, read_metaimage
 from .raw import ENDINGS as RAW, raw_json, raw_json_header, read_raw
 from .save import save as save
 from .tiff import ENDINGS as TIFF, read_tiff, read_tiff_folder, tiff_files, tiff_spacing
 
 
-Reader: TypeAlias = Callable[[Path, Header], dict[str, Any]]
-
-READERS: dict[str, Reader] = {
-    **dict.fromkeys(RAW, read_raw),
+READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".npy": read_npy,
     ".npz": read_npz,
-    **dict.fromkeys((".nii", ".nii.gz", ".nrrd", ".nhdr"), read_medical),
-    **dict.fromkeys((".mha", ".mhd"), read_metaimage),
+    ".nii": read_nifti,
+    ".nii.gz": read_nifti,
+    ".nrrd": read_nrrd,
+    ".nhdr": read_nrrd,
+    ".mha": read_metaimage,
+    ".mhd": read_metaimage,
     ".dcm": read_dicom,
-    **dict.fromkeys(TIFF, read_tiff),
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
     ".vol": refuse_kretz,
 }
 
@@ -71,8 +72,8 @@ def load(
     Medical images are rescaled (CT in HU), float64 becomes float32, and axes are exchanged and reversed so
     that x, y, z increase towards the patient's left, back and head (LPS). An oblique image keeps its voxels,
     and the turn that is left is the volume's `direction`. DICOM slices are sorted by where they lie; their
-    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are
-    converted to smaller types, as described in `Volume`.
+    names and numbers do not count. Integers of 32 and 64 bits, from any kind of file, are converted to
+    smaller types, as described in `Volume`.
 
     **Arguments:**
 
@@ -88,16 +89,21 @@ def load(
 
     **Returns:** the `Volume`, with voxels in the file's type except as described above.
 
-    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or
-    shorter than its header says, or without a header; for an image that is not 3-D or not scalar; for a
-    folder of several DICOM series, or in which slices are missing, there twice, or do not fit together; for
-    labels that lie elsewhere; for `.vol` files, which `load_ultrasound` reads; and for anything that `Volume`
-    rejects. `ImportError` for a format that needs SimpleITK or tifffile if it is missing.
+    **Raises:** `ValueError` for a file that is missing, empty, corrupt, of unknown kind, longer or shorter
+    than its header says, or without a header; for an image that is not 3-D or not scalar; for a folder of
+    several DICOM series, or of slices that do not fit together; for labels that lie elsewhere; for `.vol`
+    files, which `load_ultrasound` reads; and for anything that `Volume` rejects. `ImportError` for a format
+    that needs SimpleITK or tifffile if it is missing.
     """
     path = _existing(path)
-    given = (("spacing", spacing), ("origin", origin), ("direction", direction))
-    overrides = {name: value for name, value in given if value is not None}
-    arguments = _reader(path)(path, Header(shape, dtype)) | overrides
+    if path.name.lower().endswith(RAW):
+        arguments = read_raw(path, shape, dtype)
+    elif shape is None and dtype is None:
+        arguments = _reader(path)(path)
+    else:
+        raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
+    given = {"spacing": spacing, "origin": origin, "direction": direction}
+    arguments |= {name: value for name, value in given.items() if value is not None}
     try:
         volume = Volume(**arguments)
         return volume if labels is None else _labelled(volume, labels)
@@ -105,37 +111,31 @@ def load(
         raise ValueError(f"{path}: {fault}") from fault
 
 
-def _reader(path: Path) -> Reader:
+def _reader(path: Path) -> Callable[[Path], dict[str, Any]]:
     """The reader for a file, by the ending of its name, or for a folder, by what is in it."""
-    endings = [ending for ending in READERS if path.name.lower().endswith(ending)]
-    if endings:
-        return READERS[max(endings, key=len)]
+    for ending, reader in READERS.items():
+        if path.name.lower().endswith(ending):
+            return reader
     if (path.is_dir() and dicom_files(path)) or (path.is_file() and is_dicom(path)):
         return read_dicom  # on discs their names often have no ending
     if path.is_dir() and tiff_files(path):
         return read_tiff_folder
     fault = "is a directory without DICOM and TIFF files" if path.is_dir() else "has an unknown ending"
     raise ValueError(
-        f"path: {path} {fault}; expected a folder of these, or a file ending in {', '.join(sorted(READERS))}."
+        f"path: {path} {fault}; expected a folder of these, or a file ending in "
+        f"{', '.join(sorted((*RAW, *READERS)))}."
     )
 
 
 def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
     other = load(labels)
-    # a hundredth of a voxel, at the far end of some hundred
-    slack = {"origin": 0.01 * float(volume.spacing.min()), "shape": 0}
-    for name in ("shape", "spacing", "origin", "direction"):
-        own, found = (
-            np.eye(3) if value is None else np.asarray(value)
-            for value in (getattr(volume, name), getattr(other, name))
+    here, there = _corners(volume), _corners(other)
+    if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
+        raise ValueError(
+            f"labels: {labels} must lie where the volume does, with corners {here.tolist()}; it has "
+            f"{there.tolist()}."
         )
-        relative = 1e-4 if name == "spacing" else 0
-        if not np.allclose(own, found, rtol=relative, atol=slack.get(name, 1e-4)):
-            raise ValueError(
-                f"labels: {labels} must have the {name} of the volume, {own.tolist()}; it has "
-                f"{found.tolist()}."
-            )
     values = np.asarray(other.data)
     if values.dtype.kind == "f":
         if not np.array_equal(values, np.rint(values)):
@@ -143,6 +143,13 @@ def _labelled(volume: Volume, labels: str | os.PathLike[str]) -> Volume:
         with np.errstate(invalid="ignore"):  # `Volume` checks the range
             values = values.astype(np.int64)
     return Volume(volume.data, volume.spacing, volume.origin, values, direction=volume.direction)
+
+
+def _corners(volume: Volume) -> np.ndarray:
+    """Where the first voxel lies in the world, and the last one along each axis."""
+    direction = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
+    edges = direction * np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
+    return np.asarray(volume.origin) + np.vstack([np.zeros(3), edges.T])
 
 
 def files_of(path: Path) -> list[Path]:
@@ -164,45 +171,28 @@ def files_of(path: Path) -> list[Path]:
     return series_files(path) if is_dicom(path) else [path]
 
 
-def says_where_it_lies(path: Path) -> bool:
-    """Whether a file says where in the world its volume lies, and how its axes are turned."""
-    return "origin" in _place_told(path)
-
-
 def says_its_spacing(path: Path) -> bool:
-    """Whether a file of voxels, or the header beside it, says how far they lie apart."""
-    return "spacing" in _place_told(path)
-
-
-def _place_told(path: Path) -> Collection[str]:
-    """Which of spacing and origin a file tells, without reading its voxels."""
+    """Whether a file of voxels, or the header beside it, says how far apart they lie; they are not read."""
     name = path.name.lower()
-    if name.endswith(RAW):  # an origin there says nothing of the axes
-        return raw_json_header(path).keys() - {"origin"}
+    if name.endswith(RAW):
+        return "spacing" in raw_json_header(path)
     if name.endswith(".npz"):
-        return npz_names(path)
+        return "spacing" in npz_names(path)
     if name.endswith(TIFF):
-        return tiff_spacing(path)
-    if name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)):
-        return ()
-    return ("spacing", "origin")
+        return "spacing" in tiff_spacing(path)
+    return not (name.endswith(".npy") or (path.is_dir() and tiff_files(path) and not dicom_files(path)))
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
-    """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world.
-
-    | ending | what |
-    |---|---|
-    | `.vol` | Kretz files of GE Voluson scanners, `KRETZFILE 1.0`, uncompressed; 8-bit voxels |
+    """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world, from a
+    Kretz file (`.vol`) of GE Voluson scanners: `KRETZFILE 1.0`, uncompressed, of 8-bit voxels.
 
     Read are the volume and its geometry, and nothing of the patient or the settings; of a Doppler scan, the
     B-mode volume. Angles are taken as they stand in the file, with the middle beam at π/2; those of planes
     and beams must be evenly spaced to 0.01 of a step, by which a voxel may be misplaced. The first sample of
     a beam has depth γ = 0.
 
-    **Arguments:**
-
-    - `path`: the file.
+    **Arguments:** `path`: the file.
 
     **Returns:** the volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render
     them with `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
@@ -214,8 +204,7 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
     The format is not published. The reader is tested on files written by its tests, after the readers of
     SlicerHeart and plooney/kretz, and not on a scanner's own.
     """
-    path = _existing(path)
-    data, probe = read_kretz(path)
+    data, probe = read_kretz(_existing(path))
     return Volume(data), probe
 
 
@@ -230,21 +219,3 @@ def _existing(path: str | os.PathLike[str] | Any) -> Path:
             f"path: there is no file {path} (working directory {Path.cwd()}). Check the spelling."
         )
     return path
-
-
-def register(ending: str, reader: Reader) -> None:
-    """Register a reader with `load` for a new kind of file, or in place of an existing one.
-
-    **Arguments:**
-
-    - `ending`: how the files' names end, such as `".vti"`; case is ignored, and of two endings that match
-      a name the longer one is used.
-    - `reader`: `reader(path, header)` returns a dict of arguments of `Volume`: `data`, and those of
-      `spacing`, `origin`, `direction` and `labels` that the file holds. A reader of files that contain their
-      shape and type calls `header.refuse(path)`. `path` exists, and may be a directory.
-
-    **Raises:** `ValueError` for an ending without a dot.
-    """
-    if not ending.startswith("."):
-        raise ValueError(f'ending must start with a dot, such as ".vti"; got {ending!r}.')
-    READERS[ending.lower()] = reader

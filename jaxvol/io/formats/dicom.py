@@ -1,12 +1,12 @@
 """Reads series of DICOM slices with SimpleITK, sorted by where they lie."""
 
-from collections import Counter
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, Header, decoding, numbers_in
+from ..._util.files import MOST_VOXELS, check_pixels, decoding, numbers_in
 from .medical import simple_itk
 from .orientation import orthonormal, toward_axes
 
@@ -28,19 +28,15 @@ META_BYTES = 2**16
 KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
 """Elements of the meta information."""
 
-SERIES = b"\x20\x00\x0e\x00"
+SERIES = "0020|000e"
 """The element that tells the series."""
 
-MOST_COMPRESSED = 2000
-"""Bytes of pixels per byte of a compressed file, at most. A header that says more is not believed."""
-
-OVERLAP, AWAY = 0.01, 0.1
-"""Slices nearer to each other than this part of their usual distance lie in one place; and the part of a
-voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
+AWAY = 0.1
+"""The part of a voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
 
 
 class Slice(NamedTuple):
-    """What the header of a file says of it."""
+    """What the header of a file says of it. `axes`: directions of rows and columns, as columns."""
 
     path: Path
     series: str
@@ -49,7 +45,6 @@ class Slice(NamedTuple):
     spacing: tuple[float, float]
     position: np.ndarray
     axes: np.ndarray
-    """Directions of rows and columns, as columns."""
 
 
 def is_dicom(path: Path) -> bool:
@@ -59,97 +54,21 @@ def is_dicom(path: Path) -> bool:
 
 
 def dicom_files(folder: Path) -> list[Path]:
-    """The DICOM images in a folder, but not those in folders in it, nor an index of files, nor reports."""
+    """The DICOM images in a folder, and what is named like one; but no index of files, and no reports."""
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR")
-    return [file for file in files if is_dicom(file) and not (_meta(file, KIND) or "").startswith(NO_IMAGES)]
+    named = [file for file in files if file.suffix.lower() == ".dcm" and not file.name.startswith(".")]
+    images = [file for file in files if file in named or is_dicom(file)]
+    return [file for file in images if not (_meta(file, KIND) or "").startswith(NO_IMAGES)]
 
 
-def read_dicom(path: Path, header: Header) -> dict[str, Any]:
+def read_dicom(path: Path) -> dict[str, Any]:
     """Reader for a folder that holds one series, or for one file of a series, whose others are in its folder.
 
     **Raises:** `ValueError` naming the files, if the folder holds several series, or if slices of the series
     are missing, there twice, of different sizes or directions, shifted sideways, cut short, or compressed in
     a way that SimpleITK does not read.
     """
-    header.refuse(path)
-    return _volume(path, _slices(path))
-
-
-def series_files(path: Path) -> list[Path]:
-    """The files of the series to which this one belongs, in its folder. **Raises:** as `read_dicom`."""
-    return [each.path for each in _slices(path)]
-
-
-def _slices(path: Path) -> list[Slice]:
-    folder, series = (path, None) if path.is_dir() else (path.parent, _slice(path).series)
-    for file in folder.glob("[!.]*.[dD][cC][mM]"):  # such as an empty file
-        if file.is_file() and not is_dicom(file):
-            raise ValueError(f"{_no_dicom(file)} If it is no slice, remove it.")
-    found: list[Slice] = []
-    for file in dicom_files(folder):
-        try:
-            found.append(_slice(file))
-        except ValueError as fault:
-            if series is None:
-                raise ValueError(
-                    f"{fault} If this file is of another series, give the path of one file of the series "
-                    "that you want."
-                ) from fault
-            content = file.read_bytes()
-            if SERIES not in content or series.encode() in content:  # it may be a slice of the series
-                raise
-    if series is not None:
-        return [each for each in found if each.series == series]
-    counts = Counter((each.series, each.description) for each in found)
-    if len({series for series, _ in counts}) > 1:
-        listed = "; ".join(
-            f"{description or 'no description'} ({series}): {count} files"
-            for (series, description), count in counts.items()
-        )
-        raise ValueError(
-            f"path: {folder} holds several series: {listed}. Give the path of one file of the series that "
-            "you want, or put each into a folder of its own."
-        )
-    return found
-
-
-def _no_dicom(path: Path) -> str:
-    return f'path: {path} is no DICOM file: it does not have "DICM" at byte 128.'
-
-
-def _slice(path: Path) -> Slice:
-    if not is_dicom(path):
-        raise ValueError(_no_dicom(path))
-    reader = _reader(path)
-    syntax = _meta(path, SYNTAX)
-    if syntax not in READABLE:  # SimpleITK would take compressed bytes for pixels
-        raise ValueError(
-            f"path: {path} is stored in the transfer syntax {syntax}, which SimpleITK does not read. "
-            "Decompress the series first, for example with gdcmconv --raw."
-        )
-    with decoding(path):
-        reader.ReadImageInformation()
-    (width, height, *depth), channels = reader.GetSize(), reader.GetNumberOfComponents()
-    if channels != 1 or depth not in ([], [1]):
-        raise ValueError(
-            f"path: {path} must hold one slice of one value per pixel; got size {reader.GetSize()} and "
-            f"{channels} values. Files of several frames are not supported: save it as NRRD or NIfTI."
-        )
-    bits = _text(reader, "0028|0100")
-    n_bytes, pixels = path.stat().st_size, width * height * (int(bits) // 8 if bits.isdigit() else 1)
-    if n_bytes * (1 if syntax in PLAIN else MOST_COMPRESSED) < pixels:
-        raise ValueError(f"path: {path} is cut short: it has {n_bytes} bytes, and its pixels {pixels}.")
-    position, axes, (down, across) = (  # spacing between rows, then between columns
-        numbers_in(_text(reader, tag), count, f"path: {path} must say where it lies: element ({tag})", "\\")
-        for tag, count in (("0020|0032", 3), ("0020|0037", 6), ("0028|0030", 2))
-    )
-    if min(down, across) <= 0:
-        raise ValueError(f"path: {path}: the spacing of its pixels must be positive; got {down}, {across}.")
-    series, description = _text(reader, "0020|000e"), _text(reader, "0008|103e")
-    return Slice(path, series, description, (width, height), (across, down), position, axes.reshape(2, 3).T)
-
-
-def _volume(path: Path, slices: list[Slice]) -> dict[str, Any]:
+    slices = _slices(path)
     first = slices[0]
     for each in slices[1:]:
         for name in ("size", "spacing", "axes"):
@@ -160,11 +79,10 @@ def _volume(path: Path, slices: list[Slice]) -> dict[str, Any]:
                     f"{expected.round(4).tolist()}, and {each.path.name} {found.round(4).tolist()}. Is one "
                     "of them an overview image?"
                 )
-    width, height = first.size
-    if len(slices) < 2 or width * height * len(slices) > MOST_VOXELS:
+    if not 2 <= len(slices) <= MOST_VOXELS // math.prod(first.size):
         raise ValueError(
             f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
-            f"{len(slices)} of {width} x {height} pixels."
+            f"{len(slices)} of {first.size} pixels."
         )
     direction = orthonormal(f"path: {path}: rows and columns of {first.path.name}", first.axes)
     normal = direction[:, 2]
@@ -173,27 +91,79 @@ def _volume(path: Path, slices: list[Slice]) -> dict[str, Any]:
     return toward_axes(_pixels(slices), spacing, slices[0].position, direction)
 
 
+def series_files(path: Path) -> list[Path]:
+    """The files of the series to which this one belongs, in its folder. **Raises:** as `read_dicom`."""
+    return [each.path for each in _slices(path)]
+
+
+def _slices(path: Path) -> list[Slice]:
+    """The slices of the only series in a folder, or of that to which a file belongs."""
+    headers = {file: _header(file) for file in dicom_files(path if path.is_dir() else path.parent)}
+    if path.is_file():
+        series = _text(_header(path), SERIES)
+        return [_slice(file, found) for file, found in headers.items() if _text(found, SERIES) == series]
+    found = [_slice(file, header) for file, header in headers.items()]
+    series = {each.series: f"{each.description or 'no description'} (as {each.path.name})" for each in found}
+    if len(series) > 1:
+        raise ValueError(
+            f"path: {path} holds several series: {', '.join(series.values())}. Give the path of one file of "
+            "the series that you want, or put each into a folder of its own."
+        )
+    return found
+
+
+def _header(path: Path) -> Any:
+    """SimpleITK's reader of a file, whose header has been read."""
+    if not is_dicom(path):
+        raise ValueError(
+            f'path: {path} is no DICOM file: it does not have "DICM" at byte 128. If it is no slice, remove '
+            "it."
+        )
+    reader = _reader(path)
+    with decoding(path):
+        reader.ReadImageInformation()
+    return reader
+
+
+def _slice(path: Path, reader: Any) -> Slice:
+    syntax = _meta(path, SYNTAX)
+    if syntax not in READABLE:  # SimpleITK would take compressed bytes for pixels
+        raise ValueError(
+            f"path: {path} is stored in the transfer syntax {syntax}, which SimpleITK does not read. "
+            "Decompress the series first, for example with gdcmconv --raw."
+        )
+    (width, height, *depth), channels = reader.GetSize(), reader.GetNumberOfComponents()
+    if channels != 1 or depth not in ([], [1]):
+        raise ValueError(
+            f"path: {path} must hold one slice of one value per pixel; got size {reader.GetSize()} and "
+            f"{channels} values. Files of several frames are not supported: save it as NRRD or NIfTI."
+        )
+    bits = _text(reader, "0028|0100")
+    n_bytes = width * height * (int(bits) // 8 if bits.isdigit() else 1)
+    check_pixels(path, n_bytes, compressed=syntax not in PLAIN)
+    position, axes, (down, across) = (  # spacing between rows, then between columns
+        numbers_in(_text(reader, tag), count, f"path: {path} must say where it lies: element ({tag})", "\\")
+        for tag, count in (("0020|0032", 3), ("0020|0037", 6), ("0028|0030", 2))
+    )
+    if min(down, across) <= 0:
+        raise ValueError(f"path: {path}: the spacing of its pixels must be positive; got {down}, {across}.")
+    series, description = _text(reader, SERIES), _text(reader, "0008|103e")
+    return Slice(path, series, description, (width, height), (across, down), position, axes.reshape(2, 3).T)
+
+
 def _distance(path: Path, slices: list[Slice], normal: np.ndarray) -> float:
     """The distance between slices, which are in order and must be evenly spaced along their normal."""
     positions = np.stack([each.position for each in slices])
     heights = positions @ normal
     gaps = np.diff(heights)
     step = float(np.median(gaps))
-    names = [each.path.name for each in slices]
-    same = np.flatnonzero(gaps <= max(OVERLAP * step, 1e-6))
-    if same.size:
-        pairs = ", ".join(f"{names[i]} and {names[i + 1]}" for i in same[:3])
+    uneven = np.abs(gaps - step)
+    if step < 1e-6 or uneven.max() > AWAY * step:
+        i = int(uneven.argmax())
+        one, other = (slices[k].path.name for k in (i, i + 1))
         raise ValueError(
-            f"path: {path} holds {same.size} slices that lie where another one does: {pairs}. They are "
-            "copies, or of different times; remove all but one of each."
-        )
-    wide = np.flatnonzero(np.abs(gaps - step) > AWAY * step)
-    if wide.size:
-        i = int(wide[0])
-        raise ValueError(
-            f"path: {path} has unevenly spaced slices, or some are missing: the median distance is {step:g}, "
-            f"and {names[i]} and {names[i + 1]} are {gaps[i]:g} ({wide.size} such gaps among {len(slices)} "
-            "slices)."
+            f"path: {path} has unevenly spaced slices, or some are missing or there twice: the median "
+            f"distance is {step:g}, and {one} and {other} are {gaps[i]:g} apart."
         )
     sideways = np.abs(positions - positions[0] - np.outer(heights - heights[0], normal)).max()
     if sideways > AWAY * min(slices[0].spacing):

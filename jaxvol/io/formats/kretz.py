@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NoReturn
 import numpy as np
 from jaxtyping import UInt8
 
-from ..._util.files import MOST_VOXELS, Header, as_array, file_size
+from ..._util.files import MOST_VOXELS, as_array, file_size
 from ...march.transforms import ToroidalMap
 
 
@@ -51,7 +51,7 @@ MEANING = {
 }
 
 
-def refuse_kretz(path: Path, header: Header) -> NoReturn:
+def refuse_kretz(path: Path) -> NoReturn:
     """Reader for `load`, whose result has no place for the geometry."""
     raise ValueError(
         f"path: {path} is ultrasound as acquired, whose voxels are placed by a probe. "
@@ -69,7 +69,6 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
     n_bytes = file_size(path)
     with path.open("rb") as stream:
         items = _items(path, stream, n_bytes)
-        _require_all(path, items)
 
         def read(tag: Tag, kind: str) -> tuple[Any, ...]:
             """The numbers in an item, in a format of `struct`."""
@@ -84,18 +83,45 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
             return struct.unpack(kind, stream.read(length))
 
         shape = tuple(read(tag, "<H")[0] for tag in (BETA, SIGMA, GAMMA))
-        _check_shape(path, shape, items[VOXELS][1])
+        expected, held = math.prod(shape), items[VOXELS][1]
+        sizes = " x ".join(map(str, shape))
+        if min(shape) < 2 or expected > MOST_VOXELS:
+            raise ValueError(
+                f"path: {path} must have at least 2 planes, beams and samples, and fewer than 2**31 voxels; "
+                f"its header says {sizes}."
+            )
+        if held != expected:
+            raise ValueError(
+                f"path: {path}: item {_name(VOXELS)} must hold {sizes} = {expected} bytes, as its header (β, "
+                f"σ, γ) says; it holds {held}. Of a compressed file, it holds less: save it uncompressed."
+            )
         beta = _ends(path, BETAS, np.array(read(BETAS, f"<{shape[0]}d")))
         sigma = _ends(path, SIGMAS, np.array(read(SIGMAS, f"<{shape[1]}d")))
         resolution, first, apex = (read(tag, "<d")[0] for tag in (RESOLUTION, OFFSET_B, OFFSET_A))
-        probe = _probe(path, 1000 * resolution, first, apex, beta, sigma, shape[2])
         stream.seek(items[VOXELS][0])
-        content = stream.read(math.prod(shape))
+        content = stream.read(expected)
+    if not 0 < resolution < math.inf:
+        raise ValueError(
+            f"path: {path}: item {_name(RESOLUTION)} must be a positive length in metres; got {resolution}."
+        )
+    step = 1000 * resolution  # mm
+    a, b = apex * step, first * step
+    try:
+        probe = ToroidalMap(a, b, beta, sigma, (0.0, (shape[2] - 1) * step))
+    except ValueError as fault:
+        raise ValueError(f"path: {path} describes no probe: {fault}") from fault
+    nearest = float(probe.nearest_to_axis)
+    if nearest < -1e-6 * abs(a):  # 0 to within rounding is on the axis
+        raise ValueError(
+            f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the motor "
+            f"axis (b = {b:.4g} mm, a = {a:.4g} mm), where no sample is shown."
+        )
     return as_array(content, shape, np.dtype("u1"), "C"), probe
 
 
 def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[Tag, tuple[int, int]]:
-    """Where the content of each item begins, and its length, in bytes. Only headers are read."""
+    """Where the content of each item begins, and its length, in bytes; all of `MEANING` are there. Only
+    headers are read."""
     magic = stream.read(len(MAGIC))
     if magic != MAGIC:
         raise ValueError(
@@ -107,14 +133,9 @@ def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[Tag, tuple[int, i
     for _ in range(MOST_ITEMS):
         stream.seek(end)
         head = stream.read(ITEM.size)
-        if len(head) < ITEM.size:
-            if any(head):  # else the end, or padding
-                raise ValueError(
-                    f"path: {path} is cut short: it ends after {len(head)} of the {ITEM.size} bytes of an "
-                    "item's header."
-                )
-            return found
-        group, element, length = ITEM.unpack(head)
+        if len(head) < ITEM.size and not any(head):  # the end, or padding
+            break
+        group, element, length = ITEM.unpack(head.ljust(ITEM.size, b"\xff"))
         tag, begin = (group, element), end + ITEM.size
         end = begin + length
         if end > n_bytes:
@@ -125,37 +146,14 @@ def _items(path: Path, stream: BinaryIO, n_bytes: int) -> dict[Tag, tuple[int, i
         if tag in MEANING and tag in found:
             raise ValueError(f"path: {path} holds item {_name(tag)} twice.")
         found[tag] = begin, length
-    raise ValueError(f"path: {path} holds {MOST_ITEMS} items or more; expected some hundreds. It is corrupt.")
-
-
-def _require_all(path: Path, items: dict[Tag, tuple[int, int]]) -> None:
-    missing = [tag for tag in MEANING if tag not in items]
-    hint = ""
-    if missing == [VOXELS]:
-        data = [f"{_hex(tag)} ({length} bytes)" for tag, (_, length) in items.items() if tag[0] >> 12 == 0xD]
-        hint = (
-            " It is a compressed file, or one of several frames; items of data that it has: "
-            f"{', '.join(data) or 'none'}. Save it as one uncompressed volume."
-        )
-    elif missing == [BETAS, SIGMAS]:
-        hint = " It is a Cartesian volume, which is not supported. Export it as acquired."
-    if missing:
-        raise ValueError(f"path: {path} has no item {', no item '.join(map(_name, missing))}.{hint}")
-
-
-def _check_shape(path: Path, shape: tuple[int, ...], held: int) -> None:
-    for number, tag in zip(shape, (BETA, SIGMA, GAMMA), strict=True):
-        if number < 2:
-            raise ValueError(f"path: {path}: item {_name(tag)} must be at least 2; got {number}.")
-    expected, sizes = math.prod(shape), " x ".join(map(str, shape))
-    if expected > MOST_VOXELS:
-        raise ValueError(f"path: {path} must have fewer than 2**31 voxels; its header says {sizes}.")
-    if held != expected:
-        less = "less, as in a compressed file" if held < expected else "more"
+    else:
+        raise ValueError(f"path: {path} holds {MOST_ITEMS} items or more; expected some hundreds.")
+    if missing := [_name(tag) for tag in MEANING if tag not in found]:
         raise ValueError(
-            f"path: {path}: item {_name(VOXELS)} must hold {sizes} = {expected} bytes, as its header (β, σ, "
-            f"γ) says; it holds {held}, which is {less}."
+            f"path: {path} has no item {', no item '.join(missing)}. Compressed files, several frames and "
+            "Cartesian volumes are not supported: save it as one uncompressed volume as acquired."
         )
+    return found
 
 
 def _ends(path: Path, tag: Tag, angles: np.ndarray) -> tuple[float, float]:
@@ -173,36 +171,5 @@ def _ends(path: Path, tag: Tag, angles: np.ndarray) -> tuple[float, float]:
     return first, last
 
 
-def _probe(
-    path: Path,
-    step: float,
-    first: float,
-    apex: float,
-    beta: tuple[float, float],
-    sigma: tuple[float, float],
-    samples: int,
-) -> ToroidalMap:
-    """The map of a probe whose samples are `step` mm apart; `first` and `apex` are in steps."""
-    if not 0 < step < math.inf:
-        raise ValueError(
-            f"path: {path}: item {_name(RESOLUTION)} must be a positive length in metres; got {step / 1000}."
-        )
-    try:
-        probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (samples - 1) * step))
-    except ValueError as fault:
-        raise ValueError(f"path: {path} describes no probe: {fault}") from fault
-    nearest = float(probe.nearest_to_axis)
-    if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
-        raise ValueError(
-            f"path: {path} describes no probe: its outermost beams begin {-nearest:.4g} mm behind the "
-            f"motor axis (b = {first * step:.4g} mm, a = {apex * step:.4g} mm), where no sample is shown."
-        )
-    return probe
-
-
-def _hex(tag: Tag) -> str:
-    return f"{tag[0]:04X}:{tag[1]:X}"
-
-
 def _name(tag: Tag) -> str:
-    return f"{_hex(tag)} ({MEANING[tag]})" if tag in MEANING else _hex(tag)
+    return f"{tag[0]:04X}:{tag[1]:X}" + (f" ({MEANING[tag]})" if tag in MEANING else "")

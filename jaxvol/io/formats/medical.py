@@ -9,11 +9,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ..._util.files import MOST_VOXELS, Header, check_size, chunks, decoding, file_size
+from ..._util.files import MOST_VOXELS, check_size, decoding, file_size
 from .orientation import toward_axes
 
-
-NIFTI = (".nii", ".nii.gz")
 
 NIFTI_HEADERS = {348, 540}
 """Bytes of a header, of NIfTI-1 and NIfTI-2."""
@@ -31,77 +29,70 @@ def simple_itk(path: Path) -> Any:
     return SimpleITK
 
 
-def read_medical(path: Path, header: Header) -> dict[str, Any]:
-    """Reader for `.nii`, `.nii.gz`, `.nrrd` and `.nhdr`."""
-    header.refuse(path)
+def read_nifti(path: Path) -> dict[str, Any]:
+    """Reader for `.nii` and `.nii.gz`."""
     file_size(path)
     sitk = simple_itk(path)
-    nifti = path.name.lower().endswith(NIFTI)
     reader = sitk.ImageFileReader()
-    reader.SetFileName(str(path))
-    reader.SetImageIO("NiftiImageIO" if nifti else "NrrdImageIO")
-    with decoding(path):
-        if nifti:
-            _check_begin(path)
-        reader.ReadImageInformation()
-        size, channels = reader.GetSize(), reader.GetNumberOfComponents()
-        if len(size) != 3 or channels != 1 or not 0 < math.prod(size) <= MOST_VOXELS:
+    reader.SetImageIO("NiftiImageIO")
+    packed = path.name.lower().endswith(".gz")
+    with decoding(path), gzip.open(path) if packed else path.open("rb") as stream:
+        begin = stream.read(4)  # of other files, ITK's library prints text of its own
+        if not {int.from_bytes(begin, order) for order in ("little", "big")} & NIFTI_HEADERS:
             raise ValueError(
-                f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; "
-                f"got size {size} and {channels} values per voxel."
+                f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; "
+                f"this one with the bytes {begin.hex(' ')}. Fetch or write it again."
             )
-        if nifti:
-            _check_nifti(path, reader)
-        else:
-            itemsize = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
-            _check_nrrd(path, math.prod(size), itemsize)
-        image = reader.Execute()
-    data = sitk.GetArrayFromImage(image).T
-    return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
+        voxels = _read_header(path, reader)
+        offset = int(float(reader.GetMetaData("vox_offset")))
+        expected = offset + voxels * int(reader.GetMetaData("bitpix")) // 8
+        # only decompressing tells the size; a header may hold any number
+        held = stream.seek(min(expected, 2**62)) if packed else path.stat().st_size
+        check_size(path, held, expected, more=True)
+        return _volume(sitk, reader)
 
 
-def _check_begin(path: Path) -> None:
-    """**Raises** `ValueError` for what has no NIfTI header, about which ITK's library prints its own text."""
-    with gzip.open(path) if path.name.lower().endswith(".gz") else path.open("rb") as stream:
-        begin = stream.read(4)
-    if not {int.from_bytes(begin, order) for order in ("little", "big")} & NIFTI_HEADERS:
-        raise ValueError(
-            f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; this "
-            f"one with the bytes {begin.hex(' ')}. Fetch or write it again."
-        )
-
-
-def _check_nifti(path: Path, reader: Any) -> None:
-    voxels = math.prod(reader.GetSize()) * int(reader.GetMetaData("bitpix")) // 8
-    expected = int(float(reader.GetMetaData("vox_offset"))) + voxels
-    if path.name.lower().endswith(".gz"):
-        with gzip.open(path) as stream:
-            held = sum(map(len, chunks(stream, expected)))
-    else:
-        held = path.stat().st_size
-    check_size(path, min(held, expected), expected)  # other data may follow the voxels
-
-
-def _check_nrrd(path: Path, voxels: int, itemsize: int) -> None:
-    fields, begin, source = _nrrd_header(path)
-    if not source.is_file():
-        raise ValueError(
-            f"path: {path} must hold its voxels, or name one file of them; got {fields['datafile']!r}."
-        )
-    expected, encoding = voxels * itemsize, fields.get("encoding", "").lower()
-    held = source.stat().st_size - begin
-    if encoding in ("ascii", "text", "txt"):  # at least a digit and a space for each
-        held = (held + 1) // 2 * itemsize
-    elif encoding in ("gzip", "gz"):
+def read_nrrd(path: Path) -> dict[str, Any]:
+    """Reader for `.nrrd` and `.nhdr`."""
+    file_size(path)
+    sitk = simple_itk(path)
+    reader = sitk.ImageFileReader()
+    reader.SetImageIO("NrrdImageIO")
+    with decoding(path):
+        voxels = _read_header(path, reader)
+        itemsize = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
+        fields, begin, source = _nrrd_header(path)
+        encoding, expected = fields.get("encoding", "").lower(), voxels * itemsize
+        if encoding not in ("raw", "gzip", "gz") or not source.is_file():
+            raise ValueError(
+                f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
+                f"got {encoding!r} and {fields.get('datafile')!r}."
+            )
         with source.open("rb") as stream:
             stream.seek(begin)
-            held = sum(map(len, chunks(gzip.GzipFile(fileobj=stream), expected)))
-    elif encoding != "raw":
+            packed = encoding != "raw"
+            held = gzip.GzipFile(fileobj=stream).seek(expected) if packed else source.stat().st_size - begin
+        check_size(path, held, expected, more=True)
+        return _volume(sitk, reader)
+
+
+def _read_header(path: Path, reader: Any) -> int:
+    """Read the header of an image, which must be one of a volume. **Returns** the number of its voxels."""
+    reader.SetFileName(str(path))
+    reader.ReadImageInformation()
+    size, channels = reader.GetSize(), reader.GetNumberOfComponents()
+    if len(size) != 3 or channels != 1 or not 0 < math.prod(size) <= MOST_VOXELS:
         raise ValueError(
-            f"path: {path} must have the encoding raw, gzip or ascii; got {encoding!r}. Save it as one of "
-            "these."
+            f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; got size "
+            f"{size} and {channels} values per voxel."
         )
-    check_size(path, min(held, expected), expected)
+    return math.prod(size)
+
+
+def _volume(sitk: Any, reader: Any) -> dict[str, Any]:
+    image = reader.Execute()
+    data = sitk.GetArrayFromImage(image).T
+    return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
 
 
 def nrrd_data(path: Path) -> Path:

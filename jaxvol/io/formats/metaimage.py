@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, Header, as_array, check_size, decoding, file_size, numbers_in
+from ..._util.files import MOST_VOXELS, as_array, check_size, decoding, file_size, numbers_in
 from .medical import text_header
 from .orientation import orthonormal, toward_axes
 
@@ -32,21 +32,17 @@ TYPES = {
 }
 
 
-def read_metaimage(path: Path, header: Header) -> dict[str, Any]:
+def read_metaimage(path: Path) -> dict[str, Any]:
     """Reader for `.mha` and `.mhd` of binary voxels."""
-    header.refuse(path)
     file_size(path)
     fields, begin = _header(path)
-    sizes, channels = fields.get("DimSize", ""), fields.get("ElementNumberOfChannels", "1")
-    shape = [int(size) if size.isascii() and size.isdigit() else 0 for size in sizes.split()]
-    if len(shape) != 3 or fields.get("NDims") != "3" or channels != "1":
+    shape = [_natural(size) for size in fields.get("DimSize", "").split()]
+    channels, kind = fields.get("ElementNumberOfChannels", "1"), fields.get("ElementType", "")
+    if len(shape) != 3 or channels != "1" or min(shape) < 1 or math.prod(shape) > MOST_VOXELS:
         raise ValueError(
-            f"path: {path} must be a 3-D image of one value per voxel; got NDims = "
-            f"{fields.get('NDims', '')[:20]}, DimSize = {sizes[:60]} and {channels[:20]} values per voxel."
+            f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; got "
+            f"DimSize = {fields.get('DimSize', '')[:60]} and {channels[:20]} values per voxel."
         )
-    if not 0 < math.prod(shape) <= MOST_VOXELS:
-        raise ValueError(f"path: {path} must have 1 to 2**31 - 1 voxels; got DimSize = {sizes[:60]}.")
-    kind = fields.get("ElementType", "")
     if kind not in TYPES or not _flag(fields, "BinaryData", "T"):
         raise ValueError(
             f"path: {path}: ElementType must be one of {', '.join(TYPES)}, and BinaryData true; got "
@@ -80,36 +76,38 @@ def _header(path: Path) -> tuple[dict[str, str], int]:
     return fields, end
 
 
-def _numbers(path: Path, fields: dict[str, str], keys: tuple[str, ...], default: np.ndarray) -> np.ndarray:
-    """The numbers of the first of these keys that is there, in the shape of `default`."""
-    key = next((key for key in keys if key in fields), None)
-    if key is None:
-        return default
-    return numbers_in(fields[key], default.size, f"path: {path}: {key}").reshape(default.shape)
-
-
 def _content(path: Path, fields: dict[str, str], begin: int, expected: int) -> bytes:
     """The bytes of the voxels, `expected` in number."""
     source = metaimage_data(path)
     if not source.is_file():
-        raise ValueError(
-            f"path: {path} cannot be read: it must hold its voxels, or name one file of them that is there; "
-            f"got ElementDataFile = {fields['ElementDataFile'][:80]}."
-        )
+        raise ValueError(f"path: {path} cannot be read: there is no file of its voxels, {str(source)[:80]}.")
     held = source.stat().st_size
     if source != path:
         skipped = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file
-        if skipped != "-1" and not (skipped.isascii() and skipped.isdigit() and len(skipped) < 16):
+        begin = max(held - expected, 0) if skipped == "-1" else _natural(skipped)
+        if begin < 0:
             raise ValueError(f"path: {path}: HeaderSize must be a number of bytes; got {skipped[:40]!r}.")
-        begin = max(held - expected, 0) if skipped == "-1" else int(skipped)
     with source.open("rb") as stream, decoding(path):
         stream.seek(begin)
         if _flag(fields, "CompressedData"):  # by zlib or gzip, to the stream's own end
             content = zlib.decompressobj(wbits=47).decompress(stream.read(), expected + 1)
             check_size(path, len(content), expected)
             return content
-        check_size(path, min(max(held - begin, 0), expected), expected)  # other data may follow
+        check_size(path, max(held - begin, 0), expected, more=True)
         return stream.read(expected)
+
+
+def _numbers(path: Path, fields: dict[str, str], keys: tuple[str, ...], default: np.ndarray) -> np.ndarray:
+    """The numbers of the first of these keys that is there, in the shape of `default`."""
+    for key in keys:
+        if key in fields:
+            return numbers_in(fields[key], default.size, f"path: {path}: {key}").reshape(default.shape)
+    return default
+
+
+def _natural(text: str) -> int:
+    """The integer that a text holds, or -1."""
+    return int(text) if text.isascii() and text.isdigit() and len(text) < 16 else -1
 
 
 def _flag(fields: dict[str, str], key: str, default: str = "F") -> bool:

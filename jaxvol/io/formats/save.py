@@ -1,6 +1,7 @@
 """Writes volumes to files that `load` reads again as they were."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +28,23 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     | `.nrrd`, `.mha`, `.mhd` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
     | `.nii`, `.nii.gz` | the same; direction is rounded, to about 1e-7 |
 
-    Voxels are written in their own type, and read so: with the same values, spacing and origin. Medical
-    formats are read along the patient's axes: a volume whose axes are turned by more than 45 degrees comes
-    back with axes exchanged or reversed, and every voxel where it was in the world.
+    Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a
+    volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
+    voxel where it was in the world.
 
     A file that is there is replaced, at once when the new one is whole. `.mhd` are two files: the voxels go
     into one that ends in `.raw`, which is replaced first, and only if it belongs to the `.mhd` that is there.
 
     **Arguments:**
 
-    - `volume`: with voxels. It comes first; `save_png`, of images, has the path first. Of one that has a
-        `field`, voxels are not what is shown, and it is refused.
+    - `volume`: with voxels, not with a `field`. It comes first; `save_png`, of images, has the path first.
     - `path`: the file to write. Folders are made where they are missing.
 
     **Returns:** the path.
 
     **Raises:** `ValueError` for an unknown ending, a volume that is traced or has a field, labels or a type
     of voxels that the format cannot hold, a file that cannot be written, and a `.raw` file beside an `.mhd`
-    that is not the `.mhd`'s own. `ImportError` if the format
-    needs SimpleITK, and it is missing.
+    that is not the `.mhd`'s own. `ImportError` if the format needs SimpleITK, and it is missing.
     """
     if not isinstance(volume, Volume):
         hint = " The volume comes first, as in save(volume, path)." if isinstance(path, Volume) else ""
@@ -55,9 +54,7 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     if is_traced(volume):
         raise ValueError("volume must not be traced: save it outside of jit and grad.")
     if volume.field is not None:
-        raise ValueError(
-            "volume must have voxels; got one with a field. Save an array of the field's values."
-        )
+        raise ValueError("volume must have voxels; got one with a field. Save an array of its values.")
     path = output_file("path", path)
     name = path.name.lower()
     if not name.endswith(ENDINGS):
@@ -78,15 +75,13 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 def _check_beside(path: Path) -> None:
     """**Raises** `ValueError` if voxels of something else lie where those of an `.mhd` are written."""
     voxels = path.with_suffix(".raw")
-    try:
-        own = not voxels.exists() or (path.is_file() and metaimage_data(path).resolve() == voxels.resolve())
-    except ValueError:  # what is replaced is no MetaImage
-        own = False
-    if not own:
-        raise ValueError(
-            f"path: the voxels of {path.name} would replace {voxels}, which does not belong to it. Save it "
-            "under another name, or as .mha, which is one file."
-        )
+    with suppress(ValueError):  # what is replaced is no MetaImage
+        if not voxels.exists() or (path.is_file() and metaimage_data(path).resolve() == voxels.resolve()):
+            return
+    raise ValueError(
+        f"path: the voxels of {path.name} would replace {voxels}, which does not belong to it. Save it under "
+        "another name, or as .mha, which is one file."
+    )
 
 
 def _write_npz(volume: Volume, path: Path) -> None:

@@ -8,36 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_VOXELS, Header, file_size
+from ..._util.files import MOST_VOXELS, check_pixels, file_size
 
 
 ENDINGS = (".tif", ".tiff")
 
-MOST_COMPRESSED = 2000
-"""Bytes of pixels per byte of a compressed file, at most. A header that says more is not believed."""
-
-LENGTHS = {
-    "mm": 1.0,
-    "millimeter": 1.0,
-    "cm": 10.0,
-    "inch": 25.4,
-    "µm": 1e-3,
-    "um": 1e-3,
-    "micron": 1e-3,
-    "nm": 1e-6,
-}
+LENGTHS = {"mm": 1.0, "millimeter": 1.0, "cm": 10.0, "inch": 25.4, "nm": 1e-6}
+LENGTHS |= dict.fromkeys(("µm", "um", "micron", "\\u00b5m"), 1e-3)
 """Units of length that ImageJ and OME write, in mm."""
 
 
-def read_tiff(path: Path, header: Header) -> dict[str, Any]:
+def read_tiff(path: Path) -> dict[str, Any]:
     """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
-    header.refuse(path)
     images, spacing = _images(path)
-    if len(images) < 2:
-        raise ValueError(
-            f"path: {path} must hold at least 2 images; got {len(images)}. For a folder of images, give the "
-            "path of the folder."
-        )
     return {"data": images.transpose(2, 1, 0)} | spacing
 
 
@@ -58,15 +41,20 @@ def tiff_files(folder: Path) -> list[Path]:
     return sorted(files, key=key)
 
 
-def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
+def read_tiff_folder(folder: Path) -> dict[str, Any]:
     """Reader for a folder of files of one page each, in the order of the numbers in their names.
 
     **Raises:** `ValueError` naming the files for images of different sizes or types, and for a number that is
     missing in a sequence.
     """
-    header.refuse(folder)
     files = tiff_files(folder)
-    _check_numbers(folder, files)
+    numbers = [int(found[-1]) for file in files if (found := re.findall(r"[0-9]+", file.stem))]
+    steps = np.diff(numbers)
+    if len(numbers) == len(files) and steps.size and np.all(steps > 0) and steps.min() != steps.max():
+        i = int(np.argmax(steps))
+        raise ValueError(
+            f"path: slices are missing in {folder}: {files[i].name} is followed by {files[i + 1].name}."
+        )
     slices: list[np.ndarray] = []
     for file in files:
         images, _ = _images(file)
@@ -82,22 +70,6 @@ def read_tiff_folder(folder: Path, header: Header) -> dict[str, Any]:
     return {"data": np.stack(slices).transpose(2, 1, 0)}
 
 
-def _check_numbers(folder: Path, files: list[Path]) -> None:
-    """**Raises** `ValueError` if files' names differ in one number, and some of its values are missing."""
-    if len(files) < 2:
-        raise ValueError(f"path: {folder} must hold at least 2 slices; got {len(files)}.")
-    numbers = [[int(number) for number in re.findall(r"[0-9]+", file.stem)] for file in files]
-    if not all(numbers) or len({tuple(each[:-1]) for each in numbers}) > 1:
-        return
-    steps = np.diff([each[-1] for each in numbers])
-    if steps.min() != steps.max():
-        i = int(np.argmax(steps)) if steps.max() > np.median(steps) else int(np.argmin(steps))
-        raise ValueError(
-            f"path: slices are missing in {folder}, or there twice: {files[i].name} is followed by "
-            f"{files[i + 1].name}."
-        )
-
-
 def _tifffile(path: Path) -> Any:
     try:
         import tifffile  # pyright: ignore[reportMissingImports]
@@ -109,7 +81,7 @@ def _tifffile(path: Path) -> Any:
 def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
     """The images [z, y, x] in a file, and their spacing where it is known."""
     tifffile = _tifffile(path)
-    n_bytes = file_size(path)
+    file_size(path)
     try:
         with tifffile.TiffFile(path) as file:
             _check_last(path, file)
@@ -118,24 +90,16 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             axes, whole = file.series[0].axes, file.is_imagej or len(pages) == 1
             # ImageJ may hold a stack in its only page
             shape = file.series[0].shape if whole else (len(pages), *first.shape)
-            several = file.is_ome and (len(file.series) > 1 or set(axes) & set("CT"))
-            if several or len(kinds) > 1 or len(shape) not in (2, 3) or first.samplesperpixel != 1:
+            several = len(kinds) > 1 or (file.is_ome and (len(file.series) > 1 or set(axes) & set("CT")))
+            several = several or len(shape) not in (2, 3) or first.samplesperpixel != 1
+            if several or first.dtype is None or not 0 < math.prod(shape) <= MOST_VOXELS:
                 raise ValueError(
-                    f"path: {path} must hold one stack of images of one size, type and value per pixel; got "
-                    f"{len(file.series)} stacks, the first of shape {file.series[0].shape} ({axes}), and "
-                    f"pages of {len(kinds)} kinds. Save one stack alone."
+                    f"path: {path} must hold one stack of images of one size, type and value per pixel, and "
+                    f"fewer than 2**31 voxels; got {len(file.series)} stacks, the first of shape "
+                    f"{file.series[0].shape} ({axes}), and pages of {len(kinds)} kinds."
                 )
-            if not 0 < math.prod(shape) <= MOST_VOXELS or first.dtype is None:
-                raise ValueError(
-                    f"path: {path} must hold 1 to 2**31 - 1 voxels of a known type; got shape {shape}."
-                )
-            expected = math.prod(shape) * first.dtype.itemsize
             packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
-            if n_bytes * (MOST_COMPRESSED if packed else 1) < expected:
-                raise ValueError(
-                    f"path: {path} is cut short: it has {n_bytes} bytes, and its header announces voxels of "
-                    f"{expected}."
-                )
+            check_pixels(path, math.prod(shape) * first.dtype.itemsize, compressed=packed)
             images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
             return images.reshape(-1, *shape[-2:]), _spacing(file)
     except MemoryError:
@@ -147,7 +111,7 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
 
 
 def _check_last(path: Path, file: Any) -> None:
-    """**Raises** `ValueError` if the pages that were found are followed by others. tifffile leaves out what
+    """**Raises** `ValueError` if the pages that were found are followed by others: tifffile leaves out what
     lies beyond the end of the file."""
     format, handle = file.tiff, file.filehandle
     handle.seek(file.pages[-1].aspage().offset)
@@ -161,27 +125,16 @@ def _check_last(path: Path, file: Any) -> None:
 def _spacing(file: Any) -> dict[str, Any]:
     """Spacing (x, y, z) as OME or ImageJ wrote it, in mm, or in its own unit if that is none of length."""
     try:
-        steps = _ome_spacing(file) if file.is_ome else _imagej_spacing(file)
+        if file.is_ome:
+            image = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"]["Image"]
+            told = (image[0] if isinstance(image, list) else image)["Pixels"]
+            units = [told.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
+            steps = [float(told[f"PhysicalSize{axis}"]) for axis in "XYZ"]
+        else:
+            told, tags = file.imagej_metadata or {}, file.pages[0].aspage().tags
+            (nx, dx), (ny, dy) = (tags[name].value for name in ("XResolution", "YResolution"))
+            units, steps = [told.get("unit", "")] * 3, [dx / nx, dy / ny, float(told["spacing"])]
+        steps = [step * LENGTHS.get(str(unit).lower(), 1.0) for step, unit in zip(steps, units, strict=True)]
     except (KeyError, IndexError, ZeroDivisionError, TypeError, ValueError):
         return {}
     return {"spacing": steps} if all(0 < step < math.inf for step in steps) else {}
-
-
-def _ome_spacing(file: Any) -> list[float]:
-    image = _tifffile(Path(file.filename)).xml2dict(file.ome_metadata)["OME"]["Image"]
-    pixels = (image[0] if isinstance(image, list) else image)["Pixels"]
-    return [
-        float(pixels[f"PhysicalSize{axis}"]) * _unit(pixels.get(f"PhysicalSize{axis}Unit", "µm"))
-        for axis in "XYZ"
-    ]
-
-
-def _imagej_spacing(file: Any) -> list[float]:
-    found, tags = file.imagej_metadata or {}, file.pages[0].aspage().tags
-    (nx, dx), (ny, dy) = (tags[name].value for name in ("XResolution", "YResolution"))
-    unit = _unit(found.get("unit", ""))
-    return [dx / nx * unit, dy / ny * unit, float(found["spacing"]) * unit]
-
-
-def _unit(name: Any) -> float:
-    return LENGTHS.get(str(name).replace("\\u00B5", "µ").lower(), 1.0)

@@ -1,40 +1,31 @@
 """Does a volume turn?"""
 
 import itertools
-import json
 import sys
 
 import numpy as np
 import pytest
 from PIL import Image
-from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main
-from jaxvol.app.commands.animate import _write_gif
-from jaxvol.app.commands.orbit import angles_of, turned
+from jaxvol.app.commands.animate import angles_of, turned
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
 
 
-def test_each_frame_is_what_render_makes_of_its_settings(volume_file, tmp_path, monkeypatch, drawn):
+def test_each_frame_is_seen_from_a_camera_that_turns(volume_file, tmp_path, monkeypatch, drawn):
     monkeypatch.chdir(tmp_path)
     words = ["--frames", "5", "--degrees", "100", "--axis", "0", "1", "1"]
-    assert main(["animate", volume_file.name, *SEEN, *words, "-o", "orbit"]) == 0
-    files = sorted((tmp_path / "orbit").iterdir())
-    assert [file.name for file in files] == [f"frame_{number:04d}.png" for number in range(5)]
+    assert main(["animate", volume_file.name, *SEEN, *words, "-o", "orbit.gif"]) == 0
     camera = jv.Camera.looking_at(jv.load(volume_file), size=(16, 16))
+    assert len(drawn.scenes) == 5
     for number, (_, _, seen, march) in enumerate(drawn.scenes):
         np.testing.assert_allclose(
             seen.position, turned(camera, 25.0 * number, (0, 1, 1)).position, rtol=1e-5
         )
         assert float(march.step) == np.float32(0.4)
-    said = json.loads(Image.open(files[3]).info["jaxvol"])
-    assert (said["command"], said["settings"]["turn"]) == ("render", 75)
-    assert main(["render", "--like", str(files[3]), "-o", "again.png"]) == 0
-    np.testing.assert_array_equal(drawn.scenes[-1][2].position, drawn.scenes[3][2].position)
-    np.testing.assert_array_equal(imread("again.png"), imread(files[3]))
 
 
 def test_a_camera_turns_about_its_focal_point():
@@ -45,7 +36,6 @@ def test_a_camera_turns_about_its_focal_point():
     np.testing.assert_allclose(turned(camera, 90, (1, 0, 0)).view_up, (0, -1, 0), atol=1e-6)
     np.testing.assert_array_equal(quarter.window, camera.window)
     assert quarter.parallel_scale == 2
-    assert turned(camera, 0, (0, 0, 0)) is camera
     with pytest.raises(ValueError, match="--axis must not be 0"):
         turned(camera, 1, (0, 0, 0))
 
@@ -73,14 +63,7 @@ def test_a_gif_holds_all_frames_and_lasts_as_long_as_it_should(volume_file, tmp_
     found, lasting = zip(*frames_in(output), strict=True)
     assert lasting == (200,) * 6
     assert all((one != other).any() for one, other in itertools.pairwise(found))
-
-    images = [np.full((8, 8, 3), 20 * number, np.uint8) for number in range(12)]
-    _write_gif(tmp_path / "b.gif", iter(images), 12, 12)  # 8 and 1/3 hundredths of a second each
-    found, lasting = zip(*frames_in(tmp_path / "b.gif"), strict=True)
-    np.testing.assert_array_equal(found, images)
-    assert sum(lasting) == 1000
-    assert set(lasting) == {80, 90}
-    assert Image.open(tmp_path / "b.gif").info["loop"] == 0
+    assert Image.open(output).info["loop"] == 0
 
 
 def test_an_mp4_holds_all_frames(volume_file, tmp_path, drawn):
@@ -96,13 +79,12 @@ def test_an_mp4_holds_all_frames(volume_file, tmp_path, drawn):
 
 
 BAD = {
-    "ending": (["-o", "a.avi"], "--output: must end in .gif or .mp4, or be a folder; got a.avi"),
+    "ending": (["-o", "a.avi"], "--output: must end in .gif or .mp4; got a.avi"),
     "frames": (["--frames", "0"], "--frames must be an integer of at least 1"),
-    "fps": (["--fps", "0"], "--fps must be above 0"),
-    "fps of a gif": (["--fps", "60"], "--fps: a .gif has 50 frames a second at most; got 60"),
+    "fps": (["--fps", "0"], "--fps of a .gif must be above 0"),
+    "fps of a gif": (["--fps", "60"], "--fps of a .gif must be above 0, and 50 at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
     "step and tolerance": (["--tolerance", "0.1"], "--step and --tolerance exclude"),
-    "odd mp4": (["-o", "a.mp4", "--size", "9", "8"], "--size: an .mp4 has an even number of pixels"),
     "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }
 

@@ -38,25 +38,20 @@ BAD = [
         ["render", "x.raw", "--memory", "0"],
         "--memory: must be a number of bytes, such as 256M or 2G; got '0'",
     ),
-    (
-        ["fit", "x.raw", "--images", "a.png", "--cameras", "c.json", "--solver", "newton"],
-        "fit: error: argument --solver: invalid choice: 'newton'",
-    ),
+    (["fit", "x.raw", "--images", "a.png"], "fit: error: the following arguments are required: cameras (ja"),
     (
         ["render", "x.raw", "--sise", "9", "9"],
-        "jaxvol render: error: unrecognized arguments: --sise 9 9. Did you mean --size? (jaxvol render -",
+        "jaxvol render: error: unrecognized arguments: --sise 9 9 (jaxvol render -",
     ),
     (["info", "x.raw", "y.raw"], "jaxvol info: error: unrecognized arguments: y.raw (jaxvol info --help"),
     (["datasets"], "datasets: error: the following arguments are required: action"),
-    (["paint"], "jaxvol: error: argument COMMAND: invalid choice: 'paint' (choose from"),
+    (["paint"], "error: argument COMMAND: invalid choice: 'paint' (choose from"),
 ]
 
 
 def test_invalid_options_are_named_in_one_line(capsys):
     for words, message in BAD:
-        with pytest.raises(SystemExit) as stop:
-            main(words)
-        assert stop.value.code == 2
+        assert main(words) == 2
         printed = capsys.readouterr().err
         assert message in printed
         assert printed.count("\n") == 1
@@ -97,26 +92,22 @@ from tests.app.commands.conftest import Drawn
 
 frames.render = Drawn()
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
-calls, save_image = [], animate.save_image
-def save(*given, **how):
-    calls.append(given)
-    if len(calls) == 2:
-        print("under way", flush=True)
-        jax.block_until_ready(jax.jit(lambda x: jax.lax.fori_loop(0, 10**9, lambda i, x: jnp.sin(x), x))(1.0))
-    return save_image(*given, **how)
-animate.save_image = save
+def display(*_):
+    print("under way", flush=True)
+    return jax.jit(lambda x: jax.lax.fori_loop(0, 10**9, lambda i, x: jnp.sin(x), x))(1.0).block_until_ready()
+animate.displayed = display
 sys.exit(jaxvol.app.cli.main(sys.argv[1:]))
 """
 
 
 def test_ctrl_c_ends_a_command_at_once_and_leaves_no_half_written_files(volume_file, tmp_path):
-    """While XLA computes, which no signal stops; the first frame of an orbit is written by then."""
+    """While XLA computes, which no signal stops."""
     folder = tmp_path / "there"
     folder.mkdir()
     (folder / "mine").write_text("kept")
     words = ["animate", str(volume_file), "--preset", "engine", "--no-shade", "--step", "0.4"]
     run = subprocess.Popen(
-        [sys.executable, "-c", BUSY, *words, "--size", "16", "16", "-o", str(folder)],
+        [sys.executable, "-c", BUSY, *words, "--size", "16", "16", "-o", str(folder / "a.gif")],
         cwd=Path(__file__).parents[3],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

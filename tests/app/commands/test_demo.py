@@ -15,6 +15,7 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main
+from jaxvol.app.commands import demo
 
 
 SMALL = ["--size", "40", "30", "--resolution", "24"]
@@ -30,8 +31,9 @@ def codes(folder):
 def test_the_page_holds_the_code_that_made_its_pictures(tmp_path, capsys, monkeypatch, drawn):
     folder = tmp_path / "demo"
     monkeypatch.setattr(jv, "render", drawn)
-    assert main(["demo", "-o", str(folder), *SMALL, "--only", "head", "grain"]) == 0
-    assert "demo: before, after in" in capsys.readouterr().out
+    monkeypatch.setattr(demo, "PICTURES", {f: demo.PICTURES[f] for f in (demo.head, demo.grain)})
+    assert main(["demo", "-o", str(folder), *SMALL]) == 0
+    assert "demo: before, after\n" in capsys.readouterr().out
     names = {"head.png", "before.png", "after.png"}
     assert {path.name for path in folder.iterdir()} == {*names, "index.html"}
     assert set(re.findall(r'src="([^"]+)"', (folder / "index.html").read_text("utf-8"))) == names
@@ -54,9 +56,6 @@ def test_nothing_is_left_where_the_code_fails(tmp_path, capsys, monkeypatch):
     assert main(["demo", "-o", str(tmp_path / "demo"), *SMALL]) == 2
     assert capsys.readouterr().err.endswith("error: no light\n")
     assert not list(tmp_path.iterdir())
-    for words in (["--size", "0", "30"], ["--resolution", "2"]):
-        assert main(["demo", "-o", str(tmp_path / "demo"), *words]) == 2
-        assert words[0] in capsys.readouterr().err
 
 
 @pytest.mark.slow

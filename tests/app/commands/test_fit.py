@@ -73,7 +73,6 @@ BAD = {
     "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
     "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "each of the 3 images; got 2"),
     "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
-    "start": ({"--start": ["cameras.json"]}, "must be an object with values, colors, extinction; got a list"),
     "checkpoint": ({"--checkpoint": ["0.png/x"]}, "checkpoint: 0.png/x cannot be written"),
 }
 

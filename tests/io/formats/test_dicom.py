@@ -171,15 +171,15 @@ BAD = {
     "a tilted gantry": (tilted, r"shifted sideways by up to 2.*tilted gantry"),
     "a slice is missing": (
         lambda folder, paths: paths[2].unlink(),
-        r"unevenly spaced slices, or some are missing: the median distance is 2\.5, .* are 5",
+        r"unevenly spaced slices, or some are missing .*: the median distance is 2\.5, .* are 5 apart",
     ),
     "a slice is there twice": (
         lambda folder, paths: (folder / "copy.dcm").write_bytes(paths[1].read_bytes()),
-        r"1 slices that lie where another one does: (IM\d+.dcm and copy.dcm|copy)",
+        r"there twice: the median distance is 2\.5, and (IM\d+.dcm and copy.dcm|copy.* and IM.*) are 0 apart",
     ),
     "two series": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, tags=OTHER),
-        r"holds several series: .*(chest|head) \(.*file of the series",
+        r"holds several series: .*(chest|head) \(as IM\d+.dcm\).*file of the series",
     ),
     "an overview": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, turned(90, 0, 0)),
@@ -224,15 +224,11 @@ def test_one_of_two_series_is_chosen_by_a_file_of_it(tmp_path):
         write_slice(tmp_path / "a" / f"z{z}.dcm", DATA[:, :, z], place, tags={"0020|000e": "9"})
     other = jv.load(tmp_path / "a" / "z1.dcm")
     assert (other.shape, float(other.spacing[2])) == ((7, 6, 3), 7)
-    # what cannot be read of one does not refuse the other
-    z1 = tmp_path / "a" / "z1.dcm"
-    z1.write_bytes(z1.read_bytes()[:-40])
+    # what is no slice does not refuse the other
+    write_slice(tmp_path / "a" / "flat.dcm", DATA[:, :1, 0], ORIGIN, tags={"0020|000e": "9"})
     np.testing.assert_array_equal(jv.load(paths[0]).data, VALUES)
-    with pytest.raises(ValueError, match=r"z1\.dcm .*give the path of one file of the series"):
-        jv.load(tmp_path / "a")
-    paths[-1].write_bytes(paths[-1].read_bytes()[:-40])
-    with pytest.raises(ValueError, match=rf"{paths[-1].name} cannot be read"):
-        jv.load(paths[0])
+    with pytest.raises(ValueError, match="must agree"):
+        jv.load(tmp_path / "a" / "z1.dcm")
 
 
 def test_what_simpleitk_decompresses_is_read(tmp_path):

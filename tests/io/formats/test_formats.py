@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 
 from jaxvol._util import files
-from jaxvol.io import formats
-from jaxvol.io.formats import load, register
+from jaxvol.io.formats import load
 
 
 SHAPE = (5, 4, 3)
@@ -256,22 +255,6 @@ def test_neither_a_file_nor_a_header_takes_memory_that_the_other_does_not_back(t
             load(path)
         assert tracemalloc.get_traced_memory()[1] < 4 * files.CHUNK, name
         tracemalloc.stop()
-
-
-def test_formats_may_be_added(tmp_path, monkeypatch):
-    monkeypatch.setattr(formats, "READERS", dict(formats.READERS))
-
-    def reader(path, header):
-        header.refuse(path)
-        return {"data": ramp(), "spacing": (1, 2, 3)}
-
-    register(".Special.RAW", reader)
-    path = write(tmp_path / "a_9x9x9_uint8.special.raw", b"1")
-    assert same(load(path, origin=(1, 1, 1)), ramp(), (1, 2, 3), (1, 1, 1))
-    with pytest.raises(ValueError, match="shape and dtype are for raw files"):
-        load(path, shape=SHAPE)
-    with pytest.raises(ValueError, match="ending must start with a dot"):
-        register("vti", reader)
 
 
 @pytest.mark.parametrize(

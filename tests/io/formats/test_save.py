@@ -90,7 +90,7 @@ def test_labels_come_from_another_file(tmp_path):
     np.testing.assert_array_equal(volume.data, ramp("int16"))
     write_itk(tmp_path / "moved.nrrd", ramp("uint8"), SPACING, (0, 0, 0), turn)
     write_itk(tmp_path / "halves.nrrd", ramp("float32") / 2, SPACING, ORIGIN, turn)
-    for name, message in (("moved", "must have the origin of the volume"), ("halves", "must hold integers")):
+    for name, message in (("moved", "must lie where the volume does"), ("halves", "must hold integers")):
         with pytest.raises(ValueError, match=rf"labels: .*{name}\.nrrd {message}"):
             jv.load(tmp_path / "ct.nrrd", labels=tmp_path / f"{name}.nrrd")
     np.save(tmp_path / "ct.npy", ramp("uint8"))

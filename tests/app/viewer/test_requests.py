@@ -2,30 +2,31 @@
 
 import threading
 import time
+from typing import Any
 
-from jaxvol.app.viewer.worker import Worker
+from jaxvol.app.viewer.model import Model
 
 
-class Log(Worker[int]):
-    """A worker that waits to be let go on, and what it did."""
+class Log(Model):
+    """A model of numbers that waits to be let go on, and what it did."""
 
     def __init__(self, parts: int = 4, rest: float = 0.0):
         self.done: list[tuple[str, int]] = []
-        self.faults: list[Exception] = []
+        self.told: list[str] = []
         self.gate = threading.Semaphore(0)
         self.parts = parts
-        super().__init__(rest)
+        none: Any = None
+        super().__init__(none, none, none, self.told.append, rest)
 
-    def _failed(self, fault):
-        self.faults.append(fault)
+    def ask(self, request: Any):
+        super().ask(request)
 
-    def _coarse(self, request):
+    def _draw(self, request: Any):
         if request < 0:
             raise ValueError("negative")
         self.gate.acquire()
         self.done.append(("coarse", request))
-
-    def _fine(self, request):
+        yield
         try:
             for part in range(self.parts):
                 self.gate.acquire()
@@ -82,7 +83,7 @@ def test_a_fault_is_told_and_the_next_request_drawn():
     log = Log()
     log.ask(-1)
     assert log.wait(20)
-    assert [str(fault) for fault in log.faults] == ["negative"]
+    assert log.told == ["not drawn:\nnegative"]
     log.ask(3)
     log.go(5)
     assert log.wait(20)
