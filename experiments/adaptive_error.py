@@ -115,6 +115,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 def main(chosen: Namespace) -> dict[str, Any]:
     scenes: dict[str, Any] = {}
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
-        scenes[name] = {"outside": measure(scene), "inside": measure(inside(scene, chosen.size))}
+        scenes[name] = {"outside": measure(scene), "inside": measure(inside(scene))}
         show(scenes[name], name)
     return {"pixels": chosen.size, "summary": summary(scenes), "scenes": scenes}

@@ -15,8 +15,13 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
+SIZES = {"axes.titlesize": 9, "axes.labelsize": 9, "figure.titlesize": 9, "legend.fontsize": 8}
+SIZES |= {"xtick.labelsize": 8, "ytick.labelsize": 8, "lines.markersize": 4}
+
+
 def panels(rows: int, columns: int, width: float, height: float, **how: Any) -> tuple[Any, Any]:
     """A figure of so many panels, (rows, columns); its size is in inches."""
+    plt.rcParams.update(SIZES)
     return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **how)
 
 
@@ -28,16 +33,14 @@ def interval(panel: Any, ratio: Mapping[str, float], y: float, color: str, label
 
 def legend_below(figure: Any, panel: Any, columns: int) -> None:
     """One legend for all panels, below them: that of one panel."""
-    handles = panel.get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=8)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
 
 
-def logarithmic(panel: Any, x: float | None = None, y: float | None = None) -> None:
-    """Logarithmic scales of these bases, labelled by numbers such as 0.002 and 20, not by powers."""
-    for axis, base, setter in ((panel.xaxis, x, panel.set_xscale), (panel.yaxis, y, panel.set_yscale)):
-        if base is not None:
-            setter("log", base=base)
-            axis.set_major_formatter("{x:g}")
+def numbered(panel: Any, x: Sequence[float], names: Sequence[Any] | None = None) -> None:
+    """A logarithmic scale along x, with ticks at these numbers alone."""
+    panel.set_xscale("log", base=2)
+    panel.set_xticks(x, x if names is None else names)
+    panel.minorticks_off()
 
 
 def plain_numbers(panel: Any) -> None:

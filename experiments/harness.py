@@ -33,17 +33,8 @@ FINER = 8
 smaller."""
 
 QUICK = {"action": "store_true", "help": "tiny sizes, to check that the script runs"}
-
-HELP = {
-    "output": "default: %(default)s",
-    "size": "pixels along a side",
-    "sizes": "pixels along a side",
-    "resolution": "voxels along an axis of phantoms",
-    "paths": "paths through each pixel",
-}
-"""Of options that several scripts have."""
-
-POSITIONAL = ("commits",)
+HELP = {"size": "pixels along a side", "sizes": "pixels along a side", "output": "default: %(default)s"}
+HELP |= {"resolution": "voxels along an axis of phantoms", "paths": "paths through each pixel"}
 
 
 # -- scripts ----------------------------------------------------------------------------------------------
@@ -52,12 +43,14 @@ POSITIONAL = ("commits",)
 def command(about: str | None, output: Path, **options: Any) -> Callable[[Callable[[Namespace], None]], Main]:
     """Decorator that makes a script's `main` of a function of its options.
 
-    - `about`: what the script does, its docstring.
-    - `output`: default of `--output`, the folder to write into, which is made.
-    - `options`: the other options, by name: the default of an integer, what `add_argument` takes (a dict), or
-      a tuple, which is handed on and cannot be given. Those of `POSITIONAL` are given without their names.
+    Args:
+        about: what the script does, its docstring.
+        output: default of `--output`, the folder to write into, which is made.
+        options: the other options, by name: the default of an integer, what `add_argument` takes (a dict), or
+            a tuple, which is handed on and cannot be given. `commits` is given without its name.
 
-    The arguments as they were given, but for the output, are `argv` among the options.
+    Returns:
+        The decorator. The arguments as they were given, but for the output, are `argv` among the options.
     """
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     options["output"] = {"type": Path, "default": output, "metavar": "FOLDER"}
@@ -65,25 +58,21 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
     for name, option in options.items():
         if name not in constants:
             how = option if isinstance(option, dict) else {"type": int, "default": option}
-            flag = name if name in POSITIONAL else "--" + name.replace("_", "-")
+            flag = name if name == "commits" else "--" + name.replace("_", "-")
             parser.add_argument(flag, **{"help": HELP.get(name), **how})
 
     def made(run: Callable[[Namespace], None]) -> Main:
         def main(argv: Sequence[str] | None = None) -> None:
             given = sys.argv[1:] if argv is None else list(argv)
-            chosen = parser.parse_args(given, Namespace(argv=_without_output(given), **constants))
+            pairs = zip(["", *given], given, strict=False)
+            kept = [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]
+            chosen = parser.parse_args(given, Namespace(argv=kept, **constants))
             chosen.output.mkdir(parents=True, exist_ok=True)
             run(chosen)
 
         return main
 
     return made
-
-
-def _without_output(given: Sequence[str]) -> list[str]:
-    """Arguments without `--output FOLDER` or `--output=FOLDER`."""
-    pairs = zip(["", *given], given, strict=False)
-    return [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]
 
 
 def experiment(
@@ -93,12 +82,11 @@ def experiment(
     record and draws the chart. A result of None writes nothing. Both files have the module's name, and the
     question is how its docstring begins. Stands last in its file: as `python -m MODULE`, it runs at once.
 
-    - `draw`: draws the chart; None if a chart cannot be drawn from the record alone.
-    - `quick`: options and constants under `--quick`.
-    - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
+    Args:
+        draw: draws the chart; None if a chart cannot be drawn from the record alone.
+        quick: options and constants under `--quick`.
+        options: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
     """
-    if unknown := set(quick or ()) - set(options):
-        raise ValueError(f"quick must be some of the options; got {', '.join(sorted(unknown))}.")
 
     def made(measure: Callable[[Namespace], Any]) -> Main:
         module = sys.modules[measure.__module__]
@@ -174,24 +162,23 @@ def data() -> Path | None:
 
 
 def chosen_scenes(
-    chosen: Namespace, makers: Mapping[str, Callable[..., Scene]], phantom: str, size: int
-) -> Iterator[tuple[str, Scene]]:
+    chosen: Namespace, makers: Mapping[str, Callable[..., Any]], phantom: str, size: int
+) -> Iterator[tuple[str, Any]]:
     """The scenes of `--only`, of this size; without the folder of real volumes, or if quick, the phantom's
     alone, of `--resolution`."""
     folder = data()
     for name in [phantom] if folder is None or chosen.quick else chosen.only:
-        more = {"resolution": chosen.resolution} if name == phantom else {}
-        yield name, makers[name](folder, size, **more)
+        yield name, makers[name](folder, size, chosen.resolution)
 
 
 def frame(scene: Scene, march: jv.March) -> jv.Rendering:
     """The image with all its outputs."""
-    return jv.render(scene.volume, scene.transfer, scene.camera, march)
+    return jv.render(*scene[:3], march)
 
 
 def image(scene: Scene, march: jv.March) -> jv.Rendering:
     """The image alone, as it is timed."""
-    return jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
+    return jv.render(*scene[:3], march, outputs="rgba")
 
 
 def entered(scene: Scene) -> np.ndarray:

@@ -61,11 +61,9 @@ def behind(
 ) -> dict[str, dict[str, float | None]]:
     """The points of other programs that no point of ours is as good as, in error and in time.
 
-    `same`: errors that differ by this part count as equal, since programs that take the same samples differ
-    by rounding.
-
     For each, by what factor we miss it: `time`: that of our fastest point at its error, over its own;
-    `error`: that of our best point in its time, over its own. None where we have no such point.
+    `error`: that of our best point in its time, over its own. None where we have no such point. Errors that
+    differ by the part `same` count as equal, since programs that take the same samples differ by rounding.
     """
     found: dict[str, dict[str, float | None]] = {}
     for name, (error, seconds) in theirs.items():
@@ -93,11 +91,6 @@ def concluded(name: str, found: dict[str, Any], options: list[str]) -> dict[str,
     theirs = {n: pair for n, pair in pairs.items() if n not in ours}
     ahead = behind(list(ours.values()), theirs, SAME)
     return {
-        "view": row.view,
-        "look": row.look,
-        "lit": row.lit,
-        "toroidal": row.toroidal,
-        "volume": row.file or "phantom",
         "pixels": found["pixels"],
         "reference": found["reference"],
         "base": pareto_points.base_of(row),
@@ -138,10 +131,10 @@ def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, 
     truth = pareto_measure.converged(case, row, sizes.templates)
     made = {"": settings[base].make(case), point: settings[point].make(case)}
     rows = programs.measured(made, truth, sizes.repetitions)
-    output.mkdir(parents=True, exist_ok=True)
+    output.mkdir(exist_ok=True)
     file = output / f"{slug(name)}, {slug(point)}.png"
     jv.save_png(file, pareto_measure.beside(made[point], truth))
-    return {**rows[point], "picture, and its error times " + str(pareto_measure.AMPLIFIED): str(file)}
+    return {**rows[point], f"picture, and its error times {pareto_measure.AMPLIFIED}": str(file)}
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -150,12 +143,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
     file = path.with_suffix(".json")
     file = file if file.is_file() else record.RESULTS / "pareto.json"
     pareto_page.write(file, file.parent / "pareto", path.with_suffix(".html"))
-
-
-def there(file: str | None) -> bool:
-    """Whether a scene's volume is there."""
-    folder = harness.data()
-    return file is None or (folder is not None and (folder / file).is_file())
 
 
 @experiment(
@@ -169,14 +156,12 @@ def there(file: str | None) -> bool:
     quick={"size": 32, "repetitions": 2, "resolution": 32, "templates": 4},
 )
 def main(chosen: Namespace) -> dict[str, Any] | None:
-    given = any(word.split("=")[0] == "--scene" for word in chosen.argv)
-    names = [name for name in chosen.scene if there(ROWS[name].file)]
-    if chosen.quick and not given:
+    folder = harness.data() or Path("/none")
+    names = [n for n in chosen.scene if (file := ROWS[n].file) is None or (folder / file).is_file()]
+    if chosen.quick and chosen.scene == list(ROWS):
         names = list(QUICK)
-    if chosen.point is not None and (len(names) != 1 or not given):
+    if not names or (chosen.point is not None and len(names) != 1):
         raise ValueError(f"--point is of one scene: give one --scene that is there; got {', '.join(names)}.")
-    if not names:
-        raise ValueError("--scene must name a scene whose volume is there; got none.")
     sizes = Sizes(chosen.size, chosen.resolution, chosen.repetitions, chosen.templates)
     folder, present = chosen.output / "pareto", programs.peers()
     if chosen.point is not None:
@@ -188,7 +173,11 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
     scenes: dict[str, Any] = {}
     for name in names:
         settings = pareto_points.of(ROWS[name], present)
-        settings = pareto_points.few(settings) if chosen.quick else settings
+        if chosen.quick:  # the first two of each family
+            of_family = {
+                s.family: [n for n in settings if settings[n].family == s.family] for s in settings.values()
+            }
+            settings = {n: settings[n] for names_ in of_family.values() for n in names_[:2]}
         found = pareto_measure.scene(name, folder / slug(name), sizes, settings)
         scenes[name] = {"measured": made, **concluded(name, found, ["--quick"] if chosen.quick else options)}
     same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}

@@ -52,7 +52,6 @@ COLUMNS = 4
 TEMPLATE = Path(__file__).with_suffix(".html")
 NUMBERS = ("family", "rmse", "psnr", "ssim", "wood grain")
 """What the page tells of a point, beside its time."""
-AHEAD = "their points that it is not"
 
 
 def chart(result: dict[str, Any]) -> Any:
@@ -66,7 +65,7 @@ def chart(result: dict[str, Any]) -> Any:
     for panel in axes.flat[len(scenes) :]:
         panel.set_axis_off()
     for panel in axes[:, 0]:
-        panel.set_ylabel("time of a frame, ms", fontsize=9)
+        panel.set_ylabel("time of a frame, ms")
     used = {point["family"] for scene in scenes.values() for point in scene["points"].values()}
     marks = [
         Line2D([], [], color=color, marker=MARKS.get(family, "o"), linestyle="", label=family)
@@ -93,22 +92,18 @@ def identity(scene: str, setting: str) -> str:
 
 def draw_scene(panel: Any, name: str, scene: dict[str, Any]) -> None:
     points = scene["points"]
-    for family in dict.fromkeys(point["family"] for point in points.values()):
-        style: Any = {"color": COLORS[family], "markersize": 6 if family in MARKS else 4.5, "alpha": 0.8}
-        mine = ((name_, point) for name_, point in points.items() if point["family"] == family)
-        for setting, point in mine:
-            mark, z = MARKS.get(family, "o"), 3 if family in MARKS else 2
-            at = point["rmse"], point["time"] * 1e3
-            panel.plot(*at, mark, zorder=z, gid=identity(name, setting), **style)
+    for setting, point in points.items():
+        family = point["family"]
+        style: Any = {"markersize": 6, "zorder": 3} if family in MARKS else {"markersize": 4.5, "zorder": 2}
+        style |= {"color": COLORS[family], "alpha": 0.8, "gid": identity(name, setting)}
+        panel.plot(point["rmse"], point["time"] * 1e3, MARKS.get(family, "o"), **style)
     front = [points[n] for n in scene["front of jaxvol"]]
     corners = [(p["rmse"], p["time"] * 1e3) for p in front]
-    if corners:
-        corners.append((max(point["rmse"] for point in points.values()), corners[-1][1]))
-        panel.step(*zip(*corners, strict=True), where="post", color="k", linewidth=1.2, zorder=1)
+    corners.append((max(point["rmse"] for point in points.values()), corners[-1][1]))
+    panel.step(*zip(*corners, strict=True), where="post", color="k", linewidth=1.2, zorder=1)
     panel.axvline(scene["reference"]["rmse"], color="k", linewidth=0.8, linestyle=":")
     panel.set(xscale="log", yscale="log", xlabel="RMSE")
     panel.set_title(f"{name}, {scene['pixels']}²", fontsize=10)
-    panel.tick_params(labelsize=8, which="both")
     charts.plain_numbers(panel)
     panel.grid(which="major", linewidth=0.3)
 
@@ -133,15 +128,16 @@ def write(path: Path, pictures: Path, page: Path) -> None:
         for name, scene in result["scenes"].items()
         for setting in scene["points"]
     }
-    files = {file.relative_to(pictures).as_posix(): file for file in sorted(pictures.glob("*/*.webp"))}
+    shown = {
+        file.relative_to(pictures).as_posix(): base64.b64encode(file.read_bytes()).decode()
+        for file in sorted(pictures.glob("*/*.webp"))
+    }
     parts = {
         "<!--ABOUT-->": html.escape(about),
         "<!--CHART-->": drawn.getvalue().partition("<svg")[2].join(("<svg", "")),
         "<!--AHEAD-->": ahead(result["scenes"]),
         "/*POINTS*/": as_script(points),
-        "/*PICTURES*/": as_script(
-            {name: base64.b64encode(file.read_bytes()).decode() for name, file in files.items()}
-        ),
+        "/*PICTURES*/": as_script(shown),
     }
     text = TEMPLATE.read_text(encoding="utf-8")
     for place, part in parts.items():
@@ -175,7 +171,7 @@ def ahead(scenes: dict[str, Any]) -> str:
     for name, scene in scenes.items():
         points = scene["points"].values()
         shortest = min(point["time"] for point in points if point["family"] not in MARKS)
-        for setting, by in scene[AHEAD].items():
+        for setting, by in scene["their points that it is not"].items():
             ratios = ["none" if by[key] is None else f"{by[key]:.3g}" for key in ("time", "error")]
             ours = by["time"] and scene["points"][setting]["time"] * by["time"]
             rows.append((f"{name}: {setting}", *ratios, f"{shortest / ours:.0%}" if ours else ""))

@@ -44,7 +44,7 @@ Settings = dict[str, Setting]
 
 def sweep(
     family: str, name: str, steps: Iterable[float], *transforms: Any, toroidal: bool = True, **how: Any
-):
+) -> Settings:
     """The same setting at several steps, by name."""
     return {f"{name}, step {s:g}": Setting(family, ours(*transforms, step=s, **how), toroidal) for s in steps}
 
@@ -57,16 +57,15 @@ def lit(
     **how: Any,
 ) -> Setting:
     """A setting of light, by options of its templates."""
+    changed: Any = {"changed": copied} if "baked" in how else {}
+    return Setting(family, ours(lighting=partial(by, **how), step=step, quadrature=quadrature, **changed))
 
-    def keep(case: Case) -> Case:
-        """The same volume in an array of its own, since a volume keeps one baked light only."""
-        volume = case.scene.volume
-        copied = jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)
-        return case._replace(scene=case.scene._replace(volume=copied))
 
-    changed: Any = {"changed": keep} if "baked" in how else {}
-    light = partial(by, **how)
-    return Setting(family, ours(lighting=light, step=step, quadrature=quadrature, **changed))
+def copied(case: Case) -> Case:
+    """The same volume in an array of its own, since a volume keeps one baked light only."""
+    volume = case.scene.volume
+    volume = jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)
+    return case._replace(scene=case.scene._replace(volume=volume))
 
 
 @cache
@@ -82,19 +81,14 @@ def in_bricks(part: float, step: float, case: Case) -> Program:
     transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
     march = jv.March(step * voxel, transforms, "midpoint")
     memory = int(part * COPIES * volume.data.nbytes)
-    path = Path(_folder().name) / f"{len(list(Path(_folder().name).glob('*.npy')))}.npy"
+    path = Path(_folder().name) / f"{part:g}, {step:g}.npy"
     np.save(path, np.asarray(volume.data))
     source = jv.bricks.source_of(path, spacing=volume.spacing, origin=volume.origin)
 
     def render() -> jv.Rendering:
         return jv.render_bricks(source, transfer, camera, march, memory=memory, outputs="rgba")
 
-    def image() -> np.ndarray:
-        rendering = render()
-        assert not np.any(rendering.exhausted)
-        return np.asarray(rendering.image())
-
-    return Program(lambda: render().rgba, image)
+    return Program(lambda: render().rgba, lambda: np.asarray(render().image()))
 
 
 def tabulated(points: int, case: Case) -> Case:
@@ -118,15 +112,14 @@ def stored(kind: str, case: Case) -> Case:
     return case._replace(scene=case.scene._replace(volume=volume, transfer=transfer))
 
 
-JITTERS: dict[str, tuple[jv.Transform, ...]] = {
-    "jittered": (jv.Jitter(0),),
-    "jittered, blue": (jv.Jitter(0, "blue"),),
-    "jittered, front residual": (jv.Jitter(0, front_residual=True),),
-    "empty-space jittered": (jv.EmptySpaceJitter(0),),
-    "empty-space jittered, blue": (jv.EmptySpaceJitter(0, "blue"),),
+JITTERS: dict[str, tuple[jv.Transform, bool]] = {
+    "jittered": (jv.Jitter(0), True),
+    "jittered, blue": (jv.Jitter(0, "blue"), False),
+    "jittered, front residual": (jv.Jitter(0, front_residual=True), False),
+    "empty-space jittered": (jv.EmptySpaceJitter(0), True),
+    "empty-space jittered, blue": (jv.EmptySpaceJitter(0, "blue"), False),
 }
-PAPER = "jittered", "empty-space jittered"
-"""Those of Kye 2013, and the only ones in toroidal scans."""
+"""With whether they are measured in toroidal scans, too: those of Kye 2013."""
 PLAIN = jv.AlphaCorrection, jv.SpaceLeaping, jv.EarlyTermination
 NOT_ALIGNED: Any = {"without": (jv.AlphaCorrection,)}
 NO_LEAPING: Any = {"without": (jv.SpaceLeaping,)}
@@ -138,8 +131,8 @@ def unlit() -> Settings:
         found |= sweep(quadrature, quadrature, STEPS, quadrature=quadrature)
     for tolerance in FINEST_OF:
         found[f"adaptive, tolerance {tolerance:g}"] = Setting("adaptive", programs.adaptive(tolerance), True)
-    for name, jitter in JITTERS.items():
-        found |= sweep("jitter", name, (1.0, 2.0), *jitter, toroidal=name in PAPER)
+    for name, (jitter, toroidal) in JITTERS.items():
+        found |= sweep("jitter", name, (1.0, 2.0), jitter, toroidal=toroidal)
     found |= sweep("alignment", "not aligned", (0.5, 1.0, 2.0), **NOT_ALIGNED)
     found |= sweep("alignment", "not aligned, left", (0.5, 1.0), quadrature="left", **NOT_ALIGNED)
     found |= sweep("alignment", "plain ray casting", (0.5, 1.0, 2.0), quadrature="left", without=PLAIN)
@@ -161,20 +154,18 @@ def unlit() -> Settings:
 
 def of_templates() -> Settings:
     found = {}
-    for quadrature in ("midpoint", "left"):
+    for q in ("midpoint", "left"):
         for step in (1.0, 0.5, 2.0, 4.0):
-            name = f"lit, {quadrature}, step {step:g}"
-            found[name] = lit("deferred", deferred, step, quadrature, photons=PHOTONS)
+            found[f"lit, {q}, step {step:g}"] = lit("deferred", deferred, step, q, photons=PHOTONS)
     found |= {f"photons {n}": lit("photons", photons=n) for n in (1, 4, 8, 16)}
     found["all photons"] = lit("photons")
     found["all photons, hard occlusion"] = lit("photons", occlusion="hard")
     found["all photons, deferred"] = lit("deferred", deferred)
+    blended: Any = {"blend": True, "photons": PHOTONS}
     for n in (1, 2, 4):
-        name = f"templates {n}, photons {PHOTONS}"
-        found[name] = lit("templates", templates=n, blend=True, photons=PHOTONS)
+        found[f"templates {n}, photons {PHOTONS}"] = lit("templates", templates=n, **blended)
     for n in (2, 4, 8):
-        name = f"templates {n}, deferred"
-        found[name] = lit("deferred", deferred, templates=n, blend=True, photons=PHOTONS)
+        found[f"templates {n}, deferred"] = lit("deferred", deferred, templates=n, **blended)
     for n in (32, 64, 128):
         found[f"baked {n}"] = lit("baked", baked=n)
         found[f"baked {n}, deferred"] = lit("baked", deferred, baked=n)
@@ -237,11 +228,3 @@ def of(row: Row, there: dict[str, str]) -> Settings:
 def base_of(row: Row) -> str:
     """Name of the setting that all others of the scene are timed against."""
     return next(iter(SETTINGS[row.kind]))
-
-
-def few(settings: Settings, count: int = 2) -> Settings:
-    """The first settings of each family."""
-    families: dict[str, list[str]] = {}
-    for name, setting in settings.items():
-        families.setdefault(setting.family, []).append(name)
-    return {n: settings[n] for names in families.values() for n in names[:count]}

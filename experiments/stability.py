@@ -10,27 +10,93 @@ Beside the record and the chart, the folder `stability` holds pictures on both s
 image is what is measured. The documentation's page of failures shows all of it.
 """
 
+import math
+import textwrap
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 import jaxvol as jv
 from jaxvol._util.whole_files import whole_file
 
-from .atlas import ENTRIES, FAMILIES
-from .atlas.chart import chart
-from .atlas.entry import Entry, pictured, sweep
+from . import charts
+from .atlas import ENTRIES
+from .atlas.entry import Entry, sweep
 from .harness import experiment, recorded, show, some_of
 
 
 ABOUT = ("question", "method", "regime", "metric", "judged", "limit", "outcome", "does", "shows", "size")
+COLUMNS = 4
+OUTCOMES = {"detected and said": "C0", "documented": "C1", "fails": "C3"}
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
-    chart(ENTRIES, result["entries"], path)
+    """A panel for each entry."""
+    entries = result["entries"]
+    rows = -(-len(entries) // COLUMNS)
+    figure, axes = charts.panels(rows, COLUMNS, 3.6 * COLUMNS, 2.9 * rows)
+    for panel in axes.flat[len(entries) :]:
+        panel.set_axis_off()
+    for panel, (name, found) in zip(axes.flat, entries.items(), strict=False):
+        draw_panel(panel, ENTRIES[name], found)
+    handles = [Rectangle((0, 0), 1, 1, color=color, alpha=0.35) for color in OUTCOMES.values()]
+    labels = [f"edge; beyond it: {outcome}" for outcome in OUTCOMES]
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    figure.suptitle(
+        "From left to right a regime becomes harmful; upwards: an error. Black: the curve that finds the "
+        "edge. Dashed: the limit. Crosses: not finite."
+    )
+    charts.save(figure, path)
+
+
+def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
+    """Metric against regime, with the limit and the edge. Crosses at the top: not finite."""
+    values, curves = found["values"], found["curves"]
+    numbers = [number for curve in curves.values() for number in curve]
+    top = 2 * max(entry.limit, *(number for number in numbers if math.isfinite(number)))
+    for name, curve in curves.items():
+        style, width = ("k-", 1.4) if name == entry.judged else ("-", 1)
+        (line,) = panel.plot(values, curve, style, marker=".", markersize=6, label=name, linewidth=width)
+        lost = [v for v, number in zip(values, curve, strict=True) if not math.isfinite(number)]
+        panel.plot(lost, [top] * len(lost), "x", color=line.get_color(), markersize=6)
+    _scale(panel, "x", entry.scales[0], values)
+    _scale(panel, "y", entry.scales[1], numbers)
+    if values[0] > values[-1]:  # from harmless to harmful, from left to right
+        panel.invert_xaxis()
+    panel.axhline(entry.limit, color="0.6", linewidth=0.8, linestyle="--")
+    within, beyond = found["edge"]["within"], found["edge"]["beyond"]
+    if beyond is not None:
+        panel.axvspan(beyond if within is None else within, beyond, color=OUTCOMES[entry.outcome], alpha=0.35)
+    panel.set_title(entry.name)
+    panel.set_xlabel(entry.regime, fontsize=7)
+    panel.set_ylabel(textwrap.fill(entry.metric, 36), fontsize=7)
+    panel.tick_params(labelsize=7, which="both")
+    panel.legend(fontsize=6, framealpha=0.7)
+
+
+def _scale(panel: Any, name: Literal["x", "y"], scale: str, values: Sequence[float]) -> None:
+    """Sets the scale of an axis, with ticks that do not overlap. Linear where nothing is positive."""
+    axis, setter = getattr(panel, f"{name}axis"), getattr(panel, f"set_{name}scale")
+    axis.get_offset_text().set_size(7)
+    sizes = [abs(v) for v in values if v != 0 and math.isfinite(v)]
+    if scale == "linear" or not sizes:
+        return
+    powers = np.log10([min(sizes), max(sizes)])
+    if scale == "symlog":
+        setter("symlog", linthresh=min(sizes))
+        every = math.ceil(np.ptp(powers) / 5)
+        axis.set_ticks([0.0, *10.0 ** np.arange(math.ceil(powers[1]), math.floor(powers[0]) - 1, -every)])
+    else:
+        setter("log", nonpositive="mask")
+        axis.set_major_locator(LogLocator(numticks=6))
+    few = np.ptp(powers) <= 1  # ticks at powers of ten alone would be too few
+    axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)) if few else NullFormatter())
 
 
 def keep(entry: Entry, values: tuple[float, float], size: int, folder: Path) -> None:
@@ -51,14 +117,15 @@ def keep(entry: Entry, values: tuple[float, float], size: int, folder: Path) -> 
     quick={"picture": 64},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    if chosen.quick and chosen.only == list(ENTRIES):  # one of each family, since all take minutes to compile
-        chosen.only = [family[0].name for family in FAMILIES.values()]
+    if chosen.quick and chosen.only == list(ENTRIES):  # one of each file, since all take minutes to compile
+        chosen.only = list({entry.measure.__module__: name for name, entry in ENTRIES.items()}.values())
     entries: dict[str, Any] = {}
     for name in chosen.only:
         entry = ENTRIES[name]
         found = sweep(entry, entry.size, entry.values[:: len(entry.values) - 1] if chosen.quick else None)
         if entry.picture is not None:
-            found["pictured"] = pictured(entry, found)
+            within = found["edge"]["within"]
+            found["pictured"] = entry.pictured or (within or entry.values[0], entry.values[-1])
             keep(entry, found["pictured"], chosen.picture, chosen.output / "stability")
         entries[name] = found | {key: getattr(entry, key) for key in ABOUT}
         show({name: found["edge"]})
