@@ -61,15 +61,8 @@ class Scene(eqx.Module):
     step: float
 
     def __call__(self, probe: jv.ToroidalMap, camera: jv.Camera) -> Any:
-        return self.volume, self.transfer, camera, self.march(probe, self.step)
-
-    def march(self, probe: jv.ToroidalMap, step: float) -> jv.March:
-        return jv.March(step, (probe, jv.AlphaCorrection()), "midpoint")
-
-    def reference(self, probe: jv.ToroidalMap, camera: jv.Camera, finer: int = 1) -> jv.Rendering:
-        """The image at steps so many times finer."""
-        march = self.march(probe, self.step / finer)
-        return jv.render(self.volume, self.transfer, camera, march, outputs="rgba")
+        march = jv.March(self.step, (probe, jv.AlphaCorrection()), "midpoint")
+        return self.volume, self.transfer, camera, march
 
 
 def phantom(
@@ -88,10 +81,13 @@ def cameras(size: int) -> list[jv.Camera]:
 def views(
     scene: Scene, probe: jv.ToroidalMap, seen: list[jv.Camera], noise: float, seed: int, finer: int = 1
 ) -> list[Any]:
-    """References with their cameras."""
-    rng = np.random.default_rng(seed)
-    images = [(camera, scene.reference(probe, camera, finer).image()) for camera in seen]
-    return [(camera, image + noise * rng.normal(size=image.shape)) for camera, image in images]
+    """References with their cameras, at steps so many times finer."""
+    rng, found = np.random.default_rng(seed), []
+    fine = Scene(scene.volume, scene.transfer, scene.step / finer)
+    for camera in seen:
+        image = jv.render(*fine(probe, camera), outputs="rgba").image()
+        found.append((camera, image + noise * rng.normal(size=image.shape)))
+    return found
 
 
 def numbers(probe: jv.ToroidalMap) -> np.ndarray:
@@ -118,8 +114,7 @@ def recovered(
     scene: Scene, targets: list[Any], truth: jv.ToroidalMap, start: jv.ToroidalMap
 ) -> dict[str, Any]:
     """Errors of all numbers and their standard errors, relative to `scales`, of the fit from this start."""
-    fits = jv.fit_coarse_to_fine(jv.ImageResidual(scene, targets), start, blurs=BLURS, **HOW)
-    fit = fits[-1]
+    *_, fit = fits = jv.fit_coarse_to_fine(jv.ImageResidual(scene, targets), start, blurs=BLURS, **HOW)
     assert fit.uncertainty is not None
     errors = (numbers(fit.parameters) - numbers(truth)) / scales(truth)
     deviations = np.sqrt(np.diag(fit.uncertainty.covariance)) / scales(truth)
@@ -169,38 +164,35 @@ class UpToScale(eqx.Module):
         return volume, transfer, scaled, march
 
 
+VARIANTS = "all eight numbers", "cameras up to scale", "shells through a window", "spheres and wires"
+
+
 def left_open(variant: str, resolution: int, size: int, seed: int) -> dict[str, Any]:
     """What a variant of the problem leaves open."""
+    seen, options = cameras(size), {}
     if variant == "shells through a window":  # of equal depth, their ends out of view
         scene, probe = phantom(resolution, "shells", speckle=False)
-        inside = jv.Camera((20, 12, 350), (5, 3, 85), (1, 0, 0), 8.0, size=(size, size))
-        return determined(jv.ImageResidual(scene, views(scene, probe, [inside], NOISE, seed)), probe, probe)
-    scene, probe = phantom(resolution)
-    targets = views(scene, probe, cameras(size), NOISE, seed)
+        seen = [jv.Camera((20, 12, 350), (5, 3, 85), (1, 0, 0), 8.0, size=(size, size))]
+    else:
+        scene, probe = phantom(resolution)
+    targets = views(scene, probe, seen, NOISE, seed)
     if variant == "cameras up to scale":
         residual = jv.ImageResidual(UpToScale(scene), targets)
         return determined(residual, (probe, jnp.float32(1.0)), probe)
-    free = jax.tree.map(lambda _: jv.Unconstrained(), probe)
-    options = {"constraints": free} if variant == "all eight numbers" else {}
+    if variant == "all eight numbers":
+        options["constraints"] = jax.tree.map(lambda _: jv.Unconstrained(), probe)
     return determined(jv.ImageResidual(scene, targets), probe, probe, **options)
-
-
-VARIANTS = "all eight numbers", "cameras up to scale", "shells through a window", "spheres and wires"
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """Errors of each number, and how well each variant of the problem determines it."""
     figure, (axes,) = charts.panels(1, 2, 12, 4.2)
     at, rows = np.arange(len(NAMES)), result["recovered"]
-    together = np.array([name.startswith("all") for name in rows])
-    errors = np.array([[abs(row["errors"][name]) for name in NAMES] for row in rows.values()])
-    for kind, mark in ((True, "o"), (False, "^")):
-        some = 100 * errors[together == kind]
-        if not len(some):
-            continue
-        label = f"{len(some)} starts with {'all numbers' if kind else 'one number'} 20 % off"
+    for kind, mark, words in ((True, "o", "all numbers"), (False, "^", "one number")):
+        some = [row["errors"] for name, row in rows.items() if name.startswith("all") == kind]
+        errors = 100 * np.abs([[each[name] for name in NAMES] for each in some]).reshape(-1, len(NAMES))
         across = at + np.linspace(-0.15, 0.15, len(some))[:, None] + (0.03 if kind else 0)
-        axes[0].plot(across.ravel(), some.ravel(), mark, markersize=4, label=label)
+        axes[0].plot(across.ravel(), errors.ravel(), mark, label=f"{len(some)} starts with {words} 20 % off")
     likely = [100 * np.median([row["standard errors"][name] for row in rows.values()]) for name in NAMES]
     axes[0].plot(at, likely, "k_", markersize=26, label="standard error by the covariance (median)")
     axes[0].axhline(100 * OFF, color="k", linestyle=":", linewidth=1, label="at the start")
@@ -208,7 +200,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     ylabel = "error, % of the number (angles: of half their range)"
     axes[0].set(yscale="log", xticks=at, xticklabels=NAMES, ylabel=ylabel)
     charts.plain_numbers(axes[0])
-    axes[0].set_title("numbers of the probe, found from images", fontsize=9)
+    axes[0].set_title("numbers of the probe, found from images")
     axes[0].legend(fontsize=7, loc="upper right", bbox_to_anchor=(1, 0.95))
     cases = result["left open"]
     table = np.array([[row["standard errors"][name] for name in NAMES] for row in cases.values()])
@@ -218,7 +210,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         text = f"{100 * table[i, j]:.2g}" if known[i, j] else "open"
         axes[1].text(j, i, text, ha="center", va="center", fontsize=8)
     axes[1].set(xticks=at, xticklabels=NAMES, yticks=range(len(cases)), yticklabels=list(cases))
-    axes[1].set_title("standard error by the covariance, %; open: not determined", fontsize=9)
+    axes[1].set_title("standard error by the covariance, %; open: not determined")
     charts.save(figure, path)
 
 

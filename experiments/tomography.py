@@ -44,7 +44,7 @@ DENSEST = 0.1
 THIN = 0.1
 """Part of the mean density below which the bijection bends. With 1, low densities change too slowly."""
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
-FBP, SART, OURS = "FBP", "SART", "jaxvol"
+METHODS = FBP, SART, OURS = "FBP", "SART", "jaxvol"
 STEP, STEP_OF_VIEWS = 0.5, 1 / 6
 """Of the fit, and of the views, in voxels."""
 
@@ -102,7 +102,7 @@ class Progress:
     def __init__(self, truth: Density):
         self.truth, self.spent, self.begun = truth, 0.0, time.perf_counter()
         self.rows: list[dict[str, float]] = []
-        self.nearest: Density | None = None
+        self.nearest = truth
 
     def look(self, density: Any) -> None:
         self.spent += time.perf_counter() - self.begun
@@ -114,76 +114,63 @@ class Progress:
         self.begun = time.perf_counter()
 
 
-def filtered(sinogram: np.ndarray, truth: Density) -> tuple[Progress, str]:
+def filtered(sinogram: np.ndarray, progress: Progress) -> None:
     """FBP with each filter."""
-    progress = Progress(truth)
     for name in FILTERS:
         slices = [iradon(one.T, angles(len(one)), filter_name=name) for one in np.moveaxis(sinogram, 2, 0)]
         progress.look(np.maximum(np.stack(slices, axis=-1), 0))
-    best = int(np.argmin([row["rmse"] for row in progress.rows]))
-    return progress, f"the filter {FILTERS[best]}"
 
 
-def algebraic(sinogram: np.ndarray, truth: Density, sweeps: int) -> tuple[Progress, str]:
+def algebraic(sinogram: np.ndarray, progress: Progress, sweeps: int) -> None:
     """SART, one sweep over all views after the other."""
-    progress, slices = Progress(truth), [None] * sinogram.shape[2]
+    slices = [None] * sinogram.shape[2]
     for _ in range(sweeps):
         slices = [
             iradon_sart(one.T, angles(len(one)), image=image, clip=(0, np.inf))
             for one, image in zip(np.moveaxis(sinogram, 2, 0), slices, strict=True)
         ]
         progress.look(np.stack(slices, axis=-1))
-    return progress, "sweeps over all views"
 
 
-def fitted(sinogram: np.ndarray, truth: Density, evaluations: int) -> tuple[Progress, str]:
+def fitted(sinogram: np.ndarray, progress: Progress, evaluations: int) -> None:
     """L-BFGS from a flat and thin density: `THIN` times the mean density, estimated from the views."""
     views, n, _ = sinogram.shape
     thin = THIN * float(sinogram.mean()) / n
     # the loss has a curvature of about 1 where all densities change alike: a first step has the right length
     unit = jnp.float32(thin * np.sqrt(views * n))
     residual = Difference(rays(n, views), jnp.asarray(sinogram), unit)
+    how: dict[str, Any] = {"solver": optx.LBFGS(0.0, 0.0), "constraints": jv.Positive(thin)}
 
-    def fit(evaluations: int, look: Callable[[Any], None]) -> jv.Fit:
-        return jv.fit(
-            residual,
-            jnp.full((n, n, n), thin, jnp.float32),
-            solver=optx.LBFGS(0.0, 0.0),
-            constraints=jv.Positive(thin),
-            max_steps=evaluations,
-            patience=evaluations,
-            callback=lambda step, density, loss: look(density),
-        )
+    def fit(evaluations: int, look: Callable[[Any], None]) -> None:
+        start = jnp.full((n, n, n), thin, jnp.float32)
+        how["callback"] = lambda step, density, loss: look(density)
+        jv.fit(residual, start, max_steps=evaluations, patience=evaluations, **how)
 
     fit(2, lambda density: None)  # compiles before the clock starts
-    progress = Progress(truth)
+    progress.begun = time.perf_counter()
     fit(evaluations, progress.look)
-    return progress, "evaluations with gradient"
-
-
-METHODS = FBP, SART, OURS
 
 
 def measure(truth: Density, photons: float | None, chosen: Namespace) -> dict[str, Any]:
     """The error of each method; the slice to be drawn is kept under `"slice"`."""
     exact = np.array(line_integrals(truth, rays(len(truth), chosen.views), STEP_OF_VIEWS))
-    sinogram, middle, rows = counted(exact, photons, chosen.seed), truth.shape[2] // 2, {}
-    found = {
-        FBP: filtered(sinogram, truth),
-        SART: algebraic(sinogram, truth, chosen.sweeps),
-        OURS: fitted(sinogram, truth, chosen.evaluations),
-    }
-    for name, (progress, counts) in found.items():
-        nearest, last = min(progress.rows, key=lambda row: row["rmse"]), progress.rows[-1]
-        assert progress.nearest is not None
+    sinogram, rows = counted(exact, photons, chosen.seed), {}
+    for name in METHODS:
+        progress = Progress(truth)
+        if name == FBP:
+            filtered(sinogram, progress)
+        elif name == SART:
+            algebraic(sinogram, progress, chosen.sweeps)
+        else:
+            fitted(sinogram, progress, chosen.evaluations)
+        nearest = min(progress.rows, key=lambda row: row["rmse"])
         rows[name] = {
             "rmse": nearest["rmse"],
             "psnr": psnr(progress.nearest, truth, truth.max()),
             "at": progress.rows.index(nearest) + 1,
-            "rmse at the end": last["rmse"],
-            "counted in": counts,
+            "rmse at the end": progress.rows[-1]["rmse"],
             "all": progress.rows,
-            "slice": progress.nearest[:, :, middle],
+            "slice": progress.nearest[:, :, truth.shape[2] // 2],
         }
     return rows
 
@@ -218,9 +205,8 @@ def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> N
             by_time.loglog([row["seconds"] for row in rows[name]["all"]], errors, color + line)
         for panel in (by_count, by_time):
             panel.axhline(rows[FBP]["rmse"], color="0.5", linestyle=line, label=f"{FBP}, {photons}")
-    by_count.set(
-        xlabel="sweep over all views (SART), evaluation (jaxvol)", ylabel="RMSE of the density, 1/voxel"
-    )
+    by_count.set(xlabel="sweep over all views (SART), evaluation (jaxvol)")
+    by_count.set(ylabel="RMSE of the density, 1/voxel")
     by_time.set(xlabel="seconds, compilation left out")
     by_count.legend(fontsize=7)
     charts.save(figure, path)
