@@ -72,9 +72,6 @@ def summary(scenes: dict[str, Any]) -> dict[str, Any]:
         "images": len(rows),
         "within the tolerance": sum(ratio <= 1 for ratio in ratios),
         "largest error over tolerance": max(ratios),
-        "smallest share of pixels below the estimate": min(
-            row["share below the estimate"] for _, row in rows
-        ),
         "images with structured errors": len(structured),
         "of which jitter leaves at most": max(structured, default=None),
     }
@@ -87,22 +84,18 @@ def draw(result: dict[str, Any], path: Path) -> None:
         for view, mark in (("outside", "o"), ("inside", "s")):
             rows, color = views[view], f"C{number}"
             for row in rows.values():
-                pixels.plot(row["estimate"], row["error"], mark, color=color, markersize=4, alpha=0.7)
+                pixels.plot(row["estimate"], row["error"], mark, color=color, alpha=0.7)
             ratios = [row["rmse over tolerance"] for row in rows.values()]
-            style: dict[str, Any] = {"color": color, "markersize": 4, "linewidth": 1}
-            images.plot([float(t) for t in rows], ratios, mark + "-", label=f"{name}, {view}", **style)
+            how: dict[str, Any] = {"color": color, "linewidth": 1, "label": f"{name}, {view}"}
+            images.plot([float(t) for t in rows], ratios, mark + "-", **how)
     pixels.set(xscale="log", yscale="log", xlabel="estimated error of a pixel (Rendering.error)")
-    pixels.set_ylabel("true error, root mean square")
-    limits = pixels.get_xlim()
-    pixels.plot(limits, limits, "k-", linewidth=0.8, label="as estimated")
-    pixels.legend(fontsize=7, loc="upper left")
-    pixels.set_xlim(limits)
-    pixels.set_title(
-        "below the line: estimates on the safe side (a point: a quarter of an image)", fontsize=9
-    )
+    pixels.set(ylabel="true error, root mean square")
+    pixels.axline((1e-3, 1e-3), (1e-2, 1e-2), color="k", linewidth=0.8, label="as estimated")
+    pixels.set_title("below the line: estimates on the safe side (a point: a quarter of an image)")
+    pixels.legend(loc="upper left")
     images.axhline(1, color="k", linewidth=0.8)
     images.set(xscale="log", xlabel="tolerance", ylabel="RMSE of the image / tolerance", ylim=(0, 1.5))
-    images.set_title("below 1: within the tolerance", fontsize=9)
+    images.set_title("below 1: within the tolerance")
     images.legend(fontsize=7, ncols=2)
     charts.plain_numbers(pixels)
     charts.plain_numbers(images)

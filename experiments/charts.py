@@ -40,7 +40,7 @@ def numbered(panel: Any, x: Sequence[float], names: Sequence[Any] | None = None)
     """A logarithmic scale along x, with ticks at these numbers alone."""
     panel.set_xscale("log", base=2)
     panel.set_xticks(x, x if names is None else names)
-    panel.minorticks_off()
+    panel.set_xticks([], minor=True)
 
 
 def plain_numbers(panel: Any) -> None:

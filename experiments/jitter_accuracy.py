@@ -11,7 +11,7 @@ plain jitter can be nearer to the truth in the mean, or farther; it is noisier i
 """
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -83,53 +83,34 @@ def head(resolution: int, size: int) -> Faced:
     return Faced(scene, lambda error, step: wood_grain_energy(error[below:]), face)
 
 
-SCENES = {"cut block, orthographic": cut_block, "head, perspective": head}
-
-
-def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> list[dict[str, Any]]:
+def measure(of: Faced, chosen: Namespace) -> list[dict[str, Any]]:
     """One row for each step and march."""
     scene, grain, face = of
-    voxel = scene.step
 
-    def image(rendering: jv.Rendering) -> np.ndarray:
-        return np.asarray(rendering.rgba[..., :3], np.float64)
+    def image(march: jv.March) -> np.ndarray:
+        return np.asarray(frame(scene, march).rgba[..., :3], np.float64)
 
-    truth = image(frame(scene, marches.converged(min(steps) * voxel)))
-    rows = []
-    for step in steps:
-        under = {name: jv.March(step * voxel, marches.transforms(name, seed)) for name in METHODS}
+    truth, rows = image(marches.converged(min(chosen.steps) * scene.step)), []
+    for step in chosen.steps:
+        length = step * scene.step
+        under = {name: jv.March(length, marches.transforms(name, chosen.seed)) for name in METHODS}
         drawn = {name: partial(frame, scene, march) for name, march in under.items()}
-        seconds = timing.interleaved(drawn, repetitions)
-        for name in under:
-            rendering = drawn[name]()
-            assert not np.any(rendering.exhausted)
-            error = image(rendering) - truth
+        seconds = timing.interleaved(drawn, chosen.repetitions)
+        for name, march in under.items():
+            error = image(march) - truth
             rows.append(
                 {
                     "step": step,
                     "march": name,
-                    "wood grain": grain(error, step * voxel),
+                    "wood grain": grain(error, length),
                     "boundary noise": boundary_noise(error, face),
                     "rmse": float(np.sqrt(np.mean(error**2))),
                     "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
-                    "samples": int(np.sum(rendering.samples)),
                     "seconds": timing.median(seconds[name]),
                     "time": timing.ratio(seconds[name], seconds[marches.PLAIN]),
                 }
             )
     return rows
-
-
-def compared(result: dict[str, list[dict[str, Any]]]) -> str:
-    """A sentence that compares the RMSE of both jitters with that of ray casting."""
-    ratios: dict[str, list[float]] = {marches.JITTER: [], marches.EMPTY: []}
-    for rows in result.values():
-        errors = {(row["step"], row["march"]): row["rmse off the face"] for row in rows}
-        for (step, march), error in errors.items():
-            if march in ratios:
-                ratios[march].append(error / errors[step, marches.PLAIN])
-    said = (f"{name} {min(each):.2f} to {max(each):.2f}" for name, each in ratios.items())
-    return f"RMSE off the cut face / ray casting: {', '.join(said)}."
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -138,18 +119,15 @@ def draw(result: dict[str, Any], path: Path) -> None:
     for line, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for panel, (key, label) in zip(line, PANELS.items(), strict=True):
             for name, style in METHODS.items():
-                mine = [row for row in rows if row["march"] == name]
-                found = [row["time"]["median"] if key == "time" else row[key] for row in mine]
-                panel.plot([row["step"] for row in mine], found, style, marker=".", label=name)
-            panel.set_title(label, fontsize=9)
-            panel.set_xscale("log", base=2)
+                by_step = {row["step"]: row[key] for row in rows if row["march"] == name}
+                found = [each["median"] if key == "time" else each for each in by_step.values()]
+                panel.plot(list(by_step), found, style, marker=".", markersize=6, label=name)
+            panel.set(title=label, xlabel="step, voxels", xscale="log")
             if key != "time":
                 panel.set_yscale("log", nonpositive="mask")
-            panel.set_xlabel("step, voxels", fontsize=8)
-            panel.tick_params(labelsize=7, which="both")
-            panel.xaxis.set_major_formatter("{x:g}")
-        line[0].set_ylabel(scene, fontsize=9)
-    figure.suptitle(result["note"], fontsize=9)
+            charts.numbered(panel, STEPS, [f"{step:g}" for step in STEPS])
+        line[0].set_ylabel(scene)
+    figure.suptitle(result["note"])
     charts.legend_below(figure, axes[0, 0], 5)
     charts.save(figure, path)
 
@@ -163,10 +141,9 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 96, "resolution": 64, "repetitions": 1, "steps": (2.3, 1.9)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    result = {}
-    for name, make in SCENES.items():
-        scene = make(chosen.resolution, chosen.size)
-        result[name] = measure(scene, chosen.steps, chosen.repetitions, chosen.seed)
+    result: dict[str, Any] = {"note": NOTE}
+    for name, make in {"cut block, orthographic": cut_block, "head, perspective": head}.items():
+        result[name] = measure(make(chosen.resolution, chosen.size), chosen)
         for row in result[name]:
             show(row, name)
-    return {"note": f"{NOTE} {compared(result)}", **result}
+    return result

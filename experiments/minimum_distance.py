@@ -24,7 +24,7 @@ import jaxvol as jv
 
 from . import charts, harness, timing
 from .harness import chosen_scenes, experiment, frame, show, some_of
-from .scenes import Scene
+from .scenes import AIRWAY, OF_AIRWAY, Scene
 from .voxel_distances import VoxelLeaping, distances
 
 
@@ -51,10 +51,10 @@ def colon(folder: Path | None, size: int, resolution: int = 256) -> Scene:
     return Scene(volume, transfer, camera, float(volume.spacing[0]) / 4)
 
 
-def airway(folder: Path, size: int) -> Scene:
+def airway(folder: Path, size: int, resolution: int) -> Scene:
     """The trachea, down to where it divides; steps of a quarter voxel. The preset begins at -920 Hounsfield
     units, which the noise of air exceeds somewhere in most blocks; here it is moved up to begin at -724."""
-    volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(0.78125, 0.78125, 1))
+    volume = jv.load(folder / AIRWAY, spacing=OF_AIRWAY)
     camera = jv.Camera((96, 76, 144), (90, 89, 112), (0, -1, 0), view_angle=90, size=(size, size))
     return Scene(volume, jv.preset("ct_airway", clim=(-800, 3000)), camera, 0.2)
 
@@ -63,12 +63,7 @@ PHANTOM = "colon phantom"
 SCENES: dict[str, Callable[..., Scene]] = {"airway": airway, PHANTOM: colon}
 
 
-def march(scene: Scene, method: str | None, cell: int = 8) -> jv.March:
-    """The march that leaps by this method, or does not leap if it is None."""
-    return leaping(scene, *(() if method is None else (jv.SpaceLeaping(method, cell=cell),)))
-
-
-def leaping(scene: Scene, *leaps: jv.SpaceLeaping) -> jv.March:
+def march(scene: Scene, *leaps: jv.SpaceLeaping) -> jv.March:
     return jv.March(scene.step, (*leaps, jv.EarlyTermination(LEFT)))
 
 
@@ -84,11 +79,12 @@ def named(method: str, cell: int) -> str:
 
 def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, dict[str, Any]]:
     """Time, error and wrong pixels of a scene's frame under every method."""
-    under = {MAP: march(scene, "distance"), NONE: march(scene, None), HIERARCHY: march(scene, HIERARCHY)}
-    under |= {named(m, cell): march(scene, m, cell) for m in (PUBLISHED, PROVEN) for cell in cells}
     grid = distances(scene.volume, scene.transfer)
-    under[VOXELS] = leaping(scene, VoxelLeaping(grid))
-    under |= {named(OF_VOXELS, cell): leaping(scene, VoxelLeaping(grid, PUBLISHED, cell)) for cell in cells}
+    leaps = {MAP: jv.SpaceLeaping("distance"), HIERARCHY: jv.SpaceLeaping(), VOXELS: VoxelLeaping(grid)}
+    for cell in cells:
+        leaps |= {named(method, cell): jv.SpaceLeaping(method, cell) for method in (PUBLISHED, PROVEN)}
+        leaps[named(OF_VOXELS, cell)] = VoxelLeaping(grid, PUBLISHED, cell)
+    under = {name: march(scene, each) for name, each in leaps.items()} | {NONE: march(scene)}
     rows = harness.compare(scene, under, repetitions)
     reference = frame(scene, under[NONE])
     for name, row in rows.items():
@@ -102,29 +98,21 @@ def draw(result: dict[str, Any], path: Path) -> None:
     """Time, wrong pixels and RMSE against R; the methods without cells are lines."""
     scenes, cells = result["scenes"], result["cells"]
     figure, axes = charts.panels(len(scenes), 3, 11.5, 2.8 * len(scenes) + 0.4)
-    for (times, wrongs, errors), (scene, rows) in zip(axes, scenes.items(), strict=True):
+    labels = "time / that by the distance map", "wrong pixels (> 1/255), %", "RMSE of the image"
+    for row, (scene, rows) in zip(axes, scenes.items(), strict=True):
+        times, wrongs, errors = row
         for method, style in ((PUBLISHED, "C3o-"), (PROVEN, "C0s-"), (OF_VOXELS, "C1^-")):
-            mine = [rows[named(method, cell)] for cell in cells]
-            times.plot(cells, [row["ratio"]["median"] for row in mine], style, label=method)
-            wrongs.plot(cells, [100 * row["wrong"] for row in mine], style)
-            errors.plot(cells, [row["rmse"] for row in mine], style)
+            of_method = [rows[named(method, cell)] for cell in cells]
+            times.plot(cells, [each["ratio"]["median"] for each in of_method], style, label=method)
+            wrongs.plot(cells, [100 * each["wrong"] for each in of_method], style)
+            errors.plot(cells, [each["rmse"] for each in of_method], style)
         for method, color, line in LINES:
             times.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
             errors.axhline(rows[method]["rmse"], color=color, linestyle=line)
-        for panel, label in (
-            (times, "time / that by the distance map"),
-            (wrongs, "wrong pixels (> 1/255), %"),
-            (errors, "RMSE of the image"),
-        ):
-            panel.set_xscale("log", base=2)
-            panel.set_xticks(cells, cells)
-            panel.set_xlabel("R, side of the grid's cells, pixels", fontsize=8)
-            panel.set_title(f"{scene}: {label}", fontsize=9)
-            panel.tick_params(labelsize=8)
-            panel.set_ylim(0, 1.1 * panel.get_ylim()[1])
-        if not any(rows[named(method, cell)]["wrong"] for method in (PUBLISHED, OF_VOXELS) for cell in cells):
-            wrongs.set_ylim(0, 1)
-            wrongs.text(0.5, 0.5, "none, at any R", ha="center", fontsize=9, transform=wrongs.transAxes)
+        for panel, label in zip(row, labels, strict=True):
+            charts.numbered(panel, cells)
+            panel.set(xlabel="R, side of the grid's cells, pixels", title=f"{scene}: {label}")
+            panel.set_ylim(0, max(1.1 * panel.get_ylim()[1], 1e-3))
     charts.legend_below(figure, axes[0, 0], 5)
     charts.save(figure, path)
 
@@ -143,11 +131,5 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
         scenes[name] = measure(scene, chosen.cells, chosen.repetitions)
         show(scenes[name], name)
-    return {
-        "image": [chosen.size, chosen.size],
-        "repetitions": chosen.repetitions,
-        "opacity left": LEFT,
-        "goal at R = 8": GOAL,
-        "cells": chosen.cells,
-        "scenes": scenes,
-    }
+    about = {"image": [chosen.size] * 2, "repetitions": chosen.repetitions, "goal at R = 8": GOAL}
+    return {**about, "cells": chosen.cells, "scenes": scenes}

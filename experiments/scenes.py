@@ -60,6 +60,7 @@ ENGINE, BONSAI, AIRWAY, ANEURISM = (
     "lidc0314_airway_256x192x200_int16le.raw.gz",
     "aneurism_256x256x256_uint8.raw.gz",
 )
+CT_HEAD = "cthead_256x256x113_uint16le.raw.gz"
 WHOLE_VOXELS, OF_AIRWAY = (1.0, 1.0, 1.0), (0.78125, 0.78125, 1.0)
 """Spacings."""
 

@@ -5,20 +5,16 @@ ray caster, all in turn, at steps of one voxel on as many threads as cores. Each
 RMSE against the converged image of its own renderer, since the two shade by different rules: VTK lights nodes
 and interpolates what that gives. The goals: 1.8 times the unshaded frame in the geometric mean, and half of
 the time of VTK's shaded frame at no larger error.
-
-Volumes are read from the folder that JAXVOL_DATA names; without one, the head phantom stands in. Without VTK
-only jaxvol is measured.
 """
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 from jaxvol.lighting import Phong
 from jaxvol.metrics import rmse
 
-from . import charts, marches, programs, timing
-from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
+from . import marches, programs, timing
+from .harness import FINER, chosen_scenes, experiment, geometric_mean, show, some_of
 from .programs import Case, is_here
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -27,15 +23,15 @@ GOALS = {"over unshaded": 1.8, "VTK's shaded over ours": 2.0}
 OURS, PLAIN, VTK, VTK_PLAIN = "Phong", "unshaded", "VTK, ShadeOn", "VTK, unshaded"
 
 
-def measure(scene: Scene, there: dict[str, str], repetitions: int, finer: int) -> dict[str, Any]:
+def measure(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, Any]:
     """Times, their ratios, and the errors of the shaded images."""
     plain, lit = Case(scene), Case(scene, lighting=Phong)
     made = {PLAIN: programs.ours()(plain), OURS: programs.ours(lighting=programs.lighting_of)(lit)}
-    exact = programs.program(lit, marches.converged(scene.step, finer), Phong()).image()
+    exact = programs.program(lit, marches.converged(scene.step, FINER), Phong()).image()
     errors = {OURS: rmse(made[OURS].image(), exact)}
     if is_here(there, programs.VTK):
         made |= {VTK_PLAIN: programs.by_vtk(1, plain), VTK: programs.by_vtk(1, lit)}
-        errors[VTK] = rmse(made[VTK].image(), programs.by_vtk(1 / finer, lit).image())
+        errors[VTK] = rmse(made[VTK].image(), programs.by_vtk(1 / FINER, lit).image())
     seconds = timing.interleaved({name: each.draw for name, each in made.items()}, repetitions)
     found: dict[str, Any] = {
         "seconds": {name: timing.median(all_) for name, all_ in seconds.items()},
@@ -48,37 +44,20 @@ def measure(scene: Scene, there: dict[str, str], repetitions: int, finer: int) -
     return found
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    scenes = result["scenes"]
-    figure, axes = charts.panels(1, len(scenes), 4.6 * len(scenes), 3)
-    for panel, (name, row) in zip(axes[0], scenes.items(), strict=True):
-        bars = {n: s * 1e3 for n, s in row["seconds"].items()}
-        panel.bar(range(len(bars)), list(bars.values()), color=["#bbb", "C2", "#bbb", "C0"][: len(bars)])
-        labels = [f"{n}\nRMSE {row['rmse'][n]:.4f}" if n in row["rmse"] else n for n in bars]
-        panel.set_xticks(range(len(bars)), labels, fontsize=8)
-        panel.set_title(name, fontsize=9)
-    axes[0][0].set_ylabel("time of a frame, ms", fontsize=9)
-    figure.suptitle("Frames shaded by the gradient (RMSE: of the shaded image), and unshaded", fontsize=9)
-    charts.save(figure, path)
-
-
 @experiment(
-    draw,
     repetitions=15,
     size=512,
     resolution=192,
-    finer={"type": int, "default": 8, "help": "how many times finer the converged image's step is"},
     only=some_of(("engine", "bonsai"), "SCENE"),
-    quick={"size": 32, "repetitions": 2, "finer": 2, "resolution": 32},
+    quick={"size": 32, "repetitions": 2, "resolution": 32},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     scenes, there = {}, programs.peers()
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
-        scenes[name] = measure(scene, there, chosen.repetitions, chosen.finer)
+        scenes[name] = measure(scene, there, chosen.repetitions)
         show(scenes[name], name)
+    rows = scenes.values()
     means = {
-        key: geometric_mean(row[key]["median"] for row in scenes.values())
-        for key in GOALS
-        if all(key in row for row in scenes.values())
+        k: geometric_mean(row[k]["median"] for row in rows) for k in GOALS if all(k in row for row in rows)
     }
     return {"image": [chosen.size] * 2, "goals": GOALS, "geometric means": means, "scenes": scenes}
