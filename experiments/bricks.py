@@ -15,21 +15,20 @@ import math
 import os
 import tempfile
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.ticker import NullFormatter
 
 import jaxvol as jv
 from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of, source_of
 from jaxvol.bricks.cells import Visit
 from jaxvol.bricks.traversal import Load, Traversal
 
-from . import charts, record, timing
+from . import record, timing
 from .harness import experiment, recorded, show, some_of
 from .scan_conversion import BODY
 
@@ -55,10 +54,7 @@ counts as a number of voxels. The unit is unexplained: DEEP is 1280 voxels."""
 
 
 class Row(NamedTuple):
-    """A row of the table.
-
-    - `overlap`: in percent of the volume. `reload`, `proposed`: frames per second.
-    """
+    """A row of the table: overlap in percent of the volume, and frames per second."""
 
     overlap: float
     reload: float
@@ -133,16 +129,10 @@ def each_at_once(traversal: Traversal) -> Iterator[Load]:
         own[-1] = True  # a ray goes on through a gap, in which there is no brick
         visit = Visit(jnp.asarray(brick, jnp.int32), jnp.asarray(own), jnp.asarray(outside))
         reached, load = jnp.zeros(traversal.rays.length.shape, jnp.int32), None
-        while True:
-            found = traversal.cells_in(visit, reached)
-            if found is None:
-                break
-            if load is None:
-                load = traversal.load(brick, found.cells, *traversal.around(brick))
-            else:
-                load = load._replace(cells=found.cells)
+        while (found := traversal.cells_in(visit, reached)) is not None:
+            load = load or traversal.load(brick, found.cells, *traversal.around(brick))
             reached = found.reached
-            yield load
+            yield load._replace(cells=found.cells)
 
 
 # -- what is measured ---------------------------------------------------------------------------------------
@@ -165,16 +155,6 @@ FROM = f"{','.join(map(str, BEST))} from"
 WHOLE = "whole"
 
 
-class Scan(NamedTuple):
-    """A scan on disk."""
-
-    path: Path
-    source: VoxelSource
-    probe: jv.ToroidalMap
-    transfer: jv.TransferFunction
-    march: jv.March
-
-
 def phantom(
     resolution: int, dtype: str = "float32", *, speckle: bool = True
 ) -> tuple[jv.Volume, jv.ToroidalMap]:
@@ -185,9 +165,8 @@ def phantom(
 
 
 def camera(view: str, size: int) -> jv.Camera:
-    return jv.Camera(
-        EYES[view], (0, 0, 110), (0, 0, 1) if view == "along" else (1, 0, 0), 36.0, size=(size,) * 2
-    )
+    up = (0, 0, 1) if view == "along" else (1, 0, 0)
+    return jv.Camera(EYES[view], (0, 0, 110), up, 36.0, size=(size, size))
 
 
 def marching(scan: jv.ToroidalMap, volume: jv.Volume) -> jv.March:
@@ -196,47 +175,43 @@ def marching(scan: jv.ToroidalMap, volume: jv.Volume) -> jv.March:
     return jv.March(2 * float(last - first) / (volume.shape[2] - 1), (scan,))
 
 
+class Scan(NamedTuple):
+    """A scan on disk."""
+
+    path: Path
+    source: VoxelSource
+    probe: jv.ToroidalMap
+    march: jv.March
+
+    def render(self, view: jv.Camera, **how: Any) -> jv.Rendering:
+        """By bricks; or, without options, as a whole. First, the file is dropped from the system's page
+        cache, where that is possible."""
+        if hasattr(os, "posix_fadvise"):
+            with self.path.open("rb") as file:
+                os.fsync(file.fileno())
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        scene = jv.TransferFunction.from_points(BODY), view, self.march
+        if how:
+            return jv.render_bricks(self.source, *scene, outputs="rgba", **how)
+        return jv.render(jv.Volume(np.load(self.path)), *scene, outputs="rgba")
+
+
 def stored(folder: Path, resolution: int) -> Scan:
     volume, scan = phantom(resolution)
     path = folder / "fetus.npy"
     np.save(path, np.asarray(volume.data))
-    return Scan(path, source_of(path), scan, jv.TransferFunction.from_points(BODY), marching(scan, volume))
+    return Scan(path, source_of(path), scan, marching(scan, volume))
 
 
-def forget(path: Path) -> None:
-    """Drops a file from the system's page cache, where that is possible."""
-    if not hasattr(os, "posix_fadvise"):
-        return
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
-def whole(scan: Scan, view: jv.Camera) -> jv.Rendering:
-    forget(scan.path)
-    volume = jv.Volume(np.load(scan.path))
-    return jv.render(volume, scan.transfer, view, scan.march, outputs="rgba")
-
-
-def compared(
-    scan: Scan, view: jv.Camera, split: Split, repetitions: int, truth: np.ndarray
-) -> dict[str, dict[str, Any]]:
+def compared(scan: Scan, view: jv.Camera, split: Split, repetitions: int) -> dict[str, dict[str, Any]]:
     """Time, reads and error of each method, and time of the volume rendered whole."""
-    found: dict[str, jv.Rendering] = {}
-
-    def run(method: str) -> Any:
-        forget(scan.path)
-        how = {"bricks": split, "method": METHODS[method], "outputs": "rgba"}
-        found[method] = jv.render_bricks(scan.source, scan.transfer, view, scan.march, **how)
-        return found[method].rgba
-
-    programs: dict[str, Callable[[], Any]] = {method: partial(run, method) for method in METHODS}
-    programs[WHOLE] = lambda: whole(scan, view).rgba
-    seconds = timing.interleaved(programs, repetitions)
-    voxels = np.prod(scan.source.shape) * np.dtype(np.float32).itemsize
+    programs = {name: partial(scan.render, view, bricks=split, method=how) for name, how in METHODS.items()}
+    seconds = timing.interleaved({**programs, WHOLE: partial(scan.render, view)}, repetitions)
+    truth, voxels = np.asarray(scan.render(view).rgba), np.prod(scan.source.shape) * 4
     rows: dict[str, dict[str, Any]] = {WHOLE: {"seconds": timing.median(seconds[WHOLE])}}
-    for method in METHODS:
-        report = found[method].bricks
+    for method, program in programs.items():
+        rendering = program()
+        report = rendering.bricks
         assert report is not None
         rows[method] = {
             "seconds": timing.median(seconds[method]),
@@ -244,9 +219,8 @@ def compared(
             "needed": report.needed,
             "loads": report.loads,
             "read, times the volume": round(float(report.bytes_read / voxels), 4),
-            "stored": report.stored,
             "held, MiB": round(report.bytes_held / 2**20, 3),
-            "largest error": float(np.max(np.abs(np.asarray(found[method].rgba) - truth))),
+            "largest error": float(np.max(np.abs(np.asarray(rendering.rgba) - truth))),
         }
     return rows
 
@@ -255,52 +229,7 @@ def named(split: Split) -> str:
     return ",".join(map(str, split))
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """The paper's rates and ours, against overlap and against loads."""
-    figure, axes = charts.panels(2, 2, 10, 7)
-    rows = result["splits"]
-    styles = {"overlap": "C0o", "reload": "C1s", "naive": "C3x"}
-    paper = {name: row["paper"] for name, row in rows.items() if "paper" in row}
-    for column, key in enumerate(("overlap", "loads")):
-        theirs, ours = axes[:, column]
-        for method, of in (("overlap", "proposed"), ("reload", "reload")):
-            at = [p["overlap"] if key == "overlap" else rows[n]["bricks"] for n, p in paper.items()]
-            theirs.plot(at, [p[of] for p in paper.values()], styles[method], label=f"paper, {of}", alpha=0.7)
-        theirs.margins(x=0.12)  # room for names
-        for name, p in paper.items():
-            if p["overlap"] < 3 and p["proposed"] < 10:
-                x = p["overlap"] if key == "overlap" else rows[name]["bricks"]
-                theirs.annotate(name, (x, p["proposed"]), (4, 3), textcoords="offset points", fontsize=7)
-        for method, style in styles.items():
-            at = [row["formula"] if key == "overlap" else row[method]["loads"] for row in rows.values()]
-            rates = [1 / row[method]["seconds"] for row in rows.values()]
-            ours.plot(at, rates, style, label=method, alpha=0.7)
-        whole_ = [1 / row[WHOLE]["seconds"] for row in rows.values()]
-        ours.axhline(float(np.median(whole_)), color="0.5", linestyle="--", label="the whole volume at once")
-        for panel in (theirs, ours):
-            panel.set_yscale("log")
-            panel.set_ylabel("frames per second", fontsize=8)
-            panel.legend(fontsize=7)
-            panel.yaxis.set_major_formatter("{x:g}")
-            panel.yaxis.set_minor_formatter(NullFormatter())
-            if key == "loads":
-                panel.set_xscale("log", base=2)
-                panel.xaxis.set_major_formatter("{x:g}")
-        of_paper = "printed overlap, %" if key == "overlap" else "number of bricks"
-        theirs.set_xlabel(f"{of_paper} (names: bricks along β, σ and γ)", fontsize=8)
-        ours.set_xlabel("overlap by the formula, %" if key == "overlap" else "bricks read", fontsize=8)
-        if key == "overlap":
-            for panel in (theirs, ours):
-                panel.axvline(3, color="0.7", linewidth=0.8)
-    axes[0, 0].set_title("the paper's rates; its rule: overlap below 3 % (grey line)", fontsize=9)
-    axes[0, 1].set_title("the paper's rates; named: slow although below 3 %", fontsize=9)
-    for panel in axes[1]:
-        panel.set_title("measured here", fontsize=9)
-    charts.save(figure, path)
-
-
 @experiment(
-    draw,
     repetitions=5,
     size=64,
     resolution=320,
@@ -315,8 +244,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
 
         def measure(split: Split, view: str) -> dict[str, Any]:
             repetitions = chosen.repetitions if np.prod(split) < MANY else 1
-            seen = camera(view, chosen.size)
-            found = compared(scan, seen, split, repetitions, np.asarray(whole(scan, seen).rgba))
+            found = compared(scan, camera(view, chosen.size), split, repetitions)
             show(found, named(split), view)
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
@@ -329,18 +257,9 @@ def main(chosen: Namespace) -> dict[str, Any]:
                 **measure(split, VIEW),
             }
         views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits.values()}
-        about = {
-            "image": [chosen.size] * 2,
-            "voxels": list(scan.source.shape),
-            "step, mm": round(float(scan.march.step), 5),
-        }
-    others = [name for name in map(named, TABLE) if name not in rows]
-    rows |= recorded(chosen, "splits", others, about)
-    if not views and not chosen.quick and (path := chosen.output / "bricks.json").is_file():
-        views = record.read(path)["result"][FROM]
-    return {
-        **about,
-        "view": VIEW,
-        "splits": {name: rows[name] for name in map(named, TABLE) if name in rows},
-        FROM: views,
-    }
+        about = {"image": [chosen.size] * 2, "voxels": list(scan.source.shape)}
+    rows |= recorded(chosen, "splits", [name for name in map(named, TABLE) if name not in rows], about)
+    if not views and not chosen.quick and chosen.path.is_file():
+        views = record.read(chosen.path)["result"][FROM]
+    ordered = {name: rows[name] for name in map(named, TABLE) if name in rows}
+    return {**about, "view": VIEW, "splits": ordered, FROM: views}

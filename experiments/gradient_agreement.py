@@ -76,11 +76,13 @@ def measure(scene: Scene, methods: list[str], seed: int) -> dict[str, Any]:
     return rows
 
 
-QUICK = {"size": 24, "resolution": 24, "methods": METHODS[:2]}
-ONLY = {"only": some_of(SCENES, "VOLUME"), "methods": some_of(METHODS, "METHOD")}
-
-
-@experiment(size=256, resolution=192, quick=QUICK, **ONLY)
+@experiment(
+    size=256,
+    resolution=192,
+    only=some_of(SCENES, "VOLUME"),
+    methods=some_of(METHODS, "METHOD"),
+    quick={"size": 24, "resolution": 24, "methods": METHODS[:2]},
+)
 def main(chosen: Namespace) -> dict[str, Any]:
     scenes: dict[str, Any] = {}
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):

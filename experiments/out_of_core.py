@@ -18,6 +18,7 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import charts, timing
+from . import timing
 from .harness import experiment, show
 from .peak_memory import peak
 from .scenes import seen_head
@@ -130,84 +131,56 @@ def in_a_process(path: Path, voxels: int, pixels: int, memory: int) -> dict[str,
     return json.loads(ran.stdout.splitlines()[-1])
 
 
-def read() -> float:
-    """What this process has read from files so far, MiB, from the system's cache or not."""
-    file = Path("/proc/self/io")
-    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    return sum(int(line.split()[1]) for line in lines if line.startswith("rchar")) / 2**20
-
-
 def measure(path: Path, voxels: int, pixels: int, memory: int) -> dict[str, Any]:
     """Time and memory of images of a file, at steps of one voxel, leaping over empty space. `memory`: bytes;
     0 to render the volume as a whole, in memory."""
     _, opaque, camera, _ = seen_head(jv.phantom("head", 16), pixels)
     spacing, origin = (2 / (voxels - 1),) * 3, (-1.0,) * 3
     march = jv.March(spacing[0], (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()), "midpoint")
-    raw = {"shape": (voxels,) * 3, "dtype": "uint8"} if path.suffix == ".raw" else {}
     jax.block_until_ready(camera.position + 1)  # JAX is up
     found: dict[str, Any] = {"before": round(peak(), 1)}
-    whole = source = None
     if memory:
+        raw = {"shape": (voxels,) * 3, "dtype": "uint8"} if path.suffix == ".raw" else {}
         source = jv.bricks.source_of(path, spacing=spacing, origin=origin, **raw)
+        render, how = partial(jv.render_bricks, source), {"memory": memory}
     else:
-        begun = time.perf_counter()
         whole = jv.Volume(np.fromfile(path, np.uint8).reshape((voxels,) * 3).T, spacing, origin)
-        found["seconds to read"] = round(time.perf_counter() - begun, 3)
-
-    def image(transfer: jv.TransferFunction) -> jv.Rendering:
-        if whole is not None:
-            return jv.render(whole, transfer, camera, march, outputs="rgba")
-        return jv.render_bricks(source, transfer, camera, march, outputs="rgba", memory=memory)
-
+        render, how = partial(jv.render, whole), {}
     for name, factor in SCENES.items():
         transfer = jv.TransferFunction(opaque.values, opaque.colors, factor * opaque.extinction)
-        rendering, seconds, before = None, [], 0.0
-        for _ in range(1 + REPETITIONS):
-            begun, before = time.perf_counter(), read()
-            rendering = jax.block_until_ready(image(transfer))
-            seconds.append(round(time.perf_counter() - begun, 3))
-        assert rendering is not None
-        row: dict[str, Any] = {"first seconds": seconds[0], "seconds": seconds[1:]}
-        found[name] = row
+        draw = partial(render, transfer, camera, march, outputs="rgba", **how)
+        begun = time.perf_counter()
+        rendering = jax.block_until_ready(draw())
+        row: dict[str, Any] = {"first seconds": round(time.perf_counter() - begun, 3)}
+        row["seconds"] = timing.interleaved({name: draw}, REPETITIONS)[name]
         row["peak"] = round(peak() - found["before"], 1)
         row["mean"] = np.mean(np.asarray(rendering.rgba, np.float64), (0, 1)).tolist()
-        if whole is not None:
-            samples = jv.render(whole, transfer, camera, march).samples
-            row["samples"] = int(np.sum(np.asarray(samples), dtype=np.int64))
+        if memory:
+            row["bricks"] = rendering.bricks._asdict()
         else:
-            row |= {"MiB read": round(read() - before, 1), "bricks": rendering.bricks._asdict()}
+            row["samples"] = int(np.sum(np.asarray(render(transfer, camera, march).samples), dtype=np.int64))
+        found[name] = row
     return found
 
 
 # -- against the goals --------------------------------------------------------------------------------------
 
 
-def seconds_of(row: dict[str, Any]) -> float:
-    return timing.median(row["seconds"])
-
-
-def peak_of(row: dict[str, Any]) -> float:
-    return max(row[name]["peak"] for name in SCENES)
-
-
-def allowed(result: dict[str, Any], kind: str) -> float:
-    """The peak that is allowed, MiB."""
-    return OVER * result["memory"] + peak_of(result["constant"][kind])
-
-
 def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]:
     """The largest size of both kinds, against the goals. `fitting`: the size in memory that is scaled."""
     found: dict[str, Any] = {}
     for kind in FORMATS:
-        rows = result["bricks"][kind][large]
-        found[kind] = {"peak": peak_of(rows), "allowed": round(allowed(result, kind), 1)}
+        rows, constant = result["bricks"][kind][large], result["constant"][kind]
+        peaks, least = (max(of[name]["peak"] for name in SCENES) for of in (rows, constant))
+        found[kind] = {"peak": peaks, "allowed": round(OVER * result["memory"] + least, 1)}
         for name in SCENES:
             small, whole = (result["resident"][size][name] for size in (fitting, large))
-            taken, scaled = seconds_of(rows[name]), seconds_of(small) * whole["samples"] / small["samples"]
+            taken, resident, scaled = (timing.median(row["seconds"]) for row in (rows[name], whole, small))
+            scaled *= whole["samples"] / small["samples"]
             found[kind][name] = {
                 "seconds": taken,
-                "in memory": seconds_of(whole),
-                "ratio": round(taken / seconds_of(whole), 3),
+                "in memory": resident,
+                "ratio": round(taken / resident, 3),
                 "scaled": round(scaled, 4),
                 "ratio, scaled": round(taken / scaled, 3),
                 "difference": float(np.max(np.abs(np.subtract(rows[name]["mean"], whole["mean"])))),
@@ -215,45 +188,22 @@ def compared(result: dict[str, Any], large: str, fitting: str) -> dict[str, Any]
     return found
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """Time and memory against the size."""
-    figure, (axes,) = charts.panels(1, 3, 12, 3.6)
-    lines = {f"bricks, {kind}": (result["bricks"][kind], f"C{n}o-") for n, kind in enumerate(FORMATS)}
-    lines["in memory"] = result["resident"], "ks--"
-    for label, (by_size, style) in lines.items():
-        sizes = [int(size) for size in by_size]
-        for panel, name in zip(axes, SCENES, strict=False):
-            panel.plot(sizes, [seconds_of(row[name]) for row in by_size.values()], style, label=label)
-            panel.set_title(f"{name}: seconds for an image", fontsize=9)
-        axes[2].plot(sizes, [peak_of(row) for row in by_size.values()], style)
-    for number, kind in enumerate(FORMATS):
-        axes[2].axhline(allowed(result, kind), color=f"C{number}", linestyle=":")
-    axes[2].set_title(f"peak memory, MiB; dotted: allowed for {result['memory']} MiB", fontsize=9)
-    for panel in axes:
-        charts.logarithmic(panel, x=2, y=2)
-        panel.set_xlabel("voxels, MiB", fontsize=8)
-    axes[0].legend(fontsize=8)
-    charts.save(figure, path)
-
-
 @experiment(
-    draw,
-    pixels={"type": int, "default": 512, "help": "pixels along a side"},
+    size=512,
     sizes={"nargs": "+", "type": int, "default": (FITTING, 256, LARGE), "help": "MiB of voxels"},
-    volumes={"type": Path, "metavar": "FOLDER", "help": "keep the volumes here (default: delete them)"},
     memory={"type": int, "default": 256, "help": "MiB, the budget"},
     resident=(FITTING, LARGE),
-    quick={"pixels": 32, "sizes": [2], "memory": 4, "resident": (2, 2)},
+    quick={"size": 32, "sizes": [2], "memory": 4, "resident": (2, 2)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    result: dict[str, Any] = {"pixels": chosen.pixels, "sizes": chosen.sizes, "memory": chosen.memory}
+    result: dict[str, Any] = {"pixels": chosen.size, "sizes": chosen.sizes, "memory": chosen.memory}
     result |= {"constant": {}, "bricks": {kind: {} for kind in FORMATS}, "resident": {}}
     with tempfile.TemporaryDirectory() as temporary:
-        folder = chosen.volumes or Path(temporary)
-        folder.mkdir(parents=True, exist_ok=True)
 
         def measured(voxels: int, kind: str, memory: int) -> dict[str, Any]:
-            found = in_a_process(volume(folder, voxels, kind, chosen.seed), voxels, chosen.pixels, memory)
+            found = in_a_process(
+                volume(Path(temporary), voxels, kind, chosen.seed), voxels, chosen.size, memory
+            )
             show(found, f"{voxels}³", kind, f"{memory} MiB" if memory else "in memory")
             return found
 

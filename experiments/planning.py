@@ -267,7 +267,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     large={
         "type": int,
         "default": 512,
-        "help": "pixels along a side of the images that plans are timed with",
+        "help": "pixels along a side of what plans are timed with",
     },
     quick={"scenes": 2, "size": 24, "every": 2, "repetitions": 1, "large": 32},
 )
