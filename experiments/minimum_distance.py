@@ -80,11 +80,8 @@ def named(method: str, cell: int) -> str:
 def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, dict[str, Any]]:
     """Time, error and wrong pixels of a scene's frame under every method."""
     grid = distances(scene.volume, scene.transfer)
-    leaps = {
-        MAP: jv.SpaceLeaping("distance"),
-        HIERARCHY: jv.SpaceLeaping(HIERARCHY),
-        VOXELS: VoxelLeaping(grid),
-    }
+    leaps = {MAP: jv.SpaceLeaping("distance"), HIERARCHY: jv.SpaceLeaping(HIERARCHY)}
+    leaps[VOXELS] = VoxelLeaping(grid)
     for cell in cells:
         leaps |= {named(method, cell): jv.SpaceLeaping(method, cell) for method in (PUBLISHED, PROVEN)}
         leaps[named(OF_VOXELS, cell)] = VoxelLeaping(grid, PUBLISHED, cell)

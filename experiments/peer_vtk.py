@@ -106,13 +106,9 @@ def prepare(
     background: tuple[float, float, float] = (1.0, 1.0, 1.0),
     shade: jv.lighting.Phong | None = None,
 ) -> Drawn:
-    """A scene in VTK, drawn once.
-
-    - `step`: world length between samples.
-    - `threads`: number of threads that cast rays; by default one for each core.
-    - `shade`: with these coefficients, under a head light. VTK shades nodes, by their own gradients, and
-      interpolates what that gives.
-    """
+    """A scene in VTK, drawn once, by so many threads (by default one for each core). `shade`: with these
+    coefficients, under a head light. VTK shades nodes, by their own gradients, and interpolates what that
+    gives."""
     import vtk
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
@@ -201,9 +197,8 @@ def aim(view: Any, camera: jv.Camera) -> None:
 def as_displayed(image: np.ndarray, mapper: Any) -> np.ndarray:
     """An image as VTK's display would show it: slightly enlarged, by a texture's linear interpolation.
 
-    VTK casts one ray through the middle of every pixel, as we do, for the n x m pixels that the volume
-    may cover. It then stretches the range from the middle of the first texel to that of the last over these
-    n x m pixels, so that pixel i shows the texel coordinate (i + 1/2) (n - 1)/n - 1/2 past the first middle.
+    VTK casts one ray through the middle of every pixel, as we do, for the n x m pixels that the volume may
+    cover. It then stretches the range between the middles of the first and the last texel over these pixels.
     This is half a pixel off at the borders, which is more than all other differences together.
     """
     cast = mapper.GetRayCastImage()

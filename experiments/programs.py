@@ -23,7 +23,7 @@ except ImportError as fault:
     peer_drjit, NO_DRJIT = None, str(fault)
 
 VTK, DRJIT = "VTK", "Dr.Jit"
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 """Of peers: as many as JAX has cores."""
 LEFT = 1e-4
 """Transmittance at which rays end: 1/255 would be the error of the most accurate images."""
@@ -38,10 +38,7 @@ Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
 
 class Case(NamedTuple):
     """A scene, the transforms without which it cannot be rendered, its light, and its compositing mode.
-
-    `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options
-    `Phong`; None where the scene is unlit.
-    """
+    `lighting` makes the light, templates from their options or `Phong`; None where the scene is unlit."""
 
     scene: Scene
     placed: tuple[jv.Transform, ...] = ()
@@ -52,10 +49,11 @@ class Case(NamedTuple):
 class Program(NamedTuple):
     """A setting in a scene, ready to run.
 
-    - `draw`: renders a frame; this is what is timed.
-    - `image`: the frame, linear RGB over white.
-    - `seen`: the converged image as this program's display would show it.
-    - `samples`: mean number of a ray's samples; None where that is not known.
+    Attributes:
+        draw: renders a frame; this is what is timed.
+        image: the frame, linear RGB over white.
+        seen: the converged image as this program's display would show it.
+        samples: mean number of a ray's samples; None where that is not known.
     """
 
     draw: Callable[[], Any]
@@ -69,12 +67,11 @@ def program(case: Case, march: jv.March, lighting: Lighting | None = None) -> Pr
         how = {"compositing": case.compositing, "lighting": lighting, "outputs": outputs}
         return jv.render(*case.scene[:3], march, **how)
 
-    def image() -> np.ndarray:
-        rendering = render()
-        assert not np.any(rendering.exhausted)
-        return np.asarray(rendering.image())
-
-    return Program(lambda: render().rgba, image, samples=lambda: float(np.mean(render("all").samples)))
+    return Program(
+        draw=lambda: render().rgba,
+        image=lambda: np.asarray(render().image()),
+        samples=lambda: float(np.mean(render("all").samples)),
+    )
 
 
 def ours(
@@ -153,18 +150,14 @@ def by_vtk(step: float, case: Case) -> Program:
 def marcher(scene: Scene, quadrature: Literal["left", "midpoint"] = "left", left: float = LEFT) -> Any:
     """The scene in Dr.Jit."""
     assert peer_drjit is not None
-    return peer_drjit.prepare(*scene, quadrature=quadrature, opacity_left=left, threads=THREADS)
+    return peer_drjit.Marcher(*scene, quadrature, left, THREADS)
 
 
 def of_drjit(there: Any) -> Program:
-    def image() -> np.ndarray:
-        rgba = there.rgba()
-        return rgba[..., :3] + 1 - rgba[..., 3:]
-
-    return Program(there.draw, image)
+    return Program(there.draw, lambda: there.rgba()[..., :3] + 1 - there.rgba()[..., 3:])
 
 
-def by_drjit(quadrature: Literal["left", "midpoint"], step: float, case: Case) -> Program:
+def by_drjit(quadrature: Any, step: float, case: Case) -> Program:
     return of_drjit(marcher(case.scene._replace(step=step * case.scene.step), quadrature))
 
 

@@ -1,17 +1,15 @@
 """How fast is an image, and an image with its gradient, compared with VTK and Dr.Jit?
 
-Five scenes at steps of one voxel, two image sizes. Ours skips empty space and ends rays early; "plain" does
-neither. VTK's fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All
-use as many threads as there are cores; where JAX has a GPU, ours and Dr.Jit's use that. Frames are drawn in
-turn: a ratio is the median over rounds of a program's time over ours. Beside each time stands the RMSE of its
-image, over white, against one converged image of ours; VTK's image is compared with that image as VTK's
-display would show it.
+Five scenes at steps of one voxel. Ours skips empty space and ends rays early; "plain" does neither. VTK's
+fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All use as many
+threads as there are cores, or JAX's GPU. Frames are drawn in turn: a ratio is the median over rounds of a
+program's time over ours. Beside each time stands the RMSE of its image, over white, against one converged
+image of ours; VTK's image is compared with that image as VTK's display would show it.
 
-Also measured: the time of our frame as a program under `jax.jit`, without what Python does before it; the
-time from the start of a fresh process to its first image; and, with --gradients, the time of an
-image with the gradient of every entry of a transfer function (256 for 8-bit data), and with that of every
-voxel as float32, relative to the image alone and to Dr.Jit's replay adjoint, with the relative difference of
-the two gradients.
+Also measured: our frame as a program under `jax.jit`, without what Python does before it; the time from the
+start of a fresh process to its first image; and, with --gradients, an image with the gradient of every entry
+of a transfer function (256 for 8-bit data), and with that of every voxel as float32, relative to the image
+alone and to Dr.Jit's replay adjoint, with the relative difference of the two gradients.
 """
 
 import itertools
@@ -34,13 +32,12 @@ import numpy as np
 from matplotlib.lines import Line2D
 
 import jaxvol as jv
-from jaxvol.metrics import rmse
 from jaxvol.xla.compiling import OPTIONS
 
 from . import charts, harness, marches, peer_vtk, programs, timing
 from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
 from .programs import DRJIT, THREADS, VTK, Case, is_here
-from .scenes import PHANTOM, SCENES, Scene, seen_head
+from .scenes import PHANTOM, SCENES, Scene
 
 
 OURS, PLAIN, VTK_RAYS = "jaxvol", "jaxvol, plain", "VTK, its rays alone"
@@ -49,7 +46,6 @@ LABELS = {PLAIN: "jaxvol, all samples", VTK_RAYS: "VTK, without drawing its imag
 """How a program is called in the chart, where not as in the record."""
 GOAL = 3.0
 LEFT = 1 / 255
-SIZES = (512, 1024)
 
 
 def fast(scene: Scene) -> jv.March:
@@ -67,20 +63,11 @@ def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, d
         made[VTK_RAYS] = made[VTK]._replace(draw=drawn.cast)
     if is_here(there, DRJIT):
         made[DRJIT] = programs.of_drjit(programs.marcher(scene, left=LEFT))
-    made["under jit"] = made[OURS]._replace(draw=jitted(scene))
+    under_jit = jax.jit(lambda *moving: jv.render(scene.volume, *moving, fast(scene), outputs="rgba").rgba)
+    made["under jit"] = made[OURS]._replace(draw=lambda: under_jit(scene.transfer, scene.camera))
     rows = programs.measured(made, truth, repetitions)
     rows[OURS]["under jit"] = rows.pop("under jit")["ratio"]
     return rows
-
-
-def jitted(scene: Scene) -> Any:
-    """Our image as a program of the user's, of which Python calls nothing but the program."""
-
-    @jax.jit
-    def image(transfer: jv.TransferFunction, camera: jv.Camera) -> jax.Array:
-        return harness.image(scene._replace(transfer=transfer, camera=camera), fast(scene)).rgba
-
-    return lambda: image(scene.transfer, scene.camera)
 
 
 def gradients(
@@ -138,12 +125,9 @@ def gradients(
 
 # -- the first image of a process ---------------------------------------------------------------------------
 
-CACHE = {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-"""Small programs are kept as well."""
-
 CHILD = """
 import json, sys, time
-begun, voxels, size, left, image = sys.argv[1:]
+begun, voxels, size, left = sys.argv[1:]
 import numpy as np
 import jax
 import jaxvol as jv
@@ -154,11 +138,8 @@ volume = jv.Volume(data, (2 / (data.shape[0] - 1),) * 3, (-1.0,) * 3)
 scene = seen_head(volume, int(size))
 march = jv.March(scene.step, (jv.SpaceLeaping(), jv.EarlyTermination(float(left))))
 ready = time.time()
-rendering = jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
-rendering = jax.block_until_ready(rendering)
-done = time.time()
-np.save(image, rendering.rgba)
-times = [at - float(begun) for at in (imported, ready, done)]
+jax.block_until_ready(jv.render(*scene[:3], march, outputs="rgba"))
+times = [at - float(begun) for at in (imported, ready, time.time())]
 print(json.dumps(dict(zip(("import", "scene", "image"), times))))
 """
 
@@ -166,30 +147,25 @@ print(json.dumps(dict(zip(("import", "scene", "image"), times))))
 def first_image(size: int, resolution: int, repetitions: int) -> dict[str, Any]:
     """Seconds from the start of a process until import, scene and image of the head phantom are done: without
     a compilation cache, and where programs were compiled before."""
-    volume = jv.phantom("head", resolution)
-    scene = seen_head(volume, size)
-    truth = harness.frame(scene, marches.converged(scene.step, harness.FINER)).rgba
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"pixels": size, "voxels": resolution}
     with tempfile.TemporaryDirectory() as folder:
-        voxels, image, cache = (Path(folder) / name for name in ("voxels.npy", "image.npy", "cache"))
-        np.save(voxels, np.asarray(volume.data))
+        voxels = Path(folder) / "voxels.npy"
+        np.save(voxels, np.asarray(jv.phantom("head", resolution).data))
 
         def child(more: dict[str, str]) -> dict[str, float]:
             settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | more
-            words = [str(time.time()), str(voxels), str(size), str(LEFT), str(image)]
-            how: dict[str, Any] = {"cwd": Path(__file__).parent.parent, "env": settings, "text": True}
-            ran = subprocess.run(
-                [sys.executable, "-c", CHILD, *words], capture_output=True, check=True, **how
+            words = [sys.executable, "-c", CHILD, str(time.time()), str(voxels), str(size), str(LEFT)]
+            root = Path(__file__).parent.parent
+            return json.loads(
+                subprocess.check_output(words, cwd=root, env=settings, text=True).splitlines()[-1]
             )
-            return json.loads(ran.stdout.splitlines()[-1])
 
-        warm = {**CACHE, "JAX_COMPILATION_CACHE_DIR": str(cache)}
+        warm = {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         child(warm)  # fills the cache
         for name, more in (("nothing kept", {}), ("compiled before", warm)):
             times = [child(more) for _ in range(repetitions)]
-            medians = {part: timing.median([t[part] for t in times]) for part in times[0]}
-            found[name] = {**medians, "all": times, "rmse": rmse(np.load(image), truth)}
-    return {"pixels": size, "voxels": resolution, "settings": CACHE, **found}
+            found[name] = {part: timing.median([t[part] for t in times]) for part in times[0]}
+    return found
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -203,24 +179,20 @@ def draw(result: dict[str, Any], path: Path) -> None:
                     charts.interval(panel, rows[name]["ratio"], number + 0.2 * (shift - 1.5), color)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(GOAL, color="k", linewidth=0.8, linestyle=":")
-        panel.set_xscale("log")
-        panel.set_xticks((0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
-        panel.minorticks_off()
+        charts.numbered(panel, (0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
         ours = [(name, of_size[str(pixels)][OURS]) for name, of_size in volumes.items()]
         labels = [f"{name}\n{row['seconds'] * 1e3:.0f} ms, RMSE {row['rmse']:.4f}" for name, row in ours]
-        panel.set_yticks(range(len(volumes)), labels, fontsize=8)
+        panel.set_yticks(range(len(volumes)), labels)
         panel.set_ylim(len(volumes) - 0.5, -0.6)
         panel.set_xlabel(f"time of an image / that of jaxvol, {pixels} x {pixels} pixels", fontsize=9)
         panel.text(GOAL, -0.55, " goal", va="top", fontsize=8)
         panel.set_title(
-            "Right of 1: slower than jaxvol, whose own time and\n"
-            "error stand below a scene; bars: 95 % intervals",
-            fontsize=9,
+            "Right of 1: slower than jaxvol, whose own time and\nerror stand below a scene; bars: 95 % intervals"
         )
     shown = [name for name in COLORS if any(name in r for v in volumes.values() for r in v.values())]
     marks = [Line2D([], [], color=COLORS[name], marker="o", linestyle="") for name in shown]
     labels = [LABELS.get(name, name) for name in shown]
-    figure.legend(marks, labels, loc="outside upper center", ncols=4, fontsize=8)
+    figure.legend(marks, labels, loc="outside upper center", ncols=4)
     charts.save(figure, path)
 
 
@@ -240,7 +212,7 @@ def means(volumes: dict[str, Any], slopes: dict[str, Any], sizes: Sequence[int])
 @experiment(
     draw,
     repetitions=15,
-    sizes={"nargs": "+", "type": int, "default": SIZES},
+    sizes={"nargs": "+", "type": int, "default": (512, 1024)},
     only=some_of(SCENES, "VOLUME"),
     gradients={"action": "store_true", "help": "measure gradients, too, at the first size"},
     resolution=256,
@@ -263,9 +235,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
                     of: gradients(scene, of, there, chosen.repetitions) for of in ("transfer", "voxels")
                 }
                 show(slopes[name], name, size, "gradient")
-    first = None
-    if chosen.processes:
-        first = first_image(chosen.sizes[0], chosen.resolution, chosen.processes)
     return {
         "sizes": chosen.sizes,
         "steps to a voxel": chosen.steps,
@@ -275,7 +244,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "goal": GOAL,
         "peers": there,
         "geometric means": means(volumes, slopes, chosen.sizes),
-        "first image": first,
+        "first image": first_image(chosen.sizes[0], chosen.resolution, chosen.processes),
         "volumes": volumes,
         "gradients": slopes,
     }

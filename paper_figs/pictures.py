@@ -1,9 +1,11 @@
 """Pictures of scenes, as `experiments.pictures` renders them."""
 
 from argparse import Namespace
+from functools import partial
 
 from experiments import charts
 from experiments.harness import QUICK, Main, command
+from experiments.marches import JITTER, PLAIN
 from experiments.pictures import chae, kisti, kye, lee, lee_steps
 from experiments.pictures.kim import kim_fig8, order_of_bricks
 
@@ -58,11 +60,15 @@ def kim_fig6(chosen: Namespace) -> None:
 
 
 PICTURES: dict[str, Main] = {
-    "fig01": pictures("fig01", "Fig. 1: wood grain, and noise on the cut face", kye.fig01),
-    "fig09": pictures("fig09", FIG09, kye.fig09),
-    "fig10": pictures("fig10", FIG10, kye.fig10),
-    "fig11": pictures("fig11", FIG11, kye.fig11),
-    "fig12": pictures("fig12", FIG12, kye.fig12),
+    "fig01": pictures(
+        "fig01",
+        "Fig. 1: wood grain, and noise on the cut face",
+        partial(kye.comparison, "head", methods=(PLAIN, JITTER)),
+    ),
+    "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head")),
+    "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart")),
+    "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney")),
+    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left)),
     "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13),
     "chae_fig6": pictures("chae_fig6", chae_fig6, chae.chae_fig6, resolution=256),
     "kim_fig6": kim_fig6,

@@ -50,9 +50,12 @@ def inside(distance: np.ndarray, voxel: float) -> np.ndarray:
     return np.clip(0.5 - distance / voxel / 2, 0, 1)
 
 
+def away(place: Place) -> np.ndarray:
+    return np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
+
+
 def ball(place: Place, voxel: float) -> np.ndarray:
-    x, y, z = place
-    return SKIN * inside(np.sqrt(x**2 + y**2 + z**2) - 0.8, voxel)
+    return SKIN * inside(away(place) - 0.8, voxel)
 
 
 def floor(place: Place, voxel: float) -> np.ndarray:
@@ -60,26 +63,19 @@ def floor(place: Place, voxel: float) -> np.ndarray:
 
 
 def below_a_ball(place: Place, voxel: float) -> np.ndarray:
-    x, y, z = place
-    above = SKIN * inside(np.sqrt(x**2 + y**2 + z**2) - 0.35, voxel)
-    return np.maximum(floor(place, voxel), above)
+    return np.maximum(floor(place, voxel), SKIN * inside(away(place) - 0.35, voxel))
 
 
 def layers(place: Place, voxel: float) -> np.ndarray:
     """A ball of skin with `DEEP` under one half of its surface, and `DEEPER` under that."""
-    x, y, z = place
-    r = np.sqrt(x**2 + y**2 + z**2)
-    half = inside(-z, voxel)
-    values = ball(place, voxel)
-    values = values + half * (DEEP - SKIN) * inside(r - 0.7, voxel)
-    return values + half * (DEEPER - DEEP) * inside(r - 0.53, voxel)
+    r, half = away(place), inside(-place[2], voxel)
+    deep, deeper = (DEEP - SKIN) * inside(r - 0.7, voxel), (DEEPER - DEEP) * inside(r - 0.53, voxel)
+    return ball(place, voxel) + half * deep + half * deeper
 
 
 def veiled(place: Place, voxel: float) -> np.ndarray:
     """A ball, and a veil without material before one half of it."""
-    x, y, z = place
-    r = np.sqrt(x**2 + y**2 + z**2)
-    veil = inside(-z, voxel) * inside(abs(r - 0.92) - 0.03, voxel)
+    veil = inside(-place[2], voxel) * inside(abs(away(place) - 0.92) - 0.03, voxel)
     return np.maximum(ball(place, voxel), VEIL * veil)
 
 
@@ -108,12 +104,6 @@ STEPS: dict[str, tuple[Setup, Setup]] = {
 }
 
 
-def around(far: float, count: int = 48) -> ScattererTemplate:
-    """Photons evenly in all directions, whose intensities add to 1."""
-    offset = jnp.asarray(far * golden_spiral(count))
-    return ScattererTemplate(offset[None], jnp.full((1, count), 1 / count))
-
-
 def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """The image, and which pixels are visible."""
     spacing = 2 / (resolution - 1)
@@ -130,8 +120,9 @@ def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.nda
         jv.Material(0.5, FAR, 1.4, values=(0.4, 1.5)),
         jv.Material(opacity, FAR, index, values=(1.5, 4.0)),
     ]
-    one = around(FAR)
-    both = ScattererTemplate(*(jnp.stack([leaf] * 2) for leaf in (one.offset, setup.bright * one.intensity)))
+    count = 48  # photons evenly in all directions
+    offset = jnp.tile(FAR * golden_spiral(count), (2, 1, 1, 1))
+    both = ScattererTemplate(offset, jnp.full((2, 1, count), setup.bright / count))
     lighting = ScattererTemplates(materials, setup.lights, given=both, cutoff=setup.cutoff)
     rendering = jv.render(volume, transfer, camera, march, lighting=lighting)
     return np.asarray(rendering.image(BLACK)), np.asarray(rendering.rgba[..., 3] > 0.5)
