@@ -44,7 +44,7 @@ class Row(NamedTuple):
     peers: str | None = None
     toroidal: bool = False
     kind: Kind = "unlit"
-    finer: int = 16
+    finer: float = 16
     quadrature: Quadrature = "midpoint"
     part: float = 1.0
 

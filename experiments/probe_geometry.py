@@ -15,7 +15,6 @@ known only up to scale; and shells, which are alike at all angles, seen through 
 import warnings
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +24,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import charts, harness
+from . import harness
 from .harness import experiment, show
 
 
@@ -184,39 +183,7 @@ def left_open(variant: str, resolution: int, size: int, seed: int) -> dict[str, 
     return determined(jv.ImageResidual(scene, targets), probe, probe, **options)
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """Errors of each number, and how well each variant of the problem determines it."""
-    figure, (axes,) = charts.panels(1, 2, 12, 4.2)
-    at, rows = np.arange(len(NAMES)), result["recovered"]
-    for kind, mark, words in ((True, "o", "all numbers"), (False, "^", "one number")):
-        some = [row["errors"] for name, row in rows.items() if name.startswith("all") == kind]
-        errors = 100 * np.abs([[each[name] for name in NAMES] for each in some]).reshape(-1, len(NAMES))
-        across = at + np.linspace(-0.15, 0.15, len(some))[:, None] + (0.03 if kind else 0)
-        axes[0].plot(across.ravel(), errors.ravel(), mark, label=f"{len(some)} starts with {words} 20 % off")
-    likely = [100 * np.median([row["standard errors"][name] for row in rows.values()]) for name in NAMES]
-    axes[0].plot(at, likely, "k_", markersize=26, label="standard error by the covariance (median)")
-    axes[0].axhline(100 * OFF, color="k", linestyle=":", linewidth=1, label="at the start")
-    axes[0].axhline(100 * GOAL, color="k", linestyle="--", linewidth=1, label="goal")
-    ylabel = "error, % of the number (angles: of half their range)"
-    axes[0].set(yscale="log", xticks=at, xticklabels=NAMES, ylabel=ylabel)
-    charts.plain_numbers(axes[0])
-    axes[0].set_title("numbers of the probe, found from images")
-    axes[0].legend(fontsize=7, loc="upper right", bbox_to_anchor=(1, 0.95))
-    cases = result["left open"]
-    table = np.array([[row["standard errors"][name] for name in NAMES] for row in cases.values()])
-    known = np.isfinite(table)
-    axes[1].imshow(np.where(known, 0.35, 1), cmap="Reds", vmin=0, vmax=1.6, aspect="auto")
-    for i, j in np.ndindex(*table.shape):
-        text = f"{100 * table[i, j]:.2g}" if known[i, j] else "open"
-        axes[1].text(j, i, text, ha="center", va="center", fontsize=8)
-    axes[1].set(xticks=at, xticklabels=NAMES, yticks=range(len(cases)), yticklabels=list(cases))
-    axes[1].set_title("standard error by the covariance, %; open: not determined")
-    charts.save(figure, path)
-
-
-@experiment(
-    draw, size=32, resolution=64, starts=5, threads=3, quick={"size": 12, "resolution": 24, "starts": 1}
-)
+@experiment(size=32, resolution=64, starts=5, threads=3, quick={"size": 12, "resolution": 24, "starts": 1})
 def main(chosen: Namespace) -> dict[str, Any]:
     starts, variants = directions(np.random.default_rng(chosen.seed), chosen.starts), VARIANTS
     if chosen.quick:  # each of the other variants takes a program of its own

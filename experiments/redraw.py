@@ -19,7 +19,10 @@ from .harness import command, some_of
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 IMAGES = {"path_traced", "tomography"}
 """Records whose charts show images that no record holds."""
-OTHERS = {"viewer_latency", "gradient_agreement", "gradient_agreement_gpu"}
+OTHERS = {
+    *("bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),
+    *("out_of_core", "probe_geometry", "shading", "viewer_latency"),
+}
 """Records without a chart."""
 DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]
 

@@ -17,6 +17,7 @@ def chae_fig6(chosen: Namespace) -> str:
     return f"Chae and Shin, Fig. 6: part of an image of {size} x {size} pixels"
 
 
+FIG01 = "Fig. 1: wood grain, and noise on the cut face"
 FIG09 = "Fig. 9: the head; boundary noise is that of the cut face"
 FIG10 = "Fig. 10: a cut engine in place of the heart; boundary noise is that of the cut faces"
 FIG11 = "Fig. 11: a colon in soft tissue in place of the kidney; boundary noise is that of the cut face"

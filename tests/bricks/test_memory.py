@@ -7,9 +7,9 @@ import textwrap
 import numpy as np
 import pytest
 
-from experiments.peak_memory import STATUS
 from jaxvol.bricks import source_of
 from jaxvol.bricks.render import bricks_of
+from tests.peak_memory import STATUS
 
 from .scenes import CAMERA, PLAIN, TRANSFER
 
@@ -23,7 +23,7 @@ BESIDE = 48
 IMAGES = """
     import sys
     import jax, jaxvol as jv
-    from experiments.peak_memory import forget_peak, held, peak
+    from tests.peak_memory import forget_peak, held, peak
     from jaxvol.bricks.sources import VoxelSource
     path, n, budget = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     transfer = jv.TransferFunction([0, 255], [[1, 1, 1]] * 2, [1e-3, 1e-3])
