@@ -20,6 +20,7 @@ import sys
 import tempfile
 from argparse import Namespace
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ ROOT = Path(__file__).parent.parent
 
 
 class Worker:
-    """The process of a commit, which compiles all programs first."""
+    """The process of a commit."""
 
     def __init__(self, tree: Path, *given: Any):
         script = str(Path(__file__).with_name("compare_worker.py"))
@@ -44,11 +45,11 @@ class Worker:
         self.process = subprocess.Popen(command, bufsize=1, cwd=tree, env=environment, **how)
         self.programs: list[str] = json.loads(self._line())
 
-    def seconds(self, program: str) -> float:
-        """Of one frame."""
+    def run(self, program: str) -> None:
+        """Renders a frame."""
         assert self.process.stdin is not None
         self.process.stdin.write(program + "\n")
-        return float(self._line())
+        self._line()
 
     def _line(self) -> str:
         assert self.process.stdout is not None
@@ -69,39 +70,26 @@ def checked_out(commit: str, folder: Path) -> Path:
     return tree
 
 
-def frames(workers: dict[str, Worker], repetitions: int) -> dict[str, dict[str, list[float]]]:
-    """By program and commit, the seconds of every frame: rounds of one frame each, in an order that is
-    reversed from one round to the next."""
-    programs = list(dict.fromkeys(name for worker in workers.values() for name in worker.programs))
-    taken: dict[str, dict[str, list[float]]] = {name: {} for name in programs}
-    for repetition in range(repetitions):
-        for name in programs:
-            having = [commit for commit, worker in workers.items() if name in worker.programs]
-            for commit in having[:: 1 if repetition % 2 == 0 else -1]:
-                taken[name].setdefault(commit, []).append(workers[commit].seconds(name))
-    return taken
-
-
-def ratios(taken: dict[str, dict[str, list[float]]], base: str) -> dict[str, dict[str, dict[str, float]]]:
-    """By program and commit, its time and its ratio to the baseline's, where that has the program."""
-    return {
-        program: {
-            commit: {"seconds": timing.median(seconds), **timing.ratio(seconds, of[base])}
-            for commit, seconds in of.items()
+def measure(workers: dict[str, Worker], base: str, repetitions: int) -> dict[str, dict[str, dict[str, Any]]]:
+    """By program and commit, its time and its ratio to the baseline's, of the programs that this has."""
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for program in workers[base].programs:
+        having = {c: partial(w.run, program) for c, w in workers.items() if program in w.programs}
+        seconds = timing.interleaved(having, repetitions)
+        found[program] = {
+            commit: {"seconds": timing.median(taken), **timing.ratio(taken, seconds[base])}
+            for commit, taken in seconds.items()
         }
-        for program, of in taken.items()
-        if base in of
-    }
+    return found
 
 
-def means(found: dict[str, dict[str, dict[str, float]]]) -> dict[str, dict[str, float]]:
+def means(found: dict[str, dict[str, dict[str, Any]]], kinds: list[str]) -> dict[str, dict[str, float]]:
     """By kind and commit, the geometric mean of the scenes' ratios."""
-    kinds: dict[str, dict[str, list[float]]] = {}
-    for program, of in found.items():
-        for commit, row in of.items():
-            kind = kinds.setdefault(program.rpartition(": ")[2], {})
-            kind.setdefault(commit, []).append(row["median"])
-    return {kind: {commit: geometric_mean(each) for commit, each in of.items()} for kind, of in kinds.items()}
+    mean = {}
+    for kind in kinds:
+        rows = [row for name, row in found.items() if name.endswith(kind)]
+        mean[kind] = {c: geometric_mean(row[c]["median"] for row in rows if c in row) for c in rows[0]}
+    return mean
 
 
 @experiment(
@@ -122,11 +110,12 @@ def main(chosen: Namespace) -> dict[str, Any]:
         try:
             started = pool.map(lambda tree: Worker(tree, *given), trees.values())
             workers |= dict(zip(trees, started, strict=True))
-            found = ratios(frames(workers, chosen.repetitions), chosen.commits[0])
+            found = measure(workers, chosen.commits[0], chosen.repetitions)
         finally:
             for worker in workers.values():
                 worker.process.kill()
+    mean = means(found, chosen.kinds)
     show(found)
-    show(means(found), "geometric means")
+    show(mean, "geometric means")
     sizes = {"size": chosen.size, "repetitions": chosen.repetitions}
-    return {**sizes, "geometric means": means(found), "programs": found}
+    return {**sizes, "geometric means": mean, "programs": found}

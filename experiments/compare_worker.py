@@ -1,14 +1,13 @@
 """Renders frames of one commit, when it is told to: a process that `experiments.compare` runs for each.
 
 jaxvol is that of the commit, in the folder named first; the scenes are those beside this file, so that all
-commits render the same. On each line of stdin stands the name of a program, which is run once, and its
-seconds are printed. The first line printed names the programs, without those that the commit does not have.
+commits render the same. On each line of stdin stands the name of a program, which is run once; then a line is
+printed. The first line names the programs, without those that the commit does not have.
 """
 
 import json
 import runpy
 import sys
-import time
 from pathlib import Path
 
 
@@ -47,9 +46,8 @@ def main():
         jax.block_until_ready(each())
     print(json.dumps(list(made)), flush=True)
     for line in sys.stdin:
-        begun = time.perf_counter()
         jax.block_until_ready(made[line.rstrip("\n")]())
-        print(time.perf_counter() - begun, flush=True)
+        print("done", flush=True)
 
 
 if __name__ == "__main__":

@@ -2,17 +2,13 @@
 
 The table of the KISTI report (2005): a head and an engine under two transfer functions (1: low values
 translucent and high ones opaque; 2: all visible values opaque). It gives the speed-up over neither method, as
-the median of paired ratios, and beside each time the image's RMSE against a converged one. The goal is 4.55
-times for both methods everywhere without shading, the report's best, and the report's own speed-up in each of
-its eight cases with it.
+the median of paired ratios, and beside each time the image's RMSE against a converged one. The goal is the
+report's best, 4.55, everywhere without shading, and the report's own speed-up in each case with it.
 
-The report shades each sample by Phong's model. Its empty-space skipping fetches every sample and skips the
-shading of those that the transfer function hides: "shading skipped" here. Ours does not fetch them either.
-The report tests early termination every 16 slices, since a test costs it more than the shading that it saves;
-so segments of 1, 4, 8 and 16 samples, between which ended rays are looked for, are measured, too.
-
-Steps are one voxel long. Rays end at 1 % of transmittance. Without the folder JAXVOL_DATA of real volumes,
-the phantoms of a head and an engine stand in.
+The report's empty-space skipping fetches every sample and skips the shading of those that are transparent:
+"shading skipped" here; ours does not fetch them either. It tests early termination every 16 slices; so
+segments of 1, 4, 8 and 16 samples, between which ended rays are looked for, are measured, too. Steps are one
+voxel long. Without the folder JAXVOL_DATA of real volumes, the phantoms of a head and an engine stand in.
 """
 
 from argparse import Namespace

@@ -1,16 +1,13 @@
 """What do photons, templates, occlusion, baking and deferring cost, and what do they gain?
 
-The head phantom under opaque skin, lit from the side: with different numbers of photons per template and of
-blended templates, by one template for each pixel or for each material, under hard and soft occlusion, by
-baked light, and by deferred light, evaluated once per ray. Each frame is rendered in turn with the unlit
-head, and its time is the median of their ratios; beside it stands the image's RMSE against one that blends
-many templates under soft occlusion and lights all samples.
+The head phantom under opaque skin, lit from the side. Each frame is rendered in turn with the unlit head, and
+with one that `lighting.Phong` shades; its time is the median of their ratios. Beside it stands the image's
+RMSE against one that blends many templates under soft occlusion and lights all samples.
 
 The published form is hard occlusion, with all photons that templates hold, on all samples. Lee, Kwon and Shin
 report 20-24 frames per second with it and 42-56 without light, which is 2.2 times the time; the goal for
-baked light is 1.2 times. Times are also relative to a frame that `lighting.Phong` shades.
-
-Also measured: the error of deferred light under skin that is more and more translucent.
+baked light is 1.2 times. Also measured: the error of deferred light under skin that is more and more
+translucent.
 """
 
 import time

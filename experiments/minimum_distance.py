@@ -1,16 +1,15 @@
 """What does a minimum-distance grid gain inside a cavity, and which pixels does it spoil, by cell size?
 
 Chae and Shin, Figs. 5 and 6: a perspective camera inside a cavity, where rays run along walls and leaps by a
-distance map are short. Measured are the distance map alone, starts taken from the corner rays of cells of
-R x R pixels ("min_distance", as published), starts proven from the whole cell ("beam"), and empty stretches
-of beams, which use no cells ("hierarchy"). As in the paper, all of them end rays early. Distances are those
-of blocks of 4³ voxels, found in every image, as the library has them; and, for the map and the published
-starts, also those of voxels, found before, as the paper has them (`voxel_distances`).
+distance map are short. Measured are the distance map alone, starts taken from the corner rays of cells of R x
+R pixels ("min_distance", as published), starts proven from the whole cell ("beam"), and empty stretches of
+beams ("hierarchy"). Distances are those of blocks of 4³ voxels, found in every image; and, for the map and
+the published starts, also those of voxels, found before, as the paper has them (`voxel_distances`).
 
 The published starts are not a bound, so each time comes with the share of pixels that differ from the march
-without leaping by more than 1/255 in any channel, and with the RMSE against a converged image. The paper
-reports 53 % less time at R = 8 and distortion at R = 32. The goal is 2.1 times the speed of the distance map,
-that of voxels, at R = 8.
+without leaping by more than 1/255, and with the RMSE against a converged image. The paper reports 53 % less
+time at R = 8, which is the goal (2.1 times the speed of the distance map of voxels), and distortion at R =
+32.
 """
 
 from argparse import Namespace

@@ -17,35 +17,14 @@ from matplotlib.lines import Line2D
 
 from . import charts, record
 from .pareto_measure import slug
+from .pareto_points import SETTINGS
 from .programs import DRJIT, VTK
 
 
-COLORS = {
-    "left": "#1f77b4",
-    "midpoint": "#2ca02c",
-    "preintegrated": "#d62728",
-    "adaptive": "#9467bd",
-    "jitter": "#e377c2",
-    "alignment": "#8c564b",
-    "leaping": "#17becf",
-    "termination": "#bcbd22",
-    "transfer table": "#5254a3",
-    "storage": "#ad494a",
-    "photons": "#08306b",
-    "templates": "#7f0000",
-    "baked": "#00441b",
-    "deferred": "#fd8d8d",
-    "shaded": "#6a3d9a",
-    "shaded once": "#b15928",
-    "isosurface": "#1b9e77",
-    "isosurface, no leaping": "#d95f02",
-    "isosurface, leaping by distance": "#7570b3",
-    "whole": "#2b8cbe",
-    "bricks, memory of the whole": "#e6ab02",
-    "bricks, memory of a quarter": "#a6761d",
-    VTK: "#555555",
-    DRJIT: "#ff7f0e",
-}
+FAMILIES = [setting.family for settings in SETTINGS.values() for setting in settings.values()]
+FAMILIES = list(dict.fromkeys([*FAMILIES, VTK, DRJIT]))
+PALETTE = [*charts.plt.get_cmap("tab20").colors, *charts.plt.get_cmap("tab20b").colors]  # pyright: ignore
+COLORS = dict(zip(FAMILIES, PALETTE, strict=False))
 """By family, here and on the page."""
 MARKS = {VTK: "^", DRJIT: "s"}
 COLUMNS = 4

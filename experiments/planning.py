@@ -1,19 +1,14 @@
 """Does a plan hold its tolerance, and is anything faster within it?
 
-Random scenes: real volumes (nuclear, dental, CT and MR data) and phantoms, two volumes of float32;
-random transfer functions of three to eight points, some opaque, some with narrow peaks; random cameras, a
-quarter of them inside. (What a sample costs was fitted to five other scenes, one of the head phantom.) Each
-is planned for three tolerances. The image under the plan is compared with a converged one, over black or
-white, whichever differs more; the converged image is integrated between cells' ends, at a step of an eighth
-of a voxel, or less until it differs by at most 1e-4 from that of twice the step.
+Random scenes: real volumes and phantoms, random transfer functions of three to eight points, some opaque,
+some with narrow peaks; random cameras, a quarter of them inside. (What a sample costs was fitted to five
+other scenes.) Each is planned for three tolerances. The image under the plan is compared with a converged
+one, over black or white, whichever differs more.
 
 Of some scenes, a table of marches is searched: three quadratures and adaptive sampling, at steps from a
-thirty-second of a voxel to four, with leaps and without. Of each kind, the two with the longest steps (or the
-largest tolerances of their own) within the tolerance are timed; the fastest of all, in turn with the planned
-one.
-
-Last, what planning itself takes, programs being compiled, in images of 512 x 512 pixels under the plan. Where
-programs are not compiled yet, it takes the most of a volume's `planning seconds`.
+thirty-second of a voxel to four, with leaps and without. Of each kind, the two with the longest steps within
+the tolerance are timed; the fastest of all, in turn with the planned one. Last, what planning itself takes,
+programs being compiled, in images of 512 x 512 pixels under the plan.
 """
 
 import math

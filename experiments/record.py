@@ -23,12 +23,8 @@ PACKAGES = ("jaxvol", "jax", "jaxlib", "equinox", "numpy", "scikit-image", "matp
 
 
 def write(path: Path, question: str, result: Any, *, seed: int, command: list[str]) -> Path:
-    """Write a result as JSON, with all that is needed to run the experiment again.
-
-    - `question`: the question that the result answers.
-    - `result`: anything that JSON can hold.
-    - `command`: module and arguments, as after `python -m`.
-    """
+    """Write a result as JSON, with the question that it answers and all that is needed to run the experiment
+    again. `command`: module and arguments, as after `python -m`."""
     record = {
         "question": question,
         "command": shlex.join(["python", "-m", *command]),
@@ -49,10 +45,6 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-OTHERS = ":(top,exclude)experiments/results"
-"""All files but results, in Git's words."""
-
-
 def _device() -> dict[str, Any]:
     device = jax.devices()[0]
     return {
@@ -60,7 +52,6 @@ def _device() -> dict[str, Any]:
         "kind": device.device_kind,
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load when written": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
     }
 
 
@@ -68,21 +59,19 @@ def _processor() -> str:
     information = Path("/proc/cpuinfo")
     lines = information.read_text(encoding="utf-8").splitlines() if information.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    return names[0] if names else platform.processor()
 
 
 def commit() -> str | None:
     """The checkout's commit, with + if files other than results differ from it; None outside a checkout."""
-    here = Path(__file__).parent
 
     def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
-        ).stdout.strip()
+        return subprocess.check_output(
+            ["git", "-C", str(RESULTS), *words], text=True, stderr=subprocess.DEVNULL
+        )
 
     try:
-        return git("rev-parse", "--short", "HEAD") + (
-            "+" if git("status", "--porcelain", "--", ":/", OTHERS) else ""
-        )
+        changed = git("status", "--porcelain", "--", ":/", ":(top,exclude)experiments/results")
+        return git("rev-parse", "--short", "HEAD").strip() + "+" * bool(changed)
     except (OSError, subprocess.CalledProcessError):
         return None

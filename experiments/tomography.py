@@ -3,18 +3,13 @@
 With a black transfer function whose extinction is the value itself, a volume renders to an X-ray image:
 -log(1 - opacity) is the line integral of its values. The head phantom, as a density of 64³ voxels, is
 rendered this way by parallel rays from 24 directions around its axis, without noise and as photon counts. It
-is recovered from the same line integrals:
-
-- by scikit-image's filtered back projection (`iradon`), with negative densities set to 0 and the filter that
-  comes nearest to the truth;
-- by its SART (`iradon_sart`), which corrects the slices view by view and keeps densities from being negative;
-- by `jv.fit` with L-BFGS and the renderer's gradient with respect to every voxel. A bijection keeps densities
-  positive. All it knows of the geometry is its rays, which could come from any other cameras.
+is recovered by scikit-image's filtered back projection, with the filter that comes nearest to the truth; by
+its SART; and by `jv.fit` with L-BFGS and the renderer's gradient with respect to every voxel, whose rays
+could come from any cameras.
 
 The views are marched at a sixth of a voxel, the fit at a half. Truth and results share a grid on which values
-are trilinear, for the fit as for SART, so no method suffers from what a grid leaves out of the real world.
-Under noise both iterations first come near the truth and then fit the noise, so the nearest and the last
-error are recorded.
+are trilinear, for the fit as for SART. Under noise both iterations first come near the truth and then fit the
+noise, so the nearest and the last error are recorded.
 """
 
 import time
