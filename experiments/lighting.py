@@ -21,7 +21,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import jaxvol as jv
@@ -101,14 +100,6 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], chosen: Namespace) ->
             found[kind].append(row)
             show(row, kind)
     return found
-
-
-def held() -> dict[str, Any]:
-    """Number of photons that the templates hold, and that their arrays have room for."""
-    lighting = ScattererTemplates(FLESH, LIGHTS)
-    intensity = np.asarray(jax.jit(lambda: lighting.simulated(blend=False))().intensity)
-    each = np.sum(intensity > 0, axis=-1)
-    return {"fewest": int(each.min()), "most": int(each.max()), "room": intensity.shape[-1]}
 
 
 def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
@@ -208,7 +199,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "resolution": chosen.resolution,
         "repetitions": chosen.repetitions,
         "templates blended in the reference": chosen.many,
-        "photons of a template": held(),
         "frames": measure(scene, variants(chosen.photons, chosen.blended, chosen.baked), chosen),
         "deferring": [deferring(scene, times, chosen.seed) for times in chosen.thinned],
     }

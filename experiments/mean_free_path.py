@@ -24,6 +24,7 @@ from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
 from . import charts
 from .harness import experiment, show
+from .scenes import grid, on_cube
 
 
 GOAL = 0.01
@@ -37,13 +38,12 @@ TEMPLATES, KNOWN, TIED = "templates", "extinction known", "extinction 1/λ"
 
 def balls(resolution: int, parts: Sequence[tuple[float, tuple[float, float, float], float]]) -> jv.Volume:
     """Balls (value, centre, radius) in [-1, 1]³, with boundaries one voxel wide."""
-    line = np.linspace(-1, 1, resolution)
-    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
-    data = np.zeros(grid.shape[:3])
+    nodes = np.stack(grid(resolution), axis=-1)
+    data = np.zeros(nodes.shape[:3])
     for value, center, radius in parts:
-        inside = (radius - np.linalg.norm(grid - center, axis=-1)) * (resolution - 1) / 2 + 0.5
+        inside = (radius - np.linalg.norm(nodes - center, axis=-1)) * (resolution - 1) / 2 + 0.5
         data = np.maximum(data, value * np.clip(inside, 0, 1))
-    return jv.Volume(data.astype(np.uint8), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
+    return on_cube(data.astype(np.uint8))
 
 
 def cameras(size: int) -> list[jv.Camera]:

@@ -21,6 +21,7 @@ import jaxvol as jv
 
 from . import charts
 from .harness import experiment, show
+from .scenes import grid, on_cube
 
 
 NOISE = 0.02
@@ -51,23 +52,16 @@ class Problem(NamedTuple):
     labels: list[str]
 
 
-def grid(resolution: int) -> tuple[np.ndarray, dict[str, Any]]:
-    """Points of [-1, 1]³, (n, n, n, 3), and the spacing and origin of a volume of them."""
-    line = np.linspace(-1, 1, resolution)
-    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
-    return points, {"spacing": (2 / (resolution - 1),) * 3, "origin": (-1.0,) * 3}
-
-
 def marching(volume: jv.Volume, *, labels: bool = False) -> jv.March:
     return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(labels=labels),), "midpoint")
 
 
 def materials(resolution: int) -> Problem:
     """How many mean free paths?"""
-    points, where = grid(resolution)
+    points = np.stack(grid(resolution), axis=-1)
     distance = np.stack([np.linalg.norm(points - center, axis=-1) for center in CENTERS])
     labels = np.where(distance.min(axis=0) < 0.4, 1 + distance.argmin(axis=0), 0)
-    volume = jv.Volume(labels.astype(np.float32), labels=labels.astype(np.uint8), **where)
+    volume = on_cube(labels.astype(np.float32), labels.astype(np.uint8))
     march = marching(volume, labels=True)
 
     def of_paths(paths: Sequence[Any]) -> tuple[jv.Material, ...]:
@@ -93,10 +87,9 @@ def materials(resolution: int) -> Problem:
 
 def control_points(resolution: int, numbers: Sequence[int]) -> Problem:
     """How many control points?"""
-    points, where = grid(resolution)
-    x, y, z = np.moveaxis(points, -1, 0)
+    x, y, z = grid(resolution)
     waves = 0.5 + 0.25 * (np.sin(3 * x + y) + np.sin(2 * y - 3 * z + 1))
-    volume = jv.Volume(waves.astype(np.float32), **where)
+    volume = on_cube(waves.astype(np.float32))
     march = marching(volume)
     functions = [jv.flat_grey(volume, 2, (0, 1))]
     for number in numbers[1:]:

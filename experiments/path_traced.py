@@ -24,12 +24,9 @@ from .harness import experiment, show
 
 
 EXPLAINED = (
-    "The head phantom, lit from the left.\n"
-    "hard, soft: scatterer templates under\nhard and soft occlusion, one of several\nfor each pixel; "
-    "blended: all of them;\nbaked: light computed once, on a grid.\n"
-    "error: RMSE of the radiance against the\npath-traced image, after the one factor\n"
-    "that brings the image nearest to it.\n"
-    "noise: standard error of a pixel.\nWhite is the same radiance in all."
+    "hard, soft: occlusion of templates, of which\none is taken for each pixel; blended: all.\n"
+    "error: RMSE of the radiance after the factor\nthat brings the image nearest to the traced one.\n"
+    "White is the same radiance in all."
 )
 """The text beside the images."""
 TRACED, UNLIT = "path traced", "unlit"

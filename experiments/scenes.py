@@ -93,6 +93,16 @@ SCENES: dict[str, Callable[..., Scene]] = {
 }
 
 
+def grid(side: int) -> list[np.ndarray]:
+    """x, y and z of the nodes of [-1, 1]³."""
+    return np.meshgrid(*[np.linspace(-1, 1, side)] * 3, indexing="ij")
+
+
+def on_cube(data: np.ndarray, *labels: Any, field: Any = None) -> jv.Volume:
+    """Values at the nodes of [-1, 1]³."""
+    return jv.Volume(data, (2 / (len(data) - 1),) * 3, (-1.0,) * 3, *labels, field=field)
+
+
 def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) -> jv.Volume:
     """The part of a volume between two corners, given as fractions of its sides."""
     first, last = (

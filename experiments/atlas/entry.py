@@ -1,7 +1,6 @@
 """What is an entry of the failure atlas? A regime, swept until a method fails, and what is measured there."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -11,6 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxvol as jv
+
+from ..scenes import on_cube
 
 
 Outcome = Literal["bounded", "detected and said", "documented", "fails"]
@@ -146,23 +147,14 @@ def along_z(size: int, scale: float = 0.5) -> jv.Camera:
     return jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
 
 
-def grid(side: int) -> list[np.ndarray]:
-    """x, y and z of the nodes of [-1, 1]³."""
-    return np.meshgrid(*[np.linspace(-1, 1, side)] * 3, indexing="ij")
-
-
-def on_cube(data: np.ndarray, **more: Any) -> jv.Volume:
-    """Values on [-1, 1]³."""
-    return jv.Volume(data.astype(np.float32), [2 / (len(data) - 1)] * 3, [-1.0] * 3, **more)
-
-
 def cube(side: int = 8) -> jv.Volume:
-    """A volume of ones."""
-    return on_cube(np.ones((side,) * 3))
+    """A volume of ones on [-1, 1]³."""
+    return on_cube(np.ones((side,) * 3, np.float32))
 
 
-of_field = partial(on_cube, np.zeros((8, 8, 8)))
-"""The values of a field on [-1, 1]³."""
+def of_field(field: jv.Field) -> jv.Volume:
+    """The values of a field on [-1, 1]³."""
+    return on_cube(np.zeros((8, 8, 8), np.float32), field=field)
 
 
 def uniform(extinction: Any, color: tuple[float, ...] = (1.0, 1.0, 1.0)) -> jv.TransferFunction:

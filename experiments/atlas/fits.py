@@ -8,7 +8,8 @@ import numpy as np
 
 import jaxvol as jv
 
-from .entry import entry, grid, on_cube, rms
+from ..scenes import grid, on_cube
+from .entry import entry, rms
 
 
 MARCH = jv.March(0.06, (jv.AlphaCorrection(),), "midpoint")
@@ -20,7 +21,8 @@ TRUTH = np.array([[0.9, 0.3, 0.2], [0.8, 0.5, 0.3], [0.4, 0.7, 0.4], [0.3, 0.4, 
 def _waves() -> jv.Volume:
     """Values from 0 to 1 in all places of the image."""
     x, y, z = grid(24)
-    return on_cube(0.5 + np.sin(3 * x + 1) * np.cos(2 * y) * np.sin(2.5 * z + 0.5) / 2)
+    data = 0.5 + np.sin(3 * x + 1) * np.cos(2 * y) * np.sin(2.5 * z + 0.5) / 2
+    return on_cube(data.astype(np.float32))
 
 
 def transfer(beyond: int, extinction: float = 1.0) -> jv.TransferFunction:

@@ -9,7 +9,8 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import LEVEL, colors, entry, on_cube
+from ..scenes import on_cube
+from .entry import LEVEL, colors, entry
 
 
 RED, BLUE = (0.9, 0.25, 0.2), (0.25, 0.35, 0.6)
@@ -31,7 +32,7 @@ def _sheet_and_wall() -> jv.Volume:
     x, y, z = np.meshgrid(line, line, line, indexing="ij", sparse=True)
     # 0.2 at the faces, with a slope of one per voxel
     sheet = np.clip(0.2 + (THICK / 2 - np.abs(x - TILT * y)) / SPACING, 0, 1) * ((z > -0.6) & (z < -0.2))
-    return on_cube(np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)))
+    return on_cube(np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)).astype(np.float32))
 
 
 def sheet_image(width: float, size: int, method: str | None, cell: int = 8) -> np.ndarray:

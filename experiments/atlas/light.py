@@ -18,7 +18,8 @@ from jaxvol.lighting import (
 from jaxvol.metrics import rmse
 
 from ..printed_templates import printed_templates
-from .entry import colors, cube, entry, grid, on_cube, rms, uniform
+from ..scenes import grid, on_cube
+from .entry import colors, cube, entry, rms, uniform
 
 
 # -- energy as printed ------------------------------------------------------------------------------------
@@ -82,7 +83,7 @@ LIGHTS = DirectionalLight((0.8, 0.5, -0.6), (2.0, 2.0, 2.0)), ConstantLight((0.1
 @cache
 def _ball() -> jv.Volume:
     away = np.sqrt(sum(part**2 for part in grid(32)))
-    return on_cube(np.clip((RADIUS - away) * 15.5 + 0.5, 0, 1))
+    return on_cube(np.clip((RADIUS - away) * 15.5 + 0.5, 0, 1).astype(np.float32))
 
 
 @cache
@@ -168,7 +169,7 @@ def noisy_ball(noise: float) -> jv.Volume:
     axis, random = np.arange(SIDE) - (SIDE - 1) / 2, np.random.default_rng(0).normal(size=(SIDE,) * 3)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
     data = RISE * (SIDE / 3 - np.sqrt(x**2 + y**2 + z**2) + noise * random)
-    return on_cube(data)
+    return on_cube(data.astype(np.float32))
 
 
 def noise_picture(noise: float, size: int) -> np.ndarray:

@@ -47,7 +47,7 @@ MARCHES = {
 def hazy(share: float, size: int, march: str) -> np.ndarray:
     shade = np.tile(np.array([0.3, 0.3, 0.36, 0.36, 0.9])[:, None], 3)
     transfer = jv.TransferFunction([0.0, 0.04, 0.05, 0.1, 1.0], shade, [0.0, 0.0, 0.05, 0.05, 30.0])
-    volume = of_field(field=Hazy(jnp.asarray(share, jnp.float32)))
+    volume = of_field(Hazy(jnp.asarray(share, jnp.float32)))
     return colors(volume, transfer, along_z(size), MARCHES[march])
 
 
@@ -95,14 +95,14 @@ class Sheet(jv.Field):
 
 def sheet(ratio: float, size: int, jitter: bool) -> np.ndarray:
     """Opacity of an opaque sheet that is so many steps thick."""
-    volume = of_field(field=Sheet(jnp.asarray(ratio * STEP, jnp.float32), True))
+    volume = of_field(Sheet(jnp.asarray(ratio * STEP, jnp.float32), True))
     transfer = jv.TransferFunction([0.4, 0.6], np.ones((2, 3)), [0.0, 1e4])
     return opacities(volume, transfer, along_z(size), MARCHES["Jitter" if jitter else "ray casting"])
 
 
 def surface(ratio: float, size: int, jitter: bool) -> np.ndarray:
     """Opacity of the isosurfaces on both sides of a sheet."""
-    volume = of_field(field=Sheet(jnp.asarray(ratio * STEP, jnp.float32), False))
+    volume = of_field(Sheet(jnp.asarray(ratio * STEP, jnp.float32), False))
     transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [0.0, 1.0])
     march = jv.March(STEP, (jv.EmptySpaceJitter(0),) if jitter else ())
     return opacities(volume, transfer, along_z(size), march, compositing=jv.Isosurface(0.5))
