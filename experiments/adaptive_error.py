@@ -110,4 +110,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
         scenes[name] = {"outside": measure(scene), "inside": measure(inside(scene))}
         show(scenes[name], name)
-    return {"pixels": chosen.size, "summary": summary(scenes), "scenes": scenes}
+    return {"summary": summary(scenes), "scenes": scenes}

@@ -117,5 +117,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     mean = means(found, chosen.kinds)
     show(found)
     show(mean, "geometric means")
-    sizes = {"size": chosen.size, "repetitions": chosen.repetitions}
-    return {**sizes, "geometric means": mean, "programs": found}
+    return {"geometric means": mean, "programs": found}

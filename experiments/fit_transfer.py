@@ -131,4 +131,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     if folder is not None and not chosen.quick:
         scenes["engine"] = measure(engine(folder, chosen.resolution), chosen.size)
     show(scenes)
-    return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "goal": GOAL, "scenes": scenes}
+    return {"goal": GOAL, "scenes": scenes}

@@ -191,4 +191,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     }
     show({rule: {name: ", ".join(leaves) for name, leaves in of.items()} for rule, of in wrong.items()})
     widths = [width for width, _ in chosen.widths]
-    return {"image": [chosen.size] * 2, "widths": widths, "wrong": wrong, "relative errors": found}
+    return {"widths": widths, "wrong": wrong, "relative errors": found}

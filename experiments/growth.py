@@ -100,4 +100,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for along in chosen.only:
         found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
         show(found[along], along)
-    return {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found}
+    return {"usual": usual, "sweeps": found}

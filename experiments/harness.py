@@ -103,7 +103,9 @@ def experiment(
             if result is None:
                 return
             question = " ".join(about.partition("?")[0].split()) + "?"
-            record.write(chosen.path, question, result, seed=chosen.seed, command=chosen.command)
+            how = {"seed": chosen.seed, "command": chosen.command}
+            used = {name: getattr(chosen, name) for name in options}
+            record.write(chosen.path, question, result, options=used, **how)
             if draw is not None:
                 draw(record.read(chosen.path)["result"], chosen.path.with_suffix(".png"))
 

@@ -189,7 +189,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
     return {
         "volumes": "phantoms" if makers is PHANTOMS else "cthead and engine",
         "sizes": chosen.sizes,
-        "repetitions": chosen.repetitions,
         "goal": GOAL,
         "both, geometric mean": geometric_mean(gains),
         **measured,

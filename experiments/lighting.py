@@ -195,10 +195,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
     scene = skin_head(chosen.size, chosen.resolution)
     result = {
         "goals": GOALS,
-        "image": [chosen.size, chosen.size],
-        "resolution": chosen.resolution,
-        "repetitions": chosen.repetitions,
-        "templates blended in the reference": chosen.many,
         "frames": measure(scene, variants(chosen.photons, chosen.blended, chosen.baked), chosen),
         "deferring": [deferring(scene, times, chosen.seed) for times in chosen.thinned],
     }

@@ -177,9 +177,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
 def main(chosen: Namespace) -> dict[str, Any]:
     ball = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
     return {
-        "image": [chosen.size] * 2,
-        "resolution": chosen.resolution,
-        "paths": chosen.paths,
         "goal": GOAL,
         "three materials": three_materials(chosen.size, chosen.resolution),
         "one ball": [one_ball(thickness, ball, chosen) for thickness in chosen.thicknesses],

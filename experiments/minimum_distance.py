@@ -131,5 +131,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
         scenes[name] = measure(scene, chosen.cells, chosen.repetitions)
         show(scenes[name], name)
-    about = {"image": [chosen.size] * 2, "repetitions": chosen.repetitions, "goal at R = 8": GOAL}
-    return {**about, "cells": chosen.cells, "scenes": scenes}
+    return {"goal at R = 8": GOAL, "cells": chosen.cells, "scenes": scenes}

@@ -81,4 +81,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
             both = (of_size[str(size)][marches.BOTH]["ratio"]["median"] for of_size in volumes.values())
             means[str(size)] = geometric_mean(both)
         conditions[said] = {"goal": goal, "both, geometric means": means, "volumes": volumes}
-    return {"sizes": chosen.sizes, "repetitions": chosen.repetitions, "conditions": conditions}
+    return {"sizes": chosen.sizes, "conditions": conditions}

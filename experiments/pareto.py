@@ -30,9 +30,9 @@ import jaxvol as jv
 
 from . import charts, harness, pareto_measure, pareto_page, pareto_points, programs, record
 from .harness import experiment, recorded, show, some_of
-from .pareto_measure import Sizes, slug
+from .pareto_measure import slug
 from .pareto_scenes import ROWS
-from .programs import DRJIT, THREADS, VTK
+from .programs import DRJIT, VTK
 from .scenes import PHANTOM
 
 
@@ -89,52 +89,28 @@ def concluded(name: str, found: dict[str, Any], options: list[str]) -> dict[str,
     pairs = {n: (p["rmse"], p["time"]) for n, p in points.items()}
     ours = {n: pair for n, pair in pairs.items() if points[n]["family"] not in PEERS}
     theirs = {n: pair for n, pair in pairs.items() if n not in ours}
-    ahead = behind(list(ours.values()), theirs, SAME)
     return {
         "pixels": found["pixels"],
         "reference": found["reference"],
-        "base": pareto_points.base_of(row),
-        "base seconds": round(base, 5),
         "front of jaxvol": [list(ours)[i] for i in front(list(ours.values()))],
-        "front of all": [list(pairs)[i] for i in front(list(pairs.values()))],
         "peers left out": row.peers,
-        "jaxvol's front is left of and below all points of VTK and Dr.Jit": not ahead if theirs else None,
-        "their points that it is not": ahead,
+        "their points that it is not": behind(list(ours.values()), theirs, SAME),
         "points": points,
     }
 
 
-def summary(scenes: dict[str, Any]) -> dict[str, Any]:
-    """What the record says in short, of scenes with peers."""
-    compared = {n: s for n, s in scenes.items() if any(p["family"] in PEERS for p in s["points"].values())}
-    ahead = {n: s["their points that it is not"] for n, s in compared.items()}
-    return {
-        "points": sum(len(s["points"]) for s in scenes.values()),
-        "scenes with peers": len(compared),
-        "scenes in which jaxvol's front is left of and below all points of VTK and Dr.Jit": [
-            n for n, points in ahead.items() if not points
-        ],
-        "points that it is not left of and below, by scene": {n: p for n, p in ahead.items() if p},
-        "largest error of a reference": max(s["reference"]["rmse"] for s in scenes.values()),
-    }
-
-
-def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, str]) -> dict[str, Any]:
+def again(name: str, chosen: Namespace, output: Path, present: dict[str, str]) -> dict[str, Any]:
     """Renders and times a point, in turn with the base, and saves its picture; nothing else is changed."""
-    row = ROWS[name]
-    settings = pareto_points.of(row, present)
+    row, point = ROWS[name], chosen.point
+    settings, base = pareto_points.of(row, present), pareto_points.base_of(row)
     if point not in settings:
-        raise ValueError(
-            f"--point must be one of the settings of {name!r}, {', '.join(settings)}; got {point!r}."
-        )
-    case, base = pareto_measure.case_of(row, sizes), pareto_points.base_of(row)
-    truth = pareto_measure.converged(case, row, sizes.templates)
+        raise ValueError(f"--point must be one of {', '.join(settings)}; got {point!r}.")
+    case = pareto_measure.case_of(row, chosen)
+    truth = pareto_measure.converged(case, row, chosen.templates)
     made = {"": settings[base].make(case), point: settings[point].make(case)}
-    rows = programs.measured(made, truth, sizes.repetitions)
-    output.mkdir(exist_ok=True)
     file = output / f"{slug(name)}, {slug(point)}.png"
     jv.save_png(file, pareto_measure.beside(made[point], truth))
-    return {**rows[point], f"picture, and its error times {pareto_measure.AMPLIFIED}": str(file)}
+    return programs.measured(made, truth, chosen.repetitions)[point]
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -162,10 +138,9 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
         names = list(QUICK)
     if not names or (chosen.point is not None and len(names) != 1):
         raise ValueError(f"--point is of one scene: give one --scene that is there; got {', '.join(names)}.")
-    sizes = Sizes(chosen.size, chosen.resolution, chosen.repetitions, chosen.templates)
-    folder, present = chosen.output / "pareto", programs.peers()
+    present = programs.peers()
     if chosen.point is not None:
-        show(again(names[0], chosen.point, folder, sizes, present), names[0], chosen.point)
+        show(again(names[0], chosen, chosen.output, present), names[0], chosen.point)
         return None
 
     options = [f"--{n}={getattr(chosen, n)}" for n in ("size", "resolution", "repetitions", "seed")]
@@ -173,15 +148,11 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
     scenes: dict[str, Any] = {}
     for name in names:
         settings = pareto_points.of(ROWS[name], present)
-        if chosen.quick:  # the first two of each family
-            of_family = {
-                s.family: [n for n in settings if settings[n].family == s.family] for s in settings.values()
-            }
-            settings = {n: settings[n] for names_ in of_family.values() for n in names_[:2]}
-        found = pareto_measure.scene(name, folder / slug(name), sizes, settings)
+        settings = dict(list(settings.items())[:: 6 if chosen.quick else 1])
+        found = pareto_measure.scene(name, chosen.output / "pareto" / slug(name), chosen, settings)
         scenes[name] = {"measured": made, **concluded(name, found, ["--quick"] if chosen.quick else options)}
     same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
     scenes |= recorded(chosen, "scenes", [name for name in ROWS if name not in scenes], same)
     scenes = {name: scenes[name] for name in ROWS if name in scenes}
-    show(summary(scenes))
-    return {**same, "threads": THREADS, "peers": present, "summary": summary(scenes), "scenes": scenes}
+    show({name: scene["their points that it is not"] for name, scene in scenes.items()}, "peers ahead")
+    return {**same, "peers": present, "scenes": scenes}

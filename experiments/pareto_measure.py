@@ -7,8 +7,9 @@ times as large; in lit scenes also by the difference to half as many templates f
 """
 
 import re
+from argparse import Namespace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,32 +35,23 @@ SEEDS = 1001, 2002
 """Of the reference's templates: not those of the settings."""
 
 
-class Sizes(NamedTuple):
-    """How much is measured. `templates`: of a lit scene's reference."""
-
-    pixels: int
-    resolution: int
-    repetitions: int
-    templates: int
-
-
 def slug(name: str) -> str:
     """A setting's name as that of a file."""
     return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
 
 
-def case_of(row: Row, sizes: Sizes) -> Case:
-    return row.make(harness.data(), max(32, int(sizes.pixels * row.part)), sizes.resolution)
+def case_of(row: Row, chosen: Namespace) -> Case:
+    return row.make(harness.data(), max(32, int(chosen.size * row.part)), chosen.resolution)
 
 
-def scene(name: str, folder: Path, sizes: Sizes, settings: dict[str, Setting]) -> dict[str, Any]:
+def scene(name: str, folder: Path, chosen: Namespace, settings: dict[str, Setting]) -> dict[str, Any]:
     """All results of a scene; its pictures are written into the folder."""
     row = ROWS[name]
-    case, base = case_of(row, sizes), pareto_points.base_of(row)
-    truth = converged(case, row, sizes.templates)
+    case, base = case_of(row, chosen), pareto_points.base_of(row)
+    truth = converged(case, row, chosen.templates)
     found: dict[str, Any] = {
         "pixels": case.scene.camera.size[0],
-        "reference": own_error(case, row, truth, sizes.templates),
+        "reference": own_error(case, row, truth, chosen.templates),
         "points": {},
         "base seconds": [],
     }
@@ -68,7 +60,7 @@ def scene(name: str, folder: Path, sizes: Sizes, settings: dict[str, Setting]) -
     against = settings[base].make(case)
     for family in dict.fromkeys(setting.family for setting in settings.values()):
         made = {n: against if n == base else s.make(case) for n, s in settings.items() if s.family == family}
-        rows = programs.measured({base: against, **made}, truth, sizes.repetitions)
+        rows = programs.measured({base: against, **made}, truth, chosen.repetitions)
         found["base seconds"] += rows[base]["all seconds"]
         for point, each in made.items():
             image, seen = each.image(), each.seen(truth)

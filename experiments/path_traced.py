@@ -115,5 +115,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     rows, images = measure(chosen)
     show(rows)
     pictures(rows, images, chosen.output / "path_traced.webp")
-    about = {"image": [chosen.size] * 2, "resolution": chosen.resolution, "paths": chosen.paths}
-    return {**about, "rows": rows}
+    return {"rows": rows}

@@ -277,4 +277,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
         if scene.name not in costs:
             costs[scene.name] = cost(scene, chosen.large)
         show(rows[-1]["plans"], number, scene.name)
-    return {"pixels": chosen.size, "summary": summary(rows, costs), "planning": costs, "scenes": rows}
+    return {"summary": summary(rows, costs), "planning": costs, "scenes": rows}

@@ -6,6 +6,7 @@ import platform
 import shlex
 import subprocess
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,16 @@ BEGUN = time.monotonic()
 PACKAGES = ("jaxvol", "jax", "jaxlib", "equinox", "numpy", "scikit-image", "matplotlib")
 
 
-def write(path: Path, question: str, result: Any, *, seed: int, command: list[str]) -> Path:
+def write(
+    path: Path, question: str, result: Any, *, seed: int, command: list[str], options: Mapping[str, Any] = {}
+) -> Path:
     """Write a result as JSON, with the question that it answers and all that is needed to run the experiment
-    again. `command`: module and arguments, as after `python -m`."""
+    again. `command`: module and arguments, as after `python -m`; `options`: these, and those by default."""
     record = {
         "question": question,
         "command": shlex.join(["python", "-m", *command]),
         "seed": seed,
+        "options": options,
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
         "commit": commit(),
         "seconds": round(time.monotonic() - BEGUN),

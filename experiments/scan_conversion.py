@@ -136,5 +136,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
         scenes[name] = measure(scene, chosen.spacings, chosen.repetitions)
         show(scenes[name], name)
-    about = {"image": [chosen.size] * 2, "repetitions": chosen.repetitions, "spacings": chosen.spacings}
-    return {**about, "scenes": scenes}
+    return {"scenes": scenes}

@@ -235,10 +235,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
                 show(slopes[name], name, size, "gradient")
     return {
         "sizes": chosen.sizes,
-        "steps to a voxel": chosen.steps,
-        "repetitions": chosen.repetitions,
-        "opacity left": LEFT,
-        "threads": THREADS,
         "goal": GOAL,
         "peers": there,
         "geometric means": means(volumes, slopes, chosen.sizes),

@@ -225,10 +225,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for row in (row for rows in found.values() for row in rows.values()):
         del row["slice"]
     show(found)
-    return {
-        "voxels": list(truth.shape),
-        "views": chosen.views,
-        "densest": float(truth.max()),
-        "steps": {"views": STEP_OF_VIEWS, "fit": STEP},
-        "photons": found,
-    }
+    return {"photons": found}

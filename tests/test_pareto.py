@@ -1,5 +1,7 @@
 """Does `experiments.pareto` find the right fronts, and measure each setting beside the base?"""
 
+from argparse import Namespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from experiments.programs import Case, Program
 from experiments.scenes import PHANTOM, Scene
 
 
-SIZES = pareto_measure.Sizes(32, 16, 2, 4)
+SIZES = Namespace(size=32, resolution=16, repetitions=2, templates=4)
 OPAQUE = f"{PHANTOM}, opaque"
 FRONTS = [
     ([], []),
@@ -63,7 +65,7 @@ def test_each_setting_is_measured_beside_the_base_and_has_a_picture(monkeypatch,
     volume = jv.Volume(np.zeros((4, 4, 4), np.uint8))
     camera = jv.Camera.looking_at(volume, size=(32, 32))
     case = Case(Scene(volume, jv.preset("engine"), camera, 1.0))
-    monkeypatch.setattr(pareto_measure, "case_of", lambda row, sizes: case)
+    monkeypatch.setattr(pareto_measure, "case_of", lambda row, chosen: case)
     monkeypatch.setattr(pareto_measure, "converged", lambda case, *_: np.full((32, 32, 3), 0.5))
     monkeypatch.setattr(pareto_measure, "own_error", lambda *_: {"rmse": 1e-3})
     found = pareto_measure.scene(OPAQUE, tmp_path, SIZES, settings)
