@@ -2,25 +2,21 @@
 
 Five scenes, steps of a quarter of a voxel to four, three quadratures, and adaptive sampling at five
 tolerances. Ours skips empty space, cuts the last cell at the exit, and ends rays early. Error is the RMSE
-over white against one converged image of ours. Adaptive sampling, and peers, are compared with ours at their
-own error, which lies between those of two settings: samples and time are interpolated.
+over white against one converged image of ours.
 
 A second part looks at a transfer function whose peak is 1 % as wide as the range of values: the error of both
 second-order quadratures, by step.
 """
 
 from argparse import Namespace
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jaxvol.metrics import rmse
 
 from . import charts, programs
-from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
+from .harness import chosen_scenes, experiment, show, some_of
 from .programs import DRJIT, FINEST_OF, QUADRATURES, VTK, Case, Program, is_here
 from .scenes import PHANTOM, SCENES, Scene, peaked
 
@@ -29,8 +25,6 @@ STEPS = (0.5, 1.0, 2.0, 4.0)
 FINEST = 0.25
 ADAPTIVE = "adaptive"
 FINER = 16
-ERRORS = (1e-2, 5e-3, 2e-3)
-"""At which Dr.Jit is compared."""
 OF_DRJIT = f"{DRJIT}, left", f"{DRJIT}, midpoint"
 STYLES = {
     ADAPTIVE: "C4*-",
@@ -66,64 +60,6 @@ def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
             rows[key]["samples"] = round(each.samples(), 2)
     found = {name: {str(s): rows[of, s] for of, s in sorted(rows) if of == name} for name in STYLES}
     return {name: by_setting for name, by_setting in found.items() if by_setting}
-
-
-def least(rows: Rows, names: Sequence[str], error: float, what: str) -> float | None:
-    """What the best of these programs takes for this error, as a power of it between two of its settings;
-    None where none has it between its settings."""
-    found = []
-    for name in names:
-        known = sorted((row["rmse"], row[what]) for row in rows.get(name, {}).values())
-        if known and known[0][0] <= error <= known[-1][0]:
-            errors, taken = np.log(np.array(known)).T
-            found.append(float(np.exp(np.interp(np.log(error), errors, taken))))
-    return min(found, default=None)
-
-
-def against_uniform(rows: Rows) -> dict[str, dict[str, float | None]]:
-    """By tolerance: error over tolerance; and how many times more samples and time uniform steps take for the
-    same error, by the quadrature that is best at it."""
-    found: dict[str, dict[str, float | None]] = {}
-    for tolerance, row in rows[ADAPTIVE].items():
-        found[tolerance] = {"error over tolerance": row["rmse"] / float(tolerance)}
-        for what in ("samples", "seconds"):
-            taken = least(rows, QUADRATURES, row["rmse"], what)
-            found[tolerance][what] = None if taken is None else round(taken / row[what], 3)
-    return found
-
-
-def time_to_accuracy(rows: Rows) -> dict[str, dict[str, float]]:
-    """By peer and error, how many times longer than ours the peer takes to an image of this error, each by
-    its best setting: VTK at its own error at one voxel; Dr.Jit at three errors, where both reach them."""
-    compared = [(DRJIT, OF_DRJIT, f"{error:g}", error) for error in ERRORS]
-    if VTK in rows:
-        error = rows[VTK]["1.0"]["rmse"]
-        compared.append((VTK, (VTK,), f"{error:.4f}", error))
-    found: dict[str, dict[str, float]] = {VTK: {}, DRJIT: {}}
-    for peer, theirs, name, error in compared:
-        our, their = (least(rows, n, error, "seconds") for n in ((ADAPTIVE, *QUADRATURES), theirs))
-        if our is not None and their is not None:
-            found[peer][name] = their / our
-    return found
-
-
-def summary(scenes: dict[str, Rows]) -> dict[str, Any]:
-    """What the record says in short."""
-    uniform = {s: against_uniform(rows) for s, rows in scenes.items()}
-    tolerances = [row for of in uniform.values() for row in of.values()]
-    gains = {what: [g for row in tolerances if (g := row[what])] for what in ("samples", "seconds")}
-    faster = {s: time_to_accuracy(rows) for s, rows in scenes.items()}
-    peers = {peer: [r for of in faster.values() for r in of[peer].values()] for peer in (VTK, DRJIT)}
-    at_one = [
-        (rows["preintegrated"]["1.0"]["rmse"], rows["midpoint"]["1.0"]["rmse"]) for rows in scenes.values()
-    ]
-    return {
-        "time of peers over ours, at the same error": faster,
-        "its geometric means": {p: geometric_mean(each) for p, each in peers.items() if each},
-        "uniform steps over adaptive sampling, at its error": uniform,
-        "geometric means": {what: geometric_mean(each) for what, each in gains.items() if each},
-        "mean": float(np.mean([integrated / middle for integrated, middle in at_one])),
-    }
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -173,5 +109,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
         }
         show(scenes[name], name)
         show(peaks[name], name, "narrow peak")
-    about = {"pixels": chosen.size, "peers": there, "summary": summary(scenes)}
-    return {**about, "scenes": scenes, "peaks": peaks}
+    return {"pixels": chosen.size, "peers": there, "scenes": scenes, "peaks": peaks}

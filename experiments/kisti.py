@@ -27,7 +27,7 @@ from jaxvol.metrics import rmse
 from jaxvol.ray import Scene as EngineScene
 
 from . import charts, harness, marches, timing
-from .harness import experiment, geometric_mean, show
+from .harness import experiment, show
 from .scenes import CT_HEAD, PHANTOM, SCENES, Scene
 
 
@@ -180,18 +180,10 @@ def main(chosen: Namespace) -> dict[str, Any]:
                 if size == chosen.sizes[-1]:
                     every[case] = {str(n): tested_every(seen, n, chosen.repetitions) for n in chosen.every}
                     show(every[case], case, "ended rays are looked for every so many samples")
-    over = {
-        f"{case}, {size}": round(rows[BOTH]["speed-up"]["median"] / REPORT[case][BOTH][at], 3)
-        for case, of_size in measured["shaded"].items()
-        for at, (size, rows) in enumerate(of_size.items())
-    }
-    gains = [rows[BOTH]["speed-up"]["median"] for of in measured["scenes"].values() for rows in of.values()]
     return {
         "volumes": "phantoms" if makers is PHANTOMS else "cthead and engine",
         "sizes": chosen.sizes,
         "goal": GOAL,
-        "both, geometric mean": geometric_mean(gains),
         **measured,
-        "both, shaded, over the report's": over,
         "ended rays are looked for every so many samples": every,
     }

@@ -12,7 +12,6 @@ of a transfer function (256 for 8-bit data), and with that of every voxel as flo
 alone and to Dr.Jit's replay adjoint, with the relative difference of the two gradients.
 """
 
-import itertools
 import json
 import os
 import subprocess
@@ -20,7 +19,6 @@ import sys
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -194,19 +192,6 @@ def draw(result: dict[str, Any], path: Path) -> None:
     charts.save(figure, path)
 
 
-def means(volumes: dict[str, Any], slopes: dict[str, Any], sizes: Sequence[int]) -> dict[str, float]:
-    """Geometric mean over all scenes and sizes of each program's time over ours; and of gradients, over the
-    image and over ours."""
-    rows = [of_size[str(size)] for of_size in volumes.values() for size in sizes]
-    there = [name for name in COLORS if all(name in row for row in rows)]
-    found = {name: geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in there}
-    for of, key in itertools.product(("transfer", "voxels"), ("over image", "Dr.Jit over ours")):
-        ratios = [each[of][key]["median"] for each in slopes.values() if key in each[of]]
-        if ratios:
-            found[f"{of}, {key}"] = geometric_mean(ratios)
-    return found
-
-
 @experiment(
     draw,
     repetitions=15,
@@ -233,11 +218,14 @@ def main(chosen: Namespace) -> dict[str, Any]:
                     of: gradients(scene, of, there, chosen.repetitions) for of in ("transfer", "voxels")
                 }
                 show(slopes[name], name, size, "gradient")
+    rows = [row for of_size in volumes.values() for row in of_size.values()]
+    everywhere = [name for name in COLORS if all(name in row for row in rows)]
+    means = {name: geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in everywhere}
     return {
         "sizes": chosen.sizes,
         "goal": GOAL,
         "peers": there,
-        "geometric means": means(volumes, slopes, chosen.sizes),
+        "geometric means": means,
         "first image": first_image(chosen.sizes[0], chosen.resolution, chosen.processes),
         "volumes": volumes,
         "gradients": slopes,
