@@ -59,8 +59,8 @@ def _root(values: np.ndarray) -> float:
 
 
 def summary(scenes: dict[str, Any]) -> dict[str, Any]:
-    """How many images keep their tolerance; and the largest part that jitter leaves of errors of which more than
-    a hundredth is structured."""
+    """How many images keep their tolerance; and the largest part that jitter leaves of errors of which more
+    than a hundredth is structured."""
     rows = [(float(t), row) for views in scenes.values() for of in views.values() for t, row in of.items()]
     left = [
         row["structured energy, jittered"] / row["structured energy"]

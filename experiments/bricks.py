@@ -33,8 +33,6 @@ from .harness import experiment, recorded, show, some_of
 from .scan_conversion import BODY
 
 
-# -- the paper's scan and table ----------------------------------------------------------------------------
-
 Split = tuple[int, int, int]
 """Bricks along β, σ and γ, the axes of data[β, σ, γ]."""
 
@@ -114,9 +112,6 @@ def share(overlaps: Iterable[float], nodes: int) -> float:
     return 100 * sum(map(math.ceil, overlaps)) / nodes
 
 
-# -- the naive order ----------------------------------------------------------------------------------------
-
-
 def each_at_once(traversal: Traversal) -> Iterator[Load]:
     """A `method` of `render_bricks`, the paper's order without overlap: each brick with all its cells of each
     ray, so that what the ray meets between these, in other bricks, is blended in the wrong order."""
@@ -134,8 +129,6 @@ def each_at_once(traversal: Traversal) -> Iterator[Load]:
             reached = found.reached
             yield load._replace(cells=found.cells)
 
-
-# -- what is measured ---------------------------------------------------------------------------------------
 
 METHODS: dict[str, Any] = {"overlap": "overlap", "reload": "reload", "naive": each_at_once}
 SCALE = 0.17

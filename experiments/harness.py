@@ -37,9 +37,6 @@ HELP = {"size": "pixels along a side", "sizes": "pixels along a side", "output":
 HELP |= {"resolution": "voxels along an axis of phantoms", "paths": "paths through each pixel"}
 
 
-# -- scripts ----------------------------------------------------------------------------------------------
-
-
 def command(about: str | None, output: Path, **options: Any) -> Callable[[Callable[[Namespace], None]], Main]:
     """Decorator that makes a script's `main` of a function of its options.
 
@@ -154,9 +151,6 @@ def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-# -- scenes -----------------------------------------------------------------------------------------------
-
-
 def data() -> Path | None:
     """The folder of real volumes that JAXVOL_DATA names, or None."""
     folder = os.environ.get("JAXVOL_DATA")
@@ -186,9 +180,6 @@ def image(scene: Scene, march: jv.March) -> jv.Rendering:
 def entered(scene: Scene) -> np.ndarray:
     """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
     return np.asarray(frame(scene, jv.March(scene.step, max_samples=1)).rgba[..., 3] > 0)
-
-
-# -- measures ---------------------------------------------------------------------------------------------
 
 
 def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[str, dict[str, Any]]:

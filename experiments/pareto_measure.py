@@ -91,9 +91,6 @@ def small(linear: Image) -> Pillow.Image:
     return shown.resize((round(SIDE * width / height), SIDE), Pillow.Resampling.LANCZOS)
 
 
-# -- the converged image ----------------------------------------------------------------------------------
-
-
 def fine(case: Case, finer: float, quadrature: Quadrature) -> jv.March:
     transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping()
     return jv.March(case.scene.step / finer, transforms, quadrature)

@@ -208,8 +208,8 @@ def cost(scene: Scene, size: int) -> dict[str, dict[str, float]]:
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """By tolerance: how many plans hold it, and how many of those searched take at most 1.5 times as long as the
-    fastest march found."""
+    """By tolerance: how many plans hold it, and how many of those searched take at most 1.5 times as long as
+    the fastest march found."""
     found = {}
     for tolerance in TOLERANCES:
         plans = [row["plans"][f"{tolerance:g}"] for row in rows]

@@ -118,9 +118,6 @@ def deferred(case: Case, **how: Any) -> Lighting:
     return Deferred(lighting_of(case, **how))
 
 
-# -- other programs ---------------------------------------------------------------------------------------
-
-
 def peers() -> dict[str, str]:
     """The version of each peer, or why it is left out."""
     reason = peer_vtk.missing()
@@ -159,9 +156,6 @@ def of_drjit(there: Any) -> Program:
 
 def by_drjit(quadrature: Any, step: float, case: Case) -> Program:
     return of_drjit(marcher(case.scene._replace(step=step * case.scene.step), quadrature))
-
-
-# -- measures ---------------------------------------------------------------------------------------------
 
 
 def measured(programs: Mapping[Any, Program], truth: Image, repetitions: int) -> dict[Any, dict[str, Any]]:

@@ -121,8 +121,6 @@ def gradients(
     return found
 
 
-# -- the first image of a process ---------------------------------------------------------------------------
-
 CHILD = """
 import json, sys, time
 begun, voxels, size, left = sys.argv[1:]

@@ -106,9 +106,6 @@ def sweep(entry: Entry, size: int, values: Sequence[float] | None = None) -> dic
     return {"values": list(values), "curves": curves, "edge": found._asdict()}
 
 
-# -- shared by entries ------------------------------------------------------------------------------------
-
-
 def rgba(*scene: Any, **how: Any) -> np.ndarray:
     """An image over black, by the adjoint that compiles fastest."""
     return np.asarray(jv.render(*scene, outputs="rgba", adjoint="forward", **how).rgba, np.float64)

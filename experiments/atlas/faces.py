@@ -13,9 +13,6 @@ from jaxvol.metrics import boundary_noise
 from .entry import along_z, colors, cube, entry, opacities, ray_opacities, rms, signed, uniform
 
 
-# -- cut faces --------------------------------------------------------------------------------------------
-
-
 @cache
 def cut_block(resolution: int = 64) -> jv.Volume:
     return jv.phantom("cut_block", resolution)
@@ -53,9 +50,6 @@ def jitter_on_cut_faces(step: float, size: int) -> dict[str, float]:
     EmptySpaceJitter, rays on the face are not shifted before they leave the material, and it stays smooth."""
     on_face = np.asarray(along_z(size).rays()[0])[..., 0] < -0.05
     return {name: float(np.sqrt(boundary_noise(cut_face(step, size, name), on_face) / 3)) for name in JITTERS}
-
-
-# -- faces of labels --------------------------------------------------------------------------------------
 
 
 @cache
@@ -99,8 +93,6 @@ def jitter_at_label_faces(depth: float, size: int) -> dict[str, float]:
     }
 
 
-# -- their motion along a ray, which gradients leave out --------------------------------------------------
-
 FRONT = 0.5
 """Extinction of label 0."""
 ANGLE = 0.3
@@ -142,8 +134,6 @@ def gradients_at_label_faces(contrast: float, size: int) -> dict[str, float]:
     names = "AlphaCorrection(labels=True)", "AlphaCorrection()", "finite differences"
     return {name: abs(slope - exact) / exact for name, slope in zip(names, found, strict=True)}
 
-
-# -- behind what is cut out -------------------------------------------------------------------------------
 
 OUT = jv.Clip((-2, 2, -2, 2, -0.49, 0.35), inside_out=True)
 """Cuts a layer out of the cube: 0.51 are left in front, and 0.65 behind, no multiple of any step below."""

@@ -53,9 +53,6 @@ def _scene(transfer: jv.TransferFunction, camera: jv.Camera) -> tuple:
     return _waves(), transfer, camera, MARCH
 
 
-# -- directions that images do not determine --------------------------------------------------------------
-
-
 @entry(
     "jaxvol.fit",
     "control points beyond all values",
@@ -82,9 +79,6 @@ def fits_of_what_images_do_not_show(beyond: float, size: int) -> dict[str, float
     }
 
 
-# -- starts from which no step leads on -------------------------------------------------------------------
-
-
 @entry(
     "jaxvol.fit",
     "extinction at the start / true one",
@@ -103,8 +97,6 @@ def fits_from_opaque_starts(extinction: float, size: int) -> dict[str, float]:
     rest = float(np.sqrt(2 * found.loss / truth.size))
     return {"RMSE after 30 steps": rest, "not converged": float(not found.success)}
 
-
-# -- noise ------------------------------------------------------------------------------------------------
 
 WRONG = 0.1
 

@@ -16,8 +16,6 @@ from .entry import LEVEL, colors, entry
 RED, BLUE = (0.9, 0.25, 0.2), (0.25, 0.35, 0.6)
 
 
-# -- sheets thinner than a cell of pixels -----------------------------------------------------------------
-
 NODES = 128
 SPACING = 2 / (NODES - 1)
 THICK = 4.6 * SPACING
@@ -78,9 +76,6 @@ def sheets_thinner_than_a_cell_of_rays(ratio: float, size: int) -> dict[str, flo
     return found
 
 
-# -- steep transfer functions -----------------------------------------------------------------------------
-
-
 def steep_image(ramp: float, size: int, low: float, *, leaps: bool) -> np.ndarray:
     """A volume that is visible above `low`; extinction rises over `ramp` spacings of float32."""
     values = np.array([low, low + ramp * np.spacing(np.float32(low))], np.float32)
@@ -114,9 +109,6 @@ def occupancy_under_steep_transfer_functions(ramp: float, size: int) -> dict[str
         images = [steep_image(ramp, size, low, leaps=leaps) for leaps in (True, False)]
         found[name] = float(np.abs(images[0] - images[1]).max())
     return found
-
-
-# -- gradients of what is leapt over ----------------------------------------------------------------------
 
 
 @jax.jit

@@ -22,9 +22,6 @@ from ..scenes import grid, on_cube
 from .entry import colors, cube, entry, rms, uniform
 
 
-# -- energy as printed ------------------------------------------------------------------------------------
-
-
 @entry(
     "jaxvol.scatterer_template",
     "opacity α",
@@ -49,9 +46,6 @@ def energy_of_templates_as_printed(opacity: float, size: int) -> dict[str, float
     return {**found, "α / (1 - α)": opacity / (1 - opacity)}
 
 
-# -- few packets ------------------------------------------------------------------------------------------
-
-
 @entry(
     "jaxvol.scatterer_template",
     "packets",
@@ -73,8 +67,6 @@ def lopsided_templates(packets: float, size: int) -> dict[str, float]:
         "blend of 32": float(np.linalg.norm(middle.mean(axis=1))),
     }
 
-
-# -- mean free paths far from an object's size ------------------------------------------------------------
 
 RADIUS = 0.7
 LIGHTS = DirectionalLight((0.8, 0.5, -0.6), (2.0, 2.0, 2.0)), ConstantLight((0.15, 0.15, 0.15))
@@ -156,8 +148,6 @@ def short_mean_free_paths(ratio: float, size: int) -> dict[str, float]:
     return balls(ratio, size)
 
 
-# -- shading by gradients -----
-
 SIDE = 32
 RISE = 10.0
 """Value units per voxel, at the surface."""
@@ -210,9 +200,6 @@ def normals_in_noise(noise: float, size: int) -> dict[str, float]:
     found = np.asarray(gradient(points), np.float64)
     cosine = np.abs(np.sum(found * outward, axis=-1)) / np.linalg.norm(found, axis=-1)
     return {"angle": float(np.rad2deg(np.mean(np.arccos(np.minimum(cosine, 1)))))}
-
-
-# -- light ------------------------------------------------------------------------------------------------
 
 
 def lit_image(size: int, transforms: tuple[jv.Transform, ...], lit: bool, finer: int = 1) -> np.ndarray:

@@ -22,8 +22,6 @@ def one_ray(volume: jv.Volume, extinction: Any, step: float, origin: Any, direct
     return ray_opacities(volume, uniform(extinction), rays, jv.March(step, ALIGNED))[0]
 
 
-# -- opaque cells -----------------------------------------------------------------------------------------
-
 ORIGIN, AHEAD = (0.1, 0.2, -3.0), (0.0, 0.0, 1.0)
 through = value_and_slope(lambda extinction: one_ray(cube(), extinction, 0.5, ORIGIN, AHEAD))
 """A cube of side 2, in four steps, by its extinction."""
@@ -88,8 +86,6 @@ def extinction_without_bound(extinction: float, size: int) -> dict[str, float]:
     }
 
 
-# -- grazing exits ----------------------------------------------------------------------------------------
-
 past_edge = value_and_slope(lambda x: one_ray(cube(), 1.0, 0.25, (x, -1.5, 0.1), (1.0, 1.0, 0.0)))
 """A ray that cuts an edge of the cube, by its place x."""
 
@@ -117,9 +113,6 @@ def grazing_exits(length: float, size: int) -> dict[str, float]:
         "opacity, relative": float(abs(value + np.expm1(-exact)) / max(-np.expm1(-exact), 1e-30)),
         "opacity": float(abs(value + np.expm1(-exact))),
     }
-
-
-# -- exits at the end of a cell ---------------------------------------------------------------------------
 
 
 @value_and_slope
@@ -153,9 +146,6 @@ def exits_at_the_end_of_a_cell(part: float, size: int) -> dict[str, float]:
         "gradient, relative": float(abs(slope - 8 * exact) / (8 * exact)),
         "opacity": float(abs(value - (1 - exact))),
     }
-
-
-# -- early termination ------------------------------------------------------------------------------------
 
 
 @cache

@@ -12,8 +12,6 @@ import jaxvol as jv
 from .entry import colors, cube, entry, rms, uniform
 
 
-# -- voxels of 16-bit floats ------------------------------------------------------------------------------
-
 POINTS = [
     (40, (0.10, 0.04, 0.03), 0.0),
     (78, (0.85, 0.50, 0.35), 0.3),
@@ -60,8 +58,6 @@ def voxels_of_16_bit_floats(offset: float, size: int) -> dict[str, float]:
             found[name] = np.nan
     return found
 
-
-# -- rays of many samples ---------------------------------------------------------------------------------
 
 EXTINCTION = 1.5
 

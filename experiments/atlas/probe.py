@@ -26,8 +26,6 @@ def probe(a: float, b: float, depth: float) -> jv.ToroidalMap:
     return jv.ToroidalMap(a, b, (half - TURN, half + TURN), (half - FAN, half + FAN), (0.0, depth))
 
 
-# -- gaps of rays -----------------------------------------------------------------------------------------
-
 SIZE = A + B + 100
 """Of the probe: from the motor axis to the deepest sample."""
 
@@ -80,8 +78,6 @@ def gaps_of_rays_under_a_toroidal_map(ratio: float, size: int) -> dict[str, floa
     error = _over_gaps(np.array(ratio * SIZE), np.linspace(-0.8, 0.8, 24) * TURN)
     return {"share of the gap": float(np.mean(error)), "rays": float(np.mean(error > 0.5))}
 
-
-# -- near the motor axis ----------------------------------------------------------------------------------
 
 NEAR = (-10.0, 10.0, 50.0)
 """a, b and the range of depths of a probe whose near side touches the motor axis."""
@@ -137,9 +133,6 @@ def rays_near_the_motor_axis(offset: float, size: int) -> dict[str, float]:
     exact = -np.expm1(-EXTINCTION * np.array(lengths))
     error = float(np.abs(np.asarray(opacity, np.float64) - exact).max())
     return {"opacity": error if finite((opacity, gradient)) else np.nan}
-
-
-# -- bricks of a scan -------------------------------------------------------------------------------------
 
 
 @cache

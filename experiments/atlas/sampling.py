@@ -20,9 +20,6 @@ STEP = 2 / 128
 ALIGNED = jv.AlphaCorrection()
 
 
-# -- rays without an empty sample -------------------------------------------------------------------------
-
-
 class Hazy(jv.Field):
     """An inclined plane, exact between voxels, behind haze over a share of the cube."""
 
@@ -75,9 +72,6 @@ def wood_grain_without_empty_samples(share: float, size: int) -> dict[str, float
     plain = wood_grain_energy(haze_error(share, size, "ray casting"))
     names = "EmptySpaceJitter", "Jitter"
     return {name: abs(wood_grain_energy(haze_error(share, size, name))) / plain for name in names}
-
-
-# -- thin sheets ------------------------------------------------------------------------------------------
 
 
 class Sheet(jv.Field):
@@ -163,8 +157,6 @@ def isosurfaces_of_thin_sheets(ratio: float, size: int) -> dict[str, float]:
     return missed(surface, ratio, size, "EmptySpaceJitter", "without jitter")
 
 
-# -- offsets near 1 ---------------------------------------------------------------------------------------
-
 BLUE = {
     "Jitter": jv.Jitter(0, "blue"),
     "Jitter, front residual": jv.Jitter(0, "blue", front_residual=True),
@@ -201,9 +193,6 @@ def jitter_offsets_near_1(left: float, size: int) -> dict[str, float]:
     Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells behind it
     always cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ d."""
     return {name: float(np.abs(offset_error(left, size, each)).max()) for name, each in BLUE.items()}
-
-
-# -- tolerances finer than the finest cell ----------------------------------------------------------------
 
 
 @cache

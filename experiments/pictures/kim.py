@@ -13,8 +13,6 @@ from ..bricks import each_at_once, grid, marching, phantom, probe
 from . import BLACK, Panels, panel
 
 
-# -- bricks in the wrong order ----------------------------------------------------------------------------
-
 WATER, FLESH, SKIN, BONE = (0.06, 0.22, 0.5), (0.8, 0.1, 0.05), (1.0, 0.8, 0.6), (1.0, 1.0, 0.9)
 POINTS = [
     *((12, WATER, 0.0), (24, WATER, 0.025), (40, WATER, 0.025)),
@@ -53,8 +51,6 @@ def kim_fig8(chosen: Namespace) -> Panels:
         rows.append([*row, panel(off, caption, "" if rows else "difference")])
     return rows
 
-
-# -- the order of bricks ----------------------------------------------------------------------------------
 
 SHAPE = 41, 21, 61
 EYE = 0.0, -820.0, 533.0

@@ -49,8 +49,6 @@ def labelled(volume: jv.Volume, functions: Sequence[Any], camera: jv.Camera) -> 
     return Scene(volume, transfer, camera, float(volume.spacing.min()) / 2)
 
 
-# -- an ear before a head ---------------------------------------------------------------------------------
-
 GAP, THICK, RADIUS = 0.15, 0.06, 0.75
 """Gap between ear and head, thickness of the ear, radius of the head; the cube is 2 wide."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -85,8 +83,6 @@ def lee_fig4(chosen: Namespace) -> Panels:
         row.append(panel(image, f"brightness of the ear {(image[seen] @ LUMINANCE).mean():.3f}", title))
     return [row]
 
-
-# -- a hand -----------------------------------------------------------------------------------------------
 
 FINGERS = (  # joints from knuckle to tip, radius
     ([(-0.30, 0.0, 0.06), (-0.42, -0.05, 0.30), (-0.47, -0.02, 0.44), (-0.50, 0.03, 0.55)], 0.070),
@@ -147,9 +143,6 @@ def lee_fig5(chosen: Namespace) -> Panels:
     return [[panel(lit(scene, lighting), "", title) for title, lighting in columns.items()]]
 
 
-# -- without and with templates ---------------------------------------------------------------------------
-
-
 def head(size: int, resolution: int) -> Subject:
     return Subject(skin_head(size, resolution), [FLESH], (0.9, 0.7, -0.6))
 
@@ -199,9 +192,6 @@ def lee_fig6(chosen: Namespace) -> Panels:
             row.append(panel(lit(scene, lighting), caption, "" if rows else title))
         rows.append(row)
     return rows
-
-
-# -- all kinds of light -----------------------------------------------------------------------------------
 
 
 def matter(scene: Scene, light: Color, free_path: float = 2) -> Subject:
