@@ -23,14 +23,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from skimage.transform import iradon, iradon_sart
 
 import jaxvol as jv
 from jaxvol.metrics import psnr
 
 from . import charts
-from .charts import plt
 from .harness import experiment, show
 
 
@@ -172,36 +170,30 @@ def measure(truth: Density, photons: float | None, chosen: Namespace) -> dict[st
 
 def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
-    size = (13.4, 3.5 * len(result) + 3.2)
-    figure = plt.figure(figsize=size, layout=ConstrainedLayoutEngine(h_pad=0.08))
-    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(3.5 * len(result), 3))
+    figure, axes = charts.panels(len(result) + 1, 1 + len(METHODS), 13.4, 3.5 * len(result) + 3.2)
     white = 0.8 * truth.max()
-    upper.suptitle(
+    figure.suptitle(
         f"The middle slice of {truth.shape[2]}; grey: density, from 0 to {white:.2g} / voxel. "
-        "The errors are of the whole volume; beside RMSE stands PSNR.",
-        fontsize=9,
+        "The errors are of the whole volume; beside RMSE stands PSNR."
     )
-    shown = upper.subplots(len(result), 1 + len(METHODS), squeeze=False)
-    for number, (line, (photons, rows)) in enumerate(zip(shown, result.items(), strict=True)):
-        pictures = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}
-        for panel, (name, picture) in zip(line, pictures.items(), strict=True):
+    for line, (photons, rows) in zip(axes, result.items(), strict=False):
+        slices = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}
+        for panel, (name, picture) in zip(line, slices.items(), strict=True):
             panel.imshow(picture, cmap="gray", vmin=0, vmax=white)
-            panel.set(xticks=[], yticks=[])
             caption = f"RMSE {rows[name]['rmse']:.5f}, {rows[name]['psnr']:.1f} dB" if name in rows else ""
-            panel.set_xlabel(caption, fontsize=9)
-            if number == 0:
-                panel.set_title(name, fontsize=9)
-        line[0].set_ylabel(photons, fontsize=9)
-    by_count, by_time = lower.subplots(1, 2, sharey=True)
+            panel.set(xticks=[], yticks=[], title=name, xlabel=caption)
+        line[0].set_ylabel(photons)
+    by_count, by_time, *others = axes[-1]
+    for panel in others:
+        panel.set_axis_off()
     for (photons, rows), line in zip(result.items(), ("-", "--"), strict=False):
-        for name, color in zip((SART, OURS), ("C1", "C0"), strict=True):
+        for name, color in ((SART, "C1"), (OURS, "C0")):
             errors = [row["rmse"] for row in rows[name]["all"]]
             by_count.loglog(range(1, len(errors) + 1), errors, color + line, label=f"{name}, {photons}")
             by_time.loglog([row["seconds"] for row in rows[name]["all"]], errors, color + line)
         for panel in (by_count, by_time):
             panel.axhline(rows[FBP]["rmse"], color="0.5", linestyle=line, label=f"{FBP}, {photons}")
-    by_count.set(xlabel="sweep over all views (SART), evaluation (jaxvol)")
-    by_count.set(ylabel="RMSE of the density, 1/voxel")
+    by_count.set(xlabel="sweep (SART), evaluation (jaxvol)", ylabel="RMSE of the density, 1/voxel")
     by_time.set(xlabel="seconds, compilation left out")
     by_count.legend(fontsize=7)
     charts.save(figure, path)

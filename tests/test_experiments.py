@@ -13,7 +13,7 @@ from skimage.io import imread
 import jaxvol as jv
 from experiments import charts, gradient_errors, record, redraw
 from experiments.harness import experiment, recorded
-from experiments.voxel_distances import distances
+from experiments.minimum_distance import distances
 
 
 ROOT = Path(__file__).parent.parent
