@@ -8,7 +8,7 @@ with what is read around each brick. The paper's best split is measured from sev
 decides whether it comes back to a brick.
 
 Before each frame the file is dropped from the system's page cache, where the system can do that. A split into
-many bricks is timed once. `--only` measures some splits again, and keeps what the record says of the others.
+many bricks is timed once.
 """
 
 import math
@@ -28,8 +28,8 @@ from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of, source_of
 from jaxvol.bricks.cells import Visit
 from jaxvol.bricks.traversal import Load, Traversal
 
-from . import record, timing
-from .harness import experiment, recorded, show, some_of
+from . import timing
+from .harness import experiment, show
 from .scan_conversion import BODY
 
 
@@ -144,7 +144,6 @@ EYES: dict[str, tuple[float, float, float]] = {
 }
 """Where the camera is, mm. Across and along the fan, rays pass the curved faces at small angles."""
 VIEW = "across"
-FROM = f"{','.join(map(str, BEST))} from"
 WHOLE = "whole"
 
 
@@ -226,11 +225,10 @@ def named(split: Split) -> str:
     repetitions=5,
     size=64,
     resolution=320,
-    only=some_of([named(split) for split in TABLE], "SPLIT"),
-    quick={"size": 16, "resolution": 48, "repetitions": 1, "only": ["2,1,2"]},
+    splits=tuple(TABLE),
+    quick={"size": 16, "resolution": 48, "repetitions": 1, "splits": ((2, 1, 2),)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    splits = {name: split for split in TABLE if (name := named(split)) in chosen.only}
     rows: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         scan = stored(Path(folder), chosen.resolution)
@@ -241,18 +239,14 @@ def main(chosen: Namespace) -> dict[str, Any]:
             show(found, named(split), view)
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
-        for name, split in splits.items():
+        for split in chosen.splits:
             overlap = overlap_of(scan.probe, grid(scan.source.shape, split))
-            rows[name] = {
+            rows[named(split)] = {
                 "paper": TABLE[split]._asdict(),
                 "formula": round(printed_overlap(split), 3),
                 "formula, of these voxels": round(share(overlap, scan.source.shape[2]), 3),
                 **measure(split, VIEW),
             }
-        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits.values()}
-        about = {"image": [chosen.size] * 2, "voxels": list(scan.source.shape)}
-    rows |= recorded(chosen, "splits", [name for name in map(named, TABLE) if name not in rows], about)
-    if not views and not chosen.quick and chosen.path.is_file():
-        views = record.read(chosen.path)["result"][FROM]
-    ordered = {name: rows[name] for name in map(named, TABLE) if name in rows}
-    return {**about, "view": VIEW, "splits": ordered, FROM: views}
+        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in chosen.splits}
+        about = {"image": [chosen.size] * 2, "voxels": list(scan.source.shape), "view": VIEW}
+    return {**about, "splits": rows, f"{named(BEST)} from": views}
