@@ -10,13 +10,12 @@ second-order quadratures, by step.
 
 from argparse import Namespace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from jaxvol.metrics import rmse
 
 from . import charts, programs
-from .harness import chosen_scenes, experiment, show, some_of
+from .harness import chosen_scenes, experiment, some_of
 from .programs import DRJIT, FINEST_OF, QUADRATURES, VTK, Case, Program, is_here
 from .scenes import PHANTOM, SCENES, Scene, peaked
 
@@ -62,7 +61,7 @@ def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
     return {name: by_setting for name, by_setting in found.items() if by_setting}
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Time against error, a panel for each scene; and errors under a narrow peak."""
     scenes = result["scenes"]
     figure, axes = charts.panels(2, len(scenes), 3.4 * len(scenes), 6.4)
@@ -84,11 +83,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[0, 0].set_ylabel(f"time of a frame of {result['pixels']}² pixels, ms")
     axes[1, 0].set_ylabel("RMSE of the image")
     charts.legend_below(figure, axes[0, 0], min(6, 2 * len(scenes)))
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=9,
     size=512,
     resolution=256,
@@ -107,6 +105,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
             q: {str(s): rmse(programs.ours(step=s, quadrature=q)(case).image(), truth) for s in STEPS}
             for q in QUADRATURES[1:]
         }
-        show(scenes[name], name)
-        show(peaks[name], name, "narrow peak")
     return {"pixels": chosen.size, "peers": there, "scenes": scenes, "peaks": peaks}

@@ -10,7 +10,6 @@ it may come out slightly negative where there is none.
 """
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ import jaxvol as jv
 from jaxvol.metrics import rmse, wood_grain_energy
 
 from . import charts, programs
-from .harness import chosen_scenes, experiment, frame, show, some_of
+from .harness import chosen_scenes, experiment, frame, some_of
 from .programs import FINEST_OF, LEFT, LONGEST
 from .scenes import PHANTOM, SCENES, Scene, inside
 
@@ -75,7 +74,7 @@ def summary(scenes: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Estimated against true errors of pixels, and the error of images over the tolerance."""
     figure, ((pixels, images),) = charts.panels(1, 2, 11, 4.6)
     for number, (name, views) in enumerate(result["scenes"].items()):
@@ -97,15 +96,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
     images.legend(fontsize=7, ncols=2)
     charts.plain_numbers(pixels)
     charts.plain_numbers(images)
-    charts.save(figure, path)
+    return figure
 
 
-@experiment(
-    draw, size=256, resolution=256, only=some_of(SCENES, "VOLUME"), quick={"size": 32, "resolution": 32}
-)
+@experiment(size=256, resolution=256, only=some_of(SCENES, "VOLUME"), quick={"size": 32, "resolution": 32})
 def main(chosen: Namespace) -> dict[str, Any]:
-    scenes: dict[str, Any] = {}
-    for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
-        scenes[name] = {"outside": measure(scene), "inside": measure(inside(scene))}
-        show(scenes[name], name)
+    scenes = {
+        name: {"outside": measure(scene), "inside": measure(inside(scene))}
+        for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size)
+    }
     return {"summary": summary(scenes), "scenes": scenes}

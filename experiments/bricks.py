@@ -29,7 +29,7 @@ from jaxvol.bricks.cells import Visit
 from jaxvol.bricks.traversal import Load, Traversal
 
 from . import timing
-from .harness import experiment, show
+from .harness import experiment
 from .scan_conversion import BODY
 
 
@@ -236,7 +236,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
         def measure(split: Split, view: str) -> dict[str, Any]:
             repetitions = chosen.repetitions if np.prod(split) < MANY else 1
             found = compared(scan, camera(view, chosen.size), split, repetitions)
-            show(found, named(split), view)
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
         for split in chosen.splits:

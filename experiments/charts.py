@@ -1,14 +1,18 @@
 """How charts of experiments are drawn and saved."""
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 
 from jaxvol._util.whole_files import whole_file
+
+from . import record
 
 
 matplotlib.use("Agg")
@@ -57,6 +61,16 @@ def _labelled(leads: Sequence[int], value: float, _: Any) -> str:
     """The label of a value that is one of these digits times a power of ten; of others, none."""
     lead = value / 10 ** math.floor(math.log10(value))
     return f"{value:g}" if round(lead, 6) in leads else ""
+
+
+def draw_record(file: Path, path: Path) -> None:
+    """Draws a record into a file by the `draw` of its experiment, if that has one; and next to it its page."""
+    found = record.read(file)
+    module = import_module(shlex.split(found["command"])[2])
+    if hasattr(module, "draw"):
+        save(module.draw(found["result"]), path)
+    if hasattr(module, "page"):
+        module.page(file, path.with_suffix(".html"))
 
 
 def save(figure: Any, path: Path) -> None:

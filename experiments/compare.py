@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from . import timing
-from .harness import data, experiment, geometric_mean, show, some_of
+from .harness import data, experiment, geometric_mean, some_of
 from .scenes import PHANTOM, SCENES
 
 
@@ -114,7 +114,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
         finally:
             for worker in workers.values():
                 worker.process.kill()
-    mean = means(found, chosen.kinds)
-    show(found)
-    show(mean, "geometric means")
-    return {"geometric means": mean, "programs": found}
+    return {"geometric means": means(found, chosen.kinds), "programs": found}

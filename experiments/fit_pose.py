@@ -7,7 +7,6 @@ first, since a derivative describes only features that move by less than their o
 """
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,7 +16,7 @@ import numpy as np
 import jaxvol as jv
 
 from . import charts, fit_transfer
-from .harness import experiment, show
+from .harness import experiment
 
 
 ANGLE, SHIFT = 10.0, 0.05
@@ -55,7 +54,7 @@ def reached(rows: list[dict[str, Any]]) -> float:
     return float(np.mean([all(row[key] < goal for key, goal in GOALS.items()) for row in rows]))
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
     for (name, rows), color in zip(result["starts"].items(), ("C0", "C3"), strict=True):
         left.plot([], [], color=color, label=f"{name}: {reached(rows):.0%} of starts lead back")
@@ -70,12 +69,11 @@ def draw(result: dict[str, Any], path: Path) -> None:
     right.axhline(GOALS["shift"], color="k", linestyle=":", linewidth=0.8)
     right.set(xlabel="rotation left, degrees", ylabel="shift left / distance to focal point")
     right.set_title("after the last step; star: the start, dotted: what counts as led back")
-    charts.save(figure, path)
+    return figure
 
 
-@experiment(draw, size=96, resolution=96, starts=10, quick={"size": 32, "resolution": 24, "starts": 2})
+@experiment(size=96, resolution=96, starts=10, quick={"size": 32, "resolution": 24, "starts": 2})
 def main(chosen: Namespace) -> dict[str, Any]:
     starts = {name: measure(sigmas, chosen) for name, sigmas in SIGMAS.items()}
     found = {name: reached(rows) for name, rows in starts.items()}
-    show(found, "share of starts that lead back")
     return {"goals": GOALS, "reached": found, "starts": starts}

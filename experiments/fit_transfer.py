@@ -17,7 +17,7 @@ import jaxvol as jv
 from jaxvol.metrics import psnr
 
 from . import charts, harness
-from .harness import experiment, show
+from .harness import experiment
 from .scenes import ENGINE
 
 
@@ -105,7 +105,7 @@ def measure(scene: Scene, size: int) -> dict[str, Any]:
     return rows
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     scenes = result["scenes"]
     figure, axes = charts.panels(len(scenes), 2, 9, 3 * len(scenes))
     for (left, right), (scene, rows) in zip(axes, scenes.items(), strict=True):
@@ -122,13 +122,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
         left.set(xlabel="step of the fit", ylabel=f"{scene}\nPSNR of the views seen, dB")
         right.set(xlabel="value", ylabel="extinction, 1/length")
         right.legend()
-    charts.save(figure, path)
+    return figure
 
 
-@experiment(draw, size=96, resolution=96, quick={"size": 24, "resolution": 24})
+@experiment(size=96, resolution=96, quick={"size": 24, "resolution": 24})
 def main(chosen: Namespace) -> dict[str, Any]:
     folder, scenes = harness.data(), {"head phantom": measure(head(None, chosen.resolution), chosen.size)}
     if folder is not None and not chosen.quick:
         scenes["engine"] = measure(engine(folder, chosen.resolution), chosen.size)
-    show(scenes)
     return {"goal": GOAL, "scenes": scenes}

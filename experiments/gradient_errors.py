@@ -14,7 +14,6 @@ the larger of the two, over several weightings of the image and directions of ea
 
 from argparse import Namespace
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +26,7 @@ from matplotlib.colors import LogNorm
 import jaxvol as jv
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
 
 
 STEP = 0.11
@@ -140,7 +139,7 @@ def measure(name: str, quadrature: str, chosen: Namespace) -> dict[str, list[flo
     return found
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """A heat map of marches by leaves, for each quadrature and width."""
     found, widths = result["relative errors"], result["widths"]
     names, leaves = list(next(iter(found.values()))), list(LEAVES)
@@ -163,11 +162,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "How far the change of an image, as a leaf moves by so much, differs from the sum of its gradients: "
         f"|sum - change| / the larger one.\n{NOTE}"
     )
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     size=6,
     names=tuple(MARCHES),
     leaves=tuple(LEAVES),
@@ -189,6 +187,5 @@ def main(chosen: Namespace) -> dict[str, Any]:
         rule: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
         for rule, rows in found.items()
     }
-    show({rule: {name: ", ".join(leaves) for name, leaves in of.items()} for rule, of in wrong.items()})
     widths = [width for width, _ in chosen.widths]
     return {"widths": widths, "wrong": wrong, "relative errors": found}

@@ -9,7 +9,6 @@ ends early. Beside each time stands the image's RMSE against a converged one.
 from argparse import Namespace
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from . import charts, harness, timing
-from .harness import experiment, show, some_of
+from .harness import experiment, some_of
 from .scenes import seen_head
 
 
@@ -70,7 +69,7 @@ def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
     return round(float(np.polyfit(np.log(sizes[-3:]), np.log(times[-3:]), 1)[0]), 3)
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     sweeps = result["sweeps"]
     figure, (axes,) = charts.panels(1, len(sweeps), 3.7 * len(sweeps), 3.6, sharey=True)
     for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
@@ -90,14 +89,11 @@ def draw(result: dict[str, Any], path: Path) -> None:
     axes[0].set_ylabel("time of a frame, seconds")
     axes[0].yaxis.set_major_formatter("{x:g}")
     figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes")
-    charts.save(figure, path)
+    return figure
 
 
-@experiment(draw, repetitions=5, only=some_of(SWEEPS, "AXIS"), quick={"repetitions": 1})
+@experiment(repetitions=5, only=some_of(SWEEPS, "AXIS"), quick={"repetitions": 1})
 def main(chosen: Namespace) -> dict[str, Any]:
     sweeps, usual = (TINY, dict.fromkeys(USUAL, 32)) if chosen.quick else (SWEEPS, USUAL)
-    found: dict[str, Any] = {}
-    for along in chosen.only:
-        found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
-        show(found[along], along)
+    found = {along: measure(along, sweeps[along], usual, chosen.repetitions) for along in chosen.only}
     return {"usual": usual, "sweeps": found}

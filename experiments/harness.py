@@ -18,15 +18,12 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import marches, record, timing
+from . import charts, marches, record, timing
 from .scenes import Scene
 
 
 Main: TypeAlias = Callable[..., None]
 """`main(argv)`; without `argv`, it takes the arguments of the command line."""
-
-Draw: TypeAlias = Callable[[Any, Path], None]
-"""Draws a result, as it was read from a record, into a file."""
 
 FINER = 8
 """How many times finer the converged image's step is. By the midpoint rule, its error is some hundred times
@@ -73,14 +70,14 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
 
 
 def experiment(
-    draw: Draw | None = None, *, quick: Mapping[str, Any] | None = None, **options: Any
+    *, quick: Mapping[str, Any] | None = None, **options: Any
 ) -> Callable[[Callable[[Namespace], Any]], Main]:
-    """Decorator that makes an experiment's `main` of a function from its options to its result: it writes the
-    record and draws the chart. A result of None writes nothing. Both files have the module's name, and the
-    question is how its docstring begins. Stands last in its file: as `python -m MODULE`, it runs at once.
+    """Decorator that makes an experiment's `main` of a function from its options to its result: it prints the
+    result, writes the record and draws the chart, by the module's `draw(result)`. A result of None writes
+    nothing. Both files have the module's name, and the question is how its docstring begins. Stands last in
+    its file: as `python -m MODULE`, it runs at once.
 
     Args:
-        draw: draws the chart; None if a chart cannot be drawn from the record alone.
         quick: options and constants under `--quick`.
         options: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
     """
@@ -99,12 +96,12 @@ def experiment(
             result = measure(chosen)
             if result is None:
                 return
+            show(result)
             question = " ".join(about.partition("?")[0].split()) + "?"
             how = {"seed": chosen.seed, "command": chosen.command}
             used = {name: getattr(chosen, name) for name in options}
             record.write(chosen.path, question, result, options=used, **how)
-            if draw is not None:
-                draw(record.read(chosen.path)["result"], chosen.path.with_suffix(".png"))
+            charts.draw_record(chosen.path, chosen.path.with_suffix(".png"))
 
         if measure.__module__ == "__main__":
             main()
@@ -164,6 +161,7 @@ def chosen_scenes(
     alone, of `--resolution`."""
     folder = data()
     for name in [phantom] if folder is None or chosen.quick else chosen.only:
+        print(name, flush=True)
         yield name, makers[name](folder, size, chosen.resolution)
 
 

@@ -13,7 +13,6 @@ plain jitter can be nearer to the truth in the mean, or farther; it is noisier i
 from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
 from . import charts, marches, timing
-from .harness import entered, experiment, frame, show
+from .harness import entered, experiment, frame
 from .scenes import Scene, cropped
 
 
@@ -113,7 +112,7 @@ def measure(of: Faced, chosen: Namespace) -> list[dict[str, Any]]:
     return rows
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     scenes = {name: rows for name, rows in result.items() if name != "note"}
     figure, axes = charts.panels(len(scenes), len(PANELS), 12, 2.9 * len(scenes))
     for line, (scene, rows) in zip(axes, scenes.items(), strict=True):
@@ -129,11 +128,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         line[0].set_ylabel(scene)
     figure.suptitle(result["note"])
     charts.legend_below(figure, axes[0, 0], 5)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=5,
     size=192,
     resolution=128,
@@ -144,6 +142,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     result: dict[str, Any] = {"note": NOTE}
     for name, make in {"cut block, orthographic": cut_block, "head, perspective": head}.items():
         result[name] = measure(make(chosen.resolution, chosen.size), chosen)
-        for row in result[name]:
-            show(row, name)
     return result

@@ -27,7 +27,7 @@ from jaxvol.metrics import rmse
 from jaxvol.ray import Scene as EngineScene
 
 from . import charts, harness, marches, timing
-from .harness import experiment, show
+from .harness import experiment
 from .scenes import CT_HEAD, PHANTOM, SCENES, Scene
 
 
@@ -123,7 +123,7 @@ def tested_every(scene: Scene, samples: int, repetitions: int) -> dict[str, Any]
     return {"seconds": medians, "speed-up": timing.ratio(seconds[NEITHER], seconds[ERT])}
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Measured speed-ups as bars, the report's as crosses: without shading above, with it below."""
     sizes = result["sizes"]
     figure, axes = charts.panels(2, len(sizes), 11, 6.4, sharex=True, sharey="row")
@@ -153,11 +153,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "thin bars: 95 % intervals"
     )
     charts.legend_below(figure, axes[1, 0], 6)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=9,
     resolution=192,
     sizes=(256, 512),
@@ -175,11 +174,9 @@ def main(chosen: Namespace) -> dict[str, Any]:
             for tf, seen in (("tf 1", scene), ("tf 2", opaque(scene))):
                 case = f"{name}, {tf}"
                 for part, under in PARTS.items():
-                    rows = measured[part][case][str(size)] = measure(seen, under, chosen.repetitions)
-                    show(rows, case, size, part)
+                    measured[part][case][str(size)] = measure(seen, under, chosen.repetitions)
                 if size == chosen.sizes[-1]:
                     every[case] = {str(n): tested_every(seen, n, chosen.repetitions) for n in chosen.every}
-                    show(every[case], case, "ended rays are looked for every so many samples")
     return {
         "volumes": "phantoms" if makers is PHANTOMS else "cthead and engine",
         "sizes": chosen.sizes,

@@ -28,7 +28,7 @@ from jaxvol.lighting import ConstantLight, Deferred, DirectionalLight, Lighting,
 from jaxvol.metrics import rmse
 
 from . import charts, harness, timing
-from .harness import experiment, show
+from .harness import experiment
 from .scenes import SKIN, Scene, skin_head
 
 
@@ -98,7 +98,6 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], chosen: Namespace) ->
             if kind == BAKED:
                 row["seconds to bake"] = round(baking(scene, lighting, seed) - row["seconds"], 4)
             found[kind].append(row)
-            show(row, kind)
     return found
 
 
@@ -137,7 +136,7 @@ def picture(templates: int, seed: int, path: Path, size: int, resolution: int) -
     charts.save(figure, path)
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     figure, ((cost, deferred),) = charts.panels(1, 2, 11, 5)
     for kind, rows in result["frames"].items():
         error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
@@ -165,11 +164,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
     deferred.set_title("light once for each ray, from translucent to opaque skin")
     charts.plain_numbers(deferred)
     deferred.legend()
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=5,
     size=256,
     resolution=96,

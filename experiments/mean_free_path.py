@@ -13,7 +13,6 @@ mean free path leave it undetermined.
 
 from argparse import Namespace
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -23,7 +22,7 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
 from .scenes import grid, on_cube
 
 
@@ -141,11 +140,10 @@ def one_ball(thickness: float, volume: jv.Volume, chosen: Namespace) -> dict[str
             "loss": float(found.losses.min()),
             "message": found.message,
         }
-    show(row)
     return row
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
     losses = result["three materials"]["losses"]
     left.semilogy(range(1, len(losses) + 1), losses, "o-")
@@ -163,11 +161,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
     right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
     right.set_title("λ of one ball, from two views")
     charts.legend_below(figure, right, 2)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     size=32,
     resolution=32,
     paths=256,

@@ -28,7 +28,7 @@ from jaxvol.march.march import EmptySpaceIndex, View
 from jaxvol.scene.occupancy import FARTHEST, ROUNDING, Blocks, Occupancy
 
 from . import charts, harness, timing
-from .harness import chosen_scenes, experiment, frame, show, some_of
+from .harness import chosen_scenes, experiment, frame, some_of
 from .scenes import AIRWAY, OF_AIRWAY, Scene
 
 
@@ -146,7 +146,7 @@ def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, d
     return rows
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Time, wrong pixels and RMSE against R; the methods without cells are lines."""
     scenes, cells = result["scenes"], result["cells"]
     figure, axes = charts.panels(len(scenes), 3, 11.5, 2.8 * len(scenes) + 0.4)
@@ -166,11 +166,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
             panel.set(xlabel="R, side of the grid's cells, pixels", title=f"{scene}: {label}")
             panel.set_ylim(0, max(1.1 * panel.get_ylim()[1], 1e-3))
     charts.legend_below(figure, axes[0, 0], 5)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=15,
     size=512,
     resolution=256,
@@ -179,8 +178,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 64, "repetitions": 2, "cells": (8, 32), "resolution": 48},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    scenes: dict[str, dict[str, Any]] = {}
-    for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
-        scenes[name] = measure(scene, chosen.cells, chosen.repetitions)
-        show(scenes[name], name)
+    scenes = {
+        name: measure(scene, chosen.cells, chosen.repetitions)
+        for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size)
+    }
     return {"goal at R = 8": GOAL, "cells": chosen.cells, "scenes": scenes}

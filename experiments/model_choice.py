@@ -11,7 +11,6 @@ alone, and the candidate of the least held-out loss.
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ import numpy as np
 import jaxvol as jv
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
 from .scenes import grid, on_cube
 
 
@@ -141,7 +140,7 @@ def summary(trials: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
     }
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Held-out losses of all candidates, relative to the truth's, and how often each rule chose the truth."""
     problems = result["problems"]
     figure, axes = charts.panels(len(problems), 3, 11, 3.2 * len(problems))
@@ -169,11 +168,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         right.set(ylabel="trials", title="filled: truth chosen; hatched: too many")
         right.set_ylim(0, 1.25 * right.get_ylim()[1])
         right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     size=10,
     resolution=10,
     trials={"type": int, "default": 10, "help": "truths of each kind"},
@@ -189,5 +187,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
         trials = {f"{n:g}": [trial(problem, chosen.size, seed, n) for seed in seeds] for n in (NOISE, 0.0)}
         counts = {noise: summary(of_noise) for noise, of_noise in trials.items()}
         found[name] = {"labels": problem.labels, "summary": counts, "trials": trials}
-        show(counts, name, "noise")
     return {"goal": "the truth in 9 of 10 trials with noise, and never more without", "problems": found}

@@ -10,7 +10,6 @@ then shorter, and the goal is 1.05.
 """
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,7 +17,7 @@ import jax
 import jaxvol as jv
 
 from . import charts, marches
-from .harness import chosen_scenes, compare, experiment, geometric_mean, show, some_of
+from .harness import chosen_scenes, compare, experiment, geometric_mean, some_of
 from .scenes import PHANTOM, SCENES
 
 
@@ -33,7 +32,7 @@ SHOWN = {"as in the paper": "leaps and early ends, as in the paper"}
 """How a condition is called in the chart, where not as in the record."""
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     conditions, sizes = result["conditions"], result["sizes"]
     volumes = len(next(iter(conditions.values()))["volumes"])
     width, height = 5 * len(sizes) + 2, (0.55 * volumes + 0.7) * len(conditions) + 0.9
@@ -55,11 +54,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "time of a frame / that of ray casting: median of paired ratios, 95 % interval", fontsize=9
     )
     figure.legend(loc="outside upper center", ncols=3)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=15,
     sizes={"nargs": "+", "type": int, "default": (512, 1024), "help": "pixels along a side"},
     resolution=192,
@@ -76,8 +74,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
                 jax.clear_caches()  # a process cannot hold the programs of all scenes
                 transforms = {n: (*marches.transforms(n, chosen.seed), *more) for n in METHODS}
                 under = {n: jv.March(scene.step, each) for n, each in transforms.items()}
-                rows = volumes.setdefault(name, {})[str(size)] = compare(scene, under, chosen.repetitions)
-                show(rows, said, name, size)
+                volumes.setdefault(name, {})[str(size)] = compare(scene, under, chosen.repetitions)
             both = (of_size[str(size)][marches.BOTH]["ratio"]["median"] for of_size in volumes.values())
             means[str(size)] = geometric_mean(both)
         conditions[said] = {"goal": goal, "both, geometric means": means, "volumes": volumes}

@@ -28,7 +28,7 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import charts, harness, pareto_measure, pareto_page, pareto_points, programs, record
+from . import harness, pareto_measure, pareto_page, pareto_points, programs, record
 from .harness import experiment, recorded, show, some_of
 from .pareto_measure import slug
 from .pareto_scenes import ROWS
@@ -113,16 +113,10 @@ def again(name: str, chosen: Namespace, output: Path, present: dict[str, str]) -
     return programs.measured(made, truth, chosen.repetitions)[point]
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """The chart, and the page beside it, with the pictures that the experiment left there."""
-    charts.save(pareto_page.chart(result), path)
-    file = path.with_suffix(".json")
-    file = file if file.is_file() else record.RESULTS / "pareto.json"
-    pareto_page.write(file, file.parent / "pareto", path.with_suffix(".html"))
+draw, page = pareto_page.chart, pareto_page.write
 
 
 @experiment(
-    draw,
     repetitions=5,
     size=256,
     resolution=192,
@@ -154,5 +148,4 @@ def main(chosen: Namespace) -> dict[str, Any] | None:
     same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
     scenes |= recorded(chosen, "scenes", [name for name in ROWS if name not in scenes], same)
     scenes = {name: scenes[name] for name in ROWS if name in scenes}
-    show({name: scene["their points that it is not"] for name, scene in scenes.items()}, "peers ahead")
     return {**same, "peers": present, "scenes": scenes}

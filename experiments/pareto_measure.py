@@ -72,7 +72,6 @@ def scene(name: str, folder: Path, chosen: Namespace, settings: dict[str, Settin
                 "wood grain": wood_grain_energy(image - seen),
             }
             small(beside(each, truth)).save(folder / f"{slug(point)}.webp", quality=72, method=6)
-        harness.show({n: found["points"][n] for n in made}, name)
     jax.clear_caches()  # a process cannot hold the programs of all scenes
     return found
 

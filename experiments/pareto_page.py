@@ -87,8 +87,9 @@ def draw_scene(panel: Any, name: str, scene: dict[str, Any]) -> None:
     panel.grid(which="major", linewidth=0.3)
 
 
-def write(path: Path, pictures: Path, page: Path) -> None:
-    """Write the page of a record. `pictures`: the folder with a folder of pictures for each scene."""
+def write(path: Path, page: Path) -> None:
+    """Write the page of a record, with the pictures that the experiment left beside it."""
+    pictures = path.parent / "pareto"
     found = record.read(path)
     result, device = found["result"], found["device"]
     about = (

@@ -20,7 +20,7 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
 from . import charts, harness, timing
-from .harness import experiment, show
+from .harness import experiment
 
 
 EXPLAINED = (
@@ -113,6 +113,5 @@ def pictures(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) ->
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     rows, images = measure(chosen)
-    show(rows)
     pictures(rows, images, chosen.output / "path_traced.webp")
     return {"rows": rows}

@@ -27,7 +27,7 @@ import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from . import charts, timing
-from .harness import data, experiment, show
+from .harness import data, experiment
 from .scenes import CT_HEAD
 
 
@@ -224,7 +224,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     return {"by tolerance": found}
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Error over tolerance, scene by scene; and time over that of the fastest march found."""
     figure, ((errors, times),) = charts.panels(1, 2, 9, 3.6)
     random = np.random.default_rng(0)
@@ -246,11 +246,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         panel.set(xlabel="tolerance (RMSE of the image)", xlim=(-0.5, len(TOLERANCES) - 0.5))
     errors.set_title(f"{len(result['scenes'])} random scenes; below 1: within the tolerance")
     times.set_title("some of them; below 1: faster than a search found")
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     scenes=200,
     size=192,
     every={"type": int, "default": 10, "help": "search every so many scenes exhaustively"},
@@ -272,5 +271,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
         rows.append(measure(scene, number, number % chosen.every == 0, chosen.repetitions))
         if scene.name not in costs:
             costs[scene.name] = cost(scene, chosen.large)
-        show(rows[-1]["plans"], number, scene.name)
     return {"summary": summary(rows), "planning": costs, "scenes": rows}

@@ -24,7 +24,7 @@ import numpy as np
 import jaxvol as jv
 
 from . import harness
-from .harness import experiment, show
+from .harness import experiment
 
 
 OFF, GOAL, NOISE = 0.2, 0.005, 0.01
@@ -192,6 +192,5 @@ def main(chosen: Namespace) -> dict[str, Any]:
         scene, truth = phantom(chosen.resolution, seed=chosen.seed + number)
         targets = views(scene, truth, cameras(chosen.size), NOISE, chosen.seed + number, harness.FINER)
         rows[name] = recovered(scene, targets, truth, moved(truth, signs))
-        show({key: rows[name][key] for key in ("worst", "steps", "message")}, name)
     answers = {name: left_open(name, chosen.resolution, chosen.size, chosen.seed) for name in variants}
     return {"goal": GOAL, "recovered": rows, "left open": answers}

@@ -7,12 +7,10 @@ experiments alone. `pareto.html` holds images only if its experiment left some h
 To measure a result again, run the `command` of its record, on a machine that does nothing else.
 """
 
-import shlex
 from argparse import Namespace
-from importlib import import_module
 from pathlib import Path
 
-from . import record
+from . import charts, record
 from .harness import command, some_of
 
 
@@ -27,13 +25,6 @@ OTHERS = {
 DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]
 
 
-def draw(file: Path, path: Path) -> None:
-    """Draws a record, as the experiment of its command does."""
-    found = record.read(file)
-    _, _, module, *_ = shlex.split(found["command"])
-    import_module(module).draw(found["result"], path)
-
-
 @command(
     __doc__,
     record.RESULTS,
@@ -45,7 +36,7 @@ def main(chosen: Namespace) -> None:
         file = chosen.results / f"{name}.json"
         if not file.is_file():
             raise ValueError(f"--results must hold the record {name}.json; {chosen.results} does not.")
-        draw(file, chosen.output / f"{name}.png")
+        charts.draw_record(file, chosen.output / f"{name}.png")
         print(chosen.output / f"{name}.png")
 
 

@@ -20,7 +20,7 @@ import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from . import charts, harness, probe_geometry, timing
-from .harness import chosen_scenes, experiment, show, some_of
+from .harness import chosen_scenes, experiment, some_of
 
 
 SPACINGS = (8.0, 4.0, 2.0, 1.0)
@@ -99,7 +99,7 @@ def measure(scene: Scene, spacings: tuple[float, ...], repetitions: int) -> dict
     return rows
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Error and time of frames against the spacing; as acquired, which has none, as lines."""
     panels = {"rmse, converged": "RMSE by resampling alone", "rmse": "RMSE of a frame"}
     panels |= {"seconds": "seconds for a frame (dotted: and to convert)", "MiB": "size of the voxels, MiB"}
@@ -119,11 +119,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid"
     )
     axes[0].legend(fontsize=7)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=7,
     size=128,
     resolution=160,
@@ -132,8 +131,5 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 24, "resolution": 24, "repetitions": 1, "spacings": (4.0, 2.0)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    scenes = {}
-    for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
-        scenes[name] = measure(scene, chosen.spacings, chosen.repetitions)
-        show(scenes[name], name)
-    return {"scenes": scenes}
+    scenes = chosen_scenes(chosen, SCENES, PHANTOM, chosen.size)
+    return {"scenes": {name: measure(scene, chosen.spacings, chosen.repetitions) for name, scene in scenes}}

@@ -33,7 +33,7 @@ import jaxvol as jv
 from jaxvol.xla.compiling import OPTIONS
 
 from . import charts, harness, marches, peer_vtk, programs, timing
-from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
+from .harness import chosen_scenes, experiment, geometric_mean, some_of
 from .programs import DRJIT, THREADS, VTK, Case, is_here
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -159,7 +159,7 @@ def first_image(size: int, resolution: int, repetitions: int) -> dict[str, Any]:
     return found
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Each program's time over ours, scene by scene."""
     sizes, volumes = result["sizes"], result["volumes"]
     figure, (axes,) = charts.panels(1, len(sizes), 6 * len(sizes), 0.75 * len(volumes) + 1.5)
@@ -182,11 +182,10 @@ def draw(result: dict[str, Any], path: Path) -> None:
     marks = [Line2D([], [], color=COLORS[name], marker="o", linestyle="") for name in shown]
     labels = [LABELS.get(name, name) for name in shown]
     figure.legend(marks, labels, loc="outside upper center", ncols=4)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    draw,
     repetitions=15,
     sizes={"nargs": "+", "type": int, "default": (512, 1024)},
     only=some_of(SCENES, "VOLUME"),
@@ -203,14 +202,11 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for size in chosen.sizes:
         for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, size):
             scene = scene._replace(step=scene.step / chosen.steps)
-            rows = images(scene, there, chosen.repetitions)
-            volumes.setdefault(name, {})[str(size)] = rows
-            show(rows, name, size)
+            volumes.setdefault(name, {})[str(size)] = images(scene, there, chosen.repetitions)
             if chosen.gradients and size == chosen.sizes[0]:
                 slopes[name] = {
                     of: gradients(scene, of, there, chosen.repetitions) for of in ("transfer", "voxels")
                 }
-                show(slopes[name], name, size, "gradient")
     rows = [row for of_size in volumes.values() for row in of_size.values()]
     everywhere = [name for name in COLORS if all(name in row for row in rows)]
     means = {name: geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in everywhere}

@@ -28,7 +28,7 @@ from jaxvol._util.whole_files import whole_file
 from . import charts
 from .atlas import ENTRIES
 from .atlas.entry import Entry, sweep
-from .harness import experiment, recorded, show, some_of
+from .harness import experiment, recorded, some_of
 
 
 ABOUT = ("question", "method", "regime", "metric", "judged", "limit", "outcome", "does", "shows", "size")
@@ -36,7 +36,7 @@ COLUMNS = 4
 OUTCOMES = {"detected and said": "C0", "documented": "C1", "fails": "C3"}
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """A panel for each entry."""
     entries = result["entries"]
     rows = -(-len(entries) // COLUMNS)
@@ -52,7 +52,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
         "From left to right a regime becomes harmful; upwards: an error. Black: the curve that finds the "
         "edge. Dashed: the limit. Crosses: not finite."
     )
-    charts.save(figure, path)
+    return figure
 
 
 def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
@@ -111,7 +111,6 @@ def keep(entry: Entry, values: tuple[float, float], size: int, folder: Path) -> 
 
 
 @experiment(
-    draw,
     only=some_of(ENTRIES, "ENTRY"),
     picture={"type": int, "default": 96, "help": "pixels along a side of pictures"},
     quick={"picture": 64},
@@ -128,6 +127,5 @@ def main(chosen: Namespace) -> dict[str, Any]:
             found["pictured"] = entry.pictured or (within or entry.values[0], entry.values[-1])
             keep(entry, found["pictured"], chosen.picture, chosen.output / "stability")
         entries[name] = found | {key: getattr(entry, key) for key in ABOUT}
-        show({name: found["edge"]})
     entries |= recorded(chosen, "entries", [name for name in ENTRIES if name not in entries])
     return {"entries": {name: entries[name] for name in ENTRIES if name in entries}}

@@ -29,7 +29,7 @@ import jaxvol as jv
 from jaxvol.metrics import psnr
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
 
 
 DENSEST = 0.1
@@ -216,5 +216,4 @@ def main(chosen: Namespace) -> dict[str, Any]:
     pictures(found, truth, chosen.output / "tomography.png")
     for row in (row for rows in found.values() for row in rows.values()):
         del row["slice"]
-    show(found)
     return {"photons": found}

@@ -24,13 +24,13 @@ EXPERIMENTS = sorted(name for name in RECORDS if (ROOT / "experiments" / f"{name
 """Those whose record has their name."""
 
 
-def draw_squares(result, path):
+def draw(result):
     figure, ((panel,),) = charts.panels(1, 1, 4, 4)
     panel.plot(list(map(int, result["squares"])), list(result["squares"].values()))
-    charts.save(figure, path)
+    return figure
 
 
-@experiment(draw_squares, size=3, sizes=(1, 2, 3), quick={"size": 2, "sizes": (1, 2)})
+@experiment(size=3, sizes=(1, 2, 3), quick={"size": 2, "sizes": (1, 2)})
 def squares(chosen):
     rows = {str(size): size**2 for size in chosen.sizes}
     rows |= recorded(chosen, "squares", (), {"size": 3})
