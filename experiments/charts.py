@@ -64,7 +64,7 @@ def _labelled(leads: Sequence[int], value: float, _: Any) -> str:
 
 
 def draw_record(file: Path, path: Path) -> None:
-    """Draws a record into a file by the `draw` of its experiment, if that has one; and next to it its page."""
+    """Draws a record into a file by the `draw` of its experiment, if that has one; next to it its page."""
     found = record.read(file)
     module = import_module(shlex.split(found["command"])[2])
     if hasattr(module, "draw"):

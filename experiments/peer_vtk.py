@@ -69,10 +69,86 @@ def tabulated(transfer: jv.TransferFunction, values: Float[Array, " n"]) -> jv.T
 
 
 class Drawn:
-    """A scene in a VTK window, made by `prepare`."""
+    """A scene in a VTK window, drawn once, by so many threads (by default one for each core). `shade`: with
+    these coefficients, under a head light. VTK shades nodes, by their own gradients, and interpolates what
+    that gives."""
 
-    def __init__(self, window: Any, view: Any, mapper: Any):
-        self.window, self.view, self.mapper = window, view, mapper
+    def __init__(
+        self,
+        volume: jv.Volume,
+        transfer: jv.TransferFunction,
+        camera: jv.Camera,
+        step: float,
+        threads: int | None = None,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        shade: jv.lighting.Phong | None = None,
+    ):
+        import vtk
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+
+        data, lowest = np.asarray(volume.data), 0
+        if np.issubdtype(data.dtype, np.integer):
+            # VTK's faster loops need values that begin at 0; CT that begins at -1000 takes a third longer
+            lowest = int(data.min())
+            data = (data.astype(int) - lowest).astype(np.min_scalar_type(int(data.max()) - lowest))
+        grid = vtk.vtkImageData()
+        grid.SetDimensions(*volume.shape)
+        grid.SetSpacing(*volume.spacing.tolist())
+        grid.SetOrigin(*volume.origin.tolist())
+        grid.GetPointData().SetScalars(numpy_to_vtk(data.ravel(order="F"), deep=True))
+
+        transfer = dense(transfer, volume)
+        colors, opacities = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
+        points = transfer.values.tolist(), transfer.colors.tolist(), transfer.opacity(step).tolist()
+        for value, color, opacity in zip(*points, strict=True):
+            colors.AddRGBPoint(value - lowest, *color)
+            opacities.AddPoint(value - lowest, opacity)
+        look = vtk.vtkVolumeProperty()
+        look.SetColor(colors)
+        look.SetScalarOpacity(opacities)
+        look.SetScalarOpacityUnitDistance(step)
+        look.SetInterpolationTypeToLinear()
+        look.ShadeOff()
+        if shade is not None:
+            look.ShadeOn()
+            look.SetAmbient(float(shade.ambient))
+            look.SetDiffuse(float(shade.diffuse))
+            look.SetSpecular(float(shade.specular))
+            # (n·h)^4p, which is what VTK computes, is nearly (r·v)^p
+            look.SetSpecularPower(4 * float(shade.specular_power))
+        look.DisableGradientOpacityOn()
+
+        mapper = vtk.vtkFixedPointVolumeRayCastMapper()
+        mapper.SetInputData(grid)
+        mapper.SetBlendModeToComposite()
+        mapper.IntermixIntersectingGeometryOff()
+        # by default VTK draws a coarser image where time is short
+        mapper.AutoAdjustSampleDistancesOff()
+        mapper.LockSampleDistanceToInputSpacingOff()
+        mapper.SetSampleDistance(step)
+        mapper.SetInteractiveSampleDistance(step)
+        mapper.SetImageSampleDistance(1)
+        if threads is not None:
+            mapper.SetNumberOfThreads(threads)
+        prop = vtk.vtkVolume()
+        prop.SetMapper(mapper)
+        prop.SetProperty(look)
+
+        renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
+        renderer.AddVolume(prop)
+        light = vtk.vtkLight()
+        light.SetLightTypeToHeadlight()
+        light.SetAmbientColor(1, 1, 1)  # by default a light has none
+        renderer.AddLight(light)
+        renderer.SetBackground(*background)
+        window.SetOffScreenRendering(1)
+        window.SetMultiSamples(0)
+        window.SetSize(*camera.size)
+        window.AddRenderer(renderer)
+        aim(renderer.GetActiveCamera(), camera)
+        renderer.ResetCameraClippingRange()
+        window.Render()
+        self.window, self.view, self.mapper = window, renderer.GetActiveCamera(), mapper
 
     def draw(self) -> None:
         """Cast all rays, and show the image in the window."""
@@ -95,86 +171,6 @@ class Drawn:
         width, height = self.window.GetSize()
         pixels = vtk_to_numpy(reader.GetOutput().GetPointData().GetScalars())
         return pixels.reshape(height, width, 3)[::-1] / 255
-
-
-def prepare(
-    volume: jv.Volume,
-    transfer: jv.TransferFunction,
-    camera: jv.Camera,
-    step: float,
-    threads: int | None = None,
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    shade: jv.lighting.Phong | None = None,
-) -> Drawn:
-    """A scene in VTK, drawn once, by so many threads (by default one for each core). `shade`: with these
-    coefficients, under a head light. VTK shades nodes, by their own gradients, and interpolates what that
-    gives."""
-    import vtk
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-
-    data, lowest = np.asarray(volume.data), 0
-    if np.issubdtype(data.dtype, np.integer):
-        # VTK's faster loops need values that begin at 0; CT that begins at -1000 takes a third longer
-        lowest = int(data.min())
-        data = (data.astype(int) - lowest).astype(np.min_scalar_type(int(data.max()) - lowest))
-    grid = vtk.vtkImageData()
-    grid.SetDimensions(*volume.shape)
-    grid.SetSpacing(*volume.spacing.tolist())
-    grid.SetOrigin(*volume.origin.tolist())
-    grid.GetPointData().SetScalars(numpy_to_vtk(data.ravel(order="F"), deep=True))
-
-    transfer = dense(transfer, volume)
-    colors, opacities = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
-    points = transfer.values.tolist(), transfer.colors.tolist(), transfer.opacity(step).tolist()
-    for value, color, opacity in zip(*points, strict=True):
-        colors.AddRGBPoint(value - lowest, *color)
-        opacities.AddPoint(value - lowest, opacity)
-    look = vtk.vtkVolumeProperty()
-    look.SetColor(colors)
-    look.SetScalarOpacity(opacities)
-    look.SetScalarOpacityUnitDistance(step)
-    look.SetInterpolationTypeToLinear()
-    look.ShadeOff()
-    if shade is not None:
-        look.ShadeOn()
-        look.SetAmbient(float(shade.ambient))
-        look.SetDiffuse(float(shade.diffuse))
-        look.SetSpecular(float(shade.specular))
-        # (n·h)^4p, which is what VTK computes, is nearly (r·v)^p
-        look.SetSpecularPower(4 * float(shade.specular_power))
-    look.DisableGradientOpacityOn()
-
-    mapper = vtk.vtkFixedPointVolumeRayCastMapper()
-    mapper.SetInputData(grid)
-    mapper.SetBlendModeToComposite()
-    mapper.IntermixIntersectingGeometryOff()
-    # by default VTK draws a coarser image where time is short
-    mapper.AutoAdjustSampleDistancesOff()
-    mapper.LockSampleDistanceToInputSpacingOff()
-    mapper.SetSampleDistance(step)
-    mapper.SetInteractiveSampleDistance(step)
-    mapper.SetImageSampleDistance(1)
-    if threads is not None:
-        mapper.SetNumberOfThreads(threads)
-    prop = vtk.vtkVolume()
-    prop.SetMapper(mapper)
-    prop.SetProperty(look)
-
-    renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
-    renderer.AddVolume(prop)
-    light = vtk.vtkLight()
-    light.SetLightTypeToHeadlight()
-    light.SetAmbientColor(1, 1, 1)  # by default a light has none
-    renderer.AddLight(light)
-    renderer.SetBackground(*background)
-    window.SetOffScreenRendering(1)
-    window.SetMultiSamples(0)
-    window.SetSize(*camera.size)
-    window.AddRenderer(renderer)
-    aim(renderer.GetActiveCamera(), camera)
-    renderer.ResetCameraClippingRange()
-    window.Render()
-    return Drawn(window, renderer.GetActiveCamera(), mapper)
 
 
 def aim(view: Any, camera: jv.Camera) -> None:

@@ -141,7 +141,7 @@ def of_vtk(drawn: peer_vtk.Drawn) -> Program:
 def by_vtk(step: float, case: Case) -> Program:
     volume, transfer, camera, voxel = case.scene
     shade: Any = None if case.lighting is None else case.lighting()
-    return of_vtk(peer_vtk.prepare(volume, transfer, camera, step * voxel, THREADS, shade=shade))
+    return of_vtk(peer_vtk.Drawn(volume, transfer, camera, step * voxel, THREADS, shade=shade))
 
 
 def marcher(scene: Scene, quadrature: Literal["left", "midpoint"] = "left", left: float = LEFT) -> Any:

@@ -56,7 +56,7 @@ def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, d
     truth = programs.program(case, marches.converged(scene.step, harness.FINER)).image()
     made = {OURS: programs.program(case, fast(scene)), PLAIN: programs.program(case, jv.March(scene.step))}
     if is_here(there, VTK):
-        drawn = peer_vtk.prepare(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
+        drawn = peer_vtk.Drawn(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
         made[VTK] = programs.of_vtk(drawn)
         made[VTK_RAYS] = made[VTK]._replace(draw=drawn.cast)
     if is_here(there, DRJIT):
