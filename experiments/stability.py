@@ -65,8 +65,8 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
         (line,) = panel.plot(values, curve, style, marker=".", markersize=6, label=name, linewidth=width)
         lost = [v for v, number in zip(values, curve, strict=True) if not math.isfinite(number)]
         panel.plot(lost, [top] * len(lost), "x", color=line.get_color(), markersize=6)
-    _scale(panel, "x", entry.scales[0], values)
-    _scale(panel, "y", entry.scales[1], numbers)
+    _scale(panel, "x", values)
+    _scale(panel, "y", numbers)
     if values[0] > values[-1]:  # from harmless to harmful, from left to right
         panel.invert_xaxis()
     panel.axhline(entry.limit, color="0.6", linewidth=0.8, linestyle="--")
@@ -80,17 +80,16 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     panel.legend(fontsize=6, framealpha=0.7)
 
 
-def _scale(panel: Any, name: Literal["x", "y"], scale: str, values: Sequence[float]) -> None:
-    """Sets the scale of an axis, with ticks that do not overlap. Linear where nothing is positive."""
+def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None:
+    """A logarithmic scale, through 0 where there is one, with ticks that do not overlap."""
     axis, setter = getattr(panel, f"{name}axis"), getattr(panel, f"set_{name}scale")
-    axis.get_offset_text().set_size(7)
     sizes = [abs(v) for v in values if v != 0 and math.isfinite(v)]
-    if scale == "linear" or not sizes:
+    if not sizes:
         return
     powers = np.log10([min(sizes), max(sizes)])
-    if scale == "symlog":
+    if min(values) <= 0:
         setter("symlog", linthresh=min(sizes))
-        every = math.ceil(np.ptp(powers) / 5)
+        every = max(1, math.ceil(np.ptp(powers) / 5))
         axis.set_ticks([0.0, *10.0 ** np.arange(math.ceil(powers[1]), math.floor(powers[0]) - 1, -every)])
     else:
         setter("log", nonpositive="mask")

@@ -40,7 +40,6 @@ class Entry(NamedTuple):
         shows: what the picture shows.
         pictured: the two values; by default the last one within the limit and the last one of all.
         said: the name of the number by which jaxvol says that it fails (1) or not (0).
-        scales: of both axes of the chart, as in Matplotlib.
         size: pixels along a side of the images that are measured; pictures have their own.
     """
 
@@ -59,7 +58,6 @@ class Entry(NamedTuple):
     shows: str = ""
     pictured: tuple[float, float] | None = None
     said: str | None = None
-    scales: tuple[str, str] = ("log", "log")
     size: int = 16
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Array
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise
 
+from ..scenes import on_cube
 from .entry import along_z, colors, cube, entry, opacities, ray_opacities, rms, signed, uniform
 
 
@@ -58,7 +59,7 @@ def halves(side: int = 9) -> jv.Volume:
     labels = np.zeros((side,) * 3, np.uint8)
     labels[:, :, side // 2 :] = 1
     with jax.ensure_compile_time_eval():  # kept, although it may be made inside `jax.jit`
-        return jv.Volume(np.ones((side,) * 3, np.float32), [2 / (side - 1)] * 3, [-1.0] * 3, labels)
+        return on_cube(np.ones((side,) * 3, np.float32), labels)
 
 
 NEAR, FAR = 0.875, 1.125
@@ -121,7 +122,6 @@ def _slopes(contrast: Array) -> tuple[Array, Array, Array]:
     "relative error of the derivative by the angle of a ray",
     "AlphaCorrection(labels=True)",
     limit=0.1,
-    scales=("linear", "log"),
 )
 def gradients_at_label_faces(contrast: float, size: int) -> dict[str, float]:
     """How much may extinction jump at the face of a label before the gradient of the rays is wrong?

@@ -62,7 +62,6 @@ def _scene(transfer: jv.TransferFunction, camera: jv.Camera) -> tuple:
     outcome="detected and said",
     limit=0.0,
     said="warning",
-    scales=("linear", "linear"),
 )
 def fits_of_what_images_do_not_show(beyond: float, size: int) -> dict[str, float]:
     """What does a fit say about control points whose values the volume does not hold?

@@ -57,7 +57,6 @@ def _above(width: float, size: int) -> jv.Camera:
     picture=lambda ratio, size: sheet_image(ratio * 16, size, "min_distance", 16),
     shows='a sheet seen edge-on before a wall, under "min_distance" with R = 16',
     pictured=(1.0, 0.5),
-    scales=("log", "linear"),
     size=192,
 )
 def sheets_thinner_than_a_cell_of_rays(ratio: float, size: int) -> dict[str, float]:
@@ -96,7 +95,6 @@ def steep_image(ramp: float, size: int, low: float, *, leaps: bool) -> np.ndarra
     picture=lambda ramp, size: steep_image(ramp, size, 0.5, leaps=True),
     shows="the volume above 1/2, with leaping",
     pictured=(2.0**22, 1.0),
-    scales=("log", "linear"),
     size=48,
 )
 def occupancy_under_steep_transfer_functions(ramp: float, size: int) -> dict[str, float]:
@@ -134,7 +132,6 @@ def _gradients(volume: jv.Volume, camera: jv.Camera, extinction: Array) -> tuple
     "relative error of the gradient",
     "SpaceLeaping",
     limit=0.05,
-    scales=("symlog", "linear"),
 )
 def gradients_of_what_is_leapt_over(extinction: float, size: int) -> dict[str, float]:
     """How transparent may a region be and still get a gradient under space leaping?

@@ -29,7 +29,6 @@ from .entry import colors, cube, entry, rms, uniform
     "energy of a template that begins with 1",
     "printed, without flights",
     limit=1.0,
-    scales=("linear", "log"),
 )
 def energy_of_templates_as_printed(opacity: float, size: int) -> dict[str, float]:
     """At which opacity does a template hold more light than it was given?

@@ -34,7 +34,6 @@ through = value_and_slope(lambda extinction: one_ray(cube(), extinction, 0.5, OR
     "error",
     "gradient, relative",
     limit=0.1,
-    scales=("linear", "log"),
 )
 def gradients_of_opaque_rays(depth: float, size: int) -> dict[str, float]:
     """At which optical depth does the gradient by the extinction drown in rounding?
@@ -131,7 +130,6 @@ def spaced(spacing: Array) -> Array:
     "gradient, relative",
     outcome="bounded",
     limit=0.01,
-    scales=("symlog", "log"),
 )
 def exits_at_the_end_of_a_cell(part: float, size: int) -> dict[str, float]:
     """Does the gradient by what moves the exit hold as the last cell gets narrower?

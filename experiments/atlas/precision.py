@@ -40,7 +40,6 @@ def stored(offset: float, size: int, dtype: Any) -> np.ndarray:
     picture=lambda offset, size: stored(offset, size, jnp.bfloat16),
     shows="the head phantom stored as bfloat16",
     pictured=(0.0, 3000.0),
-    scales=("symlog", "log"),
     size=96,
 )
 def voxels_of_16_bit_floats(offset: float, size: int) -> dict[str, float]:

@@ -68,7 +68,6 @@ def gap_picture(ratio: float, size: int) -> np.ndarray:
     picture=gap_picture,
     shows="error of the length inside the sector over the length of the gap, rows by angle about the motor "
     "axis, columns by gap, from half to 1.5 times the stated length; red: missed",
-    scales=("log", "linear"),
 )
 def gaps_of_rays_under_a_toroidal_map(ratio: float, size: int) -> dict[str, float]:
     """How short a gap, where a ray leaves the sector and enters it again, is missed?
@@ -121,7 +120,6 @@ def _length(origin: np.ndarray, direction: np.ndarray) -> float:
     "opacity",
     outcome="bounded",
     limit=2e-4,
-    scales=("symlog", "log"),
 )
 def rays_near_the_motor_axis(offset: float, size: int) -> dict[str, float]:
     """Do image and gradients stay finite and right where a fan touches its axis of rotation?

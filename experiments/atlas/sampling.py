@@ -61,7 +61,6 @@ def haze_error(share: float, size: int, march: str) -> np.ndarray:
     limit=0.1,
     picture=lambda share, size: signed(haze_error(share, size, "EmptySpaceJitter"), 0.05),
     shows="error of EmptySpaceJitter, ± 0.05 from blue to red",
-    scales=("linear", "log"),
     size=96,
 )
 def wood_grain_without_empty_samples(share: float, size: int) -> dict[str, float]:
@@ -127,7 +126,6 @@ THIN = (
     limit=0.001,
     picture=lambda ratio, size: grey(sheet(ratio, size, True)),
     shows="opacity of the sheet under Jitter",
-    scales=("log", "linear"),
     size=64,
 )
 def sheets_thinner_than_a_step(ratio: float, size: int) -> dict[str, float]:
@@ -145,7 +143,6 @@ def sheets_thinner_than_a_step(ratio: float, size: int) -> dict[str, float]:
     limit=0.001,
     picture=lambda ratio, size: grey(surface(ratio, size, True)),
     shows="pixels that meet the sheet, under EmptySpaceJitter",
-    scales=("log", "linear"),
     size=64,
 )
 def isosurfaces_of_thin_sheets(ratio: float, size: int) -> dict[str, float]:

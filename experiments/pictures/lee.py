@@ -16,7 +16,7 @@ from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, HeadLight, Lighting, Phong, ScattererTemplates
 
 from ..lighting import FLESH, march
-from ..scenes import CT_HEAD, SCENES, Scene, skin_head
+from ..scenes import CT_HEAD, SCENES, Scene, grid, on_cube, skin_head
 from . import BLACK, Panels, panel
 
 
@@ -56,13 +56,12 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 def ear(resolution: int, *, head: bool) -> jv.Volume:
     """An ear on the -y side of a head, or the ear alone."""
-    x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
+    x, y, z = grid(resolution)
     side = -0.35  # y of the head's side towards the ear
     thin = np.maximum(np.hypot(x, 0.7 * z) - 0.22, abs(y - side + GAP + THICK / 2) - THICK / 2)
     skull = np.sqrt(x**2 + (y - side - RADIUS) ** 2 + z**2) - RADIUS
     inside = np.minimum(thin, skull) if head else thin
-    spacing = 2 / (resolution - 1)
-    return jv.Volume(np.clip(0.5 - inside / spacing / 2, 0, 1), (spacing,) * 3, (-1.0,) * 3)
+    return on_cube(np.clip(0.5 - inside * (resolution - 1) / 4, 0, 1))
 
 
 def lee_fig4(chosen: Namespace) -> Panels:

@@ -17,6 +17,7 @@ import jaxvol as jv
 from jaxvol._util.vec3 import golden_spiral
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, ScattererTemplate, ScattererTemplates
 
+from ..scenes import grid, on_cube
 from . import BLACK, Panels, panel
 
 
@@ -28,7 +29,7 @@ LEFT = DirectionalLight((1.0, 0.3, -0.4), (28.0, 28.0, 28.0))
 BESIDE = DirectionalLight((1.0, -0.25, -0.15), (28.0, 28.0, 28.0))
 ABOVE = DirectionalLight((0.7, 0.1, -0.8), (19.0, 19.0, 19.0))
 SKY = ConstantLight((1.0, 1.0, 1.0))
-Place = tuple[np.ndarray, np.ndarray, np.ndarray]
+Place = tuple[np.ndarray, ...]
 
 
 class Setup(NamedTuple):
@@ -107,8 +108,7 @@ STEPS: dict[str, tuple[Setup, Setup]] = {
 def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """The image, and which pixels are visible."""
     spacing = 2 / (resolution - 1)
-    x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
-    volume = jv.Volume(setup.values((x, y, z), spacing), (spacing,) * 3, (-1.0,) * 3)
+    volume = on_cube(setup.values(tuple(grid(resolution)), spacing))
     deep, deeper = setup.seen
     points = [(0.1, GREY, 0.0), (VEIL, GREY, 0.45), (0.4, GREY, 0.45), (0.5, PALE, 0.45), (0.9, PALE, 0.95)]
     points += [(1.3, PALE, 0.95), (1.7, deep, 0.95), (2.3, deep, 0.95), (2.7, deeper, 0.95)]
