@@ -89,6 +89,8 @@ def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None
     powers = np.log10([min(sizes), max(sizes)])
     if min(values) <= 0:
         setter("symlog", linthresh=min(sizes))
+        if name == "y":
+            panel.set_ylim(bottom=min(values) - min(sizes) / 3)
         every = max(1, math.ceil(np.ptp(powers) / 5))
         axis.set_ticks([0.0, *10.0 ** np.arange(math.ceil(powers[1]), math.floor(powers[0]) - 1, -every)])
     else:
