@@ -177,7 +177,10 @@ def draw(result: dict[str, Any]) -> Any:
         panel.set_ylim(len(volumes) - 0.5, -0.6)
         panel.set_xlabel(f"time of an image / that of jaxvol, {pixels} x {pixels} pixels", fontsize=9)
         panel.text(GOAL, -0.55, " goal", va="top", fontsize=8)
-        panel.set_title("Right of 1: slower than jaxvol, whose own time and\nerror stand below a scene")
+        panel.set_title(
+            "Right of 1: slower than jaxvol, whose own time and error\n"
+            "stand below a scene; bars: 95 % intervals"
+        )
     shown = [name for name in COLORS if any(name in r for v in volumes.values() for r in v.values())]
     marks = [Line2D([], [], color=COLORS[name], marker="o", linestyle="") for name in shown]
     labels = [LABELS.get(name, name) for name in shown]
