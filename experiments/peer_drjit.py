@@ -43,8 +43,11 @@ class Marcher:
     """A scene in Dr.Jit, drawn once.
 
     Args:
-        volume, transfer, camera: the scene.
-        step, quadrature: as for `jaxvol.March`.
+        volume: of the scene.
+        transfer: of the scene.
+        camera: of the scene.
+        step: as for `jaxvol.March`.
+        quadrature: as for `jaxvol.March`.
         opacity_left: as for `jaxvol.EarlyTermination`; 0 ends rays only at their exit.
         threads: number of Dr.Jit's threads in this process.
     """

@@ -36,10 +36,13 @@ def pictures(
 ) -> Main:
     """The `main` of a page of pictures of scenes.
 
-    - `title`: of the page, or a function from the options to it.
-    - `render`: from the options to the panels.
-    - `resolution`: voxels along an axis of a phantom, by default. `size`: pixels along a side of an image.
-    - `data`: whether it can show real volumes.
+    Args:
+        name: of the page.
+        title: of the page, or a function from the options to it.
+        render: from the options to the panels.
+        resolution: voxels along an axis of a phantom, by default.
+        size: pixels along a side of an image, by default.
+        data: whether it can show real volumes.
     """
 
     @command(

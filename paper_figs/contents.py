@@ -20,12 +20,15 @@ PAPERS = {
 class Entry:
     """A figure or table of a paper.
 
-    - `name`: in `pictures.PICTURES` or `records.RECORDS`, and of what is written.
-    - `paper`: a key of `PAPERS`. `title`: what the paper calls it, and what it is about.
-    - `reported`: what the paper shows and reports. `ours`: what to look at in ours.
-    - `record`: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes,
-      so that the kept picture is its record.
-    - `data`: whether it shows real volumes (`--data`).
+    Attributes:
+        name: in `pictures.PICTURES` or `records.RECORDS`, and of what is written.
+        paper: a key of `PAPERS`.
+        title: what the paper calls it, and what it is about.
+        reported: what the paper shows and reports.
+        ours: what to look at in ours.
+        record: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes, so
+            that the kept picture is its record.
+        data: whether it shows real volumes (`--data`).
     """
 
     name: str

@@ -66,11 +66,14 @@ def make(
 ) -> Path:
     """Make all figures and tables, and the page. Returns the page.
 
-    - `folder`: where they are written. With `run`, new records go into `folder`/results. Scenes of real
-      volumes are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms in their place.
-    - `results`: of the records, without `run`.
-    - `only`: names of entries; by default all.
-    - `quick`: with `run`: tiny sizes, to see that everything works.
+    Args:
+        folder: where they are written. With `run`, new records go into `folder`/results. Scenes of real volumes
+            are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms in their place.
+        results: of the records, without `run`.
+        run: measure experiments and render scenes.
+        only: names of entries; by default all.
+        quick: with `run`: tiny sizes, to see that everything works.
+        say: is told what is done.
     """
     known = [entry.name for entry in ENTRIES]
     if wrong := [name for name in only if name not in known]:

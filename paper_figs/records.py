@@ -143,8 +143,8 @@ def kim_fig9(result: dict[str, Any], path: Path) -> None:
     ours.axhline(whole, color="0.5", linestyle="--", label="the whole volume at once")
     for panel, title in ((theirs, "the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels"), (ours, None)):
         voxels, image = result["voxels"], result["image"]
-        mine = f"measured: {' x '.join(map(str, voxels[::-1]))} voxels, {image[0]} x {image[1]} pixels"
-        panel.set_title(title or mine, fontsize=9)
+        measured = f"measured: {' x '.join(map(str, voxels[::-1]))} voxels, {image[0]} x {image[1]} pixels"
+        panel.set_title(title or measured, fontsize=9)
         panel.set_yscale("log")
         panel.set_ylabel("frames per second", fontsize=8)
         panel.legend(fontsize=7)
