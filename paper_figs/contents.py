@@ -26,8 +26,8 @@ class Entry:
         title: what the paper calls it, and what it is about.
         reported: what the paper shows and reports.
         ours: what to look at in ours.
-        record: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes, so
-            that the kept picture is its record.
+        record: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes,
+            so that the kept picture is its record.
         data: whether it shows real volumes (`--data`).
     """
 

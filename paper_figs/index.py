@@ -67,8 +67,8 @@ def make(
     """Make all figures and tables, and the page. Returns the page.
 
     Args:
-        folder: where they are written. With `run`, new records go into `folder`/results. Scenes of real volumes
-            are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms in their place.
+        folder: where they are written. With `run`, new records go into `folder`/results. Scenes of real
+            volumes are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms in their place.
         results: of the records, without `run`.
         run: measure experiments and render scenes.
         only: names of entries; by default all.
