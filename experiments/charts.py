@@ -19,7 +19,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-SIZES = {"axes.titlesize": 9, "axes.labelsize": 9, "figure.titlesize": 9, "legend.fontsize": 8}
+SIZES: Any = {"axes.titlesize": 9, "axes.labelsize": 9, "figure.titlesize": 9, "legend.fontsize": 8}
 SIZES |= {"xtick.labelsize": 8, "ytick.labelsize": 8, "lines.markersize": 4}
 
 
@@ -40,7 +40,7 @@ def legend_below(figure: Any, panel: Any, columns: int) -> None:
     figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
 
 
-def numbered(panel: Any, x: Sequence[float], names: Sequence[Any] | None = None) -> None:
+def numbered(panel: Any, x: Any, names: Sequence[str] | None = None) -> None:
     """A logarithmic scale along x, with ticks at these numbers alone."""
     panel.set_xscale("log", base=2)
     panel.set_xticks(x, x if names is None else names)

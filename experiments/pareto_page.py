@@ -147,7 +147,7 @@ def as_script(data: Any) -> str:
 def ahead(scenes: dict[str, Any]) -> str:
     """A table of the points of other programs that are ahead of ours."""
     titles = ("point", "our fastest time at its error / its own", "our best error in its time / its own")
-    rows = [(*titles, "of that time, our shortest frame")]
+    rows: list[tuple[str, ...]] = [(*titles, "of that time, our shortest frame")]
     for name, scene in scenes.items():
         points = scene["points"].values()
         shortest = min(point["time"] for point in points if point["family"] not in MARKS)

@@ -79,10 +79,10 @@ def scenes(folder: Path | None, count: int, size: int, seed: int) -> Iterator[Sc
     """Random scenes, each volume's in a row."""
     all_ = volumes(folder)
     for place, (name, volume) in enumerate(all_.items()):
-        values = np.quantile(np.asarray(volume.data, np.float32), (0, 1))
+        low, high = np.quantile(np.asarray(volume.data, np.float32), (0, 1)).tolist()
         for number in range(place, count, len(all_)):
             random = np.random.default_rng((seed, number))
-            transfer = transfer_of(random, *values.tolist(), float(volume.spacing.min()))
+            transfer = transfer_of(random, low, high, float(volume.spacing.min()))
             yield Scene(name, volume, transfer, camera_of(random, volume, size))
 
 

@@ -93,9 +93,9 @@ SCENES: dict[str, Callable[..., Scene]] = {
 }
 
 
-def grid(side: int) -> list[np.ndarray]:
+def grid(side: int) -> tuple[np.ndarray, ...]:
     """x, y and z of the nodes of [-1, 1]³."""
-    return np.meshgrid(*[np.linspace(-1, 1, side)] * 3, indexing="ij")
+    return tuple(np.meshgrid(*[np.linspace(-1, 1, side)] * 3, indexing="ij"))
 
 
 def on_cube(data: np.ndarray, *labels: Any, field: Any = None) -> jv.Volume:

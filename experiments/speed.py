@@ -52,16 +52,18 @@ def fast(scene: Scene) -> jv.March:
 
 def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, dict[str, Any]]:
     """Time and error of every program's frame, and the time of ours under `jax.jit`."""
-    case = Case(scene)
+    case, march = Case(scene), fast(scene)
     truth = programs.program(case, marches.converged(scene.step, harness.FINER)).image()
-    made = {OURS: programs.program(case, fast(scene)), PLAIN: programs.program(case, jv.March(scene.step))}
+    made = {OURS: programs.program(case, march), PLAIN: programs.program(case, jv.March(scene.step))}
     if is_here(there, VTK):
         drawn = peer_vtk.Drawn(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
         made[VTK] = programs.of_vtk(drawn)
         made[VTK_RAYS] = made[VTK]._replace(draw=drawn.cast)
     if is_here(there, DRJIT):
         made[DRJIT] = programs.of_drjit(programs.marcher(scene, left=LEFT))
-    under_jit = jax.jit(lambda *moving: jv.render(scene.volume, *moving, fast(scene), outputs="rgba").rgba)
+    under_jit = jax.jit(
+        lambda tf, camera: harness.image(scene._replace(transfer=tf, camera=camera), march).rgba
+    )
     made["under jit"] = made[OURS]._replace(draw=lambda: under_jit(scene.transfer, scene.camera))
     rows = programs.measured(made, truth, repetitions)
     rows[OURS]["under jit"] = rows.pop("under jit")["ratio"]

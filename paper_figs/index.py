@@ -68,7 +68,7 @@ def make(
 
     Args:
         folder: where they are written. With `run`, new records go into `folder`/results. Scenes of real
-            volumes are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms in their place.
+            volumes are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms.
         results: of the records, without `run`.
         run: measure experiments and render scenes.
         only: names of entries; by default all.

@@ -245,7 +245,7 @@ def gallery(chosen: Namespace) -> Panels:
                 tuple(materials), lights, templates=8, blend=True, reach=REACH
             ),
         }
-        images = {
+        images: dict[str, Any] = {
             title: np.asarray(jv.render(*scene[:3], how, lighting=each, outputs="rgba").image(BLACK))
             for title, each in lightings.items()
         }

@@ -108,7 +108,7 @@ STEPS: dict[str, tuple[Setup, Setup]] = {
 def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """The image, and which pixels are visible."""
     spacing = 2 / (resolution - 1)
-    volume = on_cube(setup.values(tuple(grid(resolution)), spacing))
+    volume = on_cube(setup.values(grid(resolution), spacing))
     deep, deeper = setup.seen
     points = [(0.1, GREY, 0.0), (VEIL, GREY, 0.45), (0.4, GREY, 0.45), (0.5, PALE, 0.45), (0.9, PALE, 0.95)]
     points += [(1.3, PALE, 0.95), (1.7, deep, 0.95), (2.3, deep, 0.95), (2.7, deeper, 0.95)]
