@@ -4,8 +4,8 @@
   places: a page of `docs/` names `../paper_figs/README.md`, as it must where the repository is read.
 - Charts and pages of records are drawn from these, as `python -m experiments.redraw` does.
 - `<!-- section FILE: HEADING -->` is replaced by the text under that heading of a Markdown file.
-- `<!-- table failures -->` and `<!-- table references -->` are replaced by tables made from the record of the
-  failure atlas and from CITATION.cff.
+- `<!-- table failures -->`, `<!-- table pictures -->` and `<!-- table references -->` are replaced by tables,
+  made from the record of the failure atlas and from CITATION.cff.
 """
 
 import json
@@ -34,6 +34,7 @@ OUTSIDE = (
     "experiments/results/*.md",
     "experiments/results/*.png",
     "experiments/results/*.webp",
+    "experiments/results/stability/*.webp",
     "paper_figs/README.md",
     "paper_figs/output/*.webp",
 )
@@ -109,11 +110,29 @@ def relinked(text: str, source: str, page: str, names: set[str]) -> str:
     return "".join(parts)
 
 
+def atlas() -> dict[str, Any]:
+    """The entries of the failure atlas, as recorded."""
+    record = json.loads((ROOT / "experiments/results/stability.json").read_text(encoding="utf-8"))
+    return record["result"]["entries"]
+
+
+def pictures() -> str:
+    """The pictures of the failure atlas: one row an entry, on both sides of its edge."""
+    lines = ["| entry | within the limit | beyond it |", "|---|---|---|"]
+    for name, entry in atlas().items():
+        if "pictured" in entry:
+            file = f"experiments/results/stability/{name.replace(' ', '-')}"
+            cells = [f"{name}<br>{entry['shows']}"]
+            for number, value in enumerate(entry["pictured"], 1):
+                cells.append(f"![{entry['shows']}]({file}.{number}.webp)<br>{entry['regime']}: {value:.4g}")
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def failures() -> str:
     """The failure atlas, one row an entry."""
-    record = json.loads((ROOT / "experiments/results/stability.json").read_text(encoding="utf-8"))
     lines = ["| entry | question | edge | beyond it |", "|---|---|---|---|"]
-    for name, entry in record["result"]["entries"].items():
+    for name, entry in atlas().items():
         within, beyond = entry["edge"]["within"], entry["edge"]["beyond"]
         if beyond is None:
             edge = "none in the sweep"
@@ -148,7 +167,7 @@ def references() -> str:
     return "\n".join(lines)
 
 
-TABLES = {"failures": failures, "references": references}
+TABLES = {"failures": failures, "pictures": pictures, "references": references}
 
 
 def on_post_build(config: Any) -> None:

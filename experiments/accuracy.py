@@ -2,27 +2,21 @@
 
 Five scenes, steps of a quarter of a voxel to four, three quadratures, and adaptive sampling at five
 tolerances. Ours skips empty space, cuts the last cell at the exit, and ends rays early. Error is the RMSE
-over white against one converged image of ours; VTK's image is compared with that image as its display would
-show it. Adaptive sampling, and peers, are compared with ours at their own error, which lies between those of
-two settings: samples and time are interpolated between them, as powers of the error.
+over white against one converged image of ours.
 
 A second part looks at a transfer function whose peak is 1 % as wide as the range of values: the error of both
 second-order quadratures, by step.
 """
 
 from argparse import Namespace
-from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from jaxvol.metrics import rmse
 
 from . import charts, programs
-from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
-from .programs import DRJIT, FINEST_OF, LEFT, QUADRATURES, THREADS, VTK, Case, Program, is_here
+from .harness import chosen_scenes, experiment, some_of
+from .programs import DRJIT, FINEST_OF, QUADRATURES, VTK, Case, Program, is_here
 from .scenes import PHANTOM, SCENES, Scene, peaked
 
 
@@ -30,16 +24,15 @@ STEPS = (0.5, 1.0, 2.0, 4.0)
 FINEST = 0.25
 ADAPTIVE = "adaptive"
 FINER = 16
-ERRORS = (1e-2, 5e-3, 2e-3)
-"""At which Dr.Jit is compared."""
+OF_DRJIT = f"{DRJIT}, left", f"{DRJIT}, midpoint"
 STYLES = {
     ADAPTIVE: "C4*-",
     "left": "C0o-",
     "midpoint": "C2s-",
     "preintegrated": "C3D-",
     VTK: "C7^--",
-    f"{DRJIT}, left": "C1v--",
-    f"{DRJIT}, midpoint": "C1v:",
+    OF_DRJIT[0]: "C1v--",
+    OF_DRJIT[1]: "C1v:",
 }
 BASE = "midpoint", 1.0
 
@@ -47,153 +40,53 @@ Rows = dict[str, dict[str, dict[str, Any]]]
 """By program and step, in voxels, or tolerance: time and error."""
 
 
-def settings(there: dict[str, str]) -> dict[tuple[str, float], Any]:
-    """By program, and step or tolerance: makes the program of a case. The base first."""
-    found: dict[tuple[str, float], Any] = {BASE: programs.ours()}
-    found |= {(ADAPTIVE, tolerance): programs.adaptive(tolerance) for tolerance in FINEST_OF}
-    found |= {
+def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
+    made: dict[Any, Any] = {BASE: programs.ours()}  # the base first
+    made |= {(ADAPTIVE, tolerance): programs.adaptive(tolerance) for tolerance in FINEST_OF}
+    made |= {
         (q, step): programs.ours(step=step, quadrature=q) for step in (FINEST, *STEPS) for q in QUADRATURES
     }
     for step in STEPS:
         if is_here(there, VTK):
-            found[VTK, step] = partial(programs.by_vtk, step)
+            made[VTK, step] = partial(programs.by_vtk, step)
         if is_here(there, DRJIT):
-            for q in ("left", "midpoint"):
-                found[f"{DRJIT}, {q}", step] = partial(programs.by_drjit, q, step)
-    return found
-
-
-def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
-    made: dict[Any, Program] = {key: make(Case(scene)) for key, make in settings(there).items()}
-    rows = programs.measured(made, programs.converged(scene, FINER), repetitions)
-    found: Rows = {name: {} for name in STYLES if any(of == name for of, _ in made)}
-    for (name, setting), each in made.items():
-        row = found[name][str(setting)] = rows[name, setting]
+            for name in OF_DRJIT:
+                made[name, step] = partial(programs.by_drjit, name.split()[-1], step)
+    ready: dict[Any, Program] = {key: make(Case(scene)) for key, make in made.items()}
+    rows = programs.measured(ready, programs.converged(scene, FINER), repetitions)
+    for key, each in ready.items():
         if each.samples is not None:
-            row["samples"] = round(each.samples(), 2)
-    return {name: dict(sorted(by.items(), key=lambda item: float(item[0]))) for name, by in found.items()}
+            rows[key]["samples"] = round(each.samples(), 2)
+    found = {name: {str(s): rows[of, s] for of, s in sorted(rows) if of == name} for name in STYLES}
+    return {name: by_setting for name, by_setting in found.items() if by_setting}
 
 
-def at_error(rows: dict[str, dict[str, Any]], error: float, what: str) -> float | None:
-    """What these settings take for this error, as a power of it between two of them; None beyond all."""
-    known = sorted((row["rmse"], row[what]) for row in rows.values())
-    errors, taken = np.log(np.array(known)).T
-    inside = errors[0] <= np.log(error) <= errors[-1]
-    return float(np.exp(np.interp(np.log(error), errors, taken))) if inside else None
-
-
-def least(rows: Rows, names: Sequence[str], error: float, what: str) -> Any:
-    """What the best of these programs takes for this error; None where none has it between its settings."""
-    taken = (at_error(rows[name], error, what) for name in names if name in rows)
-    return min((t for t in taken if t is not None), default=None)
-
-
-def against_uniform(rows: Rows) -> dict[str, dict[str, float | None]]:
-    """By tolerance: error over tolerance; and how many times more samples and time uniform steps take for the
-    same error, by the quadrature that is best at it."""
-    found: dict[str, dict[str, float | None]] = {}
-    for tolerance, row in rows[ADAPTIVE].items():
-        found[tolerance] = {"error over tolerance": row["rmse"] / float(tolerance)}
-        for what in ("samples", "seconds"):
-            taken = least(rows, QUADRATURES, row["rmse"], what)
-            found[tolerance][what] = None if taken is None else round(taken / row[what], 3)
-    return found
-
-
-def time_to_accuracy(rows: Rows) -> dict[str, dict[str, float]]:
-    """By peer and error, how many times longer than ours the peer takes to an image of this error, each by
-    its best setting: VTK at its own error at one voxel; Dr.Jit at three errors, where both reach them."""
-    our, theirs = (ADAPTIVE, *QUADRATURES), (f"{DRJIT}, left", f"{DRJIT}, midpoint")
-    found: dict[str, dict[str, float]] = {VTK: {}, DRJIT: {}}
-    if VTK in rows:
-        drawn = rows[VTK]["1.0"]
-        taken = least(rows, our, drawn["rmse"], "seconds")
-        if taken is not None:
-            found[VTK][f"{drawn['rmse']:.4f}"] = drawn["seconds"] / taken
-    for error in ERRORS:
-        mine, their = (least(rows, names, error, "seconds") for names in (our, theirs))
-        if mine is not None and their is not None:
-            found[DRJIT][f"{error:g}"] = their / mine
-    return found
-
-
-def measure_peak(scene: Scene) -> dict[str, dict[str, float]]:
-    """By quadrature and step, in voxels: the error under a narrow peak."""
-    case = Case(peaked(scene))
-    truth = programs.converged(case.scene, FINER)
-    return {
-        q: {str(s): rmse(programs.ours(step=s, quadrature=q)(case).image(), truth) for s in STEPS}
-        for q in QUADRATURES[1:]
-    }
-
-
-def summary(scenes: dict[str, Rows], peaks: dict[str, Any]) -> dict[str, Any]:
-    """What the record says in short: ratios of errors at one step, and of a peak's at four and one."""
-    ratios = {
-        s: rows["preintegrated"]["1.0"]["rmse"] / rows["midpoint"]["1.0"]["rmse"]
-        for s, rows in scenes.items()
-    }
-    uniform = {s: against_uniform(rows) for s, rows in scenes.items()}
-    gains = {
-        what: [gain for of in uniform.values() for row in of.values() if (gain := row[what]) is not None]
-        for what in ("samples", "seconds")
-    }
-    faster = {s: time_to_accuracy(rows) for s, rows in scenes.items()}
-    peers = {peer: [r for of in faster.values() for r in of[peer].values()] for peer in (VTK, DRJIT)}
-    return {
-        "time of peers over ours, at the same error": faster,
-        "its geometric means": {p: geometric_mean(each) for p, each in peers.items() if each},
-        "uniform steps over adaptive sampling, at its error": uniform,
-        "geometric means": {what: geometric_mean(each) for what, each in gains.items() if each},
-        "preintegrated over midpoint, one voxel": ratios,
-        "mean": float(np.mean(list(ratios.values()))),
-        "peak: preintegrated at 4 over midpoint at 1": {
-            s: rows["preintegrated"]["4.0"] / rows["midpoint"]["1.0"] for s, rows in peaks.items()
-        },
-        "time, preintegrated over midpoint, one voxel": {
-            s: rows["preintegrated"]["1.0"]["ratio"]["median"] for s, rows in scenes.items()
-        },
-    }
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Time against error, a panel for each scene; and errors under a narrow peak."""
     scenes = result["scenes"]
     figure, axes = charts.panels(2, len(scenes), 3.4 * len(scenes), 6.4)
     for (times, errors), (name, rows) in zip(axes.T, scenes.items(), strict=True):
         for of, by_step in rows.items():
             error = [row["rmse"] for row in by_step.values()]
-            taken = [row["seconds"] * 1e3 for row in by_step.values()]
-            times.plot(error, taken, STYLES[of], label=of, markersize=4)
+            times.plot(error, [row["seconds"] * 1e3 for row in by_step.values()], STYLES[of], label=of)
         for quadrature, by_step in result["peaks"][name].items():
-            errors.plot([float(s) for s in by_step], list(by_step.values()), STYLES[quadrature], markersize=4)
-        for panel in (times, errors):
-            panel.set(xscale="log", yscale="log")
-            panel.tick_params(labelsize=8, which="both")
-        times.set_title(name, fontsize=9)
-        times.set_xlabel("RMSE of the image", fontsize=8)
-        errors.set_xscale("log", base=2)
-        errors.set_xticks(STEPS, [f"{s:g}" for s in STEPS])
-        errors.set_xlabel("step, voxels", fontsize=8)
-        errors.set_title(f"{name}, narrow peak", fontsize=9)
+            errors.plot([float(s) for s in by_step], list(by_step.values()), STYLES[quadrature])
+        times.set(xscale="log", yscale="log", title=name, xlabel="RMSE of the image")
+        errors.set(yscale="log", title=f"{name}, narrow peak", xlabel="step, voxels")
         charts.plain_numbers(times)
         charts.plain_numbers(errors)
+        charts.numbered(errors, STEPS, [f"{s:g}" for s in STEPS])
     figure.suptitle(
         "Above: each point is a length of steps, the shorter the slower; below and to the left is better. "
-        "Below: a transfer function whose peak is 1 % of the range of values",
-        fontsize=9,
+        "Below: a transfer function whose peak is 1 % of the range of values"
     )
-    axes[0, 0].set_ylabel(f"time of a frame of {result['pixels']}² pixels, ms", fontsize=8)
-    axes[1, 0].set_ylabel("RMSE of the image", fontsize=8)
+    axes[0, 0].set_ylabel(f"time of a frame of {result['pixels']}² pixels, ms")
+    axes[1, 0].set_ylabel("RMSE of the image")
     charts.legend_below(figure, axes[0, 0], min(6, 2 * len(scenes)))
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "accuracy",
-    "What does accuracy cost, by step and quadrature, beside VTK and Dr.Jit?",
-    __doc__,
-    draw,
     repetitions=9,
     size=512,
     resolution=256,
@@ -205,20 +98,11 @@ def main(chosen: Namespace) -> dict[str, Any]:
     scenes: dict[str, Rows] = {}
     peaks: dict[str, Any] = {}
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
-        scenes[name], peaks[name] = measure(scene, there, chosen.repetitions), measure_peak(scene)
-        show(scenes[name], name)
-        show(peaks[name], name, "narrow peak")
-    return {
-        "pixels": chosen.size,
-        "steps": (FINEST, *STEPS),
-        "opacity left": LEFT,
-        "threads": THREADS,
-        "peers": there,
-        "summary": summary(scenes, peaks),
-        "scenes": scenes,
-        "peaks": peaks,
-    }
-
-
-if __name__ == "__main__":
-    main()
+        scenes[name] = measure(scene, there, chosen.repetitions)
+        case = Case(peaked(scene))
+        truth = programs.converged(case.scene, FINER)
+        peaks[name] = {
+            q: {str(s): rmse(programs.ours(step=s, quadrature=q)(case).image(), truth) for s in STEPS}
+            for q in QUADRATURES[1:]
+        }
+    return {"pixels": chosen.size, "peers": there, "scenes": scenes, "peaks": peaks}

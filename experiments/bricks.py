@@ -1,37 +1,131 @@
 """What do bricks cost in an ultrasound scan, by how it is split, and does overlap save time?
 
-The scan of Kim, Kwon and Shin 2008 scaled down to a quarter along each axis, in float32, on disk: a phantom
-of a fetus, sampled by a probe of the paper's proportions (`bricks_paper.probe`). `render_bricks` renders it
-under each split of the paper's Table 1 by each of its methods: `"overlap"`, `"reload"`, and `"naive"`, which
-is wrong. They run in turn, and so does `render` of the whole volume. Beside the times stand the numbers of
-loads, and the voxels read over those of the volume. These include what is read around each brick for
-interpolation, and for the cells of a ray that are taken at a time. The best split of the paper is measured
-from several sides: whether a ray comes back to a brick depends on where it comes from.
+The scan of Kim, Kwon and Shin 2008 at a quarter along each axis, in float32, on disk: a phantom of a fetus,
+sampled by a probe of the paper's proportions. `render_bricks` renders it under each split of the paper's
+Table 1 by `"overlap"`, by `"reload"`, and in the naive order, which is wrong, all in turn, and in turn with
+`render` of the whole volume. Beside the times stand the loads, and the voxels read over those of the volume,
+with what is read around each brick. The paper's best split is measured from several sides, since a ray's way
+decides whether it comes back to a brick.
 
-Before each frame the file is dropped from the system's page cache, where the system can do that, so that
-frames read from the disk. A split into many bricks is timed once. `--only` measures some splits again and
-keeps what the record says of the others, with the commit that they are of.
+Before each frame the file is dropped from the system's page cache, where the system can do that. A split into
+many bricks is timed once.
 """
 
+import math
 import os
 import tempfile
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
-from matplotlib.ticker import NullFormatter
 
 import jaxvol as jv
-from jaxvol.bricks import VoxelSource, overlap_of, source_of
+from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of, source_of
+from jaxvol.bricks.traversal import Load, Traversal
 
-from . import bricks_paper, charts, record, timing
-from .bricks_paper import BEST, TABLE, Split
-from .harness import experiment, recorded, show, some_of
-from .naive_bricks import each_at_once
+from . import timing
+from .harness import experiment
 from .scan_conversion import BODY
+
+
+Split = tuple[int, int, int]
+"""Bricks along β, σ and γ, the axes of data[β, σ, γ]."""
+
+SHAPE = 325, 490, 1280
+"""Voxels along β, σ and γ."""
+A, B = 70.04, 338.11
+"""Of the probe, mm."""
+BETA, SIGMA = math.radians(57.29), math.radians(103.64)
+"""Ranges of angles."""
+PIXELS = 375
+BEST = 2, 4, 2
+
+NEAR, DEEP = 245.0, 349.0
+"""Fitted, since the paper does not print the range of depths: distances, from the centre of curvature, of the
+near end of the scan, and from there to its far end. They reproduce the column of overlap, if K in this unit
+counts as a number of voxels. The unit is unexplained: DEEP is 1280 voxels."""
+
+
+class Row(NamedTuple):
+    """A row of the table: overlap in percent of the volume, and frames per second."""
+
+    overlap: float
+    reload: float
+    proposed: float
+
+
+TABLE: dict[Split, Row] = {
+    (2, 2, 1): Row(0, 13.99, 13.97),
+    (2, 1, 2): Row(7.58, 11.57, 1.30),
+    (1, 2, 2): Row(2.03, 11.64, 13.27),
+    (1, 1, 4): Row(30.23, 8.35, 0.63),
+    (2, 2, 2): Row(2.03, 15.49, 16.61),
+    (2, 2, 4): Row(7.97, 17.66, 0.99),
+    (2, 4, 2): Row(0.63, 20.88, 22.87),
+    (4, 2, 2): Row(2.03, 1.07, 1.05),
+    (2, 2, 8): Row(20.78, 17.62, 1.10),
+    (2, 8, 2): Row(0.63, 19.92, 21.46),
+    (8, 2, 2): Row(2.03, 1.57, 1.50),
+    (4, 4, 4): Row(2.11, 3.19, 2.73),
+    (2, 8, 4): Row(2.58, 15.43, 17.93),
+    (2, 32, 2): Row(0.63, 10.49, 11.77),
+    (4, 4, 8): Row(5.47, 2.94, 3.02),
+    (4, 4, 16): Row(12.89, 4.22, 1.98),
+    (8, 8, 4): Row(0.70, 4.97, 3.92),
+}
+"""As printed, in the paper's order."""
+
+
+def probe(scale: float = 1.0) -> jv.ToroidalMap:
+    """The paper's probe, all lengths times `scale`. Its range of depths is to `b` as fitted."""
+    beta, sigma = ((math.pi / 2 - angle / 2, math.pi / 2 + angle / 2) for angle in (BETA, SIGMA))
+    return jv.ToroidalMap(A * scale, B * scale, beta, sigma, (0.0, B * scale * DEEP / NEAR))
+
+
+def grid(shape: tuple[int, int, int], split: Split) -> BrickGrid:
+    """Bricks as `render_bricks` makes them of so many along each axis."""
+    x, y, z = (-(-(n - 1) // count) for n, count in zip(shape, split, strict=True))
+    return BrickGrid(shape, (x, y, z))
+
+
+def printed_overlap(split: Split) -> float:
+    """Overlap in percent by the paper's formula (`jaxvol.bricks.overlap_of`), in the unit in which it gives
+    the printed column: to 0.1 in 12 of 17 rows, and to 0.4 in the others. K is taken at the near face of each
+    brick but the last, which is that between two bricks if the scan began a brick nearer; both planes
+    count from the same centre."""
+    near, (beta, sigma) = NEAR - DEEP / split[2], (probe().beta_range, probe().sigma_range)
+    if split[2] == 1:
+        return 0.0
+    scan = jv.ToroidalMap(0.0, near, beta, sigma, (0.0, DEEP))
+    voxel = DEEP / (SHAPE[2] - 1)
+    return share([k * voxel for k in overlap_of(scan, grid(SHAPE, split))], SHAPE[2])
+
+
+def share(overlaps: Iterable[float], nodes: int) -> float:
+    """The part of a volume of so many voxels along γ that is read twice, in percent: whole layers at each
+    face."""
+    return 100 * sum(map(math.ceil, overlaps)) / nodes
+
+
+def each_at_once(traversal: Traversal) -> Iterator[Load]:
+    """A `method` of `render_bricks`, the paper's order without overlap: each brick with all its cells of each
+    ray, so that what the ray meets between these, in other bricks, is blended in the wrong order."""
+    for brick in traversal.order:
+        if not traversal.visible[brick]:
+            continue
+        outside = np.ones(traversal.grid.number + 1, bool)
+        outside[brick] = False
+        own = ~outside
+        own[-1] = True  # a ray goes on through a gap, in which there is no brick
+        reached, load = jnp.zeros(traversal.rays.length.shape, jnp.int32), None
+        while (found := traversal.cells_of(brick, own, outside, reached)) is not None:
+            load = load or traversal.load(brick, found.cells)
+            reached = found.reached
+            yield load._replace(cells=found.cells)
 
 
 METHODS: dict[str, Any] = {"overlap": "overlap", "reload": "reload", "naive": each_at_once}
@@ -48,8 +142,27 @@ EYES: dict[str, tuple[float, float, float]] = {
 }
 """Where the camera is, mm. Across and along the fan, rays pass the curved faces at small angles."""
 VIEW = "across"
-FROM = f"{','.join(map(str, BEST))} from"
 WHOLE = "whole"
+
+
+def phantom(
+    resolution: int, dtype: str = "float32", *, speckle: bool = True
+) -> tuple[jv.Volume, jv.ToroidalMap]:
+    """The fetus as the paper's probe would see it, with so many samples along a beam."""
+    x, y, z = (max(8, n * resolution // SHAPE[2]) for n in SHAPE)
+    volume, scan = jv.toroidal_phantom("fetus", (x, y, z), probe=probe(SCALE), speckle=speckle)
+    return jv.Volume(np.asarray(volume.data).astype(dtype)), scan
+
+
+def camera(view: str, size: int) -> jv.Camera:
+    up = (0, 0, 1) if view == "along" else (1, 0, 0)
+    return jv.Camera(EYES[view], (0, 0, 110), up, 36.0, size=(size, size))
+
+
+def marching(scan: jv.ToroidalMap, volume: jv.Volume) -> jv.March:
+    """By steps of two samples of a beam."""
+    first, last = scan.gamma_range
+    return jv.March(2 * float(last - first) / (volume.shape[2] - 1), (scan,))
 
 
 class Scan(NamedTuple):
@@ -58,79 +171,37 @@ class Scan(NamedTuple):
     path: Path
     source: VoxelSource
     probe: jv.ToroidalMap
-    transfer: jv.TransferFunction
+    march: jv.March
 
-    @property
-    def step(self) -> float:
-        """Of rays, in mm: two samples of a beam."""
-        first, last = self.probe.gamma_range
-        return 2 * float(last - first) / (self.source.shape[2] - 1)
-
-    @property
-    def march(self) -> jv.March:
-        return jv.March(self.step, (self.probe,))
-
-
-def phantom(
-    resolution: int, dtype: str = "float32", *, speckle: bool = True
-) -> tuple[jv.Volume, jv.ToroidalMap]:
-    """The fetus as the paper's probe would see it, with so many samples along a beam."""
-    x, y, z = (max(8, n * resolution // bricks_paper.SHAPE[2]) for n in bricks_paper.SHAPE)
-    volume, probe = jv.toroidal_phantom("fetus", (x, y, z), probe=bricks_paper.probe(SCALE), speckle=speckle)
-    return jv.Volume(np.asarray(volume.data).astype(dtype)), probe
-
-
-def camera(view: str, size: int) -> jv.Camera:
-    return jv.Camera(
-        EYES[view], (0, 0, 110), (0, 0, 1) if view == "along" else (1, 0, 0), 36.0, size=(size,) * 2
-    )
+    def render(self, view: jv.Camera, **how: Any) -> jv.Rendering:
+        """By bricks; or, without options, as a whole. First, the file is dropped from the system's page
+        cache, where that is possible."""
+        if hasattr(os, "posix_fadvise"):
+            with self.path.open("rb") as file:
+                os.fsync(file.fileno())
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        scene = jv.TransferFunction.from_points(BODY), view, self.march
+        if how:
+            return jv.render_bricks(self.source, *scene, outputs="rgba", **how)
+        return jv.render(jv.Volume(np.load(self.path)), *scene, outputs="rgba")
 
 
 def stored(folder: Path, resolution: int) -> Scan:
-    volume, probe = phantom(resolution)
+    volume, scan = phantom(resolution)
     path = folder / "fetus.npy"
     np.save(path, np.asarray(volume.data))
-    return Scan(path, source_of(path), probe, jv.TransferFunction.from_points(BODY))
+    return Scan(path, source_of(path), scan, marching(scan, volume))
 
 
-def forget(path: Path) -> None:
-    """Drops a file from the system's page cache, where that is possible."""
-    if not hasattr(os, "posix_fadvise"):
-        return
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
-def frame(scan: Scan, view: jv.Camera, split: Split, method: str) -> jv.Rendering:
-    forget(scan.path)
-    how = {"bricks": split, "method": METHODS[method], "outputs": "rgba"}
-    return jv.render_bricks(scan.source, scan.transfer, view, scan.march, **how)
-
-
-def whole(scan: Scan, view: jv.Camera) -> jv.Rendering:
-    forget(scan.path)
-    volume = jv.Volume(np.load(scan.path))
-    return jv.render(volume, scan.transfer, view, scan.march, outputs="rgba")
-
-
-def compared(
-    scan: Scan, view: jv.Camera, split: Split, repetitions: int, truth: np.ndarray
-) -> dict[str, dict[str, Any]]:
+def compared(scan: Scan, view: jv.Camera, split: Split, repetitions: int) -> dict[str, dict[str, Any]]:
     """Time, reads and error of each method, and time of the volume rendered whole."""
-    found: dict[str, jv.Rendering] = {}
-
-    def run(method: str) -> Any:
-        found[method] = frame(scan, view, split, method)
-        return found[method].rgba
-
-    programs: dict[str, Callable[[], Any]] = {method: partial(run, method) for method in METHODS}
-    programs[WHOLE] = lambda: whole(scan, view).rgba
-    seconds = timing.interleaved(programs, repetitions)
-    voxels = np.prod(scan.source.shape) * np.dtype(np.float32).itemsize
+    programs = {name: partial(scan.render, view, bricks=split, method=how) for name, how in METHODS.items()}
+    seconds = timing.interleaved({**programs, WHOLE: partial(scan.render, view)}, repetitions)
+    truth, voxels = np.asarray(scan.render(view).rgba), np.prod(scan.source.shape) * 4
     rows: dict[str, dict[str, Any]] = {WHOLE: {"seconds": timing.median(seconds[WHOLE])}}
-    for method in METHODS:
-        report = found[method].bricks
+    for method, program in programs.items():
+        rendering = program()
+        report = rendering.bricks
         assert report is not None
         rows[method] = {
             "seconds": timing.median(seconds[method]),
@@ -138,9 +209,8 @@ def compared(
             "needed": report.needed,
             "loads": report.loads,
             "read, times the volume": round(float(report.bytes_read / voxels), 4),
-            "stored": report.stored,
             "held, MiB": round(report.bytes_held / 2**20, 3),
-            "largest error": float(np.max(np.abs(np.asarray(found[method].rgba) - truth))),
+            "largest error": float(np.max(np.abs(np.asarray(rendering.rgba) - truth))),
         }
     return rows
 
@@ -149,99 +219,31 @@ def named(split: Split) -> str:
     return ",".join(map(str, split))
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """The paper's rates and ours, against overlap and against loads."""
-    figure, axes = charts.panels(2, 2, 10, 7)
-    rows = result["splits"]
-    styles = {"overlap": "C0o", "reload": "C1s", "naive": "C3x"}
-    paper = {name: row["paper"] for name, row in rows.items() if "paper" in row}
-    for column, key in enumerate(("overlap", "loads")):
-        theirs, ours = axes[:, column]
-        for method, of in (("overlap", "proposed"), ("reload", "reload")):
-            at = [p["overlap"] if key == "overlap" else rows[n]["bricks"] for n, p in paper.items()]
-            theirs.plot(at, [p[of] for p in paper.values()], styles[method], label=f"paper, {of}", alpha=0.7)
-        theirs.margins(x=0.12)  # room for names
-        for name, p in paper.items():
-            if p["overlap"] < 3 and p["proposed"] < 10:
-                x = p["overlap"] if key == "overlap" else rows[name]["bricks"]
-                theirs.annotate(name, (x, p["proposed"]), (4, 3), textcoords="offset points", fontsize=7)
-        for method, style in styles.items():
-            at = [row["formula"] if key == "overlap" else row[method]["loads"] for row in rows.values()]
-            rates = [1 / row[method]["seconds"] for row in rows.values()]
-            ours.plot(at, rates, style, label=method, alpha=0.7)
-        whole_ = [1 / row[WHOLE]["seconds"] for row in rows.values()]
-        ours.axhline(float(np.median(whole_)), color="0.5", linestyle="--", label="the whole volume at once")
-        for panel in (theirs, ours):
-            panel.set_yscale("log")
-            panel.set_ylabel("frames per second", fontsize=8)
-            panel.legend(fontsize=7)
-            panel.yaxis.set_major_formatter("{x:g}")
-            panel.yaxis.set_minor_formatter(NullFormatter())
-            if key == "loads":
-                panel.set_xscale("log", base=2)
-                panel.xaxis.set_major_formatter("{x:g}")
-        of_paper = "printed overlap, %" if key == "overlap" else "number of bricks"
-        theirs.set_xlabel(f"{of_paper} (names: bricks along β, σ and γ)", fontsize=8)
-        ours.set_xlabel("overlap by the formula, %" if key == "overlap" else "bricks read", fontsize=8)
-        if key == "overlap":
-            for panel in (theirs, ours):
-                panel.axvline(3, color="0.7", linewidth=0.8)
-    axes[0, 0].set_title("the paper's rates; its rule: overlap below 3 % (grey line)", fontsize=9)
-    axes[0, 1].set_title("the paper's rates; named: slow although below 3 %", fontsize=9)
-    for panel in axes[1]:
-        panel.set_title("measured here", fontsize=9)
-    charts.save(figure, path)
-
-
 @experiment(
-    "bricks",
-    "What do bricks of an ultrasound scan cost, by how it is split, and does overlap save time?",
-    __doc__,
-    draw,
     repetitions=5,
     size=64,
     resolution=320,
-    only=some_of([named(split) for split in TABLE], "SPLIT"),
-    quick={"size": 16, "resolution": 48, "repetitions": 1, "only": ["2,1,2"]},
+    splits=tuple(TABLE),
+    quick={"size": 16, "resolution": 48, "repetitions": 1, "splits": ((2, 1, 2),)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    splits = {name: split for split in TABLE if (name := named(split)) in chosen.only}
     rows: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         scan = stored(Path(folder), chosen.resolution)
 
         def measure(split: Split, view: str) -> dict[str, Any]:
             repetitions = chosen.repetitions if np.prod(split) < MANY else 1
-            seen = camera(view, chosen.size)
-            found = compared(scan, seen, split, repetitions, np.asarray(whole(scan, seen).rgba))
-            show(found, named(split), view)
+            found = compared(scan, camera(view, chosen.size), split, repetitions)
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
-        for name, split in splits.items():
-            overlap = overlap_of(scan.probe, bricks_paper.grid(scan.source.shape, split))
-            rows[name] = {
+        for split in chosen.splits:
+            overlap = overlap_of(scan.probe, grid(scan.source.shape, split))
+            rows[named(split)] = {
                 "paper": TABLE[split]._asdict(),
-                "formula": round(bricks_paper.overlap(split), 3),
-                "formula, of these voxels": round(bricks_paper.share(overlap, scan.source.shape[2]), 3),
+                "formula": round(printed_overlap(split), 3),
+                "formula, of these voxels": round(share(overlap, scan.source.shape[2]), 3),
                 **measure(split, VIEW),
             }
-        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits.values()}
-        about = {
-            "image": [chosen.size] * 2,
-            "voxels": list(scan.source.shape),
-            "step, mm": round(scan.step, 5),
-        }
-    others = [name for name in map(named, TABLE) if name not in rows]
-    rows |= recorded("bricks", chosen, "splits", others, about)
-    if not views and not chosen.quick and (path := chosen.output / "bricks.json").is_file():
-        views = record.read(path)["result"][FROM]
-    return {
-        **about,
-        "view": VIEW,
-        "splits": {name: rows[name] for name in map(named, TABLE) if name in rows},
-        FROM: views,
-    }
-
-
-if __name__ == "__main__":
-    main()
+        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in chosen.splits}
+        about = {"image": [chosen.size] * 2, "voxels": list(scan.source.shape), "view": VIEW}
+    return {**about, "splits": rows, f"{named(BEST)} from": views}

@@ -1,8 +1,10 @@
 """How charts of experiments are drawn and saved."""
 
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +12,20 @@ import matplotlib
 
 from jaxvol._util.whole_files import whole_file
 
+from . import record
+
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
+SIZES: Any = {"axes.titlesize": 9, "axes.labelsize": 9, "figure.titlesize": 9, "legend.fontsize": 8}
+SIZES |= {"xtick.labelsize": 8, "ytick.labelsize": 8, "lines.markersize": 4}
+
+
 def panels(rows: int, columns: int, width: float, height: float, **how: Any) -> tuple[Any, Any]:
     """A figure of so many panels, (rows, columns); its size is in inches."""
+    plt.rcParams.update(SIZES)
     return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **how)
 
 
@@ -28,16 +37,14 @@ def interval(panel: Any, ratio: Mapping[str, float], y: float, color: str, label
 
 def legend_below(figure: Any, panel: Any, columns: int) -> None:
     """One legend for all panels, below them: that of one panel."""
-    handles = panel.get_legend_handles_labels()
-    figure.legend(*handles, loc="outside lower center", ncols=columns, fontsize=8)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=columns)
 
 
-def logarithmic(panel: Any, x: float | None = None, y: float | None = None) -> None:
-    """Logarithmic scales of these bases, labelled by numbers such as 0.002 and 20, not by powers."""
-    for axis, base, setter in ((panel.xaxis, x, panel.set_xscale), (panel.yaxis, y, panel.set_yscale)):
-        if base is not None:
-            setter("log", base=base)
-            axis.set_major_formatter("{x:g}")
+def numbered(panel: Any, x: Any, names: Sequence[str] | None = None) -> None:
+    """A logarithmic scale along x, with ticks at these numbers alone."""
+    panel.set_xscale("log", base=2)
+    panel.set_xticks(x, x if names is None else names)
+    panel.set_xticks([], minor=True)
 
 
 def plain_numbers(panel: Any) -> None:
@@ -54,6 +61,16 @@ def _labelled(leads: Sequence[int], value: float, _: Any) -> str:
     """The label of a value that is one of these digits times a power of ten; of others, none."""
     lead = value / 10 ** math.floor(math.log10(value))
     return f"{value:g}" if round(lead, 6) in leads else ""
+
+
+def draw_record(file: Path, path: Path) -> None:
+    """Draws a record into a file by the `draw` of its experiment, if that has one; next to it its page."""
+    found = record.read(file)
+    module = import_module(shlex.split(found["command"])[2])
+    if hasattr(module, "draw"):
+        save(module.draw(found["result"]), path)
+    if hasattr(module, "page"):
+        module.page(file, path.with_suffix(".html"))
 
 
 def save(figure: Any, path: Path) -> None:

@@ -6,9 +6,7 @@ to 0.05° and 0.1 %. Images are compared as they are, and from coarse to fine, w
 first, since a derivative describes only features that move by less than their own size.
 """
 
-import time
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,49 +16,36 @@ import numpy as np
 import jaxvol as jv
 
 from . import charts, fit_transfer
-from .harness import experiment, show
+from .harness import experiment
 
 
 ANGLE, SHIFT = 10.0, 0.05
 GOALS = {"degrees": 0.05, "shift": 1e-3}
-STEPS = 40
 SIGMAS = {"from coarse to fine": (1 / 16, 1 / 48, 0.0), "as they are": (0.0,)}
 """Standard deviations of the blurs in the stages of a fit, as a part of the image's height."""
 
 
-def measure(size: int, resolution: int, starts: int, seed: int) -> dict[str, list[dict[str, Any]]]:
-    """How far from the truth each start ends, for each sequence of blurs."""
-    volume, transfer, march = fit_transfer.head(None, resolution)
-    truth = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(size, size)).zoom(1.3)
-    pose = jv.Pose(truth)
-    target = jv.render(volume, transfer, truth, march).image()
-
-    def scene(camera: jv.Camera, _: jv.Camera) -> Any:
-        return volume, transfer, camera, march
-
-    rows = {}
-    for name, sigmas in SIGMAS.items():
-        rng = np.random.default_rng(seed)
-        rows[name] = []
-        for _ in range(starts):
-            turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-            off = {"rotation": np.deg2rad(ANGLE) * turn, "translation": SHIFT * shift}
-            camera = pose.forward(jax.tree.map(jnp.float32, off))
-            begun = time.perf_counter()
-            residual = jv.ImageResidual(scene, [(truth, target)])
-            fits = jv.fit_coarse_to_fine(residual, camera, blurs=sigmas, max_steps=STEPS)
-            losses = np.concatenate([found.losses for found in fits]).tolist()
-            left = pose.inverse(fits[-1].parameters)
-            rows[name].append(
-                {
-                    "degrees": float(np.rad2deg(np.linalg.norm(left["rotation"]))),
-                    "shift": float(np.linalg.norm(left["translation"])),
-                    "steps": len(losses),
-                    "message": fits[-1].message,
-                    "seconds": round(time.perf_counter() - begun, 3),
-                    "losses": losses,
-                }
-            )
+def measure(sigmas: tuple[float, ...], chosen: Namespace) -> list[dict[str, Any]]:
+    """How far from the truth each start ends, for a sequence of blurs."""
+    volume, transfer, march = fit_transfer.head(None, chosen.resolution)
+    truth = jv.Camera.looking_at(volume, (0.65, -1, 0.15), size=(chosen.size,) * 2).zoom(1.3)
+    pose, target = jv.Pose(truth), jv.render(volume, transfer, truth, march).image()
+    residual = jv.ImageResidual(lambda camera, _: (volume, transfer, camera, march), [(truth, target)])
+    rng, rows = np.random.default_rng(chosen.seed), []
+    for _ in range(chosen.starts):
+        turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        off = {"rotation": np.deg2rad(ANGLE) * turn, "translation": SHIFT * shift}
+        camera = pose.forward(jax.tree.map(jnp.float32, off))
+        fits = jv.fit_coarse_to_fine(residual, camera, blurs=sigmas, max_steps=40)
+        left = pose.inverse(fits[-1].parameters)
+        rows.append(
+            {
+                "degrees": float(np.rad2deg(np.linalg.norm(left["rotation"]))),
+                "shift": float(np.linalg.norm(left["translation"])),
+                "message": fits[-1].message,
+                "losses": np.concatenate([found.losses for found in fits]).tolist(),
+            }
+        )
     return rows
 
 
@@ -69,48 +54,26 @@ def reached(rows: list[dict[str, Any]]) -> float:
     return float(np.mean([all(row[key] < goal for key, goal in GOALS.items()) for row in rows]))
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
     for (name, rows), color in zip(result["starts"].items(), ("C0", "C3"), strict=True):
-        label = f"{name}: {reached(rows):.0%} of starts lead back"
-        for number, row in enumerate(rows):
-            losses, label = row["losses"], label if number == 0 else None
-            left.semilogy(range(1, len(losses) + 1), losses, color=color, alpha=0.5, label=label)
-        degrees, shift = ([row[key] for row in rows] for key in GOALS)
-        right.loglog(degrees, shift, "o", color=color, alpha=0.6)
+        left.plot([], [], color=color, label=f"{name}: {reached(rows):.0%} of starts lead back")
+        for row in rows:
+            left.semilogy(range(1, len(row["losses"]) + 1), row["losses"], color=color, alpha=0.5)
+        right.loglog(*([row[key] for row in rows] for key in GOALS), "o", color=color, alpha=0.6)
     left.set(xlabel="step, those of all stages together", ylabel="mean squared difference of the images")
+    left.set_title("a line for each of the starts")
     charts.legend_below(figure, left, 2)
     right.plot(ANGLE, SHIFT, "k*", markersize=10)
     right.axvline(GOALS["degrees"], color="k", linestyle=":", linewidth=0.8)
     right.axhline(GOALS["shift"], color="k", linestyle=":", linewidth=0.8)
     right.set(xlabel="rotation left, degrees", ylabel="shift left / distance to focal point")
-    right.set_title("after the last step; star: the start, dotted: what counts as led back", fontsize=8)
-    left.set_title("a line for each of the starts", fontsize=8)
-    charts.save(figure, path)
+    right.set_title("after the last step; star: the start, dotted: what counts as led back")
+    return figure
 
 
-@experiment(
-    "fit_pose",
-    "Is a camera's pose found from one image, from 10° and 5 % off?",
-    __doc__,
-    draw,
-    size=96,
-    resolution=96,
-    starts=10,
-    quick={"size": 32, "resolution": 24, "starts": 2},
-)
+@experiment(size=96, resolution=96, starts=10, quick={"size": 32, "resolution": 24, "starts": 2})
 def main(chosen: Namespace) -> dict[str, Any]:
-    starts = measure(chosen.size, chosen.resolution, chosen.starts, chosen.seed)
-    result = {
-        "image": [chosen.size] * 2,
-        "resolution": chosen.resolution,
-        "goals": GOALS,
-        "reached": {name: reached(rows) for name, rows in starts.items()},
-        "starts": starts,
-    }
-    show(result["reached"], "share of starts that lead back")
-    return result
-
-
-if __name__ == "__main__":
-    main()
+    starts = {name: measure(sigmas, chosen) for name, sigmas in SIGMAS.items()}
+    found = {name: reached(rows) for name, rows in starts.items()}
+    return {"goals": GOALS, "reached": found, "starts": starts}

@@ -6,11 +6,10 @@ evenly spaced points, as if nothing were known of the truth. The result is judge
 views.
 """
 
-import time
 import warnings
 from argparse import Namespace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,60 +17,53 @@ import jaxvol as jv
 from jaxvol.metrics import psnr
 
 from . import charts, harness
-from .harness import experiment, show
+from .harness import experiment
+from .scenes import ENGINE
 
 
 GOAL = 40.0
-STEPS = 40
 SEEN = ((0.65, -1, 0.15), (-1, -0.3, 0.4), (0.2, 1, 0.3), (1, 0.4, -0.5))
 HELD_OUT = ((1, -0.2, 0.6), (-0.5, 1, -0.2), (-0.3, -1, -0.6))
 KNOWN, EVEN = "points of the truth", "32 even points"
+HEAD_POINTS = [
+    (0, (0.2, 0.1, 0.1), 0.0),
+    (40, (0.4, 0.2, 0.15), 0.0),
+    (78, (0.85, 0.5, 0.35), 0.08),
+    (100, (0.8, 0.35, 0.25), 0.03),
+    (130, (0.7, 0.65, 0.3), 0.05),
+    (185, (0.9, 0.85, 0.7), 0.5),
+    (225, (0.95, 0.95, 0.9), 0.8),
+    (255, (0.8, 0.9, 0.98), 0.9),
+]
+ENGINE_POINTS = [
+    (0, (0.1, 0.1, 0.1), 0.0),
+    (50, (0.3, 0.2, 0.2), 0.0),
+    (80, (0.6, 0.5, 0.4), 0.01),
+    (120, (0.7, 0.55, 0.35), 0.03),
+    (150, (0.6, 0.3, 0.2), 0.02),
+    (190, (0.2, 0.5, 0.8), 0.2),
+    (220, (0.3, 0.6, 0.9), 0.5),
+    (255, (0.9, 0.95, 0.98), 0.7),
+]
 
-
-class Scene(NamedTuple):
-    volume: jv.Volume
-    truth: jv.TransferFunction
-    march: jv.March
+Scene = tuple[jv.Volume, jv.TransferFunction, jv.March]
 
 
 def _scene(volume: jv.Volume, points: list[Any], unit_distance: float) -> Scene:
     march = jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(),), "midpoint")
-    return Scene(volume, jv.TransferFunction.from_points(points, unit_distance), march)
+    return volume, jv.TransferFunction.from_points(points, unit_distance), march
 
 
 def head(folder: Path | None, resolution: int) -> Scene:
-    points = [
-        (0, (0.2, 0.1, 0.1), 0.0),
-        (40, (0.4, 0.2, 0.15), 0.0),
-        (78, (0.85, 0.5, 0.35), 0.08),
-        (100, (0.8, 0.35, 0.25), 0.03),
-        (130, (0.7, 0.65, 0.3), 0.05),
-        (185, (0.9, 0.85, 0.7), 0.5),
-        (225, (0.95, 0.95, 0.9), 0.8),
-        (255, (0.8, 0.9, 0.98), 0.9),
-    ]
-    return _scene(jv.phantom("head", resolution), points, 0.1)
+    return _scene(jv.phantom("head", resolution), HEAD_POINTS, 0.1)
 
 
 def engine(folder: Path, resolution: int) -> Scene:
     """Real data, subsampled to about `resolution` voxels along the longest axis."""
-    whole = jv.load(folder / "engine_256x256x128_uint8.raw.gz")
+    whole = jv.load(folder / ENGINE)
     every = max(whole.shape) // resolution
     data = np.asarray(whole.data)[::every, ::every, ::every]
-    points = [
-        (0, (0.1, 0.1, 0.1), 0.0),
-        (50, (0.3, 0.2, 0.2), 0.0),
-        (80, (0.6, 0.5, 0.4), 0.01),
-        (120, (0.7, 0.55, 0.35), 0.03),
-        (150, (0.6, 0.3, 0.2), 0.02),
-        (190, (0.2, 0.5, 0.8), 0.2),
-        (220, (0.3, 0.6, 0.9), 0.5),
-        (255, (0.9, 0.95, 0.98), 0.7),
-    ]
-    return _scene(jv.Volume(data, np.asarray(whole.spacing) * every, whole.origin), points, 4.0)
-
-
-SCENES = {"head phantom": head, "engine": engine}
+    return _scene(jv.Volume(data, np.asarray(whole.spacing) * every, whole.origin), ENGINE_POINTS, 4.0)
 
 
 def measure(scene: Scene, size: int) -> dict[str, Any]:
@@ -84,40 +76,36 @@ def measure(scene: Scene, size: int) -> dict[str, Any]:
     def image(transfer: jv.TransferFunction, view: jv.Camera) -> np.ndarray:
         return np.asarray(jv.render(volume, transfer, view, march).image())
 
-    seen, held_out = ([camera(direction) for direction in some] for some in (SEEN, HELD_OUT))
-    residual = jv.ImageResidual(
-        lambda transfer, view: (volume, transfer, view, march), [(view, image(truth, view)) for view in seen]
-    )
+    views = [(camera(direction), image(truth, camera(direction))) for direction in SEEN]
+    residual = jv.ImageResidual(lambda transfer, view: (volume, transfer, view, march), views)
     even = jv.flat_grey(volume, 32, (0, 255))
     extinction = np.full(truth.values.shape, float(even.extinction[0]))
     known = jv.TransferFunction(truth.values, np.full((len(extinction), 3), 0.5), extinction)
-    rows = {}
+    rows: dict[str, Any] = {"truth": {k: getattr(truth, k).tolist() for k in ("values", "extinction")}}
     for name, start in ((KNOWN, known), (EVEN, even)):
-        begun = time.perf_counter()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # undetermined colours of transparent points: recorded
-            found = jv.fit(residual, start, max_steps=STEPS)
+            found = jv.fit(residual, start, max_steps=40)
         assert found.uncertainty is not None
+
+        def quality(directions: Any, fitted: jv.TransferFunction = found.parameters) -> list[float]:
+            return [psnr(image(fitted, view), image(truth, view)) for view in map(camera, directions)]
+
         rows[name] = {
             "steps": len(found.losses),
             "message": found.message,
-            "seconds with compilation": round(time.perf_counter() - begun, 2),
             "losses": found.losses.tolist(),
-            "psnr at the start": [psnr(image(start, view), image(truth, view)) for view in held_out],
-            "psnr seen": [psnr(image(found.parameters, view), image(truth, view)) for view in seen],
-            "psnr held out": [psnr(image(found.parameters, view), image(truth, view)) for view in held_out],
+            "psnr at the start": quality(HELD_OUT, start),
+            "psnr seen": quality(SEEN),
+            "psnr held out": quality(HELD_OUT),
             "undetermined": found.uncertainty.undetermined,
-            "values": np.asarray(start.values).tolist(),
-            "extinction": np.asarray(found.parameters.extinction).tolist(),
+            "values": start.values.tolist(),
+            "extinction": found.parameters.extinction.tolist(),
         }
-    return {"truth": {k: np.asarray(getattr(truth, k)).tolist() for k in ("values", "extinction")}, **rows}
+    return rows
 
 
-UNDER: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 8}
-"""Where the text of a line stands."""
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     scenes = result["scenes"]
     figure, axes = charts.panels(len(scenes), 2, 9, 3 * len(scenes))
     for (left, right), (scene, rows) in zip(axes, scenes.items(), strict=True):
@@ -125,36 +113,21 @@ def draw(result: dict[str, Any], path: Path) -> None:
         right.plot(truth["values"], truth["extinction"], "k-", linewidth=3, alpha=0.3, label="the truth")
         for name, style in ((KNOWN, "C0.-"), (EVEN, "C3.-")):
             row = rows[name]
-            least = min(row["psnr held out"])
-            left.plot(
-                range(1, row["steps"] + 1), -10 * np.log10(2 * np.asarray(row["losses"])), style, label=name
-            )
-            right.plot(row["values"], row["extinction"], style, label=f"{name}: held out ≥ {least:.1f} dB")
+            left.plot(range(1, row["steps"] + 1), -10 * np.log10(2 * np.asarray(row["losses"])), style)
+            label = f"{name}: held out ≥ {min(row['psnr held out']):.1f} dB"
+            right.plot(row["values"], row["extinction"], style, label=label)
         left.axhline(GOAL, color="k", linestyle=":", linewidth=0.8)
-        left.text(0.99, GOAL, f"goal, {GOAL:g} dB", transform=left.get_yaxis_transform(), **UNDER)
+        how: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 8}
+        left.text(0.99, GOAL, f"goal, {GOAL:g} dB", transform=left.get_yaxis_transform(), **how)
         left.set(xlabel="step of the fit", ylabel=f"{scene}\nPSNR of the views seen, dB")
         right.set(xlabel="value", ylabel="extinction, 1/length")
-        right.legend(fontsize=8)
-    charts.save(figure, path)
+        right.legend()
+    return figure
 
 
-@experiment(
-    "fit_transfer",
-    "Is a transfer function recovered from four views, and do other views agree?",
-    __doc__,
-    draw,
-    size=96,
-    resolution=96,
-    quick={"size": 24, "resolution": 24},
-)
+@experiment(size=96, resolution=96, quick={"size": 24, "resolution": 24})
 def main(chosen: Namespace) -> dict[str, Any]:
-    folder, scenes = harness.data(), {}
-    for name, make in SCENES.items():
-        if make is head or (folder is not None and not chosen.quick):
-            scenes[name] = measure(make(folder, chosen.resolution), chosen.size)
-            show(scenes[name], name)
-    return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "goal": GOAL, "scenes": scenes}
-
-
-if __name__ == "__main__":
-    main()
+    folder, scenes = harness.data(), {"head phantom": measure(head(None, chosen.resolution), chosen.size)}
+    if folder is not None and not chosen.quick:
+        scenes["engine"] = measure(engine(folder, chosen.resolution), chosen.size)
+    return {"goal": GOAL, "scenes": scenes}

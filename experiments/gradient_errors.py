@@ -3,10 +3,9 @@
 A derivative describes how an image changes as long as no sample crosses a face. Where one does, the image of
 a march that does not cut its cells there jumps, and no derivative sees it. So the gradient of each march
 (float64, `adjoint="replay"`) is integrated along a move of a leaf, and compared with the change of the image
-between the ends of the move (central differences of the reference engine). By the fundamental theorem of
-calculus both agree, unless something jumped in between. The shortest move is the usual finite difference,
-which rarely meets a jump and so finds nothing wrong; the longest moves samples by about a step, as a step of
-a fit does.
+between the ends of the move (central differences of the reference engine): both agree, unless something
+jumped in between. The shortest move is the usual finite difference, which rarely meets a jump; the longest
+moves samples by about a step, as a step of a fit does.
 
 The scene has material at all faces of the volume, empty space in its middle and, in the marches named
 "labels", a segmentation with a transfer function for each label. Error: |sum of the gradients - change| over
@@ -14,9 +13,8 @@ the larger of the two, over several weightings of the image and directions of ea
 """
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -32,8 +30,8 @@ from .harness import experiment
 
 
 STEP = 0.11
-WIDTHS = {1e-5: 1, 0.1: 8, 1.0: 48}
-"""Half the lengths of moves, in the units of `Leaf` (which move samples by about a step), and the number of
+WIDTHS = ((1e-5, 1), (0.1, 8), (1.0, 48))
+"""Half the lengths of moves, in the units of `LEAVES` (which move samples by about a step), and the number of
 points of a move at which the gradient is taken."""
 WRONG = 0.1
 """Error from which a gradient counts as wrong. Correct gradients have kinks, and err by less."""
@@ -45,31 +43,25 @@ CUT = " + AlphaCorrection"
 Scene = tuple[jv.Volume, Any, jv.Camera, jv.March]
 
 
-class Leaf(NamedTuple):
-    """A part of the scene, and a change of it that moves samples by about a step."""
-
-    where: Callable[[Scene], Array]
-    unit: Callable[[Array], Any]
-
-
 def functions(scene: Scene) -> jv.TransferFunction:
     """The transfer function, or those of all labels."""
     transfer = scene[1]
     return transfer.stacked if isinstance(transfer, jv.LabelTransferFunction) else transfer
 
 
-LEAVES = {
-    "position": Leaf(lambda s: s[2].position, lambda x: STEP),
-    "focal point": Leaf(lambda s: s[2].focal_point, lambda x: STEP),
-    "view angle": Leaf(lambda s: s[2].view_angle, lambda x: 3.0),
-    "spacing": Leaf(lambda s: s[0].spacing, lambda x: STEP / 8),
-    "origin": Leaf(lambda s: s[0].origin, lambda x: STEP),
-    "step": Leaf(lambda s: s[3].step, lambda x: STEP / 24),
-    "colours": Leaf(lambda s: functions(s).colors, lambda x: 0.1),
-    # an extinction of 0 stays 0: that it may grow is a matter of leaps, not of jumps
-    "extinction": Leaf(lambda s: functions(s).extinction, lambda x: 0.1 * x),
-    "voxels": Leaf(lambda s: s[0].data, lambda x: 0.02),
+LEAVES: dict[str, tuple[Callable[[Scene], Array], Any]] = {
+    "position": (lambda s: s[2].position, STEP),
+    "focal point": (lambda s: s[2].focal_point, STEP),
+    "view angle": (lambda s: s[2].view_angle, 3.0),
+    "spacing": (lambda s: s[0].spacing, STEP / 8),
+    "origin": (lambda s: s[0].origin, STEP),
+    "step": (lambda s: s[3].step, STEP / 24),
+    "colours": (lambda s: functions(s).colors, 0.1),
+    # relative: an extinction of 0 stays 0; that it may grow is a matter of leaps, not of jumps
+    "extinction": (lambda s: functions(s).extinction, None),
+    "voxels": (lambda s: s[0].data, 0.02),
 }
+"""Parts of the scene, and a change of each that moves samples by about a step."""
 
 ALONE: dict[str, tuple[jv.Transform, ...]] = {
     "ray casting": (),
@@ -79,19 +71,17 @@ ALONE: dict[str, tuple[jv.Transform, ...]] = {
     "EarlyTermination": (jv.EarlyTermination(LEFT),),
     "labels": (),
 }
+MARCHES: dict[str, tuple[jv.Transform, ...]] = {
+    name + cut: (*transforms, *aligned)
+    for name, transforms in ALONE.items()
+    for cut, aligned in (("", ()), (CUT, (jv.AlphaCorrection(),)))
+}
+"""Each transform alone, and with cells cut at the exit."""
+MARCHES[f"labels{CUT}(labels)"] = (jv.AlphaCorrection(labels=True),)
 
 
-def marches() -> dict[str, tuple[jv.Transform, ...]]:
-    """Each transform alone, and with cells cut at the exit."""
-    pairs: dict[str, tuple[jv.Transform, ...]] = {}
-    for name, transforms in ALONE.items():
-        pairs[name] = transforms
-        pairs[name + CUT] = (*transforms, jv.AlphaCorrection())
-    return pairs | {f"labels{CUT}(labels)": (jv.AlphaCorrection(labels=True),)}
-
-
-def scene_of(name: str, quadrature: str, size: int) -> Scene:
-    """A smooth field that is visible at its rim and invisible in its middle."""
+def scene_of(name: str, quadrature: Any, size: int) -> Scene:
+    """A smooth field that is visible at its rim and invisible in its middle, in float64."""
     shape, spacing, origin = (9, 8, 10), (0.3, 0.35, 0.25), (-0.5, 0.2, 0.1)
     x, y, z = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     data = 0.15 + 0.25 * (x**2 + 0.8 * y**2 + 1.1 * z**2) + 0.1 * np.sin(2 * x + 3 * y - z)
@@ -102,23 +92,17 @@ def scene_of(name: str, quadrature: str, size: int) -> Scene:
     if name.startswith("labels"):
         other = jv.TransferFunction([0.0, 0.25, 1.0], 1 - colors, [0.0, 0.0, 6.0])
         transfer = jv.LabelTransferFunction([transfer, other])
-    camera = jv.Camera(
-        (3.9, -3.3, 3.1), np.asarray(volume.center) + 0.05, (0.1, 0, 1), 35.0, size=(size, size)
-    )
-    march = jv.March(STEP, marches()[name], quadrature, max_samples=64)
-    return jax.tree.map(_doubled, (volume, transfer, camera, march))
+    middle = np.asarray(volume.center) + 0.05
+    camera = jv.Camera((3.9, -3.3, 3.1), middle, (0.1, 0, 1), 35.0, size=(size, size))
+    march = jv.March(STEP, MARCHES[name], quadrature, max_samples=64)
+    inexact, others = eqx.partition((volume, transfer, camera, march), eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lambda leaf: jnp.asarray(leaf, float), inexact), others)
 
 
-def _doubled(leaf: Any) -> Any:
-    return jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf
-
-
-def measure(
-    name: str, quadrature: str, size: int, seed: int, leaves: Sequence[str], widths: dict[float, int]
-) -> dict[str, list[float]]:
+def measure(name: str, quadrature: str, chosen: Namespace) -> dict[str, list[float]]:
     """Relative error of the gradient with respect to each leaf, over moves of each width."""
-    scene, rng = scene_of(name, quadrature, size), np.random.default_rng(seed)
-    weights = jnp.asarray(rng.normal(size=(WEIGHTINGS, size, size, 4)))
+    scene, rng = scene_of(name, quadrature, chosen.size), np.random.default_rng(chosen.seed)
+    weights = jnp.asarray(rng.normal(size=(WEIGHTINGS, chosen.size, chosen.size, 4)))
 
     @eqx.filter_jit
     def losses(scene: Scene) -> Array:
@@ -142,63 +126,51 @@ def measure(
         slopes = [where(gradients(moved(part))).reshape(WEIGHTINGS, -1) @ move.reshape(-1) for part in parts]
         return 2 * np.mean(slopes, axis=0), np.asarray(losses(moved(1.0)) - losses(moved(-1.0)))
 
-    found: dict[str, list[float]] = {}
-    for leaf in leaves:
+    found: dict[str, list[float]] = {leaf: [] for leaf in chosen.leaves}
+    for leaf, errors in found.items():
         where, unit = LEAVES[leaf]
-        moves = [
-            jnp.asarray(rng.normal(size=where(scene).shape)) * unit(where(scene)) for _ in range(DIRECTIONS)
-        ]
-        found[leaf] = [
-            _relative(*zip(*(changes(where, width * move, points) for move in moves), strict=True))
-            for width, points in widths.items()
-        ]
+        unit = 0.1 * where(scene) if unit is None else unit
+        moves = [jnp.asarray(rng.normal(size=where(scene).shape)) * unit for _ in range(DIRECTIONS)]
+        for width, points in chosen.widths:
+            both = np.array([changes(where, width * move, points) for move in moves])
+            integral, change = both[:, 0], both[:, 1]
+            largest = max(np.linalg.norm(integral), np.linalg.norm(change))
+            errors.append(float(np.linalg.norm(integral - change) / largest))
     return found
 
 
-def _relative(integrals: Sequence[np.ndarray], changes: Sequence[np.ndarray]) -> float:
-    integral, change = np.stack(integrals), np.stack(changes)
-    largest = max(np.linalg.norm(integral), np.linalg.norm(change))
-    return float(np.linalg.norm(integral - change) / largest)
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """A heat map of marches by leaves, for each quadrature and width."""
     found, widths = result["relative errors"], result["widths"]
     names, leaves = list(next(iter(found.values()))), list(LEAVES)
-    width, height = 4.2 * len(widths) + 1.6, (0.27 * len(names) + 1.2) * len(found)
-    figure, axes = charts.panels(len(found), len(widths), width, height, sharex=True, sharey=True)
+    size = 4.2 * len(widths) + 1.6, (0.27 * len(names) + 1.2) * len(found)
+    figure, axes = charts.panels(len(found), len(widths), *size, sharex=True, sharey=True)
     for line, (quadrature, rows) in zip(axes, found.items(), strict=True):
         for number, (panel, width) in enumerate(zip(line, widths, strict=True)):
-            errors = np.array(
-                [[rows[name].get(leaf, [np.nan] * 3)[number] for leaf in leaves] for name in names]
-            )
+            unknown = [np.nan] * len(widths)
+            errors = np.array([[rows[name].get(leaf, unknown)[number] for leaf in leaves] for name in names])
             panel.imshow(errors, norm=LogNorm(1e-4, 1, clip=True), cmap="YlOrRd", aspect="auto")
             for row, column in np.argwhere(errors >= WRONG):
-                text = f"{errors[row, column]:.1f}"
-                panel.text(column, row, text, ha="center", va="center", fontsize=7, color="white")
-            panel.set_title(f"{quadrature} rule, moves of ± {width:g} step", fontsize=9)
-            panel.set_xticks(range(len(leaves)), leaves, rotation=40, ha="right", fontsize=8)
-            panel.set_yticks(range(len(names)), names, fontsize=8)
+                how: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7, "color": "white"}
+                panel.text(column, row, f"{errors[row, column]:.1f}", **how)
+            panel.set_title(f"{quadrature} rule, moves of ± {width:g} step")
+            panel.set_xticks(range(len(leaves)), leaves, rotation=40, ha="right")
+            panel.set_yticks(range(len(names)), names)
     bar = figure.colorbar(axes.flat[-1].images[0], ax=axes, shrink=0.6, pad=0.01)
-    bar.set_label(f"what the gradient misses of the change; as a number from {WRONG:g} on", fontsize=8)
+    bar.set_label(f"what the gradient misses of the change; as a number from {WRONG:g} on")
     figure.suptitle(
         "How far the change of an image, as a leaf moves by so much, differs from the sum of its gradients: "
-        f"|sum - change| / the larger one.\n{NOTE}",
-        fontsize=9,
+        f"|sum - change| / the larger one.\n{NOTE}"
     )
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "gradient_errors",
-    "Which gradients are wrong without AlphaCorrection, per transform?",
-    __doc__,
-    draw,
     size=6,
-    names=tuple(marches()),
+    names=tuple(MARCHES),
     leaves=tuple(LEAVES),
     quadratures=("left", "midpoint"),
-    widths=tuple(WIDTHS.items()),
+    widths=WIDTHS,
     quick={
         "names": ("ray casting", f"ray casting{CUT}"),
         "leaves": ("position", "colours"),
@@ -207,29 +179,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
     },
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    found: dict[str, dict[str, Any]] = {}
-    widths = dict(chosen.widths)
     with jax.enable_x64(True):
-        for rule in chosen.quadratures:
-            found[rule] = {
-                name: measure(name, rule, chosen.size, chosen.seed, chosen.leaves, widths)
-                for name in chosen.names
-            }
+        found = {
+            rule: {name: measure(name, rule, chosen) for name in chosen.names} for rule in chosen.quadratures
+        }
     wrong = {
         rule: {name: [leaf for leaf, e in row.items() if e[-1] >= WRONG] for name, row in rows.items()}
         for rule, rows in found.items()
     }
-    for rule, of in wrong.items():
-        for name, leaves in of.items():
-            print(f"{rule}, {name}: {', '.join(leaves) or 'none'}")
-    return {
-        "image": [chosen.size] * 2,
-        "widths": list(widths),
-        "wrong from": WRONG,
-        "wrong": wrong,
-        "relative errors": found,
-    }
-
-
-if __name__ == "__main__":
-    main()
+    widths = [width for width, _ in chosen.widths]
+    return {"widths": widths, "wrong": wrong, "relative errors": found}

@@ -8,7 +8,7 @@ ends early. Beside each time stands the image's RMSE against a converged one.
 
 from argparse import Namespace
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,8 @@ import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from . import charts, harness, timing
-from .harness import experiment, show, some_of
-from .scenes import Scene, seen_head
+from .harness import experiment, some_of
+from .scenes import seen_head
 
 
 OFF, ON = "no leaping", "leaping"
@@ -29,48 +29,37 @@ SWEEPS = {
     "voxels": (64, 128, 256, 512),
     "samples": (64, 256, 1024, 4096),
 }
+TINY = {"pixels": (16, 32, 64), "voxels": (16, 32, 48), "samples": (16, 32, 64)}
 LABELS = {
     "pixels": "pixels along a side of the image",
     "voxels": "voxels along a side of the volume",
     "samples": "samples across the volume",
 }
-TINY = {"pixels": (16, 32, 64), "voxels": (16, 32, 48), "samples": (16, 32, 64)}
 SIDE = 2.0  # of the phantom's cube, world length
 
 
-def scenes(along: str, sizes: Sequence[int], usual: dict[str, int]) -> dict[int, Scene]:
-    """The scene at each size along one axis; the others are as in `usual`."""
-    by_size: dict[int, Scene] = {}
-    volume: jv.Volume | None = None
+def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions: int) -> dict[str, Any]:
+    """Times, errors and slopes along one axis; the other sizes are as in `usual`."""
+    scenes = {}
+    volumes = {n: jv.phantom("head", n) for n in (sizes if along == "voxels" else [usual["voxels"]])}
     for size in sizes:
         at = usual | {along: size}
-        if volume is None or along == "voxels":
-            volume = jv.phantom("head", at["voxels"])
-        by_size[size] = seen_head(volume, at["pixels"])._replace(step=SIDE / at["samples"])
-    return by_size
-
-
-def measure(along: str, sizes: Sequence[int], usual: dict[str, int], repetitions: int) -> dict[str, Any]:
-    """Times, errors and slopes along one axis."""
-    at = scenes(along, sizes, usual)
-    marches = {
-        (size, method): (scene, jv.March(scene.step, transforms))
-        for size, scene in at.items()
+        scenes[size] = seen_head(volumes[at["voxels"]], at["pixels"])._replace(step=SIDE / at["samples"])
+    drawn = {
+        (size, method): partial(harness.image, scene, jv.March(scene.step, transforms))
+        for size, scene in scenes.items()
         for method, transforms in METHODS.items()
     }
-    drawn = {key: lambda of=of: harness.image(*of) for key, of in marches.items()}
     seconds = timing.interleaved(drawn, repetitions)
-    finest = min(min(scene.step for scene in at.values()) / 2, SIDE / usual["samples"] / harness.FINER)
+    finest = min(min(scene.step for scene in scenes.values()) / 2, SIDE / usual["samples"] / harness.FINER)
     # It may leap: if leaps skipped anything visible, the errors with and without leaping would differ.
     converged = jv.March(finest, (jv.SpaceLeaping(), jv.AlphaCorrection()), "midpoint")
     found: dict[str, Any] = {method: {} for method in METHODS}
-    for size, scene in at.items():
+    for size, scene in scenes.items():
         truth = harness.frame(scene, converged).rgba
         for method in METHODS:
-            rendering = harness.frame(*marches[size, method])
-            assert not np.any(rendering.exhausted)
-            row = harness.row(seconds[size, method], seconds[size, OFF], rmse(rendering.rgba, truth))
-            found[method][str(size)] = row | {"samples a ray": float(np.mean(rendering.samples))}
+            error = rmse(drawn[size, method]().rgba, truth)
+            found[method][str(size)] = harness.row(seconds[size, method], seconds[size, OFF], error)
     return {method: {"slope": slope(sizes, rows), "sizes": rows} for method, rows in found.items()}
 
 
@@ -80,52 +69,31 @@ def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
     return round(float(np.polyfit(np.log(sizes[-3:]), np.log(times[-3:]), 1)[0]), 3)
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     sweeps = result["sweeps"]
     figure, (axes,) = charts.panels(1, len(sweeps), 3.7 * len(sweeps), 3.6, sharey=True)
     for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
-        sizes = []
         for (method, found), style in zip(methods.items(), ("C7o-", "C0s-"), strict=True):
-            sizes = [int(size) for size in found["sizes"]]
+            sizes = np.array([int(size) for size in found["sizes"]], float)
             times = np.array([row["seconds"] for row in found["sizes"].values()])
             spread = np.array([np.quantile(row["all seconds"], (0, 1)) for row in found["sizes"].values()])
-            bars = np.abs(spread.T - times)
             label = f"{method}: time as size$^{{{found['slope']:.2f}}}$"
-            panel.errorbar(sizes, times, bars, fmt=style, markersize=4, capsize=2, label=label)
-            upper = np.array(sizes[-3:], float)
-            middle = np.exp(np.mean(np.log(times[-3:])) - found["slope"] * np.mean(np.log(upper)))
-            panel.plot(upper, middle * upper ** found["slope"], "k:", linewidth=1)
-        panel.set_xscale("log", base=2)
-        panel.set_yscale("log")
-        panel.set_xticks(sizes, sizes)
-        panel.minorticks_off()
-        panel.set_xlabel(LABELS[along], fontsize=9)
-        panel.tick_params(labelsize=8)
-        panel.legend(fontsize=8)
+            panel.errorbar(sizes, times, np.abs(spread.T - times), fmt=style, capsize=2, label=label)
+            upper, middle = sizes[-3:], np.exp(np.mean(np.log(times[-3:])))
+            fitted = middle * (upper / np.exp(np.mean(np.log(upper)))) ** found["slope"]
+            panel.plot(upper, fitted, "k:", linewidth=1)
+            charts.numbered(panel, sizes, [f"{size:g}" for size in sizes])
+        panel.set(yscale="log", xlabel=LABELS[along])
+        panel.legend()
         panel.grid(alpha=0.3)
-    axes[0].set_ylabel("time of a frame, seconds", fontsize=9)
-    figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes", fontsize=9)
+    axes[0].set_ylabel("time of a frame, seconds")
     axes[0].yaxis.set_major_formatter("{x:g}")
-    charts.save(figure, path)
+    figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes")
+    return figure
 
 
-@experiment(
-    "growth",
-    "How does the time of a frame grow with pixels, voxels and samples a ray, with leaping and without?",
-    __doc__,
-    draw,
-    repetitions=5,
-    only=some_of(SWEEPS, "AXIS"),
-    quick={"repetitions": 1},
-)
+@experiment(repetitions=5, only=some_of(SWEEPS, "AXIS"), quick={"repetitions": 1})
 def main(chosen: Namespace) -> dict[str, Any]:
     sweeps, usual = (TINY, dict.fromkeys(USUAL, 32)) if chosen.quick else (SWEEPS, USUAL)
-    found: dict[str, Any] = {}
-    for along in chosen.only:
-        found[along] = measure(along, sweeps[along], usual, chosen.repetitions)
-        show(found[along], along)
-    return {"usual": usual, "repetitions": chosen.repetitions, "sweeps": found}
-
-
-if __name__ == "__main__":
-    main()
+    found = {along: measure(along, sweeps[along], usual, chosen.repetitions) for along in chosen.only}
+    return {"usual": usual, "sweeps": found}

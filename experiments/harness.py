@@ -18,46 +18,33 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import rmse
 
-from . import marches, record, timing
+from . import charts, marches, record, timing
 from .scenes import Scene
 
 
 Main: TypeAlias = Callable[..., None]
 """`main(argv)`; without `argv`, it takes the arguments of the command line."""
 
-Draw: TypeAlias = Callable[[Any, Path], None]
-"""Draws a result, as it was read from a record, into a file."""
-
 FINER = 8
 """How many times finer the converged image's step is. By the midpoint rule, its error is some hundred times
 smaller."""
 
 QUICK = {"action": "store_true", "help": "tiny sizes, to check that the script runs"}
-
-HELP = {
-    "output": "default: %(default)s",
-    "size": "pixels along a side",
-    "sizes": "pixels along a side",
-    "resolution": "voxels along an axis of phantoms",
-    "paths": "paths through each pixel",
-}
-"""Of options that several scripts have."""
-
-POSITIONAL = ("commits",)
-
-
-# -- scripts ----------------------------------------------------------------------------------------------
+HELP = {"size": "pixels along a side", "sizes": "pixels along a side", "output": "default: %(default)s"}
+HELP |= {"resolution": "voxels along an axis of phantoms", "paths": "paths through each pixel"}
 
 
 def command(about: str | None, output: Path, **options: Any) -> Callable[[Callable[[Namespace], None]], Main]:
     """Decorator that makes a script's `main` of a function of its options.
 
-    - `about`: what the script does, its docstring.
-    - `output`: default of `--output`, the folder to write into, which is made.
-    - `options`: the other options, by name: the default of an integer, what `add_argument` takes (a dict), or
-      a tuple, which is handed on and cannot be given. Those of `POSITIONAL` are given without their names.
+    Args:
+        about: what the script does, its docstring.
+        output: default of `--output`, the folder to write into, which is made.
+        options: the other options, by name: the default of an integer, what `add_argument` takes (a dict), or
+            a tuple, which is handed on and cannot be given. `commits` is given without its name.
 
-    The arguments as they were given, but for the output, are `argv` among the options.
+    Returns:
+        The decorator. The arguments as they were given, but for the output, are `argv` among the options.
     """
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     options["output"] = {"type": Path, "default": output, "metavar": "FOLDER"}
@@ -65,13 +52,15 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
     for name, option in options.items():
         if name not in constants:
             how = option if isinstance(option, dict) else {"type": int, "default": option}
-            flag = name if name in POSITIONAL else "--" + name.replace("_", "-")
+            flag = name if name == "commits" else "--" + name.replace("_", "-")
             parser.add_argument(flag, **{"help": HELP.get(name), **how})
 
     def made(run: Callable[[Namespace], None]) -> Main:
         def main(argv: Sequence[str] | None = None) -> None:
             given = sys.argv[1:] if argv is None else list(argv)
-            chosen = parser.parse_args(given, Namespace(argv=_without_output(given), **constants))
+            pairs = zip(["", *given], given, strict=False)
+            kept = [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]
+            chosen = parser.parse_args(given, Namespace(argv=kept, **constants))
             chosen.output.mkdir(parents=True, exist_ok=True)
             run(chosen)
 
@@ -80,66 +69,55 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
     return made
 
 
-def _without_output(given: Sequence[str]) -> list[str]:
-    """Arguments without `--output FOLDER` or `--output=FOLDER`."""
-    pairs = zip(["", *given], given, strict=False)
-    return [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]
-
-
 def experiment(
-    name: str,
-    question: str,
-    about: str | None,
-    draw: Draw | None = None,
-    *,
-    quick: Mapping[str, Any] | None = None,
-    **options: Any,
+    *, quick: Mapping[str, Any] | None = None, **options: Any
 ) -> Callable[[Callable[[Namespace], Any]], Main]:
-    """Decorator that makes an experiment's `main` of a function from its options to its result: it writes the
-    record and draws the chart. A result of None writes nothing.
+    """Decorator that makes an experiment's `main` of a function from its options to its result: it prints the
+    result, writes the record and draws the chart, by the module's `draw(result)`. A result of None writes
+    nothing. Both files have the module's name, and the question is how its docstring begins. Stands last in
+    its file: as `python -m MODULE`, it runs at once.
 
-    - `name`: of the module, and of the two files.
-    - `about`: the module's docstring.
-    - `draw`: draws the chart; None if a chart cannot be drawn from the record alone.
-    - `quick`: options and constants under `--quick`.
-    - `options`: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
+    Args:
+        quick: options and constants under `--quick`.
+        options: its own, besides `--output`, `--seed` and `--quick`, as for `command`.
     """
 
-    if unknown := set(quick or ()) - set(options):
-        raise ValueError(f"quick of {name} must be some of its options; got {', '.join(sorted(unknown))}.")
-
     def made(measure: Callable[[Namespace], Any]) -> Main:
+        module = sys.modules[measure.__module__]
+        about, spec = module.__doc__ or "", module.__spec__
+        assert spec is not None
+
         @command(about, record.RESULTS, seed=0, quick=QUICK, **options)
         def main(chosen: Namespace) -> None:
+            chosen.path = chosen.output / f"{spec.name.split('.')[-1]}.json"
+            chosen.command = [spec.name, *chosen.argv]
             if chosen.quick:
                 vars(chosen).update(quick or {})
             result = measure(chosen)
             if result is None:
                 return
-            path = chosen.output / f"{name}.json"
-            record.write(path, question, result, seed=chosen.seed, command=ran(name, chosen))
-            if draw is not None:
-                draw(record.read(path)["result"], path.with_suffix(".png"))
+            show(result)
+            question = " ".join(about.partition("?")[0].split()) + "?"
+            how = {"seed": chosen.seed, "command": chosen.command}
+            used = {name: getattr(chosen, name) for name in options}
+            record.write(chosen.path, question, result, options=used, **how)
+            charts.draw_record(chosen.path, chosen.path.with_suffix(".png"))
 
+        if measure.__module__ == "__main__":
+            main()
         return main
 
     return made
 
 
-def ran(name: str, chosen: Namespace) -> list[str]:
-    """Module and arguments of an experiment that runs, as after `python -m`."""
-    return [f"experiments.{name}", *chosen.argv]
-
-
 def recorded(
-    name: str, chosen: Namespace, part: str, others: Iterable[str], same: Mapping[str, Any] = {}
+    chosen: Namespace, part: str, others: Iterable[str], same: Mapping[str, Any] = {}
 ) -> dict[str, Any]:
     """Of the record in the output, the rows of `part` with these names, with the commit and the command that
     measured them; nothing if quick, or if what it says of `same` is something else."""
-    path = chosen.output / f"{name}.json"
-    if chosen.quick or not path.is_file():
+    if chosen.quick or not chosen.path.is_file():
         return {}
-    found = record.read(path)
+    found = record.read(chosen.path)
     if any(found["result"][key] != value for key, value in same.items()):
         return {}
     made = {"commit": found["commit"], "command": found["command"]}
@@ -170,9 +148,6 @@ def _number(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-# -- scenes -----------------------------------------------------------------------------------------------
-
-
 def data() -> Path | None:
     """The folder of real volumes that JAXVOL_DATA names, or None."""
     folder = os.environ.get("JAXVOL_DATA")
@@ -180,32 +155,29 @@ def data() -> Path | None:
 
 
 def chosen_scenes(
-    chosen: Namespace, makers: Mapping[str, Callable[..., Scene]], phantom: str, size: int
-) -> Iterator[tuple[str, Scene]]:
+    chosen: Namespace, makers: Mapping[str, Callable[..., Any]], phantom: str, size: int
+) -> Iterator[tuple[str, Any]]:
     """The scenes of `--only`, of this size; without the folder of real volumes, or if quick, the phantom's
     alone, of `--resolution`."""
     folder = data()
     for name in [phantom] if folder is None or chosen.quick else chosen.only:
-        more = {"resolution": chosen.resolution} if name == phantom else {}
-        yield name, makers[name](folder, size, **more)
+        print(name, flush=True)
+        yield name, makers[name](folder, size, chosen.resolution)
 
 
 def frame(scene: Scene, march: jv.March) -> jv.Rendering:
     """The image with all its outputs."""
-    return jv.render(scene.volume, scene.transfer, scene.camera, march)
+    return jv.render(*scene[:3], march)
 
 
 def image(scene: Scene, march: jv.March) -> jv.Rendering:
     """The image alone, as it is timed."""
-    return jv.render(scene.volume, scene.transfer, scene.camera, march, outputs="rgba")
+    return jv.render(*scene[:3], march, outputs="rgba")
 
 
 def entered(scene: Scene) -> np.ndarray:
     """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
     return np.asarray(frame(scene, jv.March(scene.step, max_samples=1)).rgba[..., 3] > 0)
-
-
-# -- measures ---------------------------------------------------------------------------------------------
 
 
 def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[str, dict[str, Any]]:

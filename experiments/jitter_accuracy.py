@@ -11,9 +11,8 @@ plain jitter can be nearer to the truth in the mean, or farther; it is noisier i
 """
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
 from . import charts, marches, timing
-from .harness import entered, experiment, frame, show
+from .harness import entered, experiment, frame
 from .scenes import Scene, cropped
 
 
@@ -83,36 +82,29 @@ def head(resolution: int, size: int) -> Faced:
     return Faced(scene, lambda error, step: wood_grain_energy(error[below:]), face)
 
 
-SCENES = {"cut block, orthographic": cut_block, "head, perspective": head}
-
-
-def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> list[dict[str, Any]]:
+def measure(of: Faced, chosen: Namespace) -> list[dict[str, Any]]:
     """One row for each step and march."""
     scene, grain, face = of
-    voxel = scene.step
 
-    def image(rendering: jv.Rendering) -> np.ndarray:
-        return np.asarray(rendering.rgba[..., :3], np.float64)
+    def image(march: jv.March) -> np.ndarray:
+        return np.asarray(frame(scene, march).rgba[..., :3], np.float64)
 
-    truth = image(frame(scene, marches.converged(min(steps) * voxel)))
-    rows = []
-    for step in steps:
-        under = {name: jv.March(step * voxel, marches.transforms(name, seed)) for name in METHODS}
+    truth, rows = image(marches.converged(min(chosen.steps) * scene.step)), []
+    for step in chosen.steps:
+        length = step * scene.step
+        under = {name: jv.March(length, marches.transforms(name, chosen.seed)) for name in METHODS}
         drawn = {name: partial(frame, scene, march) for name, march in under.items()}
-        seconds = timing.interleaved(drawn, repetitions)
+        seconds = timing.interleaved(drawn, chosen.repetitions)
         for name, march in under.items():
-            rendering = frame(scene, march)
-            assert not np.any(rendering.exhausted)
-            error = image(rendering) - truth
+            error = image(march) - truth
             rows.append(
                 {
                     "step": step,
                     "march": name,
-                    "wood grain": grain(error, step * voxel),
+                    "wood grain": grain(error, length),
                     "boundary noise": boundary_noise(error, face),
                     "rmse": float(np.sqrt(np.mean(error**2))),
                     "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
-                    "samples": int(np.sum(rendering.samples)),
                     "seconds": timing.median(seconds[name]),
                     "time": timing.ratio(seconds[name], seconds[marches.PLAIN]),
                 }
@@ -120,48 +112,26 @@ def measure(of: Faced, steps: Sequence[float], repetitions: int, seed: int) -> l
     return rows
 
 
-def compared(result: dict[str, list[dict[str, Any]]]) -> str:
-    """A sentence that compares the RMSE of both jitters with that of ray casting."""
-
-    def over(name: str) -> str:
-        ratios = []
-        for rows in result.values():
-            errors = {(row["step"], row["march"]): row["rmse off the face"] for row in rows}
-            ratios += [
-                error / errors[at, marches.PLAIN] for (at, march), error in errors.items() if march == name
-            ]
-        return f"{name} {min(ratios):.2f} to {max(ratios):.2f}"
-
-    return f"RMSE off the cut face / ray casting: {over(marches.JITTER)}, {over(marches.EMPTY)}."
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     scenes = {name: rows for name, rows in result.items() if name != "note"}
     figure, axes = charts.panels(len(scenes), len(PANELS), 12, 2.9 * len(scenes))
     for line, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for panel, (key, label) in zip(line, PANELS.items(), strict=True):
             for name, style in METHODS.items():
-                mine = [row for row in rows if row["march"] == name]
-                found = [row["time"]["median"] if key == "time" else row[key] for row in mine]
-                panel.plot([row["step"] for row in mine], found, style, marker=".", label=name)
-            panel.set_title(label, fontsize=9)
-            panel.set_xscale("log", base=2)
+                by_step = {row["step"]: row[key] for row in rows if row["march"] == name}
+                found = [each["median"] if key == "time" else each for each in by_step.values()]
+                panel.plot(list(by_step), found, style, marker=".", markersize=6, label=name)
+            panel.set(title=label, xlabel="step, voxels", xscale="log")
             if key != "time":
                 panel.set_yscale("log", nonpositive="mask")
-            panel.set_xlabel("step, voxels", fontsize=8)
-            panel.tick_params(labelsize=7, which="both")
-            panel.xaxis.set_major_formatter("{x:g}")
-        line[0].set_ylabel(scene, fontsize=9)
-    figure.suptitle(result["note"], fontsize=9)
+            charts.numbered(panel, STEPS, [f"{step:g}" for step in STEPS])
+        line[0].set_ylabel(scene)
+    figure.suptitle(result["note"])
     charts.legend_below(figure, axes[0, 0], 5)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "jitter_accuracy",
-    "What do jitter and alignment do to wood grain, noise on cut faces, the whole error and the time?",
-    __doc__,
-    draw,
     repetitions=5,
     size=192,
     resolution=128,
@@ -169,14 +139,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 96, "resolution": 64, "repetitions": 1, "steps": (2.3, 1.9)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    result = {}
-    for name, make in SCENES.items():
-        scene = make(chosen.resolution, chosen.size)
-        result[name] = measure(scene, chosen.steps, chosen.repetitions, chosen.seed)
-        for row in result[name]:
-            show(row, name)
-    return {"note": f"{NOTE} {compared(result)}", **result}
-
-
-if __name__ == "__main__":
-    main()
+    result: dict[str, Any] = {"note": NOTE}
+    for name, make in {"cut block, orthographic": cut_block, "head, perspective": head}.items():
+        result[name] = measure(make(chosen.resolution, chosen.size), chosen)
+    return result

@@ -2,21 +2,13 @@
 
 The table of the KISTI report (2005): a head and an engine under two transfer functions (1: low values
 translucent and high ones opaque; 2: all visible values opaque). It gives the speed-up over neither method, as
-the median of paired ratios, and beside each time the image's RMSE against a converged one. The goal is 4.55
-times for both methods everywhere without shading, the report's best, and the report's own speed-up in each of
-its eight cases with it.
+the median of paired ratios, and beside each time the image's RMSE against a converged one. The goal is the
+report's best, 4.55, everywhere without shading, and the report's own speed-up in each case with it.
 
-The report shades each sample by Phong's model. Its empty-space skipping fetches every sample and skips the
-shading of those that the transfer function hides: "shading skipped" here. Ours does not fetch them either.
-Both are measured, over a renderer that shades every sample. The report draws slices on a graphics card; the
-head is another one, and the report gives neither its transfer functions nor its views.
-
-The report tests early termination every 16 slices, since a test costs it more than the shading that it saves.
-Here rays that have ended are looked for between two segments of samples; so segments of 1, 4, 8 and 16
-samples are measured, each with the test and without.
-
-Steps are one voxel long. Rays end at 1 % of transmittance. Without the folder JAXVOL_DATA of real volumes,
-the phantoms of a head and an engine stand in.
+The report's empty-space skipping fetches every sample and skips the shading of those that are transparent:
+"shading skipped" here; ours does not fetch them either. It tests early termination every 16 slices; so
+segments of 1, 4, 8 and 16 samples, between which ended rays are looked for, are measured, too. Steps are one
+voxel long. Without the folder JAXVOL_DATA of real volumes, the phantoms of a head and an engine stand in.
 """
 
 import math
@@ -36,8 +28,8 @@ from jaxvol.metrics import rmse
 from jaxvol.ray import Scene as EngineScene
 
 from . import charts, harness, marches, timing
-from .harness import experiment, geometric_mean, show
-from .scenes import PHANTOM, SCENES, Scene
+from .harness import experiment
+from .scenes import CT_HEAD, PHANTOM, SCENES, Scene
 
 
 LEFT = 0.01
@@ -49,8 +41,6 @@ METHODS: dict[str, tuple[jv.Transform, ...]] = {
     BOTH: (jv.SpaceLeaping(), jv.EarlyTermination(LEFT)),
 }
 SKIPPED, BOTH_SKIPPED = "ESS, shading skipped", "ERT + ESS, shading skipped"
-SIZES = (256, 512)
-EVERY = (1, 4, 8, 16)  # samples
 GOAL = 4.55
 OPAQUE = 0.95  # opacity of a voxel under the second transfer function
 REPORT = {  # speed-ups at 256², 512²
@@ -62,13 +52,9 @@ REPORT = {  # speed-ups at 256², 512²
 
 
 def cthead(folder: Path, size: int, resolution: int) -> Scene:
-    volume = jv.load(folder / "cthead_256x256x113_uint16le.raw.gz", spacing=(1, 1, 2))
+    volume = jv.load(folder / CT_HEAD, spacing=(1, 1, 2))
     camera = jv.Camera.looking_at(volume, (-0.5, -1, -0.3), (0, 0, -1), size=(size, size)).zoom(1.4)
     return Scene(volume, jv.preset("ct_skin_bone", clim=(0, 4000)), camera, 1.0)
-
-
-def engine(folder: Path, size: int, resolution: int) -> Scene:
-    return SCENES["engine"](folder, size)
 
 
 def engine_phantom(folder: Path | None, size: int, resolution: int) -> Scene:
@@ -77,7 +63,7 @@ def engine_phantom(folder: Path | None, size: int, resolution: int) -> Scene:
     return Scene(volume, jv.preset("engine", unit_distance=0.01), camera, float(volume.spacing[0]))
 
 
-REAL: dict[str, Callable[..., Scene]] = {"head": cthead, "engine": engine}
+REAL: dict[str, Callable[..., Scene]] = {"head": cthead, "engine": SCENES["engine"]}
 PHANTOMS: dict[str, Callable[..., Scene]] = {"head": SCENES[PHANTOM], "engine": engine_phantom}
 
 
@@ -105,32 +91,23 @@ SHADED: dict[str, tuple[tuple[jv.Transform, ...], Lighting]] = {
     SKIPPED: (METHODS[NEITHER], VisiblePhong()),
     BOTH_SKIPPED: (METHODS[ERT], VisiblePhong()),
 }
+UNSHADED = {name: (transforms, None) for name, transforms in METHODS.items()}
+PARTS: dict[str, dict[str, Any]] = {"scenes": UNSHADED, "shaded": SHADED}
+"""Of the record: without shading, and with it."""
 
 
-def measure(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
+def measure(scene: Scene, under: dict[str, Any], repetitions: int) -> dict[str, dict[str, Any]]:
     """Time, speed-up over neither method, and error of a scene's frame under every method."""
-    under = {name: jv.March(scene.step, transforms) for name, transforms in METHODS.items()}
-    return with_gains(harness.compare(scene, under, repetitions))
 
-
-def measure_shaded(scene: Scene, repetitions: int) -> dict[str, dict[str, Any]]:
-    """The same, shaded."""
-
-    def frame(name: str) -> Any:
-        transforms, lighting = SHADED[name]
-        march = jv.March(scene.step, transforms)
+    def frame(march: jv.March, lighting: Lighting | None) -> Any:
         return jv.render(*scene[:3], march, lighting=lighting, outputs="rgba").rgba
 
-    seconds = timing.interleaved({name: partial(frame, name) for name in SHADED}, repetitions)
-    finer = marches.converged(scene.step, harness.FINER)
-    truth = jv.render(*scene[:3], finer, lighting=Phong(), outputs="rgba").rgba
-    return with_gains({n: harness.row(seconds[n], seconds[NEITHER], rmse(frame(n), truth)) for n in SHADED})
-
-
-def with_gains(rows: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """The rows of a table, with their speed-up over neither method."""
-    for row in rows.values():
-        row["speed-up"] = timing.ratio(rows[NEITHER]["all seconds"], row["all seconds"])
+    drawn = {n: partial(frame, jv.March(scene.step, how), light) for n, (how, light) in under.items()}
+    seconds = timing.interleaved(drawn, repetitions)
+    truth = frame(marches.converged(scene.step, harness.FINER), under[NEITHER][1])
+    rows = {n: harness.row(seconds[n], seconds[NEITHER], rmse(drawn[n](), truth)) for n in drawn}
+    for name, row in rows.items():
+        row["speed-up"] = timing.ratio(seconds[NEITHER], seconds[name])
     return rows
 
 
@@ -139,101 +116,71 @@ def tested_every(scene: Scene, samples: int, repetitions: int) -> dict[str, Any]
     early termination, and what this gains."""
 
     def frame(method: str) -> Any:
-        march = jv.March(scene.step, METHODS[method])
-        parts = EngineScene(*scene[:3], march, lighting=Phong())
-        return render_scene(parts, "rgba", "replay", Tiling(cells=samples)).rgba
+        whole = EngineScene(*scene[:3], jv.March(scene.step, METHODS[method]), lighting=Phong())
+        return render_scene(whole, "rgba", "replay", Tiling(cells=samples)).rgba
 
     seconds = timing.interleaved({name: partial(frame, name) for name in (NEITHER, ERT)}, repetitions)
     medians = {name: timing.median(all_) for name, all_ in seconds.items()}
     return {"seconds": medians, "speed-up": timing.ratio(seconds[NEITHER], seconds[ERT])}
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Measured speed-ups as bars, the report's as crosses: without shading above, with it below."""
-    figure, axes = charts.panels(2, len(result["sizes"]), 11, 6.4, sharex=True, sharey="row")
+    sizes = result["sizes"]
+    figure, axes = charts.panels(2, len(sizes), 11, 6.4, sharex=True, sharey="row")
     bars = {ERT: "C3", SKIPPED: "C9", ESS: "C0", BOTH_SKIPPED: "C8", BOTH: "C2"}
     reported = {SKIPPED: ESS, BOTH_SKIPPED: BOTH}
-    for row, (key, what) in zip(axes, (("scenes", "unshaded"), ("shaded", "shaded")), strict=True):
-        for at, (panel, size) in enumerate(zip(row, result["sizes"], strict=True)):
-            scenes = result[key]
-            shown = [method for method in bars if method in scenes[next(iter(REPORT))][str(size)]]
+    for row, (part, what) in zip(axes, (("scenes", "unshaded"), ("shaded", "shaded")), strict=True):
+        for at, (panel, size) in enumerate(zip(row, sizes, strict=True)):
+            cases = [result[part][case][str(size)] for case in REPORT]
+            shown = [method for method in bars if method in cases[0]]
             width = 0.8 / len(shown)
             for shift, method in enumerate(shown):
-                for number, scene in enumerate(REPORT):
-                    gain = scenes[scene][str(size)][method]["speed-up"]
-                    x, first = number + width * (shift - (len(shown) - 1) / 2), number == 0
-                    panel.bar(
-                        x, gain["median"], 0.92 * width, color=bars[method], label=method if first else None
-                    )
-                    panel.plot((x, x), (gain["low"], gain["high"]), "k-", linewidth=1)
-                    best = REPORT[scene][reported.get(method, method)][at]
-                    panel.plot(x, best, "kx", label="the report" if first and method == BOTH else None)
+                x = [number + width * (shift - (len(shown) - 1) / 2) for number in range(len(REPORT))]
+                gains = [rows[method]["speed-up"] for rows in cases]
+                panel.bar(x, [g["median"] for g in gains], 0.92 * width, color=bars[method], label=method)
+                panel.vlines(x, [g["low"] for g in gains], [g["high"] for g in gains], "k", linewidth=1)
+                best = [report[reported.get(method, method)][at] for report in REPORT.values()]
+                panel.plot(x, best, "kx", label="the report" if method == BOTH else None)
             panel.axhline(1, color="k", linewidth=0.8)
-            panel.set_xticks(range(len(REPORT)), list(REPORT), fontsize=8)
-            panel.set_title(f"{size} x {size} pixels, {what}", fontsize=9)
-        row[0].set_ylabel("speed-up over neither", fontsize=9)
+            panel.set_xticks(range(len(REPORT)), list(REPORT))
+            panel.set_title(f"{size} x {size} pixels, {what}")
+        row[0].set_ylabel("speed-up over neither")
     for panel in axes[0]:
         panel.axhline(GOAL, color="k", linewidth=0.8, linestyle=":")
-        panel.text(
-            0.01, GOAL, f"goal, {GOAL:g}", transform=panel.get_yaxis_transform(), va="bottom", fontsize=8
-        )
     figure.suptitle(
         "Early ray termination (ERT) and empty-space skipping (ESS) under two transfer functions (tf); "
-        "thin bars: 95 % intervals",
-        fontsize=9,
+        "thin bars: 95 % intervals; dotted: the goal"
     )
     charts.legend_below(figure, axes[1, 0], 6)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "kisti",
-    "What do early ray termination and empty-space skipping save, apart and together?",
-    __doc__,
-    draw,
     repetitions=9,
     resolution=192,
-    sizes=SIZES,
-    every=EVERY,
+    sizes=(256, 512),
+    every=(1, 4, 8, 16),
     quick={"sizes": (32,), "every": (1, 8), "repetitions": 2, "resolution": 32},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     folder = harness.data()
     makers = PHANTOMS if folder is None or chosen.quick else REAL
-    scenes: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
-    shaded: dict[str, dict[str, Any]] = {name: {} for name in REPORT}
+    measured: dict[str, dict[str, Any]] = {part: {name: {} for name in REPORT} for part in PARTS}
     every: dict[str, dict[str, Any]] = {}
     for name, make in makers.items():
         for size in chosen.sizes:
             scene = make(folder, size, chosen.resolution)
             for tf, seen in (("tf 1", scene), ("tf 2", opaque(scene))):
                 case = f"{name}, {tf}"
-                scenes[case][str(size)] = measure(seen, chosen.repetitions)
-                shaded[case][str(size)] = measure_shaded(seen, chosen.repetitions)
-                show(scenes[case][str(size)], case, size, "unshaded")
-                show(shaded[case][str(size)], case, size, "shaded")
+                for part, under in PARTS.items():
+                    measured[part][case][str(size)] = measure(seen, under, chosen.repetitions)
                 if size == chosen.sizes[-1]:
                     every[case] = {str(n): tested_every(seen, n, chosen.repetitions) for n in chosen.every}
-                    show(every[case], case, "ended rays are looked for every so many samples")
-    gains = [rows[BOTH]["speed-up"]["median"] for of_size in scenes.values() for rows in of_size.values()]
-    over = {
-        f"{case}, {size}": round(rows[BOTH]["speed-up"]["median"] / REPORT[case][BOTH][at], 3)
-        for case, of_size in shaded.items()
-        for at, (size, rows) in enumerate(of_size.items())
-    }
     return {
         "volumes": "phantoms" if makers is PHANTOMS else "cthead and engine",
         "sizes": chosen.sizes,
-        "repetitions": chosen.repetitions,
-        "opacity left": LEFT,
         "goal": GOAL,
-        "both, geometric mean": geometric_mean(gains),
-        "scenes": scenes,
-        "shaded": shaded,
-        "both, shaded, over the report's": over,
+        **measured,
         "ended rays are looked for every so many samples": every,
     }
-
-
-if __name__ == "__main__":
-    main()

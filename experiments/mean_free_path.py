@@ -13,7 +13,6 @@ mean free path leave it undetermined.
 
 from argparse import Namespace
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -23,32 +22,32 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
+from .scenes import grid, on_cube
 
 
 GOAL = 0.01
 STEPS = 40
 OFF = (3.0, 1 / 3, 3.0)
 COLOR = (0.8, 0.6, 0.5)
-POSITIONS = ((0.0, -4.0, 1.0), (3.0, 2.5, 1.0))
 RADIUS = 0.7
 THICKNESSES = (0.02, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-KNOWN, TIED = "extinction known", "extinction 1/λ"
+TEMPLATES, KNOWN, TIED = "templates", "extinction known", "extinction 1/λ"
 
 
 def balls(resolution: int, parts: Sequence[tuple[float, tuple[float, float, float], float]]) -> jv.Volume:
     """Balls (value, centre, radius) in [-1, 1]³, with boundaries one voxel wide."""
-    line = np.linspace(-1, 1, resolution)
-    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
-    data = np.zeros(grid.shape[:3])
+    nodes = np.stack(grid(resolution), axis=-1)
+    data = np.zeros(nodes.shape[:3])
     for value, center, radius in parts:
-        inside = (radius - np.linalg.norm(grid - center, axis=-1)) * (resolution - 1) / 2 + 0.5
+        inside = (radius - np.linalg.norm(nodes - center, axis=-1)) * (resolution - 1) / 2 + 0.5
         data = np.maximum(data, value * np.clip(inside, 0, 1))
-    return jv.Volume(data.astype(np.uint8), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
+    return on_cube(data.astype(np.uint8))
 
 
 def cameras(size: int) -> list[jv.Camera]:
-    return [jv.Camera(position, (0, 0, 0), (0, 0, 1), 32, size=(size, size)) for position in POSITIONS]
+    positions = (0.0, -4.0, 1.0), (3.0, 2.5, 1.0)
+    return [jv.Camera(position, (0, 0, 0), (0, 0, 1), 32, size=(size, size)) for position in positions]
 
 
 def lights(brightness: Any = 1.0) -> tuple[Any, ...]:
@@ -57,9 +56,12 @@ def lights(brightness: Any = 1.0) -> tuple[Any, ...]:
 
 
 def templates(materials: Any, brightness: Any = 1.0) -> ScattererTemplates:
-    return ScattererTemplates(
-        materials, lights(brightness), templates=4, photons=12, levels=4, reach=(2.0, 4.0)
-    )
+    how: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
+    return ScattererTemplates(materials, lights(brightness), **how)
+
+
+def rendered(scene: tuple) -> jv.Rendering:
+    return jv.render(*scene[:4], lighting=scene[4])
 
 
 def marching(volume: jv.Volume) -> jv.March:
@@ -71,42 +73,31 @@ def three_materials(size: int, resolution: int) -> dict[str, Any]:
     parts = [(60, (-0.45, 0, -0.1), 0.4), (130, (0.4, 0.1, -0.2), 0.38), (210, (0.0, 0, 0.5), 0.36)]
     volume, truth = balls(resolution, parts), (0.08, 0.12, 0.16)
     march, colors = marching(volume), ((0.8, 0.4, 0.3), (0.5, 0.6, 0.3), (0.8, 0.8, 0.75))
-    points = [
-        (20.0, colors[0], 0.0),
-        *((value, color, 0.4) for (value, *_), color in zip(parts, colors, strict=True)),
-    ]
-    transfer = jv.TransferFunction.from_points(points, unit_distance=0.1)
-    ranges = ((15, 90), (90, 170), (170, 256))
+    shown = [(value, color, 0.4) for (value, *_), color in zip(parts, colors, strict=True)]
+    transfer = jv.TransferFunction.from_points([(20.0, colors[0], 0.0), *shown], unit_distance=0.1)
 
     def materials_of(paths: Sequence[float]) -> tuple[jv.Material, ...]:
-        each = zip(paths, ranges, strict=True)
+        each = zip(paths, ((15, 90), (90, 170), (170, 256)), strict=True)
         return tuple(jv.Material(0.5, path, 1.4, values=values) for path, values in each)
 
     def scene(materials: Any, camera: jv.Camera) -> tuple:
         return volume, transfer, camera, march, templates(materials)
 
-    views = [
-        (c, jv.render(*scene(materials_of(truth), c)[:4], lighting=templates(materials_of(truth))).rgba)
-        for c in cameras(size)
-    ]
+    views = [(camera, rendered(scene(materials_of(truth), camera)).rgba) for camera in cameras(size)]
     start = materials_of([path * off for path, off in zip(truth, OFF, strict=True)])
     found = jv.fit(jv.ImageResidual(scene, views), start, max_steps=STEPS)
     ratios = [float(m.mean_free_path) / path for m, path in zip(found.parameters, truth, strict=True)]
-    return {
-        "truth": truth,
-        "start": OFF,
-        "found": ratios,
-        "losses": found.losses.tolist(),
-        "message": found.message,
-    }
+    about = {"losses": found.losses.tolist(), "message": found.message}
+    return {"truth": truth, "start": OFF, "found": ratios, **about}
 
 
-def one_ball(
-    size: int, resolution: int, paths: int, thicknesses: Sequence[float], seed: int
-) -> list[dict[str, Any]]:
-    """Fit one mean free path, for each optical thickness, to renders with templates and path-traced ones."""
-    volume = balls(resolution, [(200, (0, 0, 0), RADIUS)])
+def one_ball(thickness: float, volume: jv.Volume, chosen: Namespace) -> dict[str, Any]:
+    """Fit one mean free path to renders with templates and path-traced ones."""
     march, values = marching(volume), np.array([60.0, 140.0, 255.0])
+    path = 2 * RADIUS / thickness
+    # with templates, the extinction that the camera sees is free to choose: here the true one, but enough to
+    # be visible at all
+    visible = max(1 / path, 2.0)
 
     def material(path: Any) -> jv.Material:
         return jv.Material(0.2, path, 1.0, values=(60, 256))
@@ -120,83 +111,60 @@ def one_ball(
         extinction = given["tied"] / path + (1 - given["tied"]) * given["extinction"]
         return volume, transfer(extinction), camera, march, templates(given["material"], given["brightness"])
 
+    def start(off: float, tied: float) -> dict[str, Any]:
+        known = {"tied": jnp.float32(tied), "extinction": jnp.float32(visible)}
+        return {"material": material(path * off), "brightness": jnp.float32(1.0), **known}
+
+    own, traced = [], []
+    for camera in cameras(chosen.size):
+        own.append((camera, rendered(scene(start(1.0, 0.0), camera)).image((0, 0, 0))))
+        how = {"paths": chosen.paths, "key": chosen.seed, "materials": material(path)}
+        traced.append((camera, jv.path_trace(volume, transfer(1 / path), camera, lights(), **how).radiance))
     constraints = {
         "material": None,
         "brightness": jv.Positive(),
         "tied": jv.Fixed(),
         "extinction": jv.Fixed(),
     }
-    rows = []
-    for thickness in thicknesses:
-        path = 2 * RADIUS / thickness
-        # with templates, the extinction that the camera sees is free to choose: here the true one, but enough
-        # to be visible at all
-        extinction = max(1 / path, 2.0)
-
-        def start(off: float, tied: float, path: float = path, dense: float = extinction) -> dict[str, Any]:
-            known = {"tied": jnp.float32(tied), "extinction": jnp.float32(dense)}
-            return {"material": material(path * off), "brightness": jnp.float32(1.0), **known}
-
-        own, traced = [], []
-        for camera in cameras(size):
-            *plain, lighting = scene(start(1.0, 0.0), camera)
-            own.append((camera, jv.render(*plain, lighting=lighting).image((0, 0, 0))))
-            image = jv.path_trace(
-                volume, transfer(1 / path), camera, lights(), paths=paths, key=seed, materials=material(path)
-            )
-            traced.append((camera, image.radiance))
-        cases = {"templates": (own, 0.0), KNOWN: (traced, 0.0), TIED: (traced, 1.0)}
-        row: dict[str, Any] = {"thickness": thickness}
-        for name, (views, tied) in cases.items():
-            residual = jv.ImageResidual(scene, views, background=(0, 0, 0))
-            found = jv.fit(residual, start(1 / 3, tied), constraints=constraints, max_steps=STEPS)
-            assert found.uncertainty is not None
-            errors = found.uncertainty.standard_errors
-            row[name] = {
-                "ratio": float(found.parameters["material"].mean_free_path) / path,
-                "standard error": next(e for n, e in errors.items() if "mean_free_path" in n) / path,
-                "brightness": float(found.parameters["brightness"]),
-                "undetermined": found.uncertainty.undetermined,
-                "loss": float(found.losses.min()),
-                "message": found.message,
-            }
-        rows.append(row)
-        show(row)
-    return rows
+    row: dict[str, Any] = {"thickness": thickness}
+    for name, views, tied in ((TEMPLATES, own, 0.0), (KNOWN, traced, 0.0), (TIED, traced, 1.0)):
+        residual = jv.ImageResidual(scene, views, background=(0, 0, 0))
+        found = jv.fit(residual, start(1 / 3, tied), constraints=constraints, max_steps=STEPS)
+        assert found.uncertainty is not None
+        errors = found.uncertainty.standard_errors
+        row[name] = {
+            "ratio": float(found.parameters["material"].mean_free_path) / path,
+            "standard error": next(e for n, e in errors.items() if "mean_free_path" in n) / path,
+            "brightness": float(found.parameters["brightness"]),
+            "undetermined": found.uncertainty.undetermined,
+            "loss": float(found.losses.min()),
+            "message": found.message,
+        }
+    return row
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
     losses = result["three materials"]["losses"]
     left.semilogy(range(1, len(losses) + 1), losses, "o-")
     left.set(xlabel="step of the fit", ylabel="mean squared difference of the images")
     left.set_title("λ of three materials, from starts 3 times off")
     rows = result["one ball"]
-    names = {
-        "templates": "from images by templates",
-        KNOWN: f"from path-traced images, {KNOWN}",
-        TIED: f"from path-traced images, {TIED}",
-    }
-    for (name, label), mark in zip(names.items(), ("ko", "C0s", "C3^"), strict=True):
+    for name, mark in ((TEMPLATES, "ko-"), (KNOWN, "C0s-"), (TIED, "C3^-")):
         known = [row for row in rows if not row[name]["undetermined"] and np.isfinite(row[name]["ratio"])]
-        at, ratios = [row["thickness"] for row in known], [row[name]["ratio"] for row in known]
-        right.loglog(at, ratios, mark + "-", label=label)
-    lost = [row["thickness"] for row in rows if row["templates"]["undetermined"]]
-    if lost:
-        label = "from images by templates: said to be undetermined"
-        right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label=label)
+        label = "from images by templates" if name == TEMPLATES else f"from path-traced images, {name}"
+        right.loglog([r["thickness"] for r in known], [r[name]["ratio"] for r in known], mark, label=label)
+    lost = [row["thickness"] for row in rows if row[TEMPLATES]["undetermined"]]
+    label = "from images by templates: said to be undetermined"
+    right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label=label)
     right.axhline(1, color="k", linewidth=0.8)
     right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
     right.set_title("λ of one ball, from two views")
     charts.legend_below(figure, right, 2)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "mean_free_path",
-    "Are mean free paths found back from images, of templates and path-traced?",
-    __doc__,
-    draw,
     size=32,
     resolution=32,
     paths=256,
@@ -204,16 +172,9 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 10, "resolution": 12, "paths": 2, "thicknesses": (2.0,)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    size, resolution = chosen.size, chosen.resolution
+    ball = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
     return {
-        "image": [size] * 2,
-        "resolution": resolution,
-        "paths": chosen.paths,
         "goal": GOAL,
-        "three materials": three_materials(size, resolution),
-        "one ball": one_ball(size, resolution, chosen.paths, chosen.thicknesses, chosen.seed),
+        "three materials": three_materials(chosen.size, chosen.resolution),
+        "one ball": [one_ball(thickness, ball, chosen) for thickness in chosen.thicknesses],
     }
-
-
-if __name__ == "__main__":
-    main()

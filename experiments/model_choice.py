@@ -11,7 +11,6 @@ alone, and the candidate of the least held-out loss.
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -20,34 +19,24 @@ import numpy as np
 import jaxvol as jv
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
+from .scenes import grid, on_cube
 
 
-STEPS = 40
 NOISE = 0.02
 """Standard deviation of the noise of each pixel and channel; white is 1."""
-GOAL = 9
-"""Trials of ten in which the truth is to be chosen with noise; without, never more than the truth."""
-
 CENTERS = ((-0.45, 0, -0.2), (0.4, 0.2, -0.3), (0, 0, 0.5), (0.3, -0.5, 0.2))
-RADIUS = 0.4
 COLORS = ((0.8, 0.4, 0.3), (0.5, 0.6, 0.3), (0.8, 0.8, 0.75), (0.4, 0.6, 0.8))
 CLASSES = [(0, 0, 0, 0), (0, 0, 1, 1), (0, 1, 2, 2), (0, 1, 2, 3)]
 START, PATHS = 0.4, (0.2, 1.5)
 APART = 1.3
 """Least ratio of two mean free paths of the truth."""
-
 POINTS = (2, 4, 8, 16)
 POSITIONS = ((0.0, -4.0, 1.0), (3.0, 2.5, 1.0), (-3.0, 2.0, -1.5), (1.0, 1.0, 4.0), (-2.5, -3.0, 0.5))
 TRUTHS = 3
 """So many of the first candidates are the truth, in turn."""
 SEEN = 3
 """Number of training views; the others are held out."""
-
-
-LEAST = 1e-16
-"""Smallest loss that the chart shows: where a fit is exact, the loss is 0."""
-
 RULES = ("chosen", "bic", "least")
 """Of each trial: what is chosen by `choose`, by BIC, and by the least held-out loss."""
 
@@ -62,24 +51,25 @@ class Problem(NamedTuple):
     labels: list[str]
 
 
+def marching(volume: jv.Volume, *, labels: bool = False) -> jv.March:
+    return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(labels=labels),), "midpoint")
+
+
 def materials(resolution: int) -> Problem:
     """How many mean free paths?"""
-    line = np.linspace(-1, 1, resolution)
-    grid = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
-    distance = np.stack([np.linalg.norm(grid - center, axis=-1) for center in CENTERS])
-    labels = np.where(distance.min(axis=0) < RADIUS, 1 + distance.argmin(axis=0), 0)
-    volume = jv.Volume(
-        labels.astype(np.float32), (2 / (resolution - 1),) * 3, (-1.0,) * 3, labels.astype(np.uint8)
-    )
-    march = _marching(volume, labels=True)
+    points = np.stack(grid(resolution), axis=-1)
+    distance = np.stack([np.linalg.norm(points - center, axis=-1) for center in CENTERS])
+    labels = np.where(distance.min(axis=0) < 0.4, 1 + distance.argmin(axis=0), 0)
+    volume = on_cube(labels.astype(np.float32), labels.astype(np.uint8))
+    march = marching(volume, labels=True)
 
     def of_paths(paths: Sequence[Any]) -> tuple[jv.Material, ...]:
         return tuple(jv.Material(0.5, path, label=at + 1) for at, path in enumerate(paths))
 
-    def scene(parts: Any, camera: jv.Camera) -> tuple[Any, ...]:
+    def scene(given: Any, camera: jv.Camera) -> tuple[Any, ...]:
         functions = {
-            part.label: jv.TransferFunction((0, 4), (color, color), jnp.ones(2) / part.mean_free_path)
-            for part, color in zip(parts, COLORS, strict=True)
+            each.label: jv.TransferFunction((0, 4), (color, color), jnp.ones(2) / each.mean_free_path)
+            for each, color in zip(given, COLORS, strict=True)
         }
         return volume, jv.LabelTransferFunction(functions), camera, march
 
@@ -94,20 +84,14 @@ def materials(resolution: int) -> Problem:
     return Problem(scene, candidates, draw, [str(max(classes) + 1) for classes in CLASSES])
 
 
-def _marching(volume: jv.Volume, *, labels: bool = False) -> jv.March:
-    return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(labels=labels),), "midpoint")
-
-
-def control_points(resolution: int, points: Sequence[int]) -> Problem:
+def control_points(resolution: int, numbers: Sequence[int]) -> Problem:
     """How many control points?"""
-    line = np.linspace(-1, 1, resolution)
-    x, y, z = np.meshgrid(line, line, line, indexing="ij")
+    x, y, z = grid(resolution)
     waves = 0.5 + 0.25 * (np.sin(3 * x + y) + np.sin(2 * y - 3 * z + 1))
-    volume = jv.Volume(waves.astype(np.float32), (2 / (resolution - 1),) * 3, (-1.0,) * 3)
-    march = _marching(volume)
-    start = jv.flat_grey(volume, 2, (0, 1))
-    functions = [start]
-    for number in points[1:]:
+    volume = on_cube(waves.astype(np.float32))
+    march = marching(volume)
+    functions = [jv.flat_grey(volume, 2, (0, 1))]
+    for number in numbers[1:]:
         functions.append(jv.refined(functions[-1], number))
 
     def scene(transfer: Any, camera: jv.Camera) -> tuple[Any, ...]:
@@ -118,7 +102,7 @@ def control_points(resolution: int, points: Sequence[int]) -> Problem:
         colors = generator.uniform(0.1, 0.9, (len(values), 3))
         return jv.TransferFunction(values, colors, np.exp(generator.uniform(-2, 1, len(values))))
 
-    return Problem(scene, jv.nested_points(start, points), draw, list(map(str, points)))
+    return Problem(scene, jv.nested_points(functions[0], numbers), draw, list(map(str, numbers)))
 
 
 def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any]:
@@ -132,26 +116,25 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
         image = jv.render(*problem.scene(parameters, camera)).image()
         views.append((camera, np.asarray(image) + noise * generator.normal(size=image.shape)))
     residual = jv.ImageResidual(problem.scene, views[:SEEN])
-    choice = jv.choose(residual, problem.candidates, views[SEEN:], block=1, max_steps=STEPS)
+    choice = jv.choose(residual, problem.candidates, views[SEEN:], block=1, max_steps=40)
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
-    held_out = [row.held_out_loss for row in choice.candidates]
     # of independent Gaussian residuals of one unknown variance; losses below -80 dB count as equal
     count, least = residual.count(), (1e-4 * residual.scale()) ** 2
-    bic = [
-        count * np.log(max(2 * row.fit.loss, least)) + row.numbers * np.log(count)
+    rows = [
+        {
+            "name": row.name,
+            "held_out_loss": row.held_out_loss,
+            "bic": float(count * np.log(max(2 * row.fit.loss, least)) + row.numbers * np.log(count)),
+        }
         for row in choice.candidates
     ]
-    keys = "name", "numbers", "determined", "held_out_loss", "standard_error"
     return {
         "seed": seed,
         "truth": truth,
         "chosen": choice.chosen,
-        "bic": int(np.argmin(bic)),
-        "least": int(np.argmin(held_out)),
-        "candidates": [
-            {key: getattr(row, key) for key in keys} | {"training_loss": row.fit.loss, "bic": float(of_row)}
-            for row, of_row in zip(choice.candidates, bic, strict=True)
-        ],
+        "bic": int(np.argmin([row["bic"] for row in rows])),
+        "least": int(np.argmin([row["held_out_loss"] for row in rows])),
+        "candidates": rows,
     }
 
 
@@ -166,46 +149,38 @@ def summary(trials: list[dict[str, Any]]) -> dict[str, dict[str, int]]:
     }
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Held-out losses of all candidates, relative to the truth's, and how often each rule chose the truth."""
     problems = result["problems"]
     figure, axes = charts.panels(len(problems), 3, 11, 3.2 * len(problems))
     for (left, middle, right), (name, problem) in zip(axes, problems.items(), strict=True):
-        numbers = [row["numbers"] for row in next(iter(problem["trials"].values()))[0]["candidates"]]
-        for axis, (noise, trials) in zip((left, middle), problem["trials"].items(), strict=True):
-            seen = "images without noise" if float(noise) == 0 else f"images with noise of {noise}"
+        labels = problem["labels"]
+        for panel, (noise, trials) in zip((left, middle), problem["trials"].items(), strict=True):
             for trial in trials:
-                losses = [max(row["held_out_loss"], LEAST) for row in trial["candidates"]]
+                losses = [max(row["held_out_loss"], 1e-16) for row in trial["candidates"]]  # 0: an exact fit
                 color, at = f"C{trial['truth']}", trial["chosen"]
-                axis.plot(losses, f"{color}-", linewidth=0.8, alpha=0.6)
-                axis.plot(at, losses[at], f"{color}o" if at == trial["truth"] else f"{color}X", markersize=6)
-            axis.set(yscale="log", xticks=range(len(numbers)), xticklabels=problem["labels"])
-            axis.set(xlabel=f"{name} of the fitted model", ylabel="loss in held-out views", title=seen)
-        for truth, label in enumerate(problem["labels"][:TRUTHS]):
+                panel.plot(losses, f"{color}-", linewidth=0.8, alpha=0.6)
+                panel.plot(at, losses[at], f"{color}o" if at == trial["truth"] else f"{color}X", markersize=6)
+            seen = "without noise" if float(noise) == 0 else f"with noise of {noise}"
+            panel.set(yscale="log", xticks=range(len(labels)), xticklabels=labels, title=f"images {seen}")
+            panel.set(xlabel=f"{name} of the fitted model", ylabel="loss in held-out views")
+        for truth, label in enumerate(labels[:TRUTHS]):
             left.plot([], [], f"C{truth}o-", label=f"truth {label}")
         left.legend(fontsize=7, title="marker: chosen\n(a cross: not the truth)", title_fontsize=7)
         width = 0.35
-        for shift, (noise, counts) in enumerate(problem["summary"].items()):
-            places = np.arange(len(RULES)) + (shift - 0.5) * width
-            right.bar(
-                places, [c["truth"] for c in counts.values()], width, color=f"C{shift + 4}", label=noise
-            )
-            more = [c["more"] for c in counts.values()]
-            truths = [c["truth"] for c in counts.values()]
-            right.bar(places, more, width, truths, color="none", edgecolor=f"C{shift + 4}", hatch="////")
-        right.set(xticks=range(len(RULES)), ylabel="trials")
-        right.set_title("filled: truth chosen; hatched: too many", fontsize=9)
-        right.set_xticklabels(["choose", "BIC", "least held-out loss"], fontsize=8)
+        for number, (noise, counts) in enumerate(problem["summary"].items()):
+            at, color = np.arange(len(RULES)) + (number - 0.5) * width, f"C{number + 4}"
+            right_, more = ([count[key] for count in counts.values()] for key in ("truth", "more"))
+            right.bar(at, right_, width, color=color, label=noise)
+            right.bar(at, more, width, right_, color="none", edgecolor=color, hatch="////")
+        right.set(xticks=range(len(RULES)), xticklabels=["choose", "BIC", "least held-out loss"])
+        right.set(ylabel="trials", title="filled: truth chosen; hatched: too many")
         right.set_ylim(0, 1.25 * right.get_ylim()[1])
         right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "model_choice",
-    "Is the true number of materials, and of control points, chosen by held-out views?",
-    __doc__,
-    draw,
     size=10,
     resolution=10,
     trials={"type": int, "default": 10, "help": "truths of each kind"},
@@ -213,28 +188,12 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 8, "resolution": 8, "trials": 1, "points": POINTS[:2]},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    problems: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     seeds = range(chosen.seed, chosen.seed + chosen.trials)
-    for name, problem in (
-        ("mean free paths", materials(chosen.resolution)),
-        ("control points", control_points(chosen.resolution, chosen.points)),
-    ):
-        trials = {
-            f"{noise:g}": [trial(problem, chosen.size, seed, noise) for seed in seeds]
-            for noise in (NOISE, 0.0)
-        }
+    problems = {"mean free paths": materials(chosen.resolution)}
+    problems["control points"] = control_points(chosen.resolution, chosen.points)
+    for name, problem in problems.items():
+        trials = {f"{n:g}": [trial(problem, chosen.size, seed, n) for seed in seeds] for n in (NOISE, 0.0)}
         counts = {noise: summary(of_noise) for noise, of_noise in trials.items()}
-        problems[name] = {"labels": problem.labels, "summary": counts, "trials": trials}
-        show(counts, name, "noise")
-    return {
-        "image": [chosen.size] * 2,
-        "resolution": chosen.resolution,
-        "training views": SEEN,
-        "held-out views": len(POSITIONS) - SEEN,
-        "goal": f"the truth in {GOAL} of 10 trials with noise, and never more without",
-        "problems": problems,
-    }
-
-
-if __name__ == "__main__":
-    main()
+        found[name] = {"labels": problem.labels, "summary": counts, "trials": trials}
+    return {"goal": "the truth in 9 of 10 trials with noise, and never more without", "problems": found}

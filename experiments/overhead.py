@@ -10,53 +10,29 @@ then shorter, and the goal is 1.05.
 """
 
 from argparse import Namespace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import numpy as np
 
 import jaxvol as jv
 
 from . import charts, marches
-from .harness import chosen_scenes, compare, experiment, frame, geometric_mean, show, some_of
-from .scenes import PHANTOM, SCENES, Scene
+from .harness import chosen_scenes, compare, experiment, geometric_mean, some_of
+from .scenes import PHANTOM, SCENES
 
 
 METHODS = {marches.PLAIN: "k", marches.JITTER: "C3", marches.EMPTY: "C0", marches.BOTH: "C1"}
 """With their colours in the chart."""
-SIZES = 512, 1024
-
-
-class Condition(NamedTuple):
-    """Transforms of all marches, and the goal."""
-
-    transforms: tuple[jv.Transform, ...]
-    goal: float
-
-
-CONDITIONS = {
-    "all samples": Condition((), 1.02),
-    "as in the paper": Condition((jv.SpaceLeaping(), jv.EarlyTermination(1 / 255)), 1.05),
+CONDITIONS: dict[str, tuple[tuple[jv.Transform, ...], float]] = {
+    "all samples": ((), 1.02),
+    "as in the paper": ((jv.SpaceLeaping(), jv.EarlyTermination(1 / 255)), 1.05),
 }
+"""Transforms of all marches, and the goal."""
 SHOWN = {"as in the paper": "leaps and early ends, as in the paper"}
 """How a condition is called in the chart, where not as in the record."""
 
 
-def measure(scene: Scene, repetitions: int, seed: int, condition: Condition) -> dict[str, Any]:
-    """Time and error of a scene's frame under every march."""
-    jax.clear_caches()  # a process cannot hold the programs of all scenes
-    under = {
-        name: jv.March(scene.step, (*marches.transforms(name, seed), *condition.transforms))
-        for name in METHODS
-    }
-    rows = compare(scene, under, repetitions)
-    for name, march in under.items():
-        rows[name]["aligned"] = float(np.mean(frame(scene, march).aligned))
-    return rows
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     conditions, sizes = result["conditions"], result["sizes"]
     volumes = len(next(iter(conditions.values()))["volumes"])
     width, height = 5 * len(sizes) + 2, (0.55 * volumes + 0.7) * len(conditions) + 0.9
@@ -70,45 +46,36 @@ def draw(result: dict[str, Any], path: Path) -> None:
                 charts.interval(panel, rows[name]["ratio"], number + 0.22 * (shift - 1), color, label)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(goal, color="k", linewidth=0.8, linestyle=":")
-        panel.set_title(
-            f"{SHOWN.get(condition, condition)}, {pixels} x {pixels} pixels; dotted: goal, {goal}", fontsize=9
-        )
+        said = SHOWN.get(condition, condition)
+        panel.set_title(f"{said}, {pixels} x {pixels} pixels; dotted: goal, {goal}")
         panel.set_yticks(range(volumes), list(measured))
     axes[0, 0].invert_yaxis()
     figure.supxlabel(
         "time of a frame / that of ray casting: median of paired ratios, 95 % interval", fontsize=9
     )
-    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    charts.save(figure, path)
+    figure.legend(loc="outside upper center", ncols=3)
+    return figure
 
 
 @experiment(
-    "overhead",
-    "What do empty-space jitter and alignment add to the time of a whole frame?",
-    __doc__,
-    draw,
     repetitions=15,
-    sizes={"nargs": "+", "type": int, "default": SIZES, "help": "pixels along a side; the paper's are 1024"},
+    sizes={"nargs": "+", "type": int, "default": (512, 1024), "help": "pixels along a side"},
     resolution=192,
     only=some_of(SCENES, "VOLUME"),
     quick={"sizes": (32,), "repetitions": 2, "resolution": 32},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     conditions: dict[str, Any] = {}
-    for said, condition in CONDITIONS.items():
+    for said, (more, goal) in CONDITIONS.items():
         volumes: dict[str, dict[str, Any]] = {}
         means: dict[str, float] = {}
         for size in chosen.sizes:
             for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, size):
-                rows = measure(scene, chosen.repetitions, chosen.seed, condition)
-                volumes.setdefault(name, {})[str(size)] = rows
-                show(rows, said, name, size)
-            means[str(size)] = geometric_mean(
-                of_size[str(size)][marches.BOTH]["ratio"]["median"] for of_size in volumes.values()
-            )
-        conditions[said] = {"goal": condition.goal, "both, geometric means": means, "volumes": volumes}
-    return {"sizes": chosen.sizes, "repetitions": chosen.repetitions, "conditions": conditions}
-
-
-if __name__ == "__main__":
-    main()
+                jax.clear_caches()  # a process cannot hold the programs of all scenes
+                transforms = {n: (*marches.transforms(n, chosen.seed), *more) for n in METHODS}
+                under = {n: jv.March(scene.step, each) for n, each in transforms.items()}
+                volumes.setdefault(name, {})[str(size)] = compare(scene, under, chosen.repetitions)
+            both = (of_size[str(size)][marches.BOTH]["ratio"]["median"] for of_size in volumes.values())
+            means[str(size)] = geometric_mean(both)
+        conditions[said] = {"goal": goal, "both, geometric means": means, "volumes": volumes}
+    return {"sizes": chosen.sizes, "conditions": conditions}

@@ -6,10 +6,10 @@ scenes, beside VTK and Dr.Jit. Settings are timed in turn with the scene's base;
 ratio to the base, times the base's median time over the whole scene. Errors are those of linear RGB over
 white against a converged image, whose own error is estimated (`pareto_measure`).
 
-Ctrl-C stops at the scenes that are finished. `--scene` measures some scenes again and keeps what the record
-says of the others, with the commit that they are of. `--point` renders one point of one scene again, times it
-and saves its picture beside its error. The record is `pareto.json`, the chart `pareto.png`, the page
-`pareto.html` (see `pareto_page`), the pictures that it shows are in the folder `pareto/`.
+`--scene` measures some scenes again and keeps what the record says of the others, with the commit that they
+are of. `--point` renders one point of one scene again, times it and saves its picture beside its error. The
+record is `pareto.json`, the chart `pareto.png`, the page `pareto.html` (see `pareto_page`), the pictures
+that it shows are in the folder `pareto/`.
 
 Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
 distance to our image, up to 3 / 255, is that and not an error.
@@ -30,9 +30,9 @@ import jaxvol as jv
 
 from . import harness, pareto_measure, pareto_page, pareto_points, programs, record
 from .harness import experiment, recorded, show, some_of
-from .pareto_measure import Sizes, slug
+from .pareto_measure import slug
 from .pareto_scenes import ROWS
-from .programs import DRJIT, THREADS, VTK
+from .programs import DRJIT, VTK
 from .scenes import PHANTOM
 
 
@@ -48,17 +48,11 @@ Point: TypeAlias = tuple[float, float]
 
 def front(points: Sequence[Point]) -> list[int]:
     """Numbers of the points of which none other is better in one and as good in both, by growing error. Of
-    points that are equal in both, all are kept.
-
-    **Raises:** `ValueError` for points that are not pairs of numbers, and for NaN.
-    """
-    at = np.asarray(points, float).reshape(-1, 2) if len(points) == 0 else np.asarray(points, float)
-    if at.ndim != 2 or at.shape[1] != 2 or np.isnan(at).any():
-        raise ValueError(f"points must be pairs of numbers, (error, time), without NaN; got {points!r}.")
+    points that are equal in both, all are kept."""
     found: list[int] = []
-    for i in np.lexsort((at[:, 1], at[:, 0])):
-        if not found or at[i, 1] < at[found[-1], 1] or (at[i] == at[found[-1]]).all():
-            found.append(int(i))
+    for i in sorted(range(len(points)), key=lambda i: points[i]):
+        if not found or points[i][1] < points[found[-1]][1] or points[i] == points[found[-1]]:
+            found.append(i)
     return found
 
 
@@ -67,11 +61,9 @@ def behind(
 ) -> dict[str, dict[str, float | None]]:
     """The points of other programs that no point of ours is as good as, in error and in time.
 
-    `same`: errors that differ by this part count as equal, since programs that take the same samples differ
-    by rounding.
-
     For each, by what factor we miss it: `time`: that of our fastest point at its error, over its own;
-    `error`: that of our best point in its time, over its own. None where we have no such point.
+    `error`: that of our best point in its time, over its own. None where we have no such point. Errors that
+    differ by the part `same` count as equal, since programs that take the same samples differ by rounding.
     """
     found: dict[str, dict[str, float | None]] = {}
     for name, (error, seconds) in theirs.items():
@@ -97,73 +89,34 @@ def concluded(name: str, found: dict[str, Any], options: list[str]) -> dict[str,
     pairs = {n: (p["rmse"], p["time"]) for n, p in points.items()}
     ours = {n: pair for n, pair in pairs.items() if points[n]["family"] not in PEERS}
     theirs = {n: pair for n, pair in pairs.items() if n not in ours}
-    ahead = behind(list(ours.values()), theirs, SAME)
     return {
-        "view": row.view,
-        "look": row.look,
-        "lit": row.lit,
-        "toroidal": row.toroidal,
-        "volume": row.file or "phantom",
         "pixels": found["pixels"],
         "reference": found["reference"],
-        "base": pareto_points.base_of(row),
-        "base seconds": round(base, 5),
         "front of jaxvol": [list(ours)[i] for i in front(list(ours.values()))],
-        "front of all": [list(pairs)[i] for i in front(list(pairs.values()))],
         "peers left out": row.peers,
-        "jaxvol's front is left of and below all points of VTK and Dr.Jit": not ahead if theirs else None,
-        "their points that it is not": ahead,
+        "their points that it is not": behind(list(ours.values()), theirs, SAME),
         "points": points,
-        **({"gradients": found["gradients"]} if "gradients" in found else {}),
     }
 
 
-def summary(scenes: dict[str, Any]) -> dict[str, Any]:
-    """What the record says in short, of scenes with peers."""
-    compared = {n: s for n, s in scenes.items() if any(p["family"] in PEERS for p in s["points"].values())}
-    ahead = {n: s["their points that it is not"] for n, s in compared.items()}
-    return {
-        "points": sum(len(s["points"]) for s in scenes.values()),
-        "scenes with peers": len(compared),
-        "scenes in which jaxvol's front is left of and below all points of VTK and Dr.Jit": [
-            n for n, points in ahead.items() if not points
-        ],
-        "points that it is not left of and below, by scene": {n: p for n, p in ahead.items() if p},
-        "largest error of a reference": max(s["reference"]["rmse"] for s in scenes.values()),
-    }
-
-
-def again(name: str, point: str, output: Path, sizes: Sizes, present: dict[str, str]) -> dict[str, Any]:
+def again(name: str, chosen: Namespace, output: Path, present: dict[str, str]) -> dict[str, Any]:
     """Renders and times a point, in turn with the base, and saves its picture; nothing else is changed."""
-    row = ROWS[name]
-    settings = pareto_points.of(row, present)
+    row, point = ROWS[name], chosen.point
+    settings, base = pareto_points.of(row, present), pareto_points.base_of(row)
     if point not in settings:
-        raise ValueError(
-            f"--point must be one of the settings of {name!r}, {', '.join(settings)}; got {point!r}."
-        )
-    case, base = pareto_measure.case_of(row, sizes), pareto_points.base_of(row)
-    truth = pareto_measure.converged(case, row, sizes.templates)
+        raise ValueError(f"--point must be one of {', '.join(settings)}; got {point!r}.")
+    case = pareto_measure.case_of(row, chosen)
+    truth = pareto_measure.converged(case, row, chosen.templates)
     made = {"": settings[base].make(case), point: settings[point].make(case)}
-    rows = programs.measured(made, truth, sizes.repetitions)
-    output.mkdir(parents=True, exist_ok=True)
     file = output / f"{slug(name)}, {slug(point)}.png"
     jv.save_png(file, pareto_measure.beside(made[point], truth))
-    return {**rows[point], "picture, and its error times " + str(pareto_measure.AMPLIFIED): str(file)}
+    return programs.measured(made, truth, chosen.repetitions)[point]
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """The chart, and the page beside it, with the pictures that the experiment left there."""
-    pareto_page.chart(result, path)
-    file = path.with_suffix(".json")
-    file = file if file.is_file() else record.RESULTS / "pareto.json"
-    pareto_page.write(file, file.parent / "pareto", path.with_suffix(".html"))
+draw, page = pareto_page.chart, pareto_page.write
 
 
 @experiment(
-    "pareto",
-    "What does accuracy cost, for every setting of every method, and where are the Pareto fronts?",
-    __doc__,
-    draw,
     repetitions=5,
     size=256,
     resolution=192,
@@ -173,52 +126,26 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 32, "repetitions": 2, "resolution": 32, "templates": 4},
 )
 def main(chosen: Namespace) -> dict[str, Any] | None:
-    given = any(word.split("=")[0] == "--scene" for word in chosen.argv)
-    names = [name for name in chosen.scene if there(ROWS[name].file)]
-    if chosen.quick and not given:
+    folder = harness.data() or Path("/none")
+    names = [n for n in chosen.scene if (file := ROWS[n].file) is None or (folder / file).is_file()]
+    if chosen.quick and chosen.scene == list(ROWS):
         names = list(QUICK)
-    if chosen.point is not None and (len(names) != 1 or not given):
+    if not names or (chosen.point is not None and len(names) != 1):
         raise ValueError(f"--point is of one scene: give one --scene that is there; got {', '.join(names)}.")
-    if not names:
-        raise ValueError("--scene must name a scene whose volume is there; got none.")
-    sizes = Sizes(chosen.size, chosen.resolution, chosen.repetitions, chosen.templates)
-    folder, present = chosen.output / "pareto", programs.peers()
+    present = programs.peers()
     if chosen.point is not None:
-        show(again(names[0], chosen.point, folder, sizes, present), names[0], chosen.point)
+        show(again(names[0], chosen, chosen.output, present), names[0], chosen.point)
         return None
 
     options = [f"--{n}={getattr(chosen, n)}" for n in ("size", "resolution", "repetitions", "seed")]
-    made = {
-        "commit": record.commit(),
-        "command": shlex.join(["python", "-m", *harness.ran("pareto", chosen)]),
-    }
+    made = {"commit": record.commit(), "command": shlex.join(["python", "-m", *chosen.command])}
     scenes: dict[str, Any] = {}
-    try:
-        for name in names:
-            few = pareto_points.few if chosen.quick else dict
-            found = pareto_measure.scene(
-                name, folder / slug(name), sizes, few(pareto_points.of(ROWS[name], present))
-            )
-            scenes[name] = {
-                "measured": made,
-                **concluded(name, found, ["--quick"] if chosen.quick else options),
-            }
-    except KeyboardInterrupt:
-        print(f"interrupted after {len(scenes)} scenes")
-        if not scenes:
-            return None
+    for name in names:
+        settings = pareto_points.of(ROWS[name], present)
+        settings = dict(list(settings.items())[:: 6 if chosen.quick else 1])
+        found = pareto_measure.scene(name, chosen.output / "pareto" / slug(name), chosen, settings)
+        scenes[name] = {"measured": made, **concluded(name, found, ["--quick"] if chosen.quick else options)}
     same = {"repetitions": chosen.repetitions, "voxels along an axis of phantoms": chosen.resolution}
-    scenes |= recorded("pareto", chosen, "scenes", [name for name in ROWS if name not in scenes], same)
+    scenes |= recorded(chosen, "scenes", [name for name in ROWS if name not in scenes], same)
     scenes = {name: scenes[name] for name in ROWS if name in scenes}
-    show(summary(scenes))
-    return {**same, "threads": THREADS, "peers": present, "summary": summary(scenes), "scenes": scenes}
-
-
-def there(file: str | None) -> bool:
-    """Whether a scene's volume is there."""
-    folder = harness.data()
-    return file is None or (folder is not None and (folder / file).is_file())
-
-
-if __name__ == "__main__":
-    main()
+    return {**same, "peers": present, "scenes": scenes}

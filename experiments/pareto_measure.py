@@ -2,34 +2,24 @@
 
 The converged image, the reference, is ours at a fraction of the step, by the midpoint rule (under a thin
 peak pre-integrated), cells cut at the exit, rays not ended early; of a lit scene every sample is lit, by
-many templates. Its own error is estimated twice: by the difference to the image of twice the step, and, at
-some pixels, to `render_ray_reference` in float64 by the midpoint rule, at half the step (under a thin peak
-at an eighth). In lit scenes both take one template only, and a third estimate follows from the difference to
-half as many templates from another seed.
-
-Gradients are those of the mean square of all premultiplied pixels, by `adjoint="replay"`, to the colours and
-to the extinction of all control points. Extinctions of 0, whose gradient leaping leaves out by design, do not
-count.
+many templates. Its own error is estimated by the difference to the image of twice the step, which is several
+times as large; in lit scenes also by the difference to half as many templates from another seed.
 """
 
 import re
-from collections.abc import Callable
+from argparse import Namespace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from PIL import Image as Pillow
 
 import jaxvol as jv
-from jaxvol.lighting import Lighting
 from jaxvol.metrics import psnr, rmse, ssim, wood_grain_energy
-from jaxvol.xla.compiling import OPTIONS
 
-from . import harness, pareto_points, programs, timing
-from .pareto_points import BASE, GRADIENTS, Setting
+from . import harness, pareto_points, programs
+from .pareto_points import Setting
 from .pareto_scenes import ROWS, Row
 from .programs import Case, Image, Program, Quadrature, lighting_of, program
 
@@ -41,21 +31,8 @@ SIDE = 112
 TEMPLATES = 256
 """Two images of 32 templates each differ by 0.07 on the lit head, as much as they differ from those of some
 settings."""
-PIXELS = 256
-"""Compared with float64."""
 SEEDS = 1001, 2002
 """Of the reference's templates: not those of the settings."""
-FINER = 8
-"""Steps in a voxel of the converged gradient."""
-
-
-class Sizes(NamedTuple):
-    """How much is measured. `templates`: of a lit scene's reference."""
-
-    pixels: int
-    resolution: int
-    repetitions: int
-    templates: int
 
 
 def slug(name: str) -> str:
@@ -63,18 +40,18 @@ def slug(name: str) -> str:
     return re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
 
 
-def case_of(row: Row, sizes: Sizes) -> Case:
-    return row.make(harness.data(), max(32, int(sizes.pixels * row.part)), sizes.resolution)
+def case_of(row: Row, chosen: Namespace) -> Case:
+    return row.make(harness.data(), max(32, int(chosen.size * row.part)), chosen.resolution)
 
 
-def scene(name: str, folder: Path, sizes: Sizes, settings: dict[str, Setting]) -> dict[str, Any]:
+def scene(name: str, folder: Path, chosen: Namespace, settings: dict[str, Setting]) -> dict[str, Any]:
     """All results of a scene; its pictures are written into the folder."""
     row = ROWS[name]
-    case, base = case_of(row, sizes), pareto_points.base_of(row)
-    truth = converged(case, row, sizes.templates)
+    case, base = case_of(row, chosen), pareto_points.base_of(row)
+    truth = converged(case, row, chosen.templates)
     found: dict[str, Any] = {
         "pixels": case.scene.camera.size[0],
-        "reference": own_error(case, row, truth, sizes.templates),
+        "reference": own_error(case, row, truth, chosen.templates),
         "points": {},
         "base seconds": [],
     }
@@ -83,27 +60,20 @@ def scene(name: str, folder: Path, sizes: Sizes, settings: dict[str, Setting]) -
     against = settings[base].make(case)
     for family in dict.fromkeys(setting.family for setting in settings.values()):
         made = {n: against if n == base else s.make(case) for n, s in settings.items() if s.family == family}
-        rows = programs.measured({base: against, **made}, truth, sizes.repetitions)
+        rows = programs.measured({base: against, **made}, truth, chosen.repetitions)
         found["base seconds"] += rows[base]["all seconds"]
         for point, each in made.items():
-            del rows[point]["all seconds"]
-            found["points"][point] = {"family": family, **rows[point], **quality(each, truth)}
+            image, seen = each.image(), each.seen(truth)
+            found["points"][point] = {
+                "family": family,
+                **{key: value for key, value in rows[point].items() if key != "all seconds"},
+                "psnr": round(psnr(image, seen), 3),
+                "ssim": round(ssim(image, seen), 6),
+                "wood grain": wood_grain_energy(image - seen),
+            }
             small(beside(each, truth)).save(folder / f"{slug(point)}.webp", quality=72, method=6)
-        harness.show({n: found["points"][n] for n in made}, name)
-    if row.gradients:
-        found["gradients"] = gradients(case, settings, sizes.repetitions)
     jax.clear_caches()  # a process cannot hold the programs of all scenes
     return found
-
-
-def quality(each: Program, truth: Image) -> dict[str, float]:
-    """What `harness.row` does not have of an image's error."""
-    image, seen = each.image(), each.seen(truth)
-    return {
-        "psnr": round(psnr(image, seen), 3),
-        "ssim": round(ssim(image, seen), 6),
-        "wood grain": wood_grain_energy(image - seen),
-    }
 
 
 def beside(each: Program, truth: Image) -> Image:
@@ -120,128 +90,26 @@ def small(linear: Image) -> Pillow.Image:
     return shown.resize((round(SIDE * width / height), SIDE), Pillow.Resampling.LANCZOS)
 
 
-# -- the converged image ----------------------------------------------------------------------------------
-
-
-def fine(case: Case, finer: float, quadrature: Quadrature = "midpoint") -> jv.March:
+def fine(case: Case, finer: float, quadrature: Quadrature) -> jv.March:
     transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping()
     return jv.March(case.scene.step / finer, transforms, quadrature)
 
 
 def converged(case: Case, row: Row, count: int = TEMPLATES, seed: int = SEEDS[0]) -> Image:
-    """The reference, over white. `row`: how fine it is; `count`: of templates."""
-    how = {"templates": count, "blend": True, "seed": seed} if row.noisy else {}
+    """The reference, over white, of so many templates."""
+    how = {"templates": count, "blend": True, "seed": seed} if row.kind == "lit" else {}
     lighting = None if case.lighting is None else lighting_of(case, **how)
     return program(case, fine(case, row.finer, row.quadrature), lighting).image()
 
 
 def own_error(case: Case, row: Row, truth: Image, count: int = TEMPLATES) -> dict[str, Any]:
     """What is estimated of the reference's own error: `rmse` in total, and its parts."""
-    few: Lighting | None = None if case.lighting is None or row.noisy else lighting_of(case)
-    image, exactly = truth, row.finer * (2 if row.quadrature == "midpoint" else 8)
-    if row.noisy:
-        # grown once: in float64, random numbers are others
-        grown = lighting_of(case, templates=1, photons=8, seed=SEEDS[0]).simulated()
-        few = lighting_of(case, given=grown)
-        image = program(case, fine(case, row.finer, row.quadrature), few).image()
-    coarse = program(case, fine(case, row.finer / 2, row.quadrature), few).image()
-    pixels = visible_pixels(image)
-    exact = in_float64(case, fine(case, exactly), few, pixels)
-    off = image[pixels[:, 1], pixels[:, 0]] - exact
-    found: dict[str, Any] = {
-        "steps in a voxel": row.finer,
-        "quadrature": row.quadrature,
-        "difference to twice the step": rmse(image, coarse),
-        "pixels in float64": len(pixels),
-        "steps in a voxel, float64": exactly,
-        "difference to float64": float(np.sqrt(np.mean(off**2))),
-        "largest difference to float64": float(np.abs(off).max()),
-    }
-    if row.noisy:
-        found["templates"] = count
+    coarse = converged(case, row._replace(finer=row.finer / 2), count)
+    found = {"steps in a voxel": row.finer, "difference to twice the step": rmse(truth, coarse)}
+    if row.kind == "lit":
         counts = zip((count, count // 2), SEEDS, strict=True)
         one, other = (converged(case, row._replace(finer=1), n, seed) for n, seed in counts)
         # of images with the variances v and 2 v
         found["error by the number of templates"] = rmse(one, other) / np.sqrt(3)
-    errors = found["difference to float64"], found.get("error by the number of templates", 0)
+    errors = found["difference to twice the step"], found.get("error by the number of templates", 0)
     return {"rmse": float(np.hypot(*errors)), **found}
-
-
-def visible_pixels(image: Image) -> np.ndarray:
-    """(column, row) of some pixels that show something, drawn at random; of any if none does."""
-    rows, columns = np.nonzero(np.any(image != 1, axis=-1))
-    if len(rows) == 0:
-        rows, columns = (index.ravel() for index in np.indices(image.shape[:2]))
-    drawn = np.random.default_rng(0).permutation(len(rows))[:PIXELS]
-    return np.column_stack([columns[drawn], rows[drawn]])
-
-
-def in_float64(case: Case, march: jv.March, lighting: Lighting | None, pixels: np.ndarray) -> np.ndarray:
-    """What `render_ray_reference` sees in float64 through these pixels, over white."""
-    with jax.enable_x64(True):
-        volume, transfer, camera, march, lighting = jax.tree.map(
-            doubled, (case.scene.volume, case.scene.transfer, case.scene.camera, march, lighting)
-        )
-
-        # voxels keep their type
-        volume = eqx.tree_at(lambda v: v.data, volume, case.scene.volume.data)
-
-        def one(pixel: jax.Array) -> jax.Array:
-            origin, direction = (jnp.stack(part) for part in camera.ray(pixel[0], pixel[1]))
-            how = {"pixel": (pixel[0], pixel[1]), "lighting": lighting, "compositing": case.compositing}
-            return jv.render_ray_reference(volume, transfer, origin, direction, march, **how).image()
-
-        return np.asarray(jax.vmap(one)(jnp.asarray(pixels, jnp.int32)))
-
-
-def doubled(leaf: Any) -> Any:
-    """A leaf in float64, if it is of floats."""
-    if eqx.is_inexact_array(leaf):
-        return jnp.asarray(np.asarray(leaf, np.float64))
-    return leaf
-
-
-# -- gradients --------------------------------------------------------------------------------------------
-
-
-def gradients(case: Case, settings: dict[str, Setting], repetitions: int) -> dict[str, Any]:
-    """By setting, where one is compared: relative errors, seconds, and their ratio to the base's image."""
-    transfer = case.scene.transfer
-    truth, coarser = (
-        gradient(program(case, fine(case, finer)).of_transfer, transfer)()[1] for finer in (FINER, FINER / 2)
-    )
-    rows, drawn = {}, {"image": settings[BASE].make(case).draw}
-    for name in (name for name in GRADIENTS if name in settings):
-        drawn[name] = gradient(settings[name].make(case).of_transfer, transfer)
-        rows[name] = relative(drawn[name]()[1], truth, transfer)
-    seconds = timing.interleaved(drawn, repetitions)
-    for name, row in rows.items():
-        row["seconds"] = timing.median(seconds[name])
-        row["over the base's image"] = timing.ratio(seconds[name], seconds["image"])
-    own = relative(coarser, truth, transfer)
-    return {"steps in a voxel": FINER, "reference to twice its step": own, "points": rows}
-
-
-def gradient(
-    rgba: Callable[[jv.TransferFunction], jax.Array] | None, transfer: jv.TransferFunction
-) -> Callable[[], Any]:
-    """A program of the image's loss and its gradient, to the colours and to the extinction."""
-    assert rgba is not None
-
-    def loss(leaf: Any) -> jax.Array:
-        return jnp.mean(rgba(eqx.tree_at(lambda t: (t.colors, t.extinction), transfer, leaf)) ** 2)
-
-    # compiled as one program, like the image
-    both = jax.jit(jax.value_and_grad(loss), compiler_options=OPTIONS)
-    return lambda: both((transfer.colors, transfer.extinction))
-
-
-def relative(found: Any, truth: Any, transfer: jv.TransferFunction) -> dict[str, Any]:
-    """|g - g*| / |g*|, of colours and of extinctions."""
-    visible = np.asarray(transfer.extinction) > 0
-
-    def of(g: jax.Array, exact: jax.Array) -> float:
-        ours, theirs = (np.asarray(each, np.float64)[visible] for each in (g, exact))
-        return float(np.linalg.norm(ours - theirs) / np.linalg.norm(theirs))
-
-    return {"colours": of(found[0], truth[0]), "extinction": of(found[1], truth[1])}

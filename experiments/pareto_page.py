@@ -1,11 +1,13 @@
-"""Draws the chart of a `pareto` record, and writes its page: one HTML file without network, with the picture
-behind each point.
+"""Draws the chart of a `pareto` record, and its page: one HTML file without network, the chart with
+the numbers, the command and the picture behind each point.
 
 Both are made from the record and the small pictures beside it alone. `pareto_page.html` is the page without
 its data.
 """
 
 import base64
+import html
+import io
 import json
 import math
 from pathlib import Path
@@ -14,62 +16,35 @@ from typing import Any
 from matplotlib.lines import Line2D
 
 from . import charts, record
-from .pareto_measure import AMPLIFIED, slug
+from .pareto_measure import slug
+from .pareto_points import SETTINGS
 from .programs import DRJIT, VTK
 
 
-COLORS = {
-    "left": "#1f77b4",
-    "midpoint": "#2ca02c",
-    "preintegrated": "#d62728",
-    "adaptive": "#9467bd",
-    "jitter": "#e377c2",
-    "alignment": "#8c564b",
-    "leaping": "#17becf",
-    "termination": "#bcbd22",
-    "transfer table": "#5254a3",
-    "storage": "#ad494a",
-    "photons": "#08306b",
-    "templates": "#7f0000",
-    "baked": "#00441b",
-    "deferred": "#fd8d8d",
-    "shaded": "#6a3d9a",
-    "shaded once": "#b15928",
-    "isosurface": "#1b9e77",
-    "isosurface, no leaping": "#d95f02",
-    "isosurface, leaping by distance": "#7570b3",
-    "whole": "#2b8cbe",
-    "bricks, memory of the whole": "#e6ab02",
-    "bricks, memory of a quarter": "#a6761d",
-    VTK: "#555555",
-    DRJIT: "#ff7f0e",
-}
+FAMILIES = [setting.family for settings in SETTINGS.values() for setting in settings.values()]
+FAMILIES = list(dict.fromkeys([*FAMILIES, VTK, DRJIT]))
+PALETTE = [*charts.plt.get_cmap("tab20").colors, *charts.plt.get_cmap("tab20b").colors]  # pyright: ignore
+COLORS = dict(zip(FAMILIES, PALETTE, strict=False))
 """By family, here and on the page."""
 MARKS = {VTK: "^", DRJIT: "s"}
 COLUMNS = 4
 TEMPLATE = Path(__file__).with_suffix(".html")
-DATA = "/*DATA*/"
-SHOWN = {"family": "f", "time": "t", "rmse": "e", "psnr": "p", "ssim": "s", "wood grain": "w", "command": "c"}
-"""What the page knows of a point, and how its data call it."""
-ABOUT = (
-    *("view", "look", "lit", "toroidal", "pixels", "reference", "gradients"),
-    "their points that it is not",
-)
-"""What it knows of a scene, beside its points."""
+NUMBERS = ("family", "rmse", "psnr", "ssim", "wood grain")
+"""What the page tells of a point, beside its time."""
 
 
-def chart(result: dict[str, Any], path: Path) -> None:
+def chart(result: dict[str, Any]) -> Any:
     """Time against error, a panel for each scene, with the fronts."""
     scenes = result["scenes"]
     columns = min(COLUMNS, len(scenes))
     rows = math.ceil(len(scenes) / columns)
     figure, axes = charts.panels(rows, columns, 4.4 * columns, 3.7 * rows + 0.7)
     for panel, (name, scene) in zip(axes.flat, scenes.items(), strict=False):
-        _panel(panel, name, scene)
+        draw_scene(panel, name, scene)
     for panel in axes.flat[len(scenes) :]:
         panel.set_axis_off()
     for panel in axes[:, 0]:
-        panel.set_ylabel("time of a frame, ms", fontsize=9)
+        panel.set_ylabel("time of a frame, ms")
     used = {point["family"] for scene in scenes.values() for point in scene["points"].values()}
     marks = [
         Line2D([], [], color=color, marker=MARKS.get(family, "o"), linestyle="", label=family)
@@ -86,72 +61,99 @@ def chart(result: dict[str, Any], path: Path) -> None:
         fontsize=11,
     )
     figure.legend(handles=[*marks, *lines], loc="outside lower center", ncols=min(9, 3 * columns), fontsize=9)
-    charts.save(figure, path)
+    return figure
 
 
-def _panel(panel: Any, name: str, scene: dict[str, Any]) -> None:
+def identity(scene: str, setting: str) -> str:
+    """Of a point, in the chart of the page."""
+    return f"point-{slug(scene)}-{slug(setting)}"
+
+
+def draw_scene(panel: Any, name: str, scene: dict[str, Any]) -> None:
     points = scene["points"]
-    for family in dict.fromkeys(point["family"] for point in points.values()):
-        mine = [point for point in points.values() if point["family"] == family]
-        errors, times = [p["rmse"] for p in mine], [p["time"] * 1e3 for p in mine]
-        style = {"color": COLORS[family], "markersize": 6 if family in MARKS else 4.5, "alpha": 0.8}
-        panel.plot(errors, times, MARKS.get(family, "o"), zorder=3 if family in MARKS else 2, **style)
+    for setting, point in points.items():
+        family = point["family"]
+        style: Any = {"markersize": 6, "zorder": 3} if family in MARKS else {"markersize": 4.5, "zorder": 2}
+        style |= {"color": COLORS[family], "alpha": 0.8, "gid": identity(name, setting)}
+        panel.plot(point["rmse"], point["time"] * 1e3, MARKS.get(family, "o"), **style)
     front = [points[n] for n in scene["front of jaxvol"]]
     corners = [(p["rmse"], p["time"] * 1e3) for p in front]
-    if corners:
-        corners.append((max(point["rmse"] for point in points.values()), corners[-1][1]))
-        panel.step(*zip(*corners, strict=True), where="post", color="k", linewidth=1.2, zorder=1)
+    corners.append((max(point["rmse"] for point in points.values()), corners[-1][1]))
+    panel.step(*zip(*corners, strict=True), where="post", color="k", linewidth=1.2, zorder=1)
     panel.axvline(scene["reference"]["rmse"], color="k", linewidth=0.8, linestyle=":")
     panel.set(xscale="log", yscale="log", xlabel="RMSE")
     panel.set_title(f"{name}, {scene['pixels']}²", fontsize=10)
-    panel.tick_params(labelsize=8, which="both")
     charts.plain_numbers(panel)
     panel.grid(which="major", linewidth=0.3)
 
 
-def write(path: Path, pictures: Path, page: Path) -> Path:
-    """Write the page of a record.
-
-    - `pictures`: the folder with a folder of pictures for each scene.
-    """
+def write(path: Path, page: Path) -> None:
+    """Write the page of a record, with the pictures that the experiment left beside it."""
+    pictures = path.parent / "pareto"
     found = record.read(path)
-    result = found.pop("result")
-    data = {
-        "about": found,
-        "amplified": AMPLIFIED,
-        "colors": COLORS,
-        "marks": MARKS,
-        "summary": result["summary"],
-        "peers": result["peers"],
-        "repetitions": result["repetitions"],
-        "scenes": [scene(name, each, pictures / slug(name)) for name, each in result["scenes"].items()],
+    result, device = found["result"], found["device"]
+    about = (
+        "One mark for each setting, one panel for each scene; lower left is better. The line is the front of "
+        "jaxvol's marks, the dotted line the error of the reference itself. Times are medians of "
+        f"{result['repetitions']} rounds on {device['processor']}, {device['cores']} cores. "
+        f"Commit {found['commit']}. " + "; ".join(f"{n}: {v}" for n, v in result["peers"].items()) + "."
+    )
+    drawn = io.StringIO()
+    with charts.plt.rc_context({"svg.fonttype": "none", "svg.hashsalt": "pareto"}):
+        figure = chart(result)
+        figure.savefig(drawn, format="svg", metadata={"Date": None})
+    charts.plt.close(figure)
+    points = {
+        identity(name, setting): point_of(name, scene, setting)
+        for name, scene in result["scenes"].items()
+        for setting in scene["points"]
     }
-    # "</script>" in a string would end the script
-    text = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
-    page.write_text(TEMPLATE.read_text(encoding="utf-8").replace(DATA, text), encoding="utf-8")
-    return page
+    shown = {
+        file.relative_to(pictures).as_posix(): base64.b64encode(file.read_bytes()).decode()
+        for file in sorted(pictures.glob("*/*.webp"))
+    }
+    parts = {
+        "<!--ABOUT-->": html.escape(about),
+        "<!--CHART-->": drawn.getvalue().partition("<svg")[2].join(("<svg", "")),
+        "<!--AHEAD-->": ahead(result["scenes"]),
+        "/*POINTS*/": as_script(points),
+        "/*PICTURES*/": as_script(shown),
+    }
+    text = TEMPLATE.read_text(encoding="utf-8")
+    for place, part in parts.items():
+        text = text.replace(place, part)
+    page.write_text(text, encoding="utf-8")
 
 
-def scene(name: str, found: dict[str, Any], pictures: Path) -> dict[str, Any]:
-    """What the page shows of a scene."""
-    points = [
-        {
-            "n": point,
-            **{short: rounded(row[long]) for long, short in SHOWN.items()},
-            "i": embedded(pictures / f"{slug(point)}.webp"),
-        }
-        for point, row in found["points"].items()
-    ]
-    about = {key: found[key] for key in ABOUT if key in found}
-    image = embedded(pictures / "reference.webp")
-    return {"name": name, **about, "image": image, "points": points}
+def point_of(name: str, scene: dict[str, Any], setting: str) -> dict[str, Any]:
+    """What the page tells of a point."""
+    point = scene["points"][setting]
+    numbers = {"ms": point["time"] * 1e3, **{key: point[key] for key in NUMBERS}}
+    return {
+        "scene": name,
+        "name": setting,
+        "command": point["command"],
+        "numbers": {n: f"{v:.4g}" if isinstance(v, float) else v for n, v in numbers.items()},
+        "picture": f"{slug(name)}/{slug(setting)}.webp",
+        "reference": f"{slug(name)}/reference.webp",
+    }
 
 
-def rounded(value: Any) -> Any:
-    """Numbers to four digits, which is more than the page shows."""
-    return float(f"{value:.4g}") if isinstance(value, float) else value
+def as_script(data: Any) -> str:
+    """JSON within a script, which "</script>" in a string would end."""
+    return json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
 
 
-def embedded(file: Path) -> str | None:
-    """A picture as text; None if it is not there."""
-    return base64.b64encode(file.read_bytes()).decode() if file.is_file() else None
+def ahead(scenes: dict[str, Any]) -> str:
+    """A table of the points of other programs that are ahead of ours."""
+    titles = ("point", "our fastest time at its error / its own", "our best error in its time / its own")
+    rows: list[tuple[str, ...]] = [(*titles, "of that time, our shortest frame")]
+    for name, scene in scenes.items():
+        points = scene["points"].values()
+        shortest = min(point["time"] for point in points if point["family"] not in MARKS)
+        for setting, by in scene["their points that it is not"].items():
+            ratios = ["none" if by[key] is None else f"{by[key]:.3g}" for key in ("time", "error")]
+            ours = by["time"] and scene["points"][setting]["time"] * by["time"]
+            rows.append((f"{name}: {setting}", *ratios, f"{shortest / ours:.0%}" if ours else ""))
+    lines = ("".join(f"<td>{html.escape(cell)}</td>" for cell in row) for row in rows)
+    return f"<table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"

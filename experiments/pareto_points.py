@@ -1,13 +1,13 @@
 """Which settings of which methods are charted by `pareto`? One entry each, by name: how its program is made.
 
-Each method has its own sweep around one base: the midpoint rule at steps of one voxel, cells cut at the exit
-(`AlphaCorrection`), space leaping by the hierarchy, and rays that end at a transmittance of 1e-4. In a lit
-scene the base is lit once per ray, by one template of eight photons; in a shaded one each sample is
-shaded by its gradient, and an isosurface where it is hit. A scene in bricks is rendered whole and by
-`render_bricks`, from a file, within a budget.
+Each method has its own sweep around one base, the first setting of its kind of scene. Unlit: the midpoint
+rule at steps of one voxel, cells cut at the exit (`AlphaCorrection`), space leaping by the hierarchy, and
+rays that end at a transmittance of 1e-4. In a lit scene the base is lit once per ray, by one template of
+eight photons; in a shaded one each sample is shaded by its gradient, and an isosurface where it is hit. A
+scene in bricks is rendered whole and by `render_bricks`, from a file, within a budget.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,92 +20,52 @@ import jaxvol as jv
 from jaxvol.bricks.grid import COPIES
 from jaxvol.lighting import Lighting
 
-from . import peer_vtk
-from .pareto_scenes import Row
-from .programs import (
-    DRJIT,
-    FINEST_OF,
-    LEFT,
-    QUADRATURES,
-    VTK,
-    Case,
-    Program,
-    adaptive,
-    by_drjit,
-    by_vtk,
-    deferred,
-    is_here,
-    lighting_of,
-    ours,
-)
+from . import peer_vtk, programs
+from .pareto_scenes import Kind, Row
+from .programs import DRJIT, FINEST_OF, LEFT, QUADRATURES, VTK, Case, Program, deferred, lighting_of, ours
 
 
 STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 BASE = "midpoint, step 1"
-LIT_BASE = "lit, midpoint, step 1"
-SHADED_BASE = "shaded, midpoint, step 1"
-SURFACE_BASE = "isosurface, step 1"
-WHOLE_BASE = "whole, step 1"
 PHOTONS = 8
 
 
-def unlit(row: Row) -> bool:
-    return not row.lit and not row.bricks
-
-
 class Setting(NamedTuple):
-    """A point of the chart: the method whose sweep it belongs to, and how its program is made.
-
-    `where`: of which scenes.
-    """
+    """A point of the chart: the method whose sweep it belongs to, and how its program is made. `toroidal`:
+    whether it is measured in toroidal scans, too, where each ray is bent sample by sample."""
 
     family: str
     make: Callable[[Case], Program]
-    where: Callable[[Row], bool] = unlit
+    toroidal: bool = False
 
 
-def stepped(
-    name: str,
-    family: str,
-    steps: tuple[float, ...],
-    *transforms: Any,
-    where: Callable[[Row], bool] = unlit,
-    **how: Any,
-) -> Any:
+Settings = dict[str, Setting]
+
+
+def sweep(
+    family: str, name: str, steps: Iterable[float], *transforms: Any, toroidal: bool = True, **how: Any
+) -> Settings:
     """The same setting at several steps, by name."""
-    return {f"{name}, step {s:g}": Setting(family, ours(*transforms, step=s, **how), where) for s in steps}
+    return {f"{name}, step {s:g}": Setting(family, ours(*transforms, step=s, **how), toroidal) for s in steps}
 
 
-def lit(family: str, *transforms: Any, by: Callable[..., Lighting] = lighting_of, **how: Any) -> Setting:
-    """A setting of light; `step` and `quadrature` are the march's, all else the templates'."""
-    march: dict[str, Any] = {name: how.pop(name) for name in ("step", "quadrature") if name in how}
-
-    def keep(case: Case) -> Case:  # a volume keeps one baked light only
-        return case._replace(scene=case.scene._replace(volume=copied(case.scene.volume)))
-
-    if "baked" in how:
-        march["changed"] = keep
-    made = ours(*transforms, lighting=partial(by, **how), **march)
-    return Setting(family, made, lambda row: row.noisy)
-
-
-def straight(row: Row) -> bool:
-    """Where frames are fast enough for all settings: each ray of a toroidal scan is bent sample by sample."""
-    return unlit(row) and not row.toroidal
+def lit(
+    family: str,
+    by: Callable[..., Lighting] = lighting_of,
+    step: float = 1.0,
+    quadrature: Any = "midpoint",
+    **how: Any,
+) -> Setting:
+    """A setting of light, by options of its templates."""
+    changed: Any = {"changed": copied} if "baked" in how else {}
+    return Setting(family, ours(lighting=partial(by, **how), step=step, quadrature=quadrature, **changed))
 
 
-def peer(row: Row) -> bool:
-    return row.peers is None
-
-
-def unlit_peer(row: Row) -> bool:
-    return peer(row) and not row.shaded
-
-
-def copied(volume: jv.Volume) -> jv.Volume:
-    """The same volume in arrays of its own: what is computed once for each array of voxels, such as baked
-    light, is then kept apart."""
-    return jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)
+def copied(case: Case) -> Case:
+    """The same volume in an array of its own, since a volume keeps one baked light only."""
+    volume = case.scene.volume
+    volume = jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)
+    return case._replace(scene=case.scene._replace(volume=volume))
 
 
 @cache
@@ -121,19 +81,14 @@ def in_bricks(part: float, step: float, case: Case) -> Program:
     transforms = *case.placed, jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(LEFT)
     march = jv.March(step * voxel, transforms, "midpoint")
     memory = int(part * COPIES * volume.data.nbytes)
-    path = Path(_folder().name) / f"{len(list(Path(_folder().name).glob('*.npy')))}.npy"
+    path = Path(_folder().name) / f"{part:g}, {step:g}.npy"
     np.save(path, np.asarray(volume.data))
     source = jv.bricks.source_of(path, spacing=volume.spacing, origin=volume.origin)
 
     def render() -> jv.Rendering:
         return jv.render_bricks(source, transfer, camera, march, memory=memory, outputs="rgba")
 
-    def image() -> np.ndarray:
-        rendering = render()
-        assert not np.any(rendering.exhausted)
-        return np.asarray(rendering.image())
-
-    return Program(lambda: render().rgba, image)
+    return Program(lambda: render().rgba, lambda: np.asarray(render().image()))
 
 
 def tabulated(points: int, case: Case) -> Case:
@@ -157,166 +112,119 @@ def stored(kind: str, case: Case) -> Case:
     return case._replace(scene=case.scene._replace(volume=volume, transfer=transfer))
 
 
-JITTERS: dict[str, tuple[jv.Transform, ...]] = {
-    "jittered": (jv.Jitter(0),),
-    "jittered, blue": (jv.Jitter(0, "blue"),),
-    "jittered, front residual": (jv.Jitter(0, front_residual=True),),
-    "empty-space jittered": (jv.EmptySpaceJitter(0),),
-    "empty-space jittered, blue": (jv.EmptySpaceJitter(0, "blue"),),
+JITTERS: dict[str, tuple[jv.Transform, bool]] = {
+    "jittered": (jv.Jitter(0), True),
+    "jittered, blue": (jv.Jitter(0, "blue"), False),
+    "jittered, front residual": (jv.Jitter(0, front_residual=True), False),
+    "empty-space jittered": (jv.EmptySpaceJitter(0), True),
+    "empty-space jittered, blue": (jv.EmptySpaceJitter(0, "blue"), False),
+}
+"""With whether they are measured in toroidal scans, too: those of Kye 2013."""
+PLAIN = jv.AlphaCorrection, jv.SpaceLeaping, jv.EarlyTermination
+NOT_ALIGNED: Any = {"without": (jv.AlphaCorrection,)}
+NO_LEAPING: Any = {"without": (jv.SpaceLeaping,)}
+
+
+def unlit() -> Settings:
+    found = {BASE: Setting("midpoint", ours(), True)}
+    for quadrature in QUADRATURES:
+        found |= sweep(quadrature, quadrature, STEPS, quadrature=quadrature)
+    for tolerance in FINEST_OF:
+        found[f"adaptive, tolerance {tolerance:g}"] = Setting("adaptive", programs.adaptive(tolerance), True)
+    for name, (jitter, toroidal) in JITTERS.items():
+        found |= sweep("jitter", name, (1.0, 2.0), jitter, toroidal=toroidal)
+    found |= sweep("alignment", "not aligned", (0.5, 1.0, 2.0), **NOT_ALIGNED)
+    found |= sweep("alignment", "not aligned, left", (0.5, 1.0), quadrature="left", **NOT_ALIGNED)
+    found |= sweep("alignment", "plain ray casting", (0.5, 1.0, 2.0), quadrature="left", without=PLAIN)
+    found |= sweep("leaping", "no leaping", (0.5, 1.0), **NO_LEAPING)
+    found |= sweep("leaping", "leaping by distance", (0.5, 1.0), jv.SpaceLeaping("distance"))
+    for method in ("min_distance", "beam"):
+        for cell in (4, 8, 16):
+            leaps = jv.SpaceLeaping(method, cell)
+            found[f"leaping by {method}, cell {cell}"] = Setting("leaping", ours(leaps))
+    for left in (0.1, 0.03, 0.01, 1 / 255, 1e-3):
+        found[f"ending at {left:g}"] = Setting("termination", ours(jv.EarlyTermination(left)), True)
+    found["not ending early"] = Setting("termination", ours(without=(jv.EarlyTermination,)), True)
+    for n in (16, 64, 256, 1024):
+        found[f"transfer table of {n}"] = Setting("transfer table", ours(changed=partial(tabulated, n)))
+    for kind in ("uint8", "uint16", "float16", "float32"):
+        found[f"stored as {kind}"] = Setting("storage", ours(changed=partial(stored, kind)))
+    return found
+
+
+def of_templates() -> Settings:
+    found = {}
+    for q in ("midpoint", "left"):
+        for step in (1.0, 0.5, 2.0, 4.0):
+            found[f"lit, {q}, step {step:g}"] = lit("deferred", deferred, step, q, photons=PHOTONS)
+    found |= {f"photons {n}": lit("photons", photons=n) for n in (1, 4, 8, 16)}
+    found["all photons"] = lit("photons")
+    found["all photons, hard occlusion"] = lit("photons", occlusion="hard")
+    found["all photons, deferred"] = lit("deferred", deferred)
+    blended: Any = {"blend": True, "photons": PHOTONS}
+    for n in (1, 2, 4):
+        found[f"templates {n}, photons {PHOTONS}"] = lit("templates", templates=n, **blended)
+    for n in (2, 4, 8):
+        found[f"templates {n}, deferred"] = lit("deferred", deferred, templates=n, **blended)
+    for n in (32, 64, 128):
+        found[f"baked {n}"] = lit("baked", baked=n)
+        found[f"baked {n}, deferred"] = lit("baked", deferred, baked=n)
+    for step in (0.5, 2.0):
+        found[f"baked 64, step {step:g}"] = lit("baked", step=step, baked=64)
+    return found
+
+
+def shaded() -> Settings:
+    found = sweep("shaded", "shaded, midpoint", (1.0,), lighting=lighting_of)
+    for once, by in (("", lighting_of), (" once", deferred)):
+        for q in QUADRATURES:
+            found |= sweep(f"shaded{once}", f"shaded{once}, {q}", STEPS, quadrature=q, lighting=by)
+    return found
+
+
+def surface() -> Settings:
+    found = sweep("isosurface", "isosurface", (1.0, 0.25, 0.5, 2.0, 4.0), lighting=lighting_of)
+    name = "isosurface, no leaping"
+    found |= sweep(name, name, STEPS, lighting=lighting_of, **NO_LEAPING)
+    name = "isosurface, leaping by distance"
+    return found | sweep(name, name, STEPS, jv.SpaceLeaping("distance"), lighting=lighting_of)
+
+
+def whole_and_in_bricks() -> Settings:
+    found = sweep("whole", "whole", (1.0, 0.5, 2.0, 4.0))
+    for words, part in (("of the whole", 1.0), ("of a quarter", 0.25)):
+        for step in (1.0, 2.0):
+            name = f"bricks, memory {words}"
+            found[f"{name}, step {step:g}"] = Setting(name, partial(in_bricks, part, step))
+    return found
+
+
+SETTINGS: dict[Kind, Settings] = {
+    "unlit": unlit(),
+    "lit": of_templates(),
+    "shaded": shaded(),
+    "surface": surface(),
+    "bricks": whole_and_in_bricks(),
+}
+"""By kind of scene, its base first."""
+OF_VTK = {f"{VTK}, step {step:g}": Setting(VTK, partial(programs.by_vtk, step)) for step in STEPS[1:]}
+OF_DRJIT = {
+    f"{DRJIT}, {q}, step {step:g}": Setting(DRJIT, partial(programs.by_drjit, q, step))
+    for q in ("left", "midpoint")
+    for step in STEPS[1:]
 }
 
-PAPER = "jittered", "empty-space jittered"
-"""Those of Kye 2013, and the only ones in toroidal scans."""
 
-UNLIT: dict[str, Setting] = {
-    **{
-        f"{q}, step {step:g}": Setting(q, ours(step=step, quadrature=q))
-        for q in QUADRATURES
-        for step in STEPS
-    },
-    **{f"adaptive, tolerance {t:g}": Setting("adaptive", adaptive(t)) for t in FINEST_OF},
-    **{
-        name: setting
-        for how, jitter in JITTERS.items()
-        for name, setting in stepped(
-            how, "jitter", (1.0, 2.0), *jitter, where=unlit if how in PAPER else straight
-        ).items()
-    },
-    **stepped("not aligned", "alignment", (0.5, 1.0, 2.0), without=(jv.AlphaCorrection,)),
-    **stepped("not aligned, left", "alignment", (0.5, 1.0), without=(jv.AlphaCorrection,), quadrature="left"),
-    **stepped(
-        "plain ray casting",
-        "alignment",
-        (0.5, 1.0, 2.0),
-        without=(jv.AlphaCorrection, jv.SpaceLeaping, jv.EarlyTermination),
-        quadrature="left",
-    ),
-    **stepped("no leaping", "leaping", (0.5, 1.0), without=(jv.SpaceLeaping,)),
-    **stepped("leaping by distance", "leaping", (0.5, 1.0), jv.SpaceLeaping("distance")),
-    **{
-        f"leaping by {method}, cell {cell}": Setting("leaping", ours(jv.SpaceLeaping(method, cell)), straight)
-        for method in ("min_distance", "beam")
-        for cell in (4, 8, 16)
-    },
-    **{
-        f"ending at {left:g}": Setting("termination", ours(jv.EarlyTermination(left)))
-        for left in (0.1, 0.03, 0.01, 1 / 255, 1e-3)
-    },
-    "not ending early": Setting("termination", ours(without=(jv.EarlyTermination,))),
-    **{
-        f"transfer table of {n}": Setting("transfer table", ours(changed=partial(tabulated, n)), straight)
-        for n in (16, 64, 256, 1024)
-    },
-    **{
-        f"stored as {kind}": Setting("storage", ours(changed=partial(stored, kind)), straight)
-        for kind in ("uint8", "uint16", "float16", "float32")
-    },
-}
-
-LIT: dict[str, Setting] = {
-    **{
-        f"lit, {q}, step {step:g}": lit("deferred", by=deferred, photons=PHOTONS, step=step, quadrature=q)
-        for q in ("midpoint", "left")
-        for step in STEPS[1:]
-    },
-    **{f"photons {n}": lit("photons", photons=n) for n in (1, 4, 8, 16)},
-    "all photons": lit("photons"),
-    "all photons, hard occlusion": lit("photons", occlusion="hard"),
-    **{
-        f"templates {n}, photons {PHOTONS}": lit("templates", templates=n, blend=True, photons=PHOTONS)
-        for n in (1, 2, 4)
-    },
-    **{f"baked {n}": lit("baked", baked=n) for n in (32, 64, 128)},
-    **{f"baked 64, step {step:g}": lit("baked", baked=64, step=step) for step in (0.5, 2.0)},
-    **{f"baked {n}, deferred": lit("baked", by=deferred, baked=n) for n in (32, 64, 128)},
-    "all photons, deferred": lit("deferred", by=deferred),
-    **{
-        f"templates {n}, deferred": lit("deferred", by=deferred, templates=n, blend=True, photons=PHOTONS)
-        for n in (2, 4, 8)
-    },
-}
-
-SHADED: dict[str, Setting] = {
-    f"shaded{once}, {q}, step {step:g}": Setting(
-        f"shaded{once}", ours(step=step, quadrature=q, lighting=by), lambda row: row.shaded
-    )
-    for once, by in (("", lighting_of), (" once", deferred))
-    for q in QUADRATURES
-    for step in STEPS
-}
-
-SURFACE: dict[str, Setting] = {
-    f"isosurface{how}, step {step:g}": Setting(
-        f"isosurface{how}",
-        ours(*leaps, step=step, without=without, lighting=lighting_of),
-        lambda row: row.surface,
-    )
-    for how, leaps, without in (
-        ("", (), ()),
-        (", no leaping", (), (jv.SpaceLeaping,)),
-        (", leaping by distance", (jv.SpaceLeaping("distance"),), ()),
-    )
-    for step in STEPS
-}
-
-BRICKS: dict[str, Setting] = {
-    **stepped("whole", "whole", STEPS[1:], where=lambda row: row.bricks),
-    **{
-        f"bricks, memory {words}, step {step:g}": Setting(
-            f"bricks, memory {words}", partial(in_bricks, part, step), lambda row: row.bricks
-        )
-        for words, part in (("of the whole", 1.0), ("of a quarter", 0.25))
-        for step in STEPS[2:4]
-    },
-}
-
-PEERS: dict[str, Setting] = {
-    **{f"{VTK}, step {step:g}": Setting(VTK, partial(by_vtk, step), peer) for step in STEPS[1:]},
-    **{
-        f"{DRJIT}, {q}, step {step:g}": Setting(DRJIT, partial(by_drjit, q, step), unlit_peer)
-        for q in ("left", "midpoint")
-        for step in STEPS[1:]
-    },
-}
-
-SETTINGS: dict[str, Setting] = {**UNLIT, **LIT, **SHADED, **SURFACE, **BRICKS, **PEERS}
-
-GRADIENTS = (
-    "midpoint, step 0.5",
-    BASE,
-    "midpoint, step 2",
-    "left, step 1",
-    "preintegrated, step 1",
-    "adaptive, tolerance 0.01",
-    "not aligned, step 1",
-    "no leaping, step 1",
-    "empty-space jittered, step 1",
-    "ending at 0.01",
-    f"ending at {1 / 255:g}",
-)
-"""At which gradients are compared."""
-
-
-def of(row: Row, there: dict[str, str]) -> dict[str, Setting]:
+def of(row: Row, there: dict[str, str]) -> Settings:
     """The settings of a scene, its base first; `there`: version of each peer, or why it is missing."""
-    found = {name: setting for name, setting in SETTINGS.items() if setting.where(row)}
-    present = {n: s for n, s in found.items() if is_here(there, s.family)}
-    base = base_of(row)
-    return {base: present[base], **present}
+    found = {n: s for n, s in SETTINGS[row.kind].items() if s.toroidal or not row.toroidal}
+    if row.peers is None and programs.is_here(there, VTK):
+        found |= OF_VTK
+    if row.peers is None and row.kind == "unlit" and programs.is_here(there, DRJIT):
+        found |= OF_DRJIT
+    return found
 
 
 def base_of(row: Row) -> str:
     """Name of the setting that all others of the scene are timed against."""
-    if row.surface:
-        return SURFACE_BASE
-    if row.bricks:
-        return WHOLE_BASE
-    return SHADED_BASE if row.shaded else LIT_BASE if row.lit else BASE
-
-
-def few(settings: dict[str, Setting], count: int = 2) -> dict[str, Setting]:
-    """The first settings of each family."""
-    families: dict[str, list[str]] = {}
-    for name, setting in settings.items():
-        families.setdefault(setting.family, []).append(name)
-    return {n: settings[n] for names in families.values() for n in names[:count]}
+    return next(iter(SETTINGS[row.kind]))

@@ -9,6 +9,7 @@ reference is recorded, too.
 
 import time
 from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,24 +20,18 @@ import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
 from . import charts, harness, timing
-from .harness import experiment, show
+from .harness import experiment
 
 
 EXPLAINED = (
-    "The head phantom, lit from the left.\n"
-    "hard, soft: scatterer templates under\nhard and soft occlusion, one of several\nfor each pixel; "
-    "blended: all of them;\nbaked: light computed once, on a grid.\n"
-    "error: RMSE of the radiance against the\npath-traced image, after the one factor\n"
-    "that brings the image nearest to it.\n"
-    "noise: standard error of a pixel.\nWhite is the same radiance in all."
+    "hard, soft: occlusion of templates, of which\none is taken for each pixel; blended: all.\n"
+    "error: RMSE of the radiance after the factor\nthat brings the image nearest to the traced one.\n"
+    "White is the same radiance in all."
 )
 """The text beside the images."""
 TRACED, UNLIT = "path traced", "unlit"
 LIGHTS = (DirectionalLight((0.9, 0.2, -0.5), (2.0, 2.0, 1.9)), ConstantLight((0.12, 0.12, 0.14)))
-MATERIALS = (
-    jv.Material(0.3, 0.06, 1.39, values=(50, 150)),
-    jv.Material(0.2, 0.03, 1.55, values=(150, 256)),
-)
+MATERIALS = (jv.Material(0.3, 0.06, 1.39, values=(50, 150)), jv.Material(0.2, 0.03, 1.55, values=(150, 256)))
 POINTS = [
     (50, (0.85, 0.55, 0.42), 0.0),
     (80, (0.85, 0.55, 0.42), 0.8),
@@ -45,64 +40,55 @@ POINTS = [
     (185, (0.9, 0.88, 0.8), 0.9),
     (255, (0.95, 0.95, 0.92), 0.9),
 ]
+LIGHTINGS: dict[str, dict[str, Any]] = {
+    "hard": {"occlusion": "hard"},
+    "hard, blended": {"occlusion": "hard", "blend": True},
+    "soft": {},
+    "soft, blended": {"blend": True},
+    "soft, baked": {"baked": 64},
+}
+"""Options of the templates."""
 
 
-def lightings(templates: int) -> dict[str, jv.lighting.Lighting | None]:
-    how: dict[str, Any] = {"packets": 8, "threshold": 0.008, "reach": (2.0, 4.0, 8.0), "templates": templates}
-    variants = {
-        "hard": {"occlusion": "hard"},
-        "hard, blended": {"occlusion": "hard", "blend": True},
-        "soft": {},
-        "soft, blended": {"blend": True},
-        "soft, baked": {"baked": 64},
-    }
-    lit = {name: ScattererTemplates(MATERIALS, LIGHTS, **how, **more) for name, more in variants.items()}
-    return {UNLIT: None, **lit}
+def rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.asarray(values) ** 2)))
 
 
-def measure(
-    size: int, resolution: int, paths: int, templates: int, repetitions: int, seed: int
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def measure(chosen: Namespace) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The rows of the record, and the images over black."""
-    volume = jv.phantom("head", resolution)
+    volume = jv.phantom("head", chosen.resolution)
     transfer = jv.TransferFunction.from_points(POINTS, unit_distance=0.05)
-    camera = jv.Camera((1.6, -2.6, 1.0), volume.center, (0, 0, 1), 28, size=(size, size))
-    step = float(volume.spacing.min()) / 2
-    march = jv.March(
-        step, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1 / 255)), "midpoint"
-    )
+    camera = jv.Camera((1.6, -2.6, 1.0), volume.center, (0, 0, 1), 28, size=(chosen.size,) * 2)
+    transforms = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1 / 255)
+    march = jv.March(float(volume.spacing.min()) / 2, transforms, "midpoint")
 
-    begun = time.perf_counter()
-    traced = jv.path_trace(volume, transfer, camera, LIGHTS, paths=paths, key=seed, materials=MATERIALS)
+    begun, how = time.perf_counter(), {"paths": chosen.paths, "key": chosen.seed, "materials": MATERIALS}
+    traced = jv.path_trace(volume, transfer, camera, LIGHTS, **how)
     reference = np.asarray(traced.radiance)
-    seconds = time.perf_counter() - begun
-    noise = float(np.sqrt(np.mean(np.asarray(traced.standard_error) ** 2)))
+    seconds = round(time.perf_counter() - begun, 3)
+    rows: dict[str, Any] = {TRACED: {"seconds": seconds, "standard error": rms(traced.standard_error)}}
+    images = {TRACED: reference}
 
     def frame(lighting: Any) -> jax.Array:
         return jv.render(volume, transfer, camera, march, lighting=lighting).image((0, 0, 0))
 
-    lit = lightings(templates)
-    taken = timing.interleaved({n: lambda each=each: frame(each) for n, each in lit.items()}, repetitions)
-    rows: dict[str, Any] = {TRACED: {"seconds": round(seconds, 3), "standard error": noise, "paths": paths}}
-    images = {TRACED: reference}
-    for name, each in lit.items():
-        image = np.asarray(frame(each))
+    all_: Any = {"packets": 8, "threshold": 0.008, "reach": (2.0, 4.0, 8.0), "templates": chosen.templates}
+    lit = {name: ScattererTemplates(MATERIALS, LIGHTS, **all_, **more) for name, more in LIGHTINGS.items()}
+    drawn = {name: partial(frame, lighting) for name, lighting in {UNLIT: None, **lit}.items()}
+    taken = timing.interleaved(drawn, chosen.repetitions)
+    for name, each in drawn.items():
+        image = np.asarray(each())
         scale = float(np.sum(image * reference) / np.sum(image**2))
         images[name] = image * scale
-        as_it_is, error = (float(np.sqrt(np.mean((i - reference) ** 2))) for i in (image, images[name]))
-        rows[name] = {
-            **harness.row(taken[name], taken[UNLIT], error),
-            "scale": scale,
-            "rmse as it is": as_it_is,
-        }
+        row = harness.row(taken[name], taken[UNLIT], rms(images[name] - reference))
+        rows[name] = {**row, "scale": scale, "rmse as it is": rms(image - reference)}
     return rows, images
 
 
 def pictures(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) -> None:
     columns = (len(images) + 1) // 2
     figure, axes = charts.panels(2, columns, 3 * columns, 7.4)
-    for axis in axes.flat[len(images) :]:
-        axis.set_axis_off()
+    axes.flat[-1].set_axis_off()
     axes.flat[-1].text(0, 1, EXPLAINED, va="top", fontsize=9, linespacing=1.5, wrap=True)
     white = np.quantile(images[TRACED], 0.995)  # shown as white in all images
     for axis, (name, image) in zip(axes.flat, images.items(), strict=False):
@@ -118,9 +104,6 @@ def pictures(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) ->
 
 
 @experiment(
-    "path_traced",
-    "How near do scatterer templates come to path tracing, and in what time?",
-    __doc__,
     repetitions=3,
     size=256,
     resolution=96,
@@ -129,12 +112,6 @@ def pictures(rows: dict[str, Any], images: dict[str, np.ndarray], path: Path) ->
     quick={"size": 16, "resolution": 16, "paths": 2, "templates": 2, "repetitions": 1},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    sizes = chosen.size, chosen.resolution, chosen.paths, chosen.templates, chosen.repetitions
-    rows, images = measure(*sizes, chosen.seed)
-    show(rows)
+    rows, images = measure(chosen)
     pictures(rows, images, chosen.output / "path_traced.webp")
-    return {"image": [chosen.size] * 2, "resolution": chosen.resolution, "rows": rows}
-
-
-if __name__ == "__main__":
-    main()
+    return {"rows": rows}

@@ -40,7 +40,17 @@ Drjit: TypeAlias = Any
 
 
 class Marcher:
-    """A scene in Dr.Jit, made by `prepare`."""
+    """A scene in Dr.Jit, drawn once.
+
+    Args:
+        volume: of the scene.
+        transfer: of the scene.
+        camera: of the scene.
+        step: as for `jaxvol.March`.
+        quadrature: as for `jaxvol.March`.
+        opacity_left: as for `jaxvol.EarlyTermination`; 0 ends rays only at their exit.
+        threads: number of Dr.Jit's threads in this process.
+    """
 
     def __init__(
         self,
@@ -50,7 +60,9 @@ class Marcher:
         step: float,
         quadrature: Literal["left", "midpoint"],
         opacity_left: float,
+        threads: int,
     ):
+        dr.set_thread_count(threads)
         origins, directions = (np.asarray(points).reshape(-1, 3).T for points in camera.rays())
         self.rays: Any = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions))
         self.size = camera.size
@@ -73,6 +85,7 @@ class Marcher:
         self.step, self.opacity_left = dr.opaque(mi.Float, step), dr.opaque(mi.Float, opacity_left)
         self.sampled = dr.opaque(mi.Float, step / 2 if quadrature == "midpoint" else 0.0)
         dr.eval(self.rays, self.voxels, self.transfer)
+        self.draw()
 
     def draw(self) -> None:
         """March all rays, and wait for the image."""
@@ -86,21 +99,16 @@ class Marcher:
         channels = [*np.array(self.color), 1 - np.array(self.left)]
         return np.stack(channels, axis=-1).reshape(height, width, 4)
 
-    def planes(self, image: Float[np.ndarray, "height width 4"]) -> Drjit:
-        """An image in Dr.Jit's layout, as a target for `gradient`."""
-        return mi.Vector4f(np.asarray(image, np.float32).reshape(-1, 4).T)
-
-    def differentiate(
-        self, target: Drjit | float = 0.0, of: Literal["transfer", "voxels"] = "transfer"
-    ) -> Drjit:
-        """March all rays, and wait for the gradient of `mean((rgba - target)²)`, in Dr.Jit's layout."""
+    def differentiate(self, of: Literal["transfer", "voxels"]) -> Drjit:
+        """March all rays, and wait for the gradient of `mean(rgba²)`, in Dr.Jit's layout: to (r, g, b,
+        extinction) of each point of the transfer function, as made dense here; or to the voxels."""
         leaf, texture = (self.table, self.transfer) if of == "transfer" else (self.grid, self.voxels)
         dr.enable_grad(leaf)
         dr.clear_grad(leaf)
         texture.set_tensor(leaf)
         self.color, self.left = self._march()
         image = mi.Vector4f(*self.color, 1 - self.left)
-        cotangent = 2 * (image - target) / (4 * dr.width(self.rays))
+        cotangent = 2 * image / (4 * dr.width(self.rays))
         dr.eval(self.color, self.left, cotangent)
         self._march_again(cotangent)
         gradient = dr.grad(leaf)
@@ -110,12 +118,9 @@ class Marcher:
         texture.set_tensor(leaf)
         return gradient
 
-    def gradient(
-        self, target: Drjit | float = 0.0, of: Literal["transfer", "voxels"] = "transfer"
-    ) -> Float[np.ndarray, "..."]:
-        """The same: to (r, g, b, extinction) of each of the n points of the transfer function, as made dense
-        here, (n, 4); or to the voxels, (nx, ny, nz)."""
-        found = np.array(self.differentiate(target, of))
+    def gradient(self, of: Literal["transfer", "voxels"]) -> Float[np.ndarray, "..."]:
+        """The same: (points, 4), or (nx, ny, nz)."""
+        found = np.array(self.differentiate(of))
         return found if of == "transfer" else found[..., 0].transpose(2, 1, 0)
 
     @dr.syntax
@@ -174,25 +179,3 @@ class Marcher:
         fraction = (value - self.first) / (self.last - self.first)
         r, g, b, extinction = self.transfer.eval(mi.Float((fraction * (n - 1) + 0.5) / n))
         return mi.Color3f(r, g, b), extinction
-
-
-def prepare(
-    volume: jv.Volume,
-    transfer: jv.TransferFunction,
-    camera: jv.Camera,
-    step: float,
-    quadrature: Literal["left", "midpoint"] = "left",
-    opacity_left: float = 0.0,
-    threads: int | None = None,
-) -> Marcher:
-    """A scene in Dr.Jit, drawn once.
-
-    - `step`, `quadrature`: as for `jaxvol.March`.
-    - `opacity_left`: as for `jaxvol.EarlyTermination`; 0 ends rays only at their exit.
-    - `threads`: number of Dr.Jit's threads in this process; unchanged by default.
-    """
-    if threads is not None:
-        dr.set_thread_count(threads)
-    marcher = Marcher(volume, transfer, camera, step, quadrature, opacity_left)
-    marcher.draw()
-    return marcher

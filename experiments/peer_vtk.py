@@ -69,10 +69,86 @@ def tabulated(transfer: jv.TransferFunction, values: Float[Array, " n"]) -> jv.T
 
 
 class Drawn:
-    """A scene in a VTK window, made by `prepare`."""
+    """A scene in a VTK window, drawn once, by so many threads (by default one for each core). `shade`: with
+    these coefficients, under a head light. VTK shades nodes, by their own gradients, and interpolates what
+    that gives."""
 
-    def __init__(self, window: Any, view: Any, mapper: Any):
-        self.window, self.view, self.mapper = window, view, mapper
+    def __init__(
+        self,
+        volume: jv.Volume,
+        transfer: jv.TransferFunction,
+        camera: jv.Camera,
+        step: float,
+        threads: int | None = None,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        shade: jv.lighting.Phong | None = None,
+    ):
+        import vtk
+        from vtkmodules.util.numpy_support import numpy_to_vtk
+
+        data, lowest = np.asarray(volume.data), 0
+        if np.issubdtype(data.dtype, np.integer):
+            # VTK's faster loops need values that begin at 0; CT that begins at -1000 takes a third longer
+            lowest = int(data.min())
+            data = (data.astype(int) - lowest).astype(np.min_scalar_type(int(data.max()) - lowest))
+        grid = vtk.vtkImageData()
+        grid.SetDimensions(*volume.shape)
+        grid.SetSpacing(*volume.spacing.tolist())
+        grid.SetOrigin(*volume.origin.tolist())
+        grid.GetPointData().SetScalars(numpy_to_vtk(data.ravel(order="F"), deep=True))
+
+        transfer = dense(transfer, volume)
+        colors, opacities = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
+        points = transfer.values.tolist(), transfer.colors.tolist(), transfer.opacity(step).tolist()
+        for value, color, opacity in zip(*points, strict=True):
+            colors.AddRGBPoint(value - lowest, *color)
+            opacities.AddPoint(value - lowest, opacity)
+        look = vtk.vtkVolumeProperty()
+        look.SetColor(colors)
+        look.SetScalarOpacity(opacities)
+        look.SetScalarOpacityUnitDistance(step)
+        look.SetInterpolationTypeToLinear()
+        look.ShadeOff()
+        if shade is not None:
+            look.ShadeOn()
+            look.SetAmbient(float(shade.ambient))
+            look.SetDiffuse(float(shade.diffuse))
+            look.SetSpecular(float(shade.specular))
+            # (n·h)^4p, which is what VTK computes, is nearly (r·v)^p
+            look.SetSpecularPower(4 * float(shade.specular_power))
+        look.DisableGradientOpacityOn()
+
+        mapper = vtk.vtkFixedPointVolumeRayCastMapper()
+        mapper.SetInputData(grid)
+        mapper.SetBlendModeToComposite()
+        mapper.IntermixIntersectingGeometryOff()
+        # by default VTK draws a coarser image where time is short
+        mapper.AutoAdjustSampleDistancesOff()
+        mapper.LockSampleDistanceToInputSpacingOff()
+        mapper.SetSampleDistance(step)
+        mapper.SetInteractiveSampleDistance(step)
+        mapper.SetImageSampleDistance(1)
+        if threads is not None:
+            mapper.SetNumberOfThreads(threads)
+        prop = vtk.vtkVolume()
+        prop.SetMapper(mapper)
+        prop.SetProperty(look)
+
+        renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
+        renderer.AddVolume(prop)
+        light = vtk.vtkLight()
+        light.SetLightTypeToHeadlight()
+        light.SetAmbientColor(1, 1, 1)  # by default a light has none
+        renderer.AddLight(light)
+        renderer.SetBackground(*background)
+        window.SetOffScreenRendering(1)
+        window.SetMultiSamples(0)
+        window.SetSize(*camera.size)
+        window.AddRenderer(renderer)
+        aim(renderer.GetActiveCamera(), camera)
+        renderer.ResetCameraClippingRange()
+        window.Render()
+        self.window, self.view, self.mapper = window, renderer.GetActiveCamera(), mapper
 
     def draw(self) -> None:
         """Cast all rays, and show the image in the window."""
@@ -97,90 +173,6 @@ class Drawn:
         return pixels.reshape(height, width, 3)[::-1] / 255
 
 
-def prepare(
-    volume: jv.Volume,
-    transfer: jv.TransferFunction,
-    camera: jv.Camera,
-    step: float,
-    threads: int | None = None,
-    background: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    shade: jv.lighting.Phong | None = None,
-) -> Drawn:
-    """A scene in VTK, drawn once.
-
-    - `step`: world length between samples.
-    - `threads`: number of threads that cast rays; by default one for each core.
-    - `shade`: with these coefficients, under a head light. VTK shades nodes, by their own gradients, and
-      interpolates what that gives.
-    """
-    import vtk
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-
-    data, lowest = np.asarray(volume.data), 0
-    if np.issubdtype(data.dtype, np.integer):
-        # VTK's faster loops need values that begin at 0; CT that begins at -1000 takes a third longer
-        lowest = int(data.min())
-        data = (data.astype(int) - lowest).astype(np.min_scalar_type(int(data.max()) - lowest))
-    grid = vtk.vtkImageData()
-    grid.SetDimensions(*volume.shape)
-    grid.SetSpacing(*volume.spacing.tolist())
-    grid.SetOrigin(*volume.origin.tolist())
-    grid.GetPointData().SetScalars(numpy_to_vtk(data.ravel(order="F"), deep=True))
-
-    transfer = dense(transfer, volume)
-    colors, opacities = vtk.vtkColorTransferFunction(), vtk.vtkPiecewiseFunction()
-    points = transfer.values.tolist(), transfer.colors.tolist(), transfer.opacity(step).tolist()
-    for value, color, opacity in zip(*points, strict=True):
-        colors.AddRGBPoint(value - lowest, *color)
-        opacities.AddPoint(value - lowest, opacity)
-    look = vtk.vtkVolumeProperty()
-    look.SetColor(colors)
-    look.SetScalarOpacity(opacities)
-    look.SetScalarOpacityUnitDistance(step)
-    look.SetInterpolationTypeToLinear()
-    look.ShadeOff()
-    if shade is not None:
-        look.ShadeOn()
-        look.SetAmbient(float(shade.ambient))
-        look.SetDiffuse(float(shade.diffuse))
-        look.SetSpecular(float(shade.specular))
-        # (n·h)^4p, which is what VTK computes, is nearly (r·v)^p
-        look.SetSpecularPower(4 * float(shade.specular_power))
-    look.DisableGradientOpacityOn()
-
-    mapper = vtk.vtkFixedPointVolumeRayCastMapper()
-    mapper.SetInputData(grid)
-    mapper.SetBlendModeToComposite()
-    mapper.IntermixIntersectingGeometryOff()
-    # by default VTK draws a coarser image where time is short
-    mapper.AutoAdjustSampleDistancesOff()
-    mapper.LockSampleDistanceToInputSpacingOff()
-    mapper.SetSampleDistance(step)
-    mapper.SetInteractiveSampleDistance(step)
-    mapper.SetImageSampleDistance(1)
-    if threads is not None:
-        mapper.SetNumberOfThreads(threads)
-    prop = vtk.vtkVolume()
-    prop.SetMapper(mapper)
-    prop.SetProperty(look)
-
-    renderer, window = vtk.vtkRenderer(), vtk.vtkRenderWindow()
-    renderer.AddVolume(prop)
-    light = vtk.vtkLight()
-    light.SetLightTypeToHeadlight()
-    light.SetAmbientColor(1, 1, 1)  # by default a light has none
-    renderer.AddLight(light)
-    renderer.SetBackground(*background)
-    window.SetOffScreenRendering(1)
-    window.SetMultiSamples(0)
-    window.SetSize(*camera.size)
-    window.AddRenderer(renderer)
-    aim(renderer.GetActiveCamera(), camera)
-    renderer.ResetCameraClippingRange()
-    window.Render()
-    return Drawn(window, renderer.GetActiveCamera(), mapper)
-
-
 def aim(view: Any, camera: jv.Camera) -> None:
     """Give VTK's camera the view of ours."""
     left, right, bottom, top = camera.window.tolist()
@@ -201,9 +193,8 @@ def aim(view: Any, camera: jv.Camera) -> None:
 def as_displayed(image: np.ndarray, mapper: Any) -> np.ndarray:
     """An image as VTK's display would show it: slightly enlarged, by a texture's linear interpolation.
 
-    VTK casts one ray through the middle of every pixel, as we do, for the n x m pixels that the volume
-    may cover. It then stretches the range from the middle of the first texel to that of the last over these
-    n x m pixels, so that pixel i shows the texel coordinate (i + 1/2) (n - 1)/n - 1/2 past the first middle.
+    VTK casts one ray through the middle of every pixel, as we do, for the n x m pixels that the volume may
+    cover. It then stretches the range between the middles of the first and the last texel over these pixels.
     This is half a pixel off at the borders, which is more than all other differences together.
     """
     cast = mapper.GetRayCastImage()

@@ -14,8 +14,6 @@ known only up to scale; and shells, which are alike at all angles, seen through 
 
 import warnings
 from argparse import Namespace
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -25,8 +23,8 @@ import numpy as np
 
 import jaxvol as jv
 
-from . import charts, harness
-from .harness import experiment, show
+from . import harness
+from .harness import experiment
 
 
 OFF, GOAL, NOISE = 0.2, 0.005, 0.01
@@ -38,6 +36,11 @@ BLURS = (1 / 8, 1 / 32, None)
 independent, as the covariance supposes."""
 HOW = {"max_steps": 100, "rtol": 1e-5, "patience": 4}
 NAMES = ("a", "b", "first β", "last β", "first σ", "last σ", "last γ")
+ENDINGS: Any = (
+    *(".a", ".b", ".beta_range[0]", ".beta_range[1]", ".sigma_range[0]", ".sigma_range[1]"),
+    (".gamma_range", ".gamma_range[1]"),
+)
+"""How `Uncertainty.standard_errors` calls them."""
 PLACES = ((60, -250, -110), (0, 0, 85), (1, 0, 0)), ((-220, 120, 40), (0, 0, 85), (0, 0, 1))
 """Position, focal point and up of the cameras, mm."""
 TISSUE = [
@@ -56,15 +59,8 @@ class Scene(eqx.Module):
     step: float
 
     def __call__(self, probe: jv.ToroidalMap, camera: jv.Camera) -> Any:
-        return self.volume, self.transfer, camera, self.march(probe, self.step)
-
-    def march(self, probe: jv.ToroidalMap, step: float) -> jv.March:
-        return jv.March(step, (probe, jv.AlphaCorrection()), "midpoint")
-
-    def reference(self, probe: jv.ToroidalMap, camera: jv.Camera, finer: int = 1) -> jv.Rendering:
-        """The image at steps so many times finer."""
-        march = self.march(probe, self.step / finer)
-        return jv.render(self.volume, self.transfer, camera, march, outputs="rgba")
+        march = jv.March(self.step, (probe, jv.AlphaCorrection()), "midpoint")
+        return self.volume, self.transfer, camera, march
 
 
 def phantom(
@@ -81,12 +77,15 @@ def cameras(size: int) -> list[jv.Camera]:
 
 
 def views(
-    scene: Scene, probe: jv.ToroidalMap, size: int, noise: float, seed: int, finer: int = 1
+    scene: Scene, probe: jv.ToroidalMap, seen: list[jv.Camera], noise: float, seed: int, finer: int = 1
 ) -> list[Any]:
-    """References with their cameras."""
-    rng = np.random.default_rng(seed)
-    images = [(camera, scene.reference(probe, camera, finer).image()) for camera in cameras(size)]
-    return [(camera, image + noise * rng.normal(size=image.shape)) for camera, image in images]
+    """References with their cameras, at steps so many times finer."""
+    rng, found = np.random.default_rng(seed), []
+    fine = Scene(scene.volume, scene.transfer, scene.step / finer)
+    for camera in seen:
+        image = jv.render(*fine(probe, camera), outputs="rgba").image()
+        found.append((camera, image + noise * rng.normal(size=image.shape)))
+    return found
 
 
 def numbers(probe: jv.ToroidalMap) -> np.ndarray:
@@ -113,8 +112,7 @@ def recovered(
     scene: Scene, targets: list[Any], truth: jv.ToroidalMap, start: jv.ToroidalMap
 ) -> dict[str, Any]:
     """Errors of all numbers and their standard errors, relative to `scales`, of the fit from this start."""
-    fits = jv.fit_coarse_to_fine(jv.ImageResidual(scene, targets), start, blurs=BLURS, **HOW)
-    fit = fits[-1]
+    *_, fit = fits = jv.fit_coarse_to_fine(jv.ImageResidual(scene, targets), start, blurs=BLURS, **HOW)
     assert fit.uncertainty is not None
     errors = (numbers(fit.parameters) - numbers(truth)) / scales(truth)
     deviations = np.sqrt(np.diag(fit.uncertainty.covariance)) / scales(truth)
@@ -131,9 +129,8 @@ def recovered(
 def directions(rng: np.random.Generator, all_off: int) -> dict[str, np.ndarray]:
     """Starts, by name: which numbers are off, and to which side."""
     together = {f"all, {n}": rng.choice([-1.0, 1.0], len(NAMES)) for n in range(all_off)}
-    sides = rng.choice([-1.0, 1.0], len(NAMES))
-    one = {name: side * row for name, side, row in zip(NAMES, sides, np.eye(len(NAMES)), strict=True)}
-    return together | one
+    one = np.diag(rng.choice([-1.0, 1.0], len(NAMES)))
+    return together | dict(zip(NAMES, one, strict=True))
 
 
 def determined(residual: Any, at: Any, truth: jv.ToroidalMap, **options: Any) -> dict[str, Any]:
@@ -143,20 +140,8 @@ def determined(residual: Any, at: Any, truth: jv.ToroidalMap, **options: Any) ->
         warnings.simplefilter("ignore")  # that directions are not determined is what is asked here
         found = jv.fit(residual, at, **HOW | {"max_steps": 1}, **options).uncertainty
     assert found is not None
-    of_number = {
-        "a": ".a",
-        "b": ".b",
-        "first β": ".beta_range[0]",
-        "last β": ".beta_range[1]",
-        "first σ": ".sigma_range[0]",
-        "last σ": ".sigma_range[1]",
-        "last γ": (".gamma_range", ".gamma_range[1]"),
-    }
-    errors = {
-        number: next(error for name, error in found.standard_errors.items() if name.endswith(ending))
-        for number, ending in of_number.items()
-    }
-    relative = {name: errors[name] / scale for name, scale in zip(NAMES, scales(truth), strict=True)}
+    errors = [next(e for n, e in found.standard_errors.items() if n.endswith(ends)) for ends in ENDINGS]
+    relative = dict(zip(NAMES, np.divide(errors, scales(truth)).tolist(), strict=True))
     return {"undetermined": found.undetermined, "standard errors": relative}
 
 
@@ -176,122 +161,36 @@ class UpToScale(eqx.Module):
         return volume, transfer, scaled, march
 
 
-def as_it_is(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """Spheres and wires from known cameras."""
-    scene, probe = phantom(resolution)
-    residual = jv.ImageResidual(scene, views(scene, probe, size, NOISE, seed))
-    return determined(residual, probe, probe)
+VARIANTS = "all eight numbers", "cameras up to scale", "shells through a window", "spheres and wires"
 
 
-def all_eight(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """The first depth is free, too."""
-    scene, probe = phantom(resolution)
-    free = jax.tree.map(lambda _: jv.Unconstrained(), probe)
-    residual = jv.ImageResidual(scene, views(scene, probe, size, NOISE, seed))
-    return determined(residual, probe, probe, constraints=free)
+def left_open(variant: str, resolution: int, size: int, seed: int) -> dict[str, Any]:
+    """What a variant of the problem leaves open."""
+    seen, options = cameras(size), {}
+    if variant == "shells through a window":  # of equal depth, their ends out of view
+        scene, probe = phantom(resolution, "shells", speckle=False)
+        seen = [jv.Camera((20, 12, 350), (5, 3, 85), (1, 0, 0), 8.0, size=(size, size))]
+    else:
+        scene, probe = phantom(resolution)
+    targets = views(scene, probe, seen, NOISE, seed)
+    if variant == "cameras up to scale":
+        residual = jv.ImageResidual(UpToScale(scene), targets)
+        return determined(residual, (probe, jnp.float32(1.0)), probe)
+    if variant == "all eight numbers":
+        options["constraints"] = jax.tree.map(lambda _: jv.Unconstrained(), probe)
+    return determined(jv.ImageResidual(scene, targets), probe, probe, **options)
 
 
-def up_to_scale(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """The places of the cameras are known but for a factor."""
-    scene, probe = phantom(resolution)
-    residual = jv.ImageResidual(UpToScale(scene), views(scene, probe, size, NOISE, seed))
-    return determined(residual, (probe, jnp.float32(1.0)), probe)
-
-
-def through_a_window(resolution: int, size: int, seed: int) -> dict[str, Any]:
-    """Shells of equal depth, whose ends are out of view."""
-    scene, probe = phantom(resolution, "shells", speckle=False)
-    inside = jv.Camera((20, 12, 350), (5, 3, 85), (1, 0, 0), 8.0, size=(size, size))
-    image = scene.reference(probe, inside).image()
-    noise = NOISE * np.random.default_rng(seed).normal(size=image.shape)
-    return determined(jv.ImageResidual(scene, [(inside, image + noise)]), probe, probe)
-
-
-VARIANTS = {
-    "all eight numbers": all_eight,
-    "cameras up to scale": up_to_scale,
-    "shells through a window": through_a_window,
-    "spheres and wires": as_it_is,
-}
-
-
-def draw(result: dict[str, Any], path: Path) -> None:
-    """Errors of each number, and how well each variant of the problem determines it."""
-    figure, (axes,) = charts.panels(1, 2, 12, 4.2)
-    at, rows = np.arange(len(NAMES)), result["recovered"]
-    together = np.array([name.startswith("all") for name in rows])
-    errors = np.array([[abs(row["errors"][name]) for name in NAMES] for row in rows.values()])
-    for kind, mark in ((True, "o"), (False, "^")):
-        some = 100 * errors[together == kind]
-        if not len(some):
-            continue
-        label = f"{len(some)} starts with {'all numbers' if kind else 'one number'} 20 % off"
-        across = at + np.linspace(-0.15, 0.15, len(some))[:, None] + (0.03 if kind else 0)
-        axes[0].plot(across.ravel(), some.ravel(), mark, markersize=4, label=label)
-    likely = [100 * np.median([row["standard errors"][name] for row in rows.values()]) for name in NAMES]
-    axes[0].plot(at, likely, "k_", markersize=26, label="standard error by the covariance (median)")
-    axes[0].axhline(100 * OFF, color="k", linestyle=":", linewidth=1, label="at the start")
-    axes[0].axhline(100 * GOAL, color="k", linestyle="--", linewidth=1, label="goal")
-    ylabel = "error, % of the number (angles: of half their range)"
-    axes[0].set(yscale="log", xticks=at, xticklabels=NAMES, ylabel=ylabel)
-    charts.plain_numbers(axes[0])
-    axes[0].set_title("numbers of the probe, found from images", fontsize=9)
-    axes[0].legend(fontsize=7, loc="upper right", bbox_to_anchor=(1, 0.95))
-    cases = result["left open"]
-    table = np.array([[row["standard errors"][name] for name in NAMES] for row in cases.values()])
-    known = np.isfinite(table)
-    axes[1].imshow(np.where(known, 0.35, 1), cmap="Reds", vmin=0, vmax=1.6, aspect="auto")
-    for i, j in np.ndindex(*table.shape):
-        text = f"{100 * table[i, j]:.2g}" if known[i, j] else "open"
-        axes[1].text(j, i, text, ha="center", va="center", fontsize=8)
-    axes[1].set(xticks=at, xticklabels=NAMES, yticks=range(len(cases)), yticklabels=list(cases))
-    axes[1].set_title("standard error by the covariance, %; open: not determined", fontsize=9)
-    charts.save(figure, path)
-
-
-@experiment(
-    "probe_geometry",
-    "Is the geometry of a swept probe found from images, and what do the images leave open?",
-    __doc__,
-    draw,
-    size=32,
-    resolution=64,
-    starts=5,
-    threads=3,
-    quick={"size": 12, "resolution": 24, "starts": 1},
-)
+@experiment(size=32, resolution=64, starts=5, quick={"size": 12, "resolution": 24, "starts": 1})
 def main(chosen: Namespace) -> dict[str, Any]:
     starts, variants = directions(np.random.default_rng(chosen.seed), chosen.starts), VARIANTS
     if chosen.quick:  # each of the other variants takes a program of its own
-        starts, variants = dict(list(starts.items())[:1]), {"spheres and wires": as_it_is}
+        starts, variants = dict(list(starts.items())[:1]), ("spheres and wires",)
 
-    def found_from(number: int) -> dict[str, Any]:
-        name, signs = list(starts.items())[number]
+    rows: dict[str, Any] = {}
+    for number, (name, signs) in enumerate(starts.items()):
         scene, truth = phantom(chosen.resolution, seed=chosen.seed + number)
-        targets = views(scene, truth, chosen.size, NOISE, chosen.seed + number, harness.FINER)
-        row = recovered(scene, targets, truth, moved(truth, signs))
-        show({key: row[key] for key in ("worst", "steps", "message")}, name)
-        return row
-
-    with ThreadPoolExecutor(chosen.threads) as pool:
-        of_variants = {
-            name: pool.submit(variant, chosen.resolution, chosen.size, chosen.seed)
-            for name, variant in variants.items()
-        }
-        first = found_from(0)  # compiles what the others share
-        rows = [first, *pool.map(found_from, range(1, len(starts)))]
-        left_open = {name: of_variants[name].result() for name in reversed(variants)}
-    return {
-        "image": [chosen.size, chosen.size],
-        "off": OFF,
-        "noise": NOISE,
-        "goal": GOAL,
-        "step, voxels": VOXELS,
-        "blurs": BLURS,
-        "recovered": dict(zip(starts, rows, strict=True)),
-        "left open": left_open,
-    }
-
-
-if __name__ == "__main__":
-    main()
+        targets = views(scene, truth, cameras(chosen.size), NOISE, chosen.seed + number, harness.FINER)
+        rows[name] = recovered(scene, targets, truth, moved(truth, signs))
+    answers = {name: left_open(name, chosen.resolution, chosen.size, chosen.seed) for name in variants}
+    return {"goal": GOAL, "recovered": rows, "left open": answers}

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -24,7 +23,7 @@ except ImportError as fault:
     peer_drjit, NO_DRJIT = None, str(fault)
 
 VTK, DRJIT = "VTK", "Dr.Jit"
-THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 """Of peers: as many as JAX has cores."""
 LEFT = 1e-4
 """Transmittance at which rays end: 1/255 would be the error of the most accurate images."""
@@ -39,10 +38,7 @@ Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
 
 class Case(NamedTuple):
     """A scene, the transforms without which it cannot be rendered, its light, and its compositing mode.
-
-    `lighting` makes the light: templates from the options of `ScattererTemplates`, or without options
-    `Phong`; None where the scene is unlit.
-    """
+    `lighting` makes the light, templates from their options or `Phong`; None where the scene is unlit."""
 
     scene: Scene
     placed: tuple[jv.Transform, ...] = ()
@@ -53,38 +49,28 @@ class Case(NamedTuple):
 class Program(NamedTuple):
     """A setting in a scene, ready to run.
 
-    - `draw`: renders a frame; this is what is timed.
-    - `image`: the frame, linear RGB over white.
-    - `seen`: the converged image as this program's display would show it.
-    - `of_transfer`: the frame's premultiplied RGBA, as a function of the transfer function; None where it
-      cannot be differentiated.
-    - `samples`: mean number of a ray's samples; None where that is not known.
+    Attributes:
+        draw: renders a frame; this is what is timed.
+        image: the frame, linear RGB over white.
+        seen: the converged image as this program's display would show it.
+        samples: mean number of a ray's samples; None where that is not known.
     """
 
     draw: Callable[[], Any]
     image: Callable[[], Image]
     seen: Callable[[Image], Image] = lambda truth: truth
-    of_transfer: Callable[[jv.TransferFunction], jax.Array] | None = None
     samples: Callable[[], float] | None = None
 
 
 def program(case: Case, march: jv.March, lighting: Lighting | None = None) -> Program:
-    volume, transfer, camera, _ = case.scene
-
-    def render(transfer: jv.TransferFunction, outputs: Any = "rgba") -> jv.Rendering:
+    def render(outputs: Any = "rgba") -> jv.Rendering:
         how = {"compositing": case.compositing, "lighting": lighting, "outputs": outputs}
-        return jv.render(volume, transfer, camera, march, **how)
-
-    def image() -> np.ndarray:
-        rendering = render(transfer)
-        assert not np.any(rendering.exhausted)
-        return np.asarray(rendering.image())
+        return jv.render(*case.scene[:3], march, **how)
 
     return Program(
-        lambda: render(transfer).rgba,
-        image,
-        of_transfer=lambda t: render(t).rgba,
-        samples=lambda: float(np.mean(render(transfer, "all").samples)),
+        draw=lambda: render().rgba,
+        image=lambda: np.asarray(render().image()),
+        samples=lambda: float(np.mean(render("all").samples)),
     )
 
 
@@ -132,9 +118,6 @@ def deferred(case: Case, **how: Any) -> Lighting:
     return Deferred(lighting_of(case, **how))
 
 
-# -- other programs ---------------------------------------------------------------------------------------
-
-
 def peers() -> dict[str, str]:
     """The version of each peer, or why it is left out."""
     reason = peer_vtk.missing()
@@ -158,28 +141,21 @@ def of_vtk(drawn: peer_vtk.Drawn) -> Program:
 def by_vtk(step: float, case: Case) -> Program:
     volume, transfer, camera, voxel = case.scene
     shade: Any = None if case.lighting is None else case.lighting()
-    return of_vtk(peer_vtk.prepare(volume, transfer, camera, step * voxel, THREADS, shade=shade))
+    return of_vtk(peer_vtk.Drawn(volume, transfer, camera, step * voxel, THREADS, shade=shade))
 
 
 def marcher(scene: Scene, quadrature: Literal["left", "midpoint"] = "left", left: float = LEFT) -> Any:
     """The scene in Dr.Jit."""
     assert peer_drjit is not None
-    return peer_drjit.prepare(*scene, quadrature=quadrature, opacity_left=left, threads=THREADS)
+    return peer_drjit.Marcher(*scene, quadrature, left, THREADS)
 
 
 def of_drjit(there: Any) -> Program:
-    def image() -> np.ndarray:
-        rgba = there.rgba()
-        return rgba[..., :3] + 1 - rgba[..., 3:]
-
-    return Program(there.draw, image)
+    return Program(there.draw, lambda: there.rgba()[..., :3] + 1 - there.rgba()[..., 3:])
 
 
-def by_drjit(quadrature: Literal["left", "midpoint"], step: float, case: Case) -> Program:
+def by_drjit(quadrature: Any, step: float, case: Case) -> Program:
     return of_drjit(marcher(case.scene._replace(step=step * case.scene.step), quadrature))
-
-
-# -- measures ---------------------------------------------------------------------------------------------
 
 
 def measured(programs: Mapping[Any, Program], truth: Image, repetitions: int) -> dict[Any, dict[str, Any]]:

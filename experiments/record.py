@@ -6,6 +6,7 @@ import platform
 import shlex
 import subprocess
 import time
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,17 +23,16 @@ BEGUN = time.monotonic()
 PACKAGES = ("jaxvol", "jax", "jaxlib", "equinox", "numpy", "scikit-image", "matplotlib")
 
 
-def write(path: Path, question: str, result: Any, *, seed: int, command: list[str]) -> Path:
-    """Write a result as JSON, with all that is needed to run the experiment again.
-
-    - `question`: the question that the result answers.
-    - `result`: anything that JSON can hold.
-    - `command`: module and arguments, as after `python -m`.
-    """
+def write(
+    path: Path, question: str, result: Any, *, seed: int, command: list[str], options: Mapping[str, Any] = {}
+) -> Path:
+    """Write a result as JSON, with the question that it answers and all that is needed to run the experiment
+    again. `command`: module and arguments, as after `python -m`; `options`: these, and those by default."""
     record = {
         "question": question,
         "command": shlex.join(["python", "-m", *command]),
         "seed": seed,
+        "options": options,
         "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
         "commit": commit(),
         "seconds": round(time.monotonic() - BEGUN),
@@ -49,10 +49,6 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-OTHERS = ":(top,exclude)experiments/results"
-"""All files but results, in Git's words."""
-
-
 def _device() -> dict[str, Any]:
     device = jax.devices()[0]
     return {
@@ -60,7 +56,6 @@ def _device() -> dict[str, Any]:
         "kind": device.device_kind,
         "processor": _processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "load when written": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
     }
 
 
@@ -68,21 +63,19 @@ def _processor() -> str:
     information = Path("/proc/cpuinfo")
     lines = information.read_text(encoding="utf-8").splitlines() if information.is_file() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    return names[0] if names else platform.processor()
 
 
 def commit() -> str | None:
     """The checkout's commit, with + if files other than results differ from it; None outside a checkout."""
-    here = Path(__file__).parent
 
     def git(*words: str) -> str:
-        return subprocess.run(
-            ["git", "-C", str(here), *words], capture_output=True, text=True, check=True
-        ).stdout.strip()
+        return subprocess.check_output(
+            ["git", "-C", str(RESULTS), *words], text=True, stderr=subprocess.DEVNULL
+        )
 
     try:
-        return git("rev-parse", "--short", "HEAD") + (
-            "+" if git("status", "--porcelain", "--", ":/", OTHERS) else ""
-        )
+        changed = git("status", "--porcelain", "--", ":/", ":(top,exclude)experiments/results")
+        return git("rev-parse", "--short", "HEAD").strip() + "+" * bool(changed)
     except (OSError, subprocess.CalledProcessError):
         return None

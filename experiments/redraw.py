@@ -1,31 +1,28 @@
 """Draws charts and pages from their records; nothing is measured.
 
 `python -m experiments.redraw` draws all, `--only speed kisti` some. They are not kept beside the records, and
-the documentation draws its own. `path_traced.webp`, `tomography.png` and `lit.png` show images that no record
-holds: their experiments alone draw them. `pareto.html` holds images only if its experiment left some here.
+the documentation draws its own. `path_traced.webp`, `tomography.png` and `lit.png` are drawn by their
+experiments alone. `pareto.html` holds images only if its experiment left some here.
 
 To measure a result again, run the `command` of its record, on a machine that does nothing else.
 """
 
-import shlex
 from argparse import Namespace
-from importlib import import_module
 from pathlib import Path
 
-from . import record
+from . import charts, record
 from .harness import command, some_of
 
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
-DRAWN = [name for name in NAMES if name not in ("path_traced", "tomography")]
-"""Records whose experiment draws a chart from them."""
-
-
-def draw(file: Path, path: Path) -> None:
-    """Draws a record, as the experiment of its command does."""
-    found = record.read(file)
-    _, _, module, *_ = shlex.split(found["command"])
-    import_module(module).draw(found["result"], path)
+IMAGES = {"path_traced", "tomography"}
+"""Records whose charts show images that no record holds."""
+OTHERS = {
+    *("bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),
+    *("out_of_core", "probe_geometry", "shading", "viewer_latency"),
+}
+"""Records without a chart."""
+DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]
 
 
 @command(
@@ -39,7 +36,7 @@ def main(chosen: Namespace) -> None:
         file = chosen.results / f"{name}.json"
         if not file.is_file():
             raise ValueError(f"--results must hold the record {name}.json; {chosen.results} does not.")
-        draw(file, chosen.output / f"{name}.png")
+        charts.draw_record(file, chosen.output / f"{name}.png")
         print(chosen.output / f"{name}.png")
 
 

@@ -4,7 +4,7 @@ Ultrasound as acquired is rendered under its `ToroidalMap`, without resampling, 
 Cartesian grids of different spacing, in distances between the samples of a beam. Every image is compared with
 the converged image of the volume as acquired. Beside the error of a frame at steps of one such distance is
 that of converged frames, which resampling alone brings; and the time of a frame, the time of the conversion,
-and the size of the grid. 8-bit voxels stay 8-bit; one grid is measured in float32, too.
+and the size of the grid.
 """
 
 import time
@@ -20,14 +20,12 @@ import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from . import charts, harness, probe_geometry, timing
-from .harness import experiment, show, some_of
+from .harness import chosen_scenes, experiment, some_of
 
 
 SPACINGS = (8.0, 4.0, 2.0, 1.0)
 """In distances between the samples of a beam."""
 DIRECT = "as acquired"
-FLOAT = 2.0
-"""The spacing at which a grid of float32 is measured, too: what rounding to 8 bits adds."""
 FINER = 4
 """How many times finer the step of the frames is that show what resampling alone brings."""
 APLIO = "us_aplio_convex_239x128x91_uint8.raw.gz"
@@ -55,10 +53,9 @@ def phantom(name: str, folder: Path | None, size: int, resolution: int) -> Scene
     return Scene(volume, probe, jv.TransferFunction.from_points(points), camera)
 
 
-def scan(folder: Path | None, size: int, resolution: int) -> Scene:
+def scan(folder: Path, size: int, resolution: int) -> Scene:
     """A real convex scan of reverberation; its file has the beam's samples first. Half of its angles and its
     lengths, mm, are from its header; the angle of elevation is taken as the whole one."""
-    assert folder is not None
     data = np.asarray(jv.load(folder / APLIO).data)
     volume = jv.Volume(np.ascontiguousarray(data.transpose(2, 1, 0)))
     beta, sigma = (np.deg2rad((90 - half, 90 + half)) for half in (54.45 / 2, 38.55))
@@ -79,15 +76,14 @@ def measure(scene: Scene, spacings: tuple[float, ...], repetitions: int) -> dict
     """Errors, times and sizes: as acquired, and by the spacing of the grid."""
     grids, rows = {DIRECT: scene.volume}, {DIRECT: {"spacing": None, "convert seconds": 0.0}}
     for spacing in spacings:
-        acquired = {f"{spacing:g}": scene.volume}
-        if spacing == FLOAT:
-            acquired[f"{spacing:g}, float32"] = jv.Volume(scene.volume.data.astype("float32"))
-        for name, volume in acquired.items():
-            convert = partial(jv.scan_convert, volume, scene.probe, spacing * scene.sample)
-            jax.block_until_ready(convert().data)  # compiles it
-            begin = time.perf_counter()
-            grids[name] = jax.block_until_ready(convert())
-            rows[name] = {"spacing": spacing, "convert seconds": round(time.perf_counter() - begin, 4)}
+        name, convert = (
+            f"{spacing:g}",
+            partial(jv.scan_convert, scene.volume, scene.probe, spacing * scene.sample),
+        )
+        jax.block_until_ready(convert().data)  # compiles it
+        begin = time.perf_counter()
+        grids[name] = jax.block_until_ready(convert())
+        rows[name] = {"spacing": spacing, "convert seconds": round(time.perf_counter() - begin, 4)}
 
     def frame(name: str, finer: int = 1) -> jv.Rendering:
         located = (scene.probe,) if name == DIRECT else ()
@@ -100,41 +96,33 @@ def measure(scene: Scene, spacings: tuple[float, ...], repetitions: int) -> dict
         row |= harness.row(seconds[name], seconds[DIRECT], rmse(frame(name).rgba, truth))
         row["rmse, converged"] = rmse(frame(name, FINER).rgba, truth)
         row["MiB"] = round(grids[name].data.nbytes / 2**20, 3)
-        row["shape"] = grids[name].shape
     return rows
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Error and time of frames against the spacing; as acquired, which has none, as lines."""
     panels = {"rmse, converged": "RMSE by resampling alone", "rmse": "RMSE of a frame"}
     panels |= {"seconds": "seconds for a frame (dotted: and to convert)", "MiB": "size of the voxels, MiB"}
     figure, (axes,) = charts.panels(1, len(panels), 13, 3.4)
-    for number, (scene, rows) in enumerate(result["scenes"].items()):
-        mine = [row for name, row in rows.items() if row["spacing"] and "," not in name]
-        at = [row["spacing"] for row in mine]
-        for panel, key in zip(axes, panels, strict=True):
-            panel.plot(at, [row[key] for row in mine], f"C{number}o-", label=scene)
+    for panel, (key, label) in zip(axes, panels.items(), strict=True):
+        for number, (scene, rows) in enumerate(result["scenes"].items()):
+            at = {row["spacing"]: row for name, row in rows.items() if row["spacing"] and "," not in name}
+            panel.plot(list(at), [row[key] for row in at.values()], f"C{number}o-", label=scene)
             panel.axhline(rows[DIRECT][key], color=f"C{number}", linestyle="--", linewidth=1)
             if key == "seconds":
-                panel.plot(at, [row[key] + row["convert seconds"] for row in mine], f"C{number}:")
-    for panel, label in zip(axes, panels.values(), strict=True):
-        charts.logarithmic(panel, x=2, y=10)
-        panel.set_xlabel("spacing of the grid / distance between samples", fontsize=8)
-        panel.tick_params(labelsize=8, which="both")
-        panel.set_title(label, fontsize=9)
+                both = [row[key] + row["convert seconds"] for row in at.values()]
+                panel.plot(list(at), both, f"C{number}:")
+        panel.set(yscale="log", xlabel="spacing of the grid / distance between samples", title=label)
+        panel.yaxis.set_major_formatter("{x:g}")
+        charts.numbered(panel, SPACINGS, [f"{spacing:g}" for spacing in SPACINGS])
     figure.suptitle(
-        "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid",
-        fontsize=9,
+        "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid"
     )
     axes[0].legend(fontsize=7)
-    charts.save(figure, path)
+    return figure
 
 
 @experiment(
-    "scan_conversion",
-    "What error does scan conversion bring against rendering as acquired, and what does it cost?",
-    __doc__,
-    draw,
     repetitions=7,
     size=128,
     resolution=160,
@@ -143,18 +131,5 @@ def draw(result: dict[str, Any], path: Path) -> None:
     quick={"size": 24, "resolution": 24, "repetitions": 1, "spacings": (4.0, 2.0)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    folder, scenes = harness.data(), {}
-    for name in [PHANTOM] if folder is None or chosen.quick else chosen.only:
-        scene = SCENES[name](folder, chosen.size, chosen.resolution)
-        scenes[name] = measure(scene, chosen.spacings, chosen.repetitions)
-        show(scenes[name], name)
-    return {
-        "image": [chosen.size] * 2,
-        "repetitions": chosen.repetitions,
-        "spacings": chosen.spacings,
-        "scenes": scenes,
-    }
-
-
-if __name__ == "__main__":
-    main()
+    scenes = chosen_scenes(chosen, SCENES, PHANTOM, chosen.size)
+    return {"scenes": {name: measure(scene, chosen.spacings, chosen.repetitions) for name, scene in scenes}}

@@ -3,7 +3,7 @@ that of the voxels" (Kye 2013, section 2.1)."""
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,7 +24,6 @@ VESSELS = [
     (255, (1.00, 0.95, 0.85), 0.9),
 ]
 """For contrast agent in 8-bit angiography: shows the vessels alone."""
-
 
 SKIN = [
     (40, (0.10, 0.04, 0.03), 0.0),
@@ -55,39 +54,53 @@ def skin_head(size: int, resolution: int) -> Scene:
     return Scene(volume, transfer, camera, float(volume.spacing[0]) / 2)
 
 
-def engine(folder: Path, size: int) -> Scene:
-    volume = jv.load(folder / "engine_256x256x128_uint8.raw.gz")
-    camera = jv.Camera.looking_at(volume, (0.6, -0.9, -0.7), (0, 0, -1), size=(size, size)).zoom(1.4)
-    return Scene(volume, jv.preset("engine"), camera, 1.0)
+ENGINE, BONSAI, AIRWAY, ANEURISM = (
+    "engine_256x256x128_uint8.raw.gz",
+    "bonsai_256x256x256_uint8.raw.gz",
+    "lidc0314_airway_256x192x200_int16le.raw.gz",
+    "aneurism_256x256x256_uint8.raw.gz",
+)
+CT_HEAD = "cthead_256x256x113_uint16le.raw.gz"
+WHOLE_VOXELS, OF_AIRWAY = (1.0, 1.0, 1.0), (0.78125, 0.78125, 1.0)
+"""Spacings."""
 
 
-def bonsai(folder: Path, size: int) -> Scene:
-    volume = jv.load(folder / "bonsai_256x256x256_uint8.raw.gz")
-    camera = jv.Camera.looking_at(volume, (0.3, 1, 0.3), (0, 0, 1), size=(size, size)).zoom(1.3)
-    return Scene(volume, jv.preset("bonsai"), camera, 1.0)
+def real(
+    file: str, transfer: Any, view: Any, up: Any, zoom: float, spacing: tuple[float, ...] = WHOLE_VOXELS
+) -> Callable[..., Scene]:
+    """Makes the scene of a real volume. `transfer`: name of a preset, or points."""
+
+    def make(folder: Path, size: int, resolution: int = 0) -> Scene:
+        volume = jv.load(folder / file, spacing=spacing)
+        function = (
+            jv.preset(transfer) if isinstance(transfer, str) else jv.TransferFunction.from_points(transfer)
+        )
+        camera = jv.Camera.looking_at(volume, view, up, size=(size, size)).zoom(zoom)
+        return Scene(volume, function, camera, spacing[0])
+
+    return make
 
 
-def airway(folder: Path, size: int) -> Scene:
-    """A part of a chest CT whose faces all cut tissue, seen from outside."""
-    volume = jv.load(folder / "lidc0314_airway_256x192x200_int16le.raw.gz", spacing=(0.78125, 0.78125, 1))
-    camera = jv.Camera.looking_at(volume, (0.4, -1, 0.5), (0, 0, 1), size=(size, size)).zoom(1.3)
-    return Scene(volume, jv.preset("ct_chest"), camera, 0.78125)
-
-
-def aneurism(folder: Path, size: int) -> Scene:
-    volume = jv.load(folder / "aneurism_256x256x256_uint8.raw.gz")
-    camera = jv.Camera.looking_at(volume, (0.5, -1, 0.4), (0, 0, 1), size=(size, size)).zoom(1.3)
-    return Scene(volume, jv.TransferFunction.from_points(VESSELS), camera, 1.0)
-
-
+engine = real(ENGINE, "engine", (0.6, -0.9, -0.7), (0, 0, -1), 1.4)
 PHANTOM = "head phantom"
 SCENES: dict[str, Callable[..., Scene]] = {
     PHANTOM: head,
     "engine": engine,
-    "bonsai": bonsai,
-    "lidc0314_airway": airway,
-    "aneurism": aneurism,
+    "bonsai": real(BONSAI, "bonsai", (0.3, 1, 0.3), (0, 0, 1), 1.3),
+    # a part of a chest CT whose faces all cut tissue, seen from outside
+    "lidc0314_airway": real(AIRWAY, "ct_chest", (0.4, -1, 0.5), (0, 0, 1), 1.3, OF_AIRWAY),
+    "aneurism": real(ANEURISM, VESSELS, (0.5, -1, 0.4), (0, 0, 1), 1.3),
 }
+
+
+def grid(side: int) -> tuple[np.ndarray, ...]:
+    """x, y and z of the nodes of [-1, 1]³."""
+    return tuple(np.meshgrid(*[np.linspace(-1, 1, side)] * 3, indexing="ij"))
+
+
+def on_cube(data: np.ndarray, *labels: Any, field: Any = None) -> jv.Volume:
+    """Values at the nodes of [-1, 1]³."""
+    return jv.Volume(data, (2 / (len(data) - 1),) * 3, (-1.0,) * 3, *labels, field=field)
 
 
 def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) -> jv.Volume:
@@ -100,7 +113,7 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
     return jv.Volume(part, volume.spacing, origin)
 
 
-def inside(scene: Scene, size: int) -> Scene:
+def inside(scene: Scene) -> Scene:
     """The scene seen from its widest empty place, towards what is visible."""
     from scipy.ndimage import distance_transform_edt  # not at the top: the first image of a process is timed
 
@@ -113,7 +126,7 @@ def inside(scene: Scene, size: int) -> Scene:
     place = np.unravel_index(np.argmax(np.where(middle, away, -1)), data.shape)
     origin = np.asarray(volume.origin, np.float64)
     target = origin + spacing * np.argwhere(extinction > 0).mean(axis=0)
-    camera = jv.Camera(origin + spacing * place, target, (0.1, 0.2, 1.0), 75.0, size=(size, size))
+    camera = jv.Camera(origin + spacing * place, target, (0.1, 0.2, 1.0), 75.0, size=scene.camera.size)
     return scene._replace(camera=camera)
 
 

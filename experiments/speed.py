@@ -1,22 +1,24 @@
 """How fast is an image, and an image with its gradient, compared with VTK and Dr.Jit?
 
-Five scenes at steps of one voxel, two image sizes. Ours skips empty space and ends rays early; "plain" does
-neither. VTK's fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All
-use as many threads as there are cores; where JAX has a GPU, ours and Dr.Jit's use that. Frames are drawn in
-turn: a ratio is the median over rounds of a program's time over ours. Beside each time stands the RMSE of its
-image, over white, against one converged image of ours; VTK's image is compared with that image as VTK's
-display would show it.
+Five scenes at steps of one voxel. Ours skips empty space and ends rays early; "plain" does neither. VTK's
+fixed-point ray caster does both (`peer_vtk.py`), Dr.Jit ends rays early (`peer_drjit.py`). All use as many
+threads as there are cores, or JAX's GPU. Frames are drawn in turn: a ratio is the median over rounds of a
+program's time over ours. Beside each time stands the RMSE of its image, over white, against one converged
+image of ours; VTK's image is compared with that image as VTK's display would show it.
 
-Also measured: the time of our frame as a program under `jax.jit`, without what Python does before it; the
-time from the start of a fresh process to its first image (`fresh.py`); and, with --gradients, the time of an
-image with the gradient of every entry of a transfer function (256 for 8-bit data), and with that of every
-voxel as float32, relative to the image alone and to Dr.Jit's replay adjoint, with the relative difference of
-the two gradients.
+Also measured: our frame as a program under `jax.jit`, without what Python does before it; the time from the
+start of a fresh process to its first image; and, with --gradients, an image with the gradient of every entry
+of a transfer function (256 for 8-bit data), and with that of every voxel as float32, relative to the image
+alone and to Dr.Jit's replay adjoint, with the relative difference of the two gradients.
 """
 
-import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
 from argparse import Namespace
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -30,8 +32,8 @@ from matplotlib.lines import Line2D
 import jaxvol as jv
 from jaxvol.xla.compiling import OPTIONS
 
-from . import charts, fresh, harness, marches, peer_vtk, programs, timing
-from .harness import chosen_scenes, experiment, geometric_mean, show, some_of
+from . import charts, harness, marches, peer_vtk, programs, timing
+from .harness import chosen_scenes, experiment, geometric_mean, some_of
 from .programs import DRJIT, THREADS, VTK, Case, is_here
 from .scenes import PHANTOM, SCENES, Scene
 
@@ -42,7 +44,6 @@ LABELS = {PLAIN: "jaxvol, all samples", VTK_RAYS: "VTK, without drawing its imag
 """How a program is called in the chart, where not as in the record."""
 GOAL = 3.0
 LEFT = 1 / 255
-SIZES = (512, 1024)
 
 
 def fast(scene: Scene) -> jv.March:
@@ -51,29 +52,22 @@ def fast(scene: Scene) -> jv.March:
 
 def images(scene: Scene, there: dict[str, str], repetitions: int) -> dict[str, dict[str, Any]]:
     """Time and error of every program's frame, and the time of ours under `jax.jit`."""
-    case = Case(scene)
+    case, march = Case(scene), fast(scene)
     truth = programs.program(case, marches.converged(scene.step, harness.FINER)).image()
-    made = {OURS: programs.program(case, fast(scene)), PLAIN: programs.program(case, jv.March(scene.step))}
+    made = {OURS: programs.program(case, march), PLAIN: programs.program(case, jv.March(scene.step))}
     if is_here(there, VTK):
-        drawn = peer_vtk.prepare(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
+        drawn = peer_vtk.Drawn(scene.volume, scene.transfer, scene.camera, scene.step, THREADS)
         made[VTK] = programs.of_vtk(drawn)
         made[VTK_RAYS] = made[VTK]._replace(draw=drawn.cast)
     if is_here(there, DRJIT):
         made[DRJIT] = programs.of_drjit(programs.marcher(scene, left=LEFT))
-    made["under jit"] = made[OURS]._replace(draw=jitted(scene))
+    under_jit = jax.jit(
+        lambda tf, camera: harness.image(scene._replace(transfer=tf, camera=camera), march).rgba
+    )
+    made["under jit"] = made[OURS]._replace(draw=lambda: under_jit(scene.transfer, scene.camera))
     rows = programs.measured(made, truth, repetitions)
     rows[OURS]["under jit"] = rows.pop("under jit")["ratio"]
     return rows
-
-
-def jitted(scene: Scene) -> Any:
-    """Our image as a program of the user's, of which Python calls nothing but the program."""
-
-    @jax.jit
-    def image(transfer: jv.TransferFunction, camera: jv.Camera) -> jax.Array:
-        return harness.image(scene._replace(transfer=transfer, camera=camera), fast(scene)).rgba
-
-    return lambda: image(scene.transfer, scene.camera)
 
 
 def gradients(
@@ -88,16 +82,12 @@ def gradients(
     if of == "voxels":
         volume = eqx.tree_at(lambda v: v.data, volume, jnp.asarray(volume.data, jnp.float32))
         scene = scene._replace(volume=volume)
-    leaf = volume.data if of == "voxels" else (transfer.colors, transfer.extinction)
-    march = fast(scene)
+    where: Any = (lambda p: p[0].data) if of == "voxels" else (lambda p: (p[1].colors, p[1].extinction))
+    leaf, march = where((volume, transfer)), fast(scene)
 
-    def loss(leaf: Any, march: jv.March = march) -> jax.Array:
-        if of == "voxels":
-            here = scene._replace(volume=eqx.tree_at(lambda v: v.data, volume, leaf))
-        else:
-            changed = eqx.tree_at(lambda t: (t.colors, t.extinction), transfer, leaf)
-            here = scene._replace(transfer=changed)
-        return jnp.mean(harness.image(here, march).rgba ** 2)
+    def loss(leaf: Any) -> jax.Array:
+        volume_, transfer_ = eqx.tree_at(where, (volume, transfer), leaf)
+        return jnp.mean(harness.image(scene._replace(volume=volume_, transfer=transfer_), march).rgba ** 2)
 
     def entries(found: Any) -> np.ndarray:
         return np.asarray(found) if of == "voxels" else np.column_stack(found)
@@ -109,21 +99,16 @@ def gradients(
         "image": lambda: harness.image(scene, march),
         "image and gradient": lambda: both_of(leaf),
     }
-    found: dict[str, Any] = {"entries": len(ours) if of == "transfer" else ours.size}
-    found["pixels"] = scene.camera.size[0]
+    found: dict[str, Any] = {}
     if is_here(there, DRJIT):
         marcher = programs.marcher(scene, left=LEFT)
         timed[DRJIT] = partial(marcher.differentiate, of=of)
         theirs = marcher.gradient(of=of)
-        # with leaps, the gradient of what has an extinction of 0 is left out; without leaps it is computed
+        # with leaps, the gradient of what has an extinction of 0 is left out
         seen = np.ones(ours.shape, bool)
         if of == "transfer":
             seen[:, 3] = np.asarray(transfer.extinction > 0)
-        plain = entries(jax.grad(loss)(leaf, jv.March(march.step, (jv.EarlyTermination(LEFT),))))
-        size = np.linalg.norm(theirs)
-        found["size"] = float(size)
         found["difference"] = float(np.linalg.norm((ours - theirs)[seen]) / np.linalg.norm(theirs[seen]))
-        found["difference, without leaps"] = float(np.linalg.norm(plain - theirs) / size)
     seconds = timing.interleaved(timed, repetitions)
     both = seconds["image and gradient"]
     found["seconds"] = {name: timing.median(times) for name, times in seconds.items()}
@@ -133,7 +118,50 @@ def gradients(
     return found
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+CHILD = """
+import json, sys, time
+begun, voxels, size, left = sys.argv[1:]
+import numpy as np
+import jax
+import jaxvol as jv
+imported = time.time()
+from experiments.scenes import seen_head
+data = np.load(voxels)
+volume = jv.Volume(data, (2 / (data.shape[0] - 1),) * 3, (-1.0,) * 3)
+scene = seen_head(volume, int(size))
+march = jv.March(scene.step, (jv.SpaceLeaping(), jv.EarlyTermination(float(left))))
+ready = time.time()
+jax.block_until_ready(jv.render(*scene[:3], march, outputs="rgba"))
+times = [at - float(begun) for at in (imported, ready, time.time())]
+print(json.dumps(dict(zip(("import", "scene", "image"), times))))
+"""
+
+
+def first_image(size: int, resolution: int, repetitions: int) -> dict[str, Any]:
+    """Seconds from the start of a process until import, scene and image of the head phantom are done: without
+    a compilation cache, and where programs were compiled before."""
+    found: dict[str, Any] = {"pixels": size, "voxels": resolution}
+    with tempfile.TemporaryDirectory() as folder:
+        voxels = Path(folder) / "voxels.npy"
+        np.save(voxels, np.asarray(jv.phantom("head", resolution).data))
+
+        def child(more: dict[str, str]) -> dict[str, float]:
+            settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | more
+            words = [sys.executable, "-c", CHILD, str(time.time()), str(voxels), str(size), str(LEFT)]
+            root = Path(__file__).parent.parent
+            return json.loads(
+                subprocess.check_output(words, cwd=root, env=settings, text=True).splitlines()[-1]
+            )
+
+        warm = {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        child(warm)  # fills the cache
+        for name, more in (("nothing kept", {}), ("compiled before", warm)):
+            times = [child(more) for _ in range(repetitions)]
+            found[name] = {part: timing.median([t[part] for t in times]) for part in times[0]}
+    return found
+
+
+def draw(result: dict[str, Any]) -> Any:
     """Each program's time over ours, scene by scene."""
     sizes, volumes = result["sizes"], result["volumes"]
     figure, (axes,) = charts.panels(1, len(sizes), 6 * len(sizes), 0.75 * len(volumes) + 1.5)
@@ -144,47 +172,27 @@ def draw(result: dict[str, Any], path: Path) -> None:
                     charts.interval(panel, rows[name]["ratio"], number + 0.2 * (shift - 1.5), color)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(GOAL, color="k", linewidth=0.8, linestyle=":")
-        panel.set_xscale("log")
-        panel.set_xticks((0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
-        panel.minorticks_off()
+        charts.numbered(panel, (0.5, 1, 2, 3, 5, 10, 20), ("0.5", "1", "2", "3", "5", "10", "20"))
         ours = [(name, of_size[str(pixels)][OURS]) for name, of_size in volumes.items()]
         labels = [f"{name}\n{row['seconds'] * 1e3:.0f} ms, RMSE {row['rmse']:.4f}" for name, row in ours]
-        panel.set_yticks(range(len(volumes)), labels, fontsize=8)
+        panel.set_yticks(range(len(volumes)), labels)
         panel.set_ylim(len(volumes) - 0.5, -0.6)
         panel.set_xlabel(f"time of an image / that of jaxvol, {pixels} x {pixels} pixels", fontsize=9)
         panel.text(GOAL, -0.55, " goal", va="top", fontsize=8)
         panel.set_title(
-            "Right of 1: slower than jaxvol, whose own time and\n"
-            "error stand below a scene; bars: 95 % intervals",
-            fontsize=9,
+            "Right of 1: slower than jaxvol, whose own time and error\n"
+            "stand below a scene; bars: 95 % intervals"
         )
     shown = [name for name in COLORS if any(name in r for v in volumes.values() for r in v.values())]
     marks = [Line2D([], [], color=COLORS[name], marker="o", linestyle="") for name in shown]
     labels = [LABELS.get(name, name) for name in shown]
-    figure.legend(marks, labels, loc="outside upper center", ncols=4, fontsize=8)
-    charts.save(figure, path)
-
-
-def means(volumes: dict[str, Any], slopes: dict[str, Any], sizes: Sequence[int]) -> dict[str, float]:
-    """Geometric mean over all scenes and sizes of each program's time over ours; and of gradients, over the
-    image and over ours."""
-    rows = [of_size[str(size)] for of_size in volumes.values() for size in sizes]
-    there = [name for name in COLORS if all(name in row for row in rows)]
-    found = {name: geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in there}
-    for of, key in itertools.product(("transfer", "voxels"), ("over image", "Dr.Jit over ours")):
-        ratios = [each[of][key]["median"] for each in slopes.values() if key in each[of]]
-        if ratios:
-            found[f"{of}, {key}"] = geometric_mean(ratios)
-    return found
+    figure.legend(marks, labels, loc="outside upper center", ncols=4)
+    return figure
 
 
 @experiment(
-    "speed",
-    "How fast is an image, and an image with its gradient, beside VTK and Dr.Jit?",
-    __doc__,
-    draw,
     repetitions=15,
-    sizes={"nargs": "+", "type": int, "default": SIZES},
+    sizes={"nargs": "+", "type": int, "default": (512, 1024)},
     only=some_of(SCENES, "VOLUME"),
     gradients={"action": "store_true", "help": "measure gradients, too, at the first size"},
     resolution=256,
@@ -199,31 +207,20 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for size in chosen.sizes:
         for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, size):
             scene = scene._replace(step=scene.step / chosen.steps)
-            rows = images(scene, there, chosen.repetitions)
-            volumes.setdefault(name, {})[str(size)] = rows
-            show(rows, name, size)
+            volumes.setdefault(name, {})[str(size)] = images(scene, there, chosen.repetitions)
             if chosen.gradients and size == chosen.sizes[0]:
                 slopes[name] = {
                     of: gradients(scene, of, there, chosen.repetitions) for of in ("transfer", "voxels")
                 }
-                show(slopes[name], name, size, "gradient")
-    first = None
-    if chosen.processes:
-        first = fresh.measure(chosen.sizes[0], chosen.resolution, LEFT, chosen.processes)
+    rows = [row for of_size in volumes.values() for row in of_size.values()]
+    everywhere = [name for name in COLORS if all(name in row for row in rows)]
+    means = {name: geometric_mean(row[name]["ratio"]["median"] for row in rows) for name in everywhere}
     return {
         "sizes": chosen.sizes,
-        "steps to a voxel": chosen.steps,
-        "repetitions": chosen.repetitions,
-        "opacity left": LEFT,
-        "threads": THREADS,
         "goal": GOAL,
         "peers": there,
-        "geometric means": means(volumes, slopes, chosen.sizes),
-        "first image": first,
+        "geometric means": means,
+        "first image": first_image(chosen.sizes[0], chosen.resolution, chosen.processes),
         "volumes": volumes,
         "gradients": slopes,
     }
-
-
-if __name__ == "__main__":
-    main()

@@ -6,7 +6,6 @@ from one packet of light, and of one from four.
 """
 
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import jaxvol as jv
 from jaxvol.lighting import scatterer_templates
 
 from . import charts
-from .harness import experiment, show
+from .harness import experiment
 
 
 INDEX = 1.4
@@ -62,7 +61,7 @@ def grown(packets: int, seed: int) -> dict[str, Any]:
     }
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
+def draw(result: dict[str, Any]) -> Any:
     """Photons seen along z; the area of a dot is the photon's intensity. The cross marks the sample that they
     light, and the ring the centre of their light."""
     figure, (axes,) = charts.panels(1, 2, 9, 4.6)
@@ -84,16 +83,11 @@ def draw(result: dict[str, Any], path: Path) -> None:
             fontsize=10,
         )
     figure.colorbar(dots, ax=axes, label="z / λ")
-    charts.save(figure, path)
+    return figure
 
 
-@experiment("templates", "Which photons do templates hold, and do they lean to one side?", __doc__, draw)
+@experiment()
 def main(chosen: Namespace) -> dict[str, Any]:
     tables = {name: brightest(*how, chosen.seed) for name, how in TABLES.items()}
-    show(tables)
     packets = {"one packet": 1, "four packets": 4}
     return {"tables": tables, "grown": {name: grown(n, chosen.seed) for name, n in packets.items()}}
-
-
-if __name__ == "__main__":
-    main()

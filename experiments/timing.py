@@ -31,13 +31,12 @@ def interleaved(programs: dict[Name, Callable[[], Any]], repetitions: int) -> di
 
 
 def ratio(seconds: list[float], base: list[float], seed: int = 0) -> dict[str, float]:
-    """Median of the paired ratios, their quartiles, and the median's 95 % interval by bootstrap."""
+    """Median of the paired ratios, and its 95 % interval by bootstrap."""
     ratios = np.array(seconds) / np.array(base)
     drawn = np.random.default_rng(seed).choice(ratios, (2000, len(ratios)))
     low, high = np.quantile(np.median(drawn, axis=1), (0.025, 0.975))
-    lower, upper = np.quantile(ratios, (0.25, 0.75))
-    found = {"median": np.median(ratios), "lower quartile": lower, "upper quartile": upper}
-    return {k: round(float(v), 4) for k, v in {**found, "low": low, "high": high}.items()}
+    found = {"median": np.median(ratios), "low": low, "high": high}
+    return {k: round(float(v), 4) for k, v in found.items()}
 
 
 def median(seconds: list[float]) -> float:

@@ -3,40 +3,33 @@
 With a black transfer function whose extinction is the value itself, a volume renders to an X-ray image:
 -log(1 - opacity) is the line integral of its values. The head phantom, as a density of 64³ voxels, is
 rendered this way by parallel rays from 24 directions around its axis, without noise and as photon counts. It
-is recovered from the same line integrals:
-
-- by scikit-image's filtered back projection (`iradon`), with negative densities set to 0 and the filter that
-  comes nearest to the truth;
-- by its SART (`iradon_sart`), which corrects the slices view by view and keeps densities from being negative;
-- by `jv.fit` with L-BFGS and the renderer's gradient with respect to every voxel. A bijection keeps densities
-  positive. All it knows of the geometry is its rays, which could come from any other cameras.
+is recovered by scikit-image's filtered back projection, with the filter that comes nearest to the truth; by
+its SART; and by `jv.fit` with L-BFGS and the renderer's gradient with respect to every voxel, whose rays
+could come from any cameras.
 
 The views are marched at a sixth of a voxel, the fit at a half. Truth and results share a grid on which values
-are trilinear, for the fit as for SART, so no method suffers from what a grid leaves out of the real world.
-Under noise both iterations first come near the truth and then fit the noise, so the nearest and the last
-error are recorded.
+are trilinear, for the fit as for SART. Under noise both iterations first come near the truth and then fit the
+noise, so the nearest and the last error are recorded.
 """
 
 import time
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from skimage.transform import iradon, iradon_sart
 
 import jaxvol as jv
 from jaxvol.metrics import psnr
 
 from . import charts
-from .charts import plt
-from .harness import experiment, show
+from .harness import experiment
 
 
 DENSEST = 0.1
@@ -44,20 +37,13 @@ DENSEST = 0.1
 THIN = 0.1
 """Part of the mean density below which the bijection bends. With 1, low densities change too slowly."""
 FILTERS = ("ramp", "shepp-logan", "cosine", "hamming", "hann")
-FBP, SART, OURS = "FBP", "SART", "jaxvol"
+METHODS = FBP, SART, OURS = "FBP", "SART", "jaxvol"
+STEP, STEP_OF_VIEWS = 0.5, 1 / 6
+"""Of the fit, and of the views, in voxels."""
 
 Rays = tuple[Float[Array, "views columns slices 3"], Float[Array, "views columns slices 3"]]
 Sinogram = Float[Array, "views columns slices"]
 Density = Float[np.ndarray, "n n n"]
-
-
-class Setting(NamedTuple):
-    """Numbers of iterations, and the renderer's steps in voxels."""
-
-    sweeps: int
-    evaluations: int
-    step: float = 0.5
-    step_of_views: float = 1 / 6
 
 
 def angles(views: int) -> np.ndarray:
@@ -98,10 +84,9 @@ class Difference(eqx.Module):
     rays: Rays
     measured: Sinogram
     unit: Float[Array, ""]
-    step: float = eqx.field(static=True)
 
     def __call__(self, density: Array) -> Array:
-        return (line_integrals(density, self.rays, self.step) - self.measured) / self.unit
+        return (line_integrals(density, self.rays, STEP) - self.measured) / self.unit
 
 
 class Progress:
@@ -110,7 +95,7 @@ class Progress:
     def __init__(self, truth: Density):
         self.truth, self.spent, self.begun = truth, 0.0, time.perf_counter()
         self.rows: list[dict[str, float]] = []
-        self.nearest: Density | None = None
+        self.nearest = truth
 
     def look(self, density: Any) -> None:
         self.spent += time.perf_counter() - self.begun
@@ -122,118 +107,99 @@ class Progress:
         self.begun = time.perf_counter()
 
 
-def filtered(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+def filtered(sinogram: np.ndarray, progress: Progress) -> None:
     """FBP with each filter."""
-    progress = Progress(truth)
     for name in FILTERS:
         slices = [iradon(one.T, angles(len(one)), filter_name=name) for one in np.moveaxis(sinogram, 2, 0)]
         progress.look(np.maximum(np.stack(slices, axis=-1), 0))
-    best = int(np.argmin([row["rmse"] for row in progress.rows]))
-    return progress, f"the filter {FILTERS[best]}"
 
 
-def algebraic(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+def algebraic(sinogram: np.ndarray, progress: Progress, sweeps: int) -> None:
     """SART, one sweep over all views after the other."""
-    progress, slices = Progress(truth), [None] * sinogram.shape[2]
-    for _ in range(setting.sweeps):
+    slices = [None] * sinogram.shape[2]
+    for _ in range(sweeps):
         slices = [
             iradon_sart(one.T, angles(len(one)), image=image, clip=(0, np.inf))
             for one, image in zip(np.moveaxis(sinogram, 2, 0), slices, strict=True)
         ]
         progress.look(np.stack(slices, axis=-1))
-    return progress, "sweeps over all views"
 
 
-def fitted(sinogram: np.ndarray, truth: Density, setting: Setting) -> tuple[Progress, str]:
+def fitted(sinogram: np.ndarray, progress: Progress, evaluations: int) -> None:
     """L-BFGS from a flat and thin density: `THIN` times the mean density, estimated from the views."""
     views, n, _ = sinogram.shape
     thin = THIN * float(sinogram.mean()) / n
     # the loss has a curvature of about 1 where all densities change alike: a first step has the right length
     unit = jnp.float32(thin * np.sqrt(views * n))
-    residual = Difference(rays(n, views), jnp.asarray(sinogram), unit, setting.step)
+    residual = Difference(rays(n, views), jnp.asarray(sinogram), unit)
+    how: dict[str, Any] = {"solver": optx.LBFGS(0.0, 0.0), "constraints": jv.Positive(thin)}
 
-    def fit(evaluations: int, look: Callable[[Any], None]) -> jv.Fit:
-        return jv.fit(
-            residual,
-            jnp.full((n, n, n), thin, jnp.float32),
-            solver=optx.LBFGS(0.0, 0.0),
-            constraints=jv.Positive(thin),
-            max_steps=evaluations,
-            patience=evaluations,
-            callback=lambda step, density, loss: look(density),
-        )
+    def fit(evaluations: int, look: Callable[[Any], None]) -> None:
+        start = jnp.full((n, n, n), thin, jnp.float32)
+        how["callback"] = lambda step, density, loss: look(density)
+        jv.fit(residual, start, max_steps=evaluations, patience=evaluations, **how)
 
     fit(2, lambda density: None)  # compiles before the clock starts
-    progress = Progress(truth)
-    fit(setting.evaluations, progress.look)
-    return progress, "evaluations with gradient"
+    progress.begun = time.perf_counter()
+    fit(evaluations, progress.look)
 
 
-METHODS = {FBP: filtered, SART: algebraic, OURS: fitted}
-
-
-def measure(truth: Density, views: int, photons: float | None, setting: Setting, seed: int) -> dict[str, Any]:
+def measure(truth: Density, photons: float | None, chosen: Namespace) -> dict[str, Any]:
     """The error of each method; the slice to be drawn is kept under `"slice"`."""
-    exact = np.array(line_integrals(truth, rays(len(truth), views), setting.step_of_views))
-    sinogram, middle, rows = counted(exact, photons, seed), truth.shape[2] // 2, {}
-    for name, method in METHODS.items():
-        progress, counts = method(sinogram, truth, setting)
-        nearest, last = min(progress.rows, key=lambda row: row["rmse"]), progress.rows[-1]
-        assert progress.nearest is not None
+    exact = np.array(line_integrals(truth, rays(len(truth), chosen.views), STEP_OF_VIEWS))
+    sinogram, rows = counted(exact, photons, chosen.seed), {}
+    for name in METHODS:
+        progress = Progress(truth)
+        if name == FBP:
+            filtered(sinogram, progress)
+        elif name == SART:
+            algebraic(sinogram, progress, chosen.sweeps)
+        else:
+            fitted(sinogram, progress, chosen.evaluations)
+        nearest = min(progress.rows, key=lambda row: row["rmse"])
         rows[name] = {
             "rmse": nearest["rmse"],
             "psnr": psnr(progress.nearest, truth, truth.max()),
             "at": progress.rows.index(nearest) + 1,
-            "rmse at the end": last["rmse"],
-            "counted in": counts,
+            "rmse at the end": progress.rows[-1]["rmse"],
             "all": progress.rows,
-            "slice": progress.nearest[:, :, middle],
+            "slice": progress.nearest[:, :, truth.shape[2] // 2],
         }
     return rows
 
 
 def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> None:
     """A slice by each method and number of photons; below, the whole volume's error over the iterations."""
-    size = (13.4, 3.5 * len(result) + 3.2)
-    figure = plt.figure(figsize=size, layout=ConstrainedLayoutEngine(h_pad=0.08))
-    (upper,), (lower,) = figure.subfigures(2, 1, squeeze=False, height_ratios=(3.5 * len(result), 3))
+    figure, axes = charts.panels(len(result) + 1, 1 + len(METHODS), 13.4, 3.5 * len(result) + 3.2)
     white = 0.8 * truth.max()
-    upper.suptitle(
+    figure.suptitle(
         f"The middle slice of {truth.shape[2]}; grey: density, from 0 to {white:.2g} / voxel. "
-        "The errors are of the whole volume; beside RMSE stands PSNR.",
-        fontsize=9,
+        "The errors are of the whole volume; beside RMSE stands PSNR."
     )
-    shown = upper.subplots(len(result), 1 + len(METHODS), squeeze=False)
-    for number, (line, (photons, rows)) in enumerate(zip(shown, result.items(), strict=True)):
-        pictures = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}
-        for panel, (name, picture) in zip(line, pictures.items(), strict=True):
+    for line, (photons, rows) in zip(axes, result.items(), strict=False):
+        slices = {"truth": truth[:, :, truth.shape[2] // 2], **{n: rows[n]["slice"] for n in METHODS}}
+        for panel, (name, picture) in zip(line, slices.items(), strict=True):
             panel.imshow(picture, cmap="gray", vmin=0, vmax=white)
-            panel.set(xticks=[], yticks=[])
             caption = f"RMSE {rows[name]['rmse']:.5f}, {rows[name]['psnr']:.1f} dB" if name in rows else ""
-            panel.set_xlabel(caption, fontsize=9)
-            if number == 0:
-                panel.set_title(name, fontsize=9)
-        line[0].set_ylabel(photons, fontsize=9)
-    by_count, by_time = lower.subplots(1, 2, sharey=True)
+            panel.set(xticks=[], yticks=[], title=name, xlabel=caption)
+        line[0].set_ylabel(photons)
+    by_count, by_time, *others = axes[-1]
+    for panel in others:
+        panel.set_axis_off()
     for (photons, rows), line in zip(result.items(), ("-", "--"), strict=False):
-        for name, color in zip((SART, OURS), ("C1", "C0"), strict=True):
+        for name, color in ((SART, "C1"), (OURS, "C0")):
             errors = [row["rmse"] for row in rows[name]["all"]]
             by_count.loglog(range(1, len(errors) + 1), errors, color + line, label=f"{name}, {photons}")
             by_time.loglog([row["seconds"] for row in rows[name]["all"]], errors, color + line)
         for panel in (by_count, by_time):
             panel.axhline(rows[FBP]["rmse"], color="0.5", linestyle=line, label=f"{FBP}, {photons}")
-    by_count.set(
-        xlabel="sweep over all views (SART), evaluation (jaxvol)", ylabel="RMSE of the density, 1/voxel"
-    )
+    by_count.set(xlabel="sweep (SART), evaluation (jaxvol)", ylabel="RMSE of the density, 1/voxel")
     by_time.set(xlabel="seconds, compilation left out")
     by_count.legend(fontsize=7)
     charts.save(figure, path)
 
 
 @experiment(
-    "tomography",
-    "Is a density recovered from 24 X-ray views, beside filtered back projection and SART?",
-    __doc__,
     resolution=64,
     views=24,
     photons={"nargs": "*", "type": float, "default": [1e4], "help": "photons per ray; also without noise"},
@@ -243,23 +209,11 @@ def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> N
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     truth = np.asarray(jv.phantom("head", chosen.resolution).data, np.float32) / 255 * DENSEST
-    setting = Setting(chosen.sweeps, chosen.evaluations)
     found: dict[str, Any] = {}
     for photons in (None, *chosen.photons):
         name = "no noise" if photons is None else f"{photons:g} photons a ray"
-        found[name] = measure(truth, chosen.views, photons, setting, chosen.seed)
+        found[name] = measure(truth, photons, chosen)
     pictures(found, truth, chosen.output / "tomography.png")
     for row in (row for rows in found.values() for row in rows.values()):
         del row["slice"]
-    show(found)
-    return {
-        "voxels": list(truth.shape),
-        "views": chosen.views,
-        "densest": float(truth.max()),
-        "steps": {"views": setting.step_of_views, "fit": setting.step},
-        "photons": found,
-    }
-
-
-if __name__ == "__main__":
-    main()
+    return {"photons": found}

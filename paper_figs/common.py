@@ -1,8 +1,6 @@
-"""What the scripts share: options, pages of pictures, and tables.
+"""How figures are made: from options, pictures and records.
 
-A script computes nothing: it draws the record of an experiment, or lays out pictures that
-`experiments.pictures` renders. Pages keep their pixels: one pixel of a picture is one ray, since resampling
-would smooth the artefacts.
+Pages keep their pixels: one pixel of a picture is one ray, since resampling would smooth the artefacts.
 """
 
 from argparse import Namespace
@@ -29,52 +27,57 @@ GAP, HEAD, TEXT = 4, 40, 54  # pixels: gap between images, height of the title a
 
 
 def pictures(
-    about: str | None,
-    file: str,
+    name: str,
     title: str | Callable[[Namespace], str],
     render: Callable[[Namespace], Panels],
     resolution: int = 160,
     size: int = 256,
+    data: bool = False,
 ) -> Main:
-    """The `main` of a script that shows pictures of scenes.
+    """The `main` of a page of pictures of scenes.
 
-    - `about`: the module's docstring.
-    - `file`: what is written. `title`: of the page, or a function from the options to it.
-    - `render`: from the options to the panels.
-    - `resolution`: voxels along an axis of a phantom, by default. `size`: pixels along a side of an image.
+    Args:
+        name: of the page.
+        title: of the page, or a function from the options to it.
+        render: from the options to the panels.
+        resolution: voxels along an axis of a phantom, by default.
+        size: pixels along a side of an image, by default.
+        data: whether it can show real volumes.
     """
 
-    @command(about, OUTPUT, data=DATA, size=size, resolution=resolution, quick=QUICK)
+    @command(
+        f"Renders {name}.", OUTPUT, data=DATA if data else (), size=size, resolution=resolution, quick=QUICK
+    )
     def main(chosen: Namespace) -> None:
         if chosen.quick:
             chosen.size, chosen.resolution = 48, 40
         panels = render(chosen)
-        page(panels, title if isinstance(title, str) else title(chosen), chosen.output / file)
+        page(panels, title if isinstance(title, str) else title(chosen), chosen.output / f"{name}.webp")
         for each in (each for row in panels for each in row):
-            print(file, each.above, each.below.replace("\n", ", "))
+            print(name, each.above, each.below.replace("\n", ", "))
 
     return main
 
 
-def from_record(about: str | None, file: str, name: str, draw: Callable[[Any, Path], None]) -> Main:
-    """The `main` of a script that draws the record of an experiment: `draw(result, path)`."""
+def from_record(file: str, experiment: str, draw: Callable[[Any, Path], None]) -> Main:
+    """The `main` of a chart of an experiment's record: `draw(result, path)`."""
 
-    @command(about, OUTPUT, results=RECORDS)
+    @command(f"Draws {file} from the record of experiments.{experiment}.", OUTPUT, results=RECORDS)
     def main(chosen: Namespace) -> None:
-        draw(record.read(chosen.results / f"{name}.json")["result"], chosen.output / file)
+        draw(record.read(chosen.results / f"{experiment}.json")["result"], chosen.output / file)
         print(chosen.output / file)
 
     return main
 
 
-def table_from_record(about: str | None, file: str, name: str, table: Callable[[Any], str]) -> Main:
-    """The same of a script that writes a Markdown table: `table(result)`."""
+def table_from_record(name: str, experiment: str, table: Callable[[Any], str]) -> Main:
+    """The same of a Markdown table: `table(result)`."""
 
     def write(result: Any, path: Path) -> None:
         with whole_file(path) as part:
             part.write_text(table(result), encoding="utf-8")
 
-    return from_record(about, file, name, write)
+    return from_record(f"{name}.md", experiment, write)
 
 
 def page(panels: Panels, title: str, path: Path) -> None:

@@ -1,6 +1,6 @@
 """Which figures and tables there are: what each paper shows and reports, and how ours is made.
 
-`index.py` makes a page of these. A new script of this folder needs an entry here.
+`index.py` makes a page of these. A new figure needs an entry here.
 """
 
 from dataclasses import dataclass
@@ -20,12 +20,15 @@ PAPERS = {
 class Entry:
     """A figure or table of a paper.
 
-    - `name`: of the script, and of what it writes.
-    - `paper`: a key of `PAPERS`. `title`: what the paper calls it, and what it is about.
-    - `reported`: what the paper shows and reports. `ours`: what to look at in ours.
-    - `record`: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes,
-      so that the kept picture is its record.
-    - `data`: whether the kept picture shows real volumes (`--data`).
+    Attributes:
+        name: in `pictures.PICTURES` or `records.RECORDS`, and of what is written.
+        paper: a key of `PAPERS`.
+        title: what the paper calls it, and what it is about.
+        reported: what the paper shows and reports.
+        ours: what to look at in ours.
+        record: of the experiment that it is drawn from; None where a scene is rendered, which takes minutes,
+            so that the kept picture is its record.
+        data: whether it shows real volumes (`--data`).
     """
 
     name: str
@@ -38,12 +41,12 @@ class Entry:
 
     @property
     def file(self) -> str:
-        """Name of the file that the script writes."""
+        """Name of the file that is written."""
         return f"{self.name}.{'md' if self.name in TABLES else 'webp'}"
 
 
 TABLES = "table1", "kim_table1", "kisti_table", "lee_tables"
-"""Scripts that write a table, in Markdown."""
+"""Those that are tables, in Markdown."""
 
 ENTRIES = (
     Entry(

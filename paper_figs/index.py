@@ -15,14 +15,18 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
 from itertools import starmap
 from pathlib import Path
-from types import ModuleType
 
 from experiments import harness, record
 from experiments.charts import whole_file
 
 from .common import OUTPUT
 from .contents import ENTRIES, PAPERS, Entry
+from .pictures import PICTURES
+from .records import RECORDS
 
+
+FIGURES = PICTURES | RECORDS
+"""What makes each figure and table, by name."""
 
 STYLE = """
 body { font: 16px/1.45 sans-serif; max-width: 74rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
@@ -62,11 +66,14 @@ def make(
 ) -> Path:
     """Make all figures and tables, and the page. Returns the page.
 
-    - `folder`: where they are written. With `run`, new records go into `folder`/results. Scenes of real
-      volumes are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms in their place.
-    - `results`: of the records, without `run`.
-    - `only`: names of entries; by default all.
-    - `quick`: with `run`: tiny sizes, to see that everything works.
+    Args:
+        folder: where they are written. With `run`, new records go into `folder`/results. Scenes of real
+            volumes are then rendered from the folder JAXVOL_DATA, or, without one, from phantoms.
+        results: of the records, without `run`.
+        run: measure experiments and render scenes.
+        only: names of entries; by default all.
+        quick: with `run`: tiny sizes, to see that everything works.
+        say: is told what is done.
     """
     known = [entry.name for entry in ENTRIES]
     if wrong := [name for name in only if name not in known]:
@@ -78,7 +85,7 @@ def make(
         _measure(entries, results, quick, say)
     for number, entry in enumerate(entries, 1):
         say(f"[{number}/{len(entries)}] {entry.name}")
-        with redirect_stdout(sys.stdout if run else io.StringIO()):  # what a script prints is in its file
+        with redirect_stdout(sys.stdout if run else io.StringIO()):  # what is printed is in the file
             _draw(entry, folder, results, run, quick)
     page = folder / "index.html"
     with whole_file(page) as part:
@@ -90,23 +97,19 @@ def _measure(entries: Sequence[Entry], results: Path, quick: bool, say: Callable
     for name in sorted({entry.record for entry in entries if entry.record}):
         say(f"measuring experiments.{name}")
         options = ["--quick"] if quick else []
-        _script("experiments", name).main(["--output", str(results), *options])
+        importlib.import_module(f"experiments.{name}").main(["--output", str(results), *options])
 
 
 def _draw(entry: Entry, folder: Path, results: Path, run: bool, quick: bool) -> None:
     given = ["--output", str(folder)]
     if entry.record:
-        _script("paper_figs", entry.name).main([*given, "--results", str(results)])
+        FIGURES[entry.name]([*given, "--results", str(results)])
     elif run:
         folder_of_data = None if quick else harness.data()
         real = ["--data", str(folder_of_data)] if folder_of_data and entry.data else []
-        _script("paper_figs", entry.name).main([*given, *real, *(["--quick"] if quick else [])])
+        FIGURES[entry.name]([*given, *real, *(["--quick"] if quick else [])])
     elif folder.resolve() != OUTPUT.resolve():
         shutil.copyfile(OUTPUT / entry.file, folder / entry.file)
-
-
-def _script(package: str, name: str) -> ModuleType:
-    return importlib.import_module(f"{package}.{name}")
 
 
 def _page(entries: Sequence[Entry], folder: Path, results: Path, run: bool) -> str:
@@ -142,7 +145,7 @@ def _section(entry: Entry, folder: Path, results: Path, run: bool) -> str:
 
 def origin(entry: Entry, results: Path, run: bool) -> str:
     """How a figure came about, and the command that makes it again."""
-    command = f"`python -m paper_figs.{entry.name}{' --data FOLDER' if entry.data else ''}`"
+    command = f"`python -m paper_figs {entry.name}{' --data FOLDER' if entry.data else ''}`"
     if entry.record:
         found = record.read(results / f"{entry.record}.json")
         device = found["device"]

@@ -13,7 +13,7 @@ from skimage.io import imread
 import jaxvol as jv
 from experiments import charts, gradient_errors, record, redraw
 from experiments.harness import experiment, recorded
-from experiments.voxel_distances import distances
+from experiments.minimum_distance import distances
 
 
 ROOT = Path(__file__).parent.parent
@@ -24,52 +24,43 @@ EXPERIMENTS = sorted(name for name in RECORDS if (ROOT / "experiments" / f"{name
 """Those whose record has their name."""
 
 
-def draw_squares(result, path):
+def draw(result):
     figure, ((panel,),) = charts.panels(1, 1, 4, 4)
     panel.plot(list(map(int, result["squares"])), list(result["squares"].values()))
-    charts.save(figure, path)
+    return figure
 
 
-@experiment(
-    "squares",
-    "How large are squares?",
-    "Squares.",
-    draw_squares,
-    size=3,
-    sizes=(1, 2, 3),
-    quick={"size": 2, "sizes": (1, 2)},
-)
+@experiment(size=3, sizes=(1, 2, 3), quick={"size": 2, "sizes": (1, 2)})
 def squares(chosen):
     rows = {str(size): size**2 for size in chosen.sizes}
-    rows |= recorded("squares", chosen, "squares", (), {"size": 3})
+    rows |= recorded(chosen, "squares", (), {"size": 3})
     return {"size": chosen.size, "squares": rows}
 
 
 def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(tmp_path):
     squares(["--quick", f"--output={tmp_path}", "--seed", "4"])
-    found = record.read(tmp_path / "squares.json")
-    assert found["command"] == "python -m experiments.squares --quick --seed 4"
-    assert found["question"].endswith("?")
+    name = __name__.split(".")[-1]
+    found = record.read(tmp_path / f"{name}.json")
+    assert found["command"] == f"python -m {__name__} --quick --seed 4"
+    assert found["question"] == (__doc__ or "").strip()
     assert found["seed"] == 4
     assert found["versions"]["jaxvol"]
     assert found["device"]["platform"]
     assert found["result"] == {"size": 2, "squares": {"1": 1, "2": 4}}
-    assert imread(tmp_path / "squares.png").std() > 10
+    assert imread(tmp_path / f"{name}.png").std() > 10
     squares(["--output", str(tmp_path)])
-    assert record.read(tmp_path / "squares.json")["result"]["squares"] == {"1": 1, "2": 4, "3": 9}
+    assert record.read(tmp_path / f"{name}.json")["result"]["squares"] == {"1": 1, "2": 4, "3": 9}
 
 
 def test_what_is_not_measured_again_is_kept_with_its_commit_if_it_is_of_the_same_sizes(tmp_path):
     result = {"size": 3, "rows": {"a": {"seconds": 1}, "b": {"seconds": 2}}}
     path = record.write(tmp_path / "kept.json", "?", result, seed=0, command=["experiments.kept"])
     made = {key: record.read(path)[key] for key in ("commit", "command")}
-    chosen = Namespace(output=tmp_path, quick=False)
-    assert recorded("kept", chosen, "rows", ["b", "c"], {"size": 3}) == {
-        "b": {"measured": made, "seconds": 2}
-    }
-    assert recorded("kept", chosen, "rows", ["b"], {"size": 4}) == {}
+    chosen = Namespace(path=path, quick=False)
+    assert recorded(chosen, "rows", ["b", "c"], {"size": 3}) == {"b": {"measured": made, "seconds": 2}}
+    assert recorded(chosen, "rows", ["b"], {"size": 4}) == {}
     chosen.quick = True
-    assert recorded("kept", chosen, "rows", ["b"], {"size": 3}) == {}
+    assert recorded(chosen, "rows", ["b"], {"size": 3}) == {}
 
 
 @pytest.mark.slow
@@ -92,8 +83,7 @@ def test_every_experiment_takes_its_options(name, capsys):
 
 
 def test_every_record_has_a_chart_that_can_be_drawn(tmp_path):
-    images = {"path_traced", "tomography"}  # which no record holds
-    assert set(redraw.DRAWN) - COMPARE == RECORDS - images
+    assert set(redraw.DRAWN) - COMPARE == RECORDS - redraw.IMAGES - redraw.OTHERS
     for name in redraw.DRAWN:  # a record of another name is of the experiment of its command
         module = record.read(record.RESULTS / f"{name}.json")["command"].split()[2]
         assert hasattr(importlib.import_module(module), "draw")

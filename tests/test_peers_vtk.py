@@ -43,7 +43,7 @@ class Scene(NamedTuple):
     def drawn_by_vtk(self, shade: Phong | None = None) -> tuple[np.ndarray, Any]:
         """VTK's image over the background, (height, width, 3) in [0, 1], top row first, and its mapper."""
         step = STEP * self.voxel
-        drawn = peer_vtk.prepare(*self, step, background=BACKGROUND, shade=shade)
+        drawn = peer_vtk.Drawn(*self, step, background=BACKGROUND, shade=shade)
         return drawn.image(), drawn.mapper
 
     def drawn(self, mapper: Any, lighting: Phong | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,14 +11,12 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
+from ..scenes import on_cube
+
 
 Outcome = Literal["bounded", "detected and said", "documented", "fails"]
 """What jaxvol does: the failure cannot occur; or it occurs and jaxvol says so, by an error, a warning or an
 output; or a docstring states it; or none of these."""
-
-Curves = dict[str, float]
-"""Measured numbers at one value of the regime, by name."""
-
 
 LEVEL = 1 / 255
 
@@ -25,38 +24,58 @@ LEVEL = 1 / 255
 class Entry(NamedTuple):
     """One way in which a method fails.
 
-    - `name`: stable; docstrings point to it.
-    - `question`: that the sweep answers.
-    - `method`: the object whose docstring states the edge, such as `jaxvol.Jitter`.
-    - `regime`: what is swept, with its unit. `values`: from harmless to harmful.
-    - `measure`: from a value and the number of pixels along a side to the measured numbers.
-    - `metric`: what these numbers are. `judged`: the name of the one that finds the edge.
-    - `does`: what jaxvol does, in a sentence; `outcome`: in a word.
-    - `limit`: up to which that number counts as good, by default one level of 8 bits; NaN never does.
-    - `picture`: linear RGB image at a value, in [0, 1], where an image is measured; `shows`: what it shows.
-    - `pictured`: the two values; by default the last one within the limit and the last one of all.
-    - `said`: the name of the number by which jaxvol says that it fails (1) or not (0).
-    - `scales`: of both axes of the chart, as in Matplotlib.
-    - `size`: pixels along a side of the images that are measured; pictures have their own.
+    Attributes:
+        name: stable; docstrings point to it.
+        question: that the sweep answers.
+        does: what jaxvol does, in a sentence; `outcome`: in a word.
+        measure: from a value and the number of pixels along a side to the measured numbers, by name.
+        method: the object whose docstring states the edge, such as `jaxvol.Jitter`.
+        regime: what is swept, with its unit.
+        values: of the regime, from harmless to harmful.
+        metric: what the measured numbers are.
+        judged: the name of the one that finds the edge.
+        outcome: what jaxvol does.
+        limit: up to which that number counts as good, by default one level of 8 bits; NaN never does.
+        picture: linear RGB image at a value, in [0, 1], where an image is measured.
+        shows: what the picture shows.
+        pictured: the two values; by default the last one within the limit and the last one of all.
+        said: the name of the number by which jaxvol says that it fails (1) or not (0).
+        size: pixels along a side of the images that are measured; pictures have their own.
     """
 
     name: str
     question: str
+    does: str
+    measure: Callable[[float, int], dict[str, float]]
     method: str
     regime: str
     values: tuple[float, ...]
-    measure: Callable[[float, int], Curves]
     metric: str
     judged: str
-    does: str
     outcome: Outcome = "documented"
     limit: float = LEVEL
     picture: Callable[[float, int], np.ndarray] | None = None
     shows: str = ""
     pictured: tuple[float, float] | None = None
     said: str | None = None
-    scales: tuple[str, str] = ("log", "log")
     size: int = 16
+
+
+ENTRIES: dict[str, Entry] = {}
+"""All entries, by name."""
+
+
+def entry(*about: Any, **more: Any) -> Callable[[Callable[[float, int], dict[str, float]]], Entry]:
+    """Decorator that makes an entry of a function that measures, by whose name it is called. The docstring is
+    the question, and, below it, what jaxvol does. The arguments are the entry's, from `method` on."""
+
+    def made(measure: Callable[[float, int], dict[str, float]]) -> Entry:
+        question, _, does = (" ".join(part.split()) for part in (measure.__doc__ or "").partition("\n\n"))
+        name = measure.__name__.replace("_", " ").replace("16 bit", "16-bit")
+        ENTRIES[name] = Entry(name, question, does, measure, *about, **more)
+        return ENTRIES[name]
+
+    return made
 
 
 class Edge(NamedTuple):
@@ -85,36 +104,22 @@ def sweep(entry: Entry, size: int, values: Sequence[float] | None = None) -> dic
     return {"values": list(values), "curves": curves, "edge": found._asdict()}
 
 
-def pictured(entry: Entry, found: dict[str, Any]) -> tuple[float, float]:
-    """The two values of which an entry has pictures."""
-    if entry.pictured is not None:
-        return entry.pictured
-    within = found["edge"]["within"]
-    return (entry.values[0] if within is None else within), entry.values[-1]
+def rgba(*scene: Any, **how: Any) -> np.ndarray:
+    """An image over black, by the adjoint that compiles fastest."""
+    return np.asarray(jv.render(*scene, outputs="rgba", adjoint="forward", **how).rgba, np.float64)
 
 
-# -- shared by entries ------------------------------------------------------------------------------------
-
-White = tuple[float, float, float]
-
-
-def colors(*parts: Any, **how: Any) -> np.ndarray:
-    """Colour over black of an image, by the adjoint that compiles fastest."""
-    rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
-    return np.asarray(rendering.rgba[..., :3], np.float64)
+def colors(*scene: Any, **how: Any) -> np.ndarray:
+    return rgba(*scene, **how)[..., :3]
 
 
-def opacities(*parts: Any, **how: Any) -> np.ndarray:
-    """Opacity of each pixel."""
-    rendering = jv.render(*parts, outputs="rgba", adjoint="forward", **how)
-    return np.asarray(rendering.rgba[..., 3], np.float64)
+def opacities(*scene: Any, **how: Any) -> np.ndarray:
+    return rgba(*scene, **how)[..., 3]
 
 
-def ray_opacities(
-    volume: jv.Volume, transfer: Any, rays: tuple[Any, Any], march: jv.March, **how: Any
-) -> Array:
+def ray_opacities(volume: jv.Volume, transfer: Any, rays: tuple[Any, Any], march: jv.March) -> Array:
     """Opacity of rays, (origins, directions)."""
-    return jv.render_rays(volume, transfer, *rays, march, outputs="rgba", **how).rgba[..., 3]
+    return jv.render_rays(volume, transfer, *rays, march, outputs="rgba").rgba[..., 3]
 
 
 def value_and_slope(function: Callable[[Array], Array]) -> Callable[[Any], tuple[np.float64, np.float64]]:
@@ -137,19 +142,19 @@ def along_z(size: int, scale: float = 0.5) -> jv.Camera:
     return jv.Camera((0, 0, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
 
 
-def of_field(field: jv.Field) -> jv.Volume:
-    """The values of a field on [-1, 1]³."""
-    return jv.Volume(np.zeros((8, 8, 8), np.float32), [2 / 7] * 3, [-1.0] * 3, field=field)
-
-
-def uniform(extinction: Any, color: White = (1.0, 1.0, 1.0)) -> jv.TransferFunction:
-    """The same colour and extinction for every value. The extinction may be traced."""
-    return jv.TransferFunction([0.0, 1.0], np.tile(color, (2, 1)), jnp.full(2, extinction))
-
-
 def cube(side: int = 8) -> jv.Volume:
     """A volume of ones on [-1, 1]³."""
-    return jv.Volume(np.ones((side,) * 3, np.float32), [2 / (side - 1)] * 3, [-1.0] * 3)
+    return on_cube(np.ones((side,) * 3, np.float32))
+
+
+def of_field(field: jv.Field) -> jv.Volume:
+    """The values of a field on [-1, 1]³."""
+    return on_cube(np.zeros((8, 8, 8), np.float32), field=field)
+
+
+def uniform(extinction: Any, color: tuple[float, ...] = (1.0, 1.0, 1.0)) -> jv.TransferFunction:
+    """The same colour and extinction for every value. The extinction may be traced."""
+    return jv.TransferFunction([0.0, 1.0], np.tile(color, (2, 1)), jnp.full(2, extinction))
 
 
 def signed(error: np.ndarray, largest: float) -> np.ndarray:
@@ -167,8 +172,6 @@ def grey(values: np.ndarray) -> np.ndarray:
 
 def shift_of(transform: Any, offset: Any) -> Any:
     """A jitter whose random number is `offset` in all pixels. It must have been made with `"blue"`."""
-    import equinox as eqx
-
     tile = jnp.full_like(transform.noise.tile, offset)
     return eqx.tree_at(lambda jitter: jitter.noise.tile, transform, tile)
 

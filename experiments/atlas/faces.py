@@ -10,13 +10,8 @@ from jaxtyping import Array
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise
 
-from .entry import Entry, along_z, colors, cube, opacities, ray_opacities, rms, signed, uniform
-
-
-SEED = 0
-
-
-# -- cut faces --------------------------------------------------------------------------------------------
+from ..scenes import on_cube
+from .entry import along_z, colors, cube, entry, opacities, ray_opacities, rms, signed, uniform
 
 
 @cache
@@ -33,36 +28,29 @@ def cut_face(step: float, size: int, jitter: str) -> np.ndarray:
 
 
 JITTERS = {
-    "Jitter": jv.Jitter(SEED),
-    "Jitter, front residual": jv.Jitter(SEED, front_residual=True),
-    "EmptySpaceJitter": jv.EmptySpaceJitter(SEED),
+    "Jitter": jv.Jitter(0),
+    "Jitter, front residual": jv.Jitter(0, front_residual=True),
+    "EmptySpaceJitter": jv.EmptySpaceJitter(0),
 }
 
 
-def cut_faces(step: float, size: int) -> dict[str, float]:
-    """Standard deviation of the noise of one channel on the face."""
-    on_face = np.asarray(along_z(size).rays()[0])[..., 0] < -0.05
-    return {name: float(np.sqrt(boundary_noise(cut_face(step, size, name), on_face) / 3)) for name in JITTERS}
-
-
-CUT = Entry(
-    name="jitter on cut faces",
-    question="From which step on does Jitter show as noise where the box cuts material?",
-    method="jaxvol.Jitter",
-    regime="step, voxels",
-    values=(0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0),
-    measure=cut_faces,
-    metric="noise on the face, standard deviation",
-    judged="Jitter",
-    does="Jitter leaves out the first ξ d of the material. With front_residual the noise is smaller; under "
-    "EmptySpaceJitter, rays on the face are not shifted before they leave the material, and it stays smooth.",
+@entry(
+    "jaxvol.Jitter",
+    "step, voxels",
+    (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0),
+    "noise on the face, standard deviation",
+    "Jitter",
     picture=lambda step, size: cut_face(step, size, "Jitter"),
     shows="the block under Jitter; its left half is the cut face",
     size=64,
 )
+def jitter_on_cut_faces(step: float, size: int) -> dict[str, float]:
+    """From which step on does Jitter show as noise where the box cuts material?
 
-
-# -- faces of labels --------------------------------------------------------------------------------------
+    Jitter leaves out the first ξ d of the material. With front_residual the noise is smaller; under
+    EmptySpaceJitter, rays on the face are not shifted before they leave the material, and it stays smooth."""
+    on_face = np.asarray(along_z(size).rays()[0])[..., 0] < -0.05
+    return {name: float(np.sqrt(boundary_noise(cut_face(step, size, name), on_face) / 3)) for name in JITTERS}
 
 
 @cache
@@ -71,7 +59,7 @@ def halves(side: int = 9) -> jv.Volume:
     labels = np.zeros((side,) * 3, np.uint8)
     labels[:, :, side // 2 :] = 1
     with jax.ensure_compile_time_eval():  # kept, although it may be made inside `jax.jit`
-        return jv.Volume(np.ones((side,) * 3, np.float32), [2 / (side - 1)] * 3, [-1.0] * 3, labels)
+        return on_cube(np.ones((side,) * 3, np.float32), labels)
 
 
 NEAR, FAR = 0.875, 1.125
@@ -81,35 +69,30 @@ NEAR, FAR = 0.875, 1.125
 def label_face(depth: float, size: int, *, cut: bool) -> np.ndarray:
     """Error of the opacity of the far half, of extinction 1, for steps of this optical depth."""
     transfer = jv.LabelTransferFunction([None, uniform(1.0)])
-    march = jv.March(depth, (jv.EmptySpaceJitter(SEED), jv.AlphaCorrection(labels=cut)))
+    march = jv.March(depth, (jv.EmptySpaceJitter(0), jv.AlphaCorrection(labels=cut)))
     return opacities(halves(), transfer, along_z(size), march) - (1 - np.exp(-FAR))
 
 
-def label_faces(depth: float, size: int) -> dict[str, float]:
+@entry(
+    "jaxvol.AlphaCorrection",
+    "optical depth of a step",
+    (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
+    "RMSE of the opacity behind the face",
+    "AlphaCorrection()",
+    picture=lambda depth, size: signed(label_face(depth, size, cut=False), 0.2),
+    shows="error of the opacity without labels=True, ± 0.2 from blue to red",
+    size=32,
+)
+def jitter_at_label_faces(depth: float, size: int) -> dict[str, float]:
+    """From which step on does jitter show as noise at the faces of a segmentation?
+
+    Without labels=True a structure is as thick as its whole cells, which jitter moves. With it, cells are cut
+    at the face, and the error is that of rounding."""
     return {
         "AlphaCorrection()": float(np.std(label_face(depth, size, cut=False))),
         "AlphaCorrection(labels=True)": rms(label_face(depth, size, cut=True)),
     }
 
-
-LABELS = Entry(
-    name="jitter at label faces",
-    question="From which step on does jitter show as noise at the faces of a segmentation?",
-    method="jaxvol.AlphaCorrection",
-    regime="optical depth of a step",
-    values=(0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
-    measure=label_faces,
-    metric="RMSE of the opacity behind the face",
-    judged="AlphaCorrection()",
-    does="Without labels=True a structure is as thick as its whole cells, which jitter moves. With it, "
-    "cells are cut at the face, and the error is that of rounding.",
-    picture=lambda depth, size: signed(label_face(depth, size, cut=False), 0.2),
-    shows="error of the opacity without labels=True, ± 0.2 from blue to red",
-    size=32,
-)
-
-
-# -- their motion along a ray, which gradients leave out --------------------------------------------------
 
 FRONT = 0.5
 """Extinction of label 0."""
@@ -132,32 +115,25 @@ def _slopes(contrast: Array) -> tuple[Array, Array, Array]:
     return jax.grad(opacity)(angle, True), jax.grad(opacity)(angle, False), difference
 
 
-def moving_face(contrast: float, size: int) -> dict[str, float]:
-    """`contrast`: extinction behind the face, over that in front of it."""
+@entry(
+    "jaxvol.AlphaCorrection",
+    "extinction behind the face / in front of it",
+    (1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 5.0),
+    "relative error of the derivative by the angle of a ray",
+    "AlphaCorrection(labels=True)",
+    limit=0.1,
+)
+def gradients_at_label_faces(contrast: float, size: int) -> dict[str, float]:
+    """How much may extinction jump at the face of a label before the gradient of the rays is wrong?
+
+    Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the exit.
+    Finite differences of the same image, whose cells are cut at the face, are right."""
     depth = FRONT * (NEAR + contrast * FAR) / np.cos(ANGLE)
     exact = depth * np.tan(ANGLE) * np.exp(-depth)
     found = (float(slope) for slope in _slopes(jnp.asarray(contrast, jnp.float32)))
     names = "AlphaCorrection(labels=True)", "AlphaCorrection()", "finite differences"
     return {name: abs(slope - exact) / exact for name, slope in zip(names, found, strict=True)}
 
-
-FACES = Entry(
-    name="gradients at label faces",
-    question="How much may extinction jump at the face of a label before the gradient of the rays is wrong?",
-    method="jaxvol.AlphaCorrection",
-    regime="extinction behind the face / in front of it",
-    values=(1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 5.0),
-    measure=moving_face,
-    metric="relative error of the derivative by the angle of a ray",
-    judged="AlphaCorrection(labels=True)",
-    limit=0.1,
-    does="Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the "
-    "exit. Finite differences of the same image, whose cells are cut at the face, are right.",
-    scales=("linear", "log"),
-)
-
-
-# -- behind what is cut out -------------------------------------------------------------------------------
 
 OUT = jv.Clip((-2, 2, -2, 2, -0.49, 0.35), inside_out=True)
 """Cuts a layer out of the cube: 0.51 are left in front, and 0.65 behind, no multiple of any step below."""
@@ -167,30 +143,27 @@ OUT = jv.Clip((-2, 2, -2, 2, -0.49, 0.35), inside_out=True)
 def hollowed(depth: float, size: int, *, cut: bool) -> np.ndarray:
     """Error of the opacity of what is left of a cube of extinction 1, for steps of this optical depth."""
     aligned = (jv.AlphaCorrection(),) if cut else ()
-    march = jv.March(depth, (OUT, jv.EmptySpaceJitter(SEED), *aligned))
+    march = jv.March(depth, (OUT, jv.EmptySpaceJitter(0), *aligned))
     return opacities(cube(), uniform(1.0), along_z(size), march) - (1 - np.exp(-1.16))
 
 
-def behind_cuts(depth: float, size: int) -> dict[str, float]:
-    return {
-        "EmptySpaceJitter": float(np.std(hollowed(depth, size, cut=False))),
-        "EmptySpaceJitter, AlphaCorrection": rms(hollowed(depth, size, cut=True)),
-    }
-
-
-BEHIND = Entry(
-    name="jitter behind cuts",
-    question="From which step on does jitter show as noise on the far side of what is cut out?",
-    method="jaxvol.Clip",
-    regime="optical depth of a step",
-    values=(0.004, 0.012, 0.02, 0.04, 0.12, 0.4, 1.2),
-    measure=behind_cuts,
-    metric="noise of the opacity, standard deviation; with AlphaCorrection, its RMSE",
-    judged="EmptySpaceJitter",
-    does="Rays are shifted in the gap, so that the face behind it lies where the next sample happens to be, "
-    "and material there is as thick as its whole cells. AlphaCorrection cuts them at the face, and the error "
-    "is that of rounding. Cut faces that a ray meets first are smooth without it.",
+@entry(
+    "jaxvol.Clip",
+    "optical depth of a step",
+    (0.004, 0.012, 0.02, 0.04, 0.12, 0.4, 1.2),
+    "noise of the opacity, standard deviation; with AlphaCorrection, its RMSE",
+    "EmptySpaceJitter",
     picture=lambda depth, size: signed(hollowed(depth, size, cut=False), 0.1),
     shows="error of the opacity without AlphaCorrection, ± 0.1 from blue to red",
     size=32,
 )
+def jitter_behind_cuts(depth: float, size: int) -> dict[str, float]:
+    """From which step on does jitter show as noise on the far side of what is cut out?
+
+    Rays are shifted in the gap, so that the face behind it lies where the next sample happens to be, and
+    material there is as thick as its whole cells. AlphaCorrection cuts them at the face, and the error is
+    that of rounding. Cut faces that a ray meets first are smooth without it."""
+    return {
+        "EmptySpaceJitter": float(np.std(hollowed(depth, size, cut=False))),
+        "EmptySpaceJitter, AlphaCorrection": rms(hollowed(depth, size, cut=True)),
+    }

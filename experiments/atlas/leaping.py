@@ -9,14 +9,12 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, colors
+from ..scenes import on_cube
+from .entry import LEVEL, colors, entry
 
 
-LEVEL = 1 / 255
 RED, BLUE = (0.9, 0.25, 0.2), (0.25, 0.35, 0.6)
 
-
-# -- sheets thinner than a cell of pixels -----------------------------------------------------------------
 
 NODES = 128
 SPACING = 2 / (NODES - 1)
@@ -32,18 +30,15 @@ def _sheet_and_wall() -> jv.Volume:
     x, y, z = np.meshgrid(line, line, line, indexing="ij", sparse=True)
     # 0.2 at the faces, with a slope of one per voxel
     sheet = np.clip(0.2 + (THICK / 2 - np.abs(x - TILT * y)) / SPACING, 0, 1) * ((z > -0.6) & (z < -0.2))
-    return jv.Volume(
-        np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)).astype(np.float32), [SPACING] * 3, [-1.0] * 3
-    )
+    return on_cube(np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)).astype(np.float32))
 
 
 def sheet_image(width: float, size: int, method: str | None, cell: int = 8) -> np.ndarray:
     """The sheet, so many pixels wide. `method`: of leaping, or None."""
     values, extinction = [0.199, 0.2, 0.35, 0.4], [0.0, 200.0, 200.0, 200.0]
     transfer = jv.TransferFunction(values, [BLUE, BLUE, BLUE, RED], extinction)
-    camera = _above(width, size)
     leaps = () if method is None else (jv.SpaceLeaping(method, cell=cell),)
-    return colors(_sheet_and_wall(), transfer, camera, jv.March(1 / 64, leaps))
+    return colors(_sheet_and_wall(), transfer, _above(width, size), jv.March(1 / 64, leaps))
 
 
 def _above(width: float, size: int) -> jv.Camera:
@@ -52,13 +47,26 @@ def _above(width: float, size: int) -> jv.Camera:
     return jv.Camera((0.01, 0.02, -3), (0.01, 0.02, 0), (0, 1, 0), size=(size, size), parallel_scale=scale)
 
 
-CELLS = (4, 8, 16)
+@entry(
+    "jaxvol.SpaceLeaping",
+    "width of the sheet in pixels / R",
+    (2.0, 1.5, 1.2, 1.0, 0.9, 0.75, 0.5, 0.25, 0.125),
+    "share of the sheet's pixels that are wrong",
+    "min_distance, R = 16",
+    limit=0.001,
+    picture=lambda ratio, size: sheet_image(ratio * 16, size, "min_distance", 16),
+    shows='a sheet seen edge-on before a wall, under "min_distance" with R = 16',
+    pictured=(1.0, 0.5),
+    size=192,
+)
+def sheets_thinner_than_a_cell_of_rays(ratio: float, size: int) -> dict[str, float]:
+    """How wide must a structure be, in the image, for a minimum-distance grid with cells of R pixels to see
+    it?
 
-
-def lost(ratio: float, size: int) -> dict[str, float]:
-    """Share of the sheet's pixels that are wrong, for a sheet `ratio` cells wide."""
+    Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R no larger
+    than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which lose nothing."""
     found = {}
-    for method, cell in (*(("min_distance", cell) for cell in CELLS), ("beam", 16)):
+    for method, cell in (*(("min_distance", cell) for cell in (4, 8, 16)), ("beam", 16)):
         truth = sheet_image(ratio * cell, size, None)
         x, y, _ = np.moveaxis(np.asarray(_above(ratio * cell, size).rays()[0]), -1, 0)
         sheet = (np.abs(x - TILT * y) < 0.45 * THICK) & (np.maximum(np.abs(x), np.abs(y)) < 1)
@@ -67,76 +75,38 @@ def lost(ratio: float, size: int) -> dict[str, float]:
     return found
 
 
-LOST = Entry(
-    name="sheets thinner than a cell of rays",
-    question="How wide must a structure be, in the image, for a minimum-distance grid with cells of R pixels "
-    "to see it?",
-    method="jaxvol.SpaceLeaping",
-    regime="width of the sheet in pixels / R",
-    values=(2.0, 1.5, 1.2, 1.0, 0.9, 0.75, 0.5, 0.25, 0.125),
-    measure=lost,
-    metric="share of the sheet's pixels that are wrong",
-    judged="min_distance, R = 16",
-    limit=0.001,
-    does='Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R '
-    'no larger than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which '
-    "lose nothing.",
-    picture=lambda ratio, size: sheet_image(ratio * 16, size, "min_distance", 16),
-    shows='a sheet seen edge-on before a wall, under "min_distance" with R = 16',
-    pictured=(1.0, 0.5),
-    scales=("log", "linear"),
-    size=192,
-)
-
-
-# -- steep transfer functions -----------------------------------------------------------------------------
-
-
-@cache
-def _gaussian() -> jv.Volume:
-    return jv.phantom("gaussian", 41)
-
-
 def steep_image(ramp: float, size: int, low: float, *, leaps: bool) -> np.ndarray:
     """A volume that is visible above `low`; extinction rises over `ramp` spacings of float32."""
     values = np.array([low, low + ramp * np.spacing(np.float32(low))], np.float32)
     transfer = jv.TransferFunction(values, [RED, RED], [0.0, 50.0])
-    camera = jv.Camera.looking_at(_gaussian(), (0.5, -0.9, 0.4), size=(size, size)).zoom(1.5)
-    transforms = (jv.SpaceLeaping(),) if leaps else ()
-    return colors(_gaussian(), transfer, camera, jv.March(0.02, transforms))
+    volume = jv.phantom("gaussian", 41)
+    camera = jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=(size, size)).zoom(1.5)
+    return colors(volume, transfer, camera, jv.March(0.02, (jv.SpaceLeaping(),) if leaps else ()))
 
 
-def steep(ramp: float, size: int) -> dict[str, float]:
+@entry(
+    "jaxvol.SpaceLeaping",
+    "width of the ramp, spacings of float32",
+    (2.0**22, 2.0**16, 2.0**10, 64.0, 8.0, 2.0, 1.0),
+    "largest difference from the march without leaping",
+    "visible above 1/2",
+    outcome="bounded",
+    limit=1e-6,
+    picture=lambda ramp, size: steep_image(ramp, size, 0.5, leaps=True),
+    shows="the volume above 1/2, with leaping",
+    pictured=(2.0**22, 1.0),
+    size=48,
+)
+def occupancy_under_steep_transfer_functions(ramp: float, size: int) -> dict[str, float]:
+    """Does space leaping lose anything if a transfer function rises within one spacing of float32?
+
+    Ranges of blocks are widened by the rounding of interpolation, so that what is called empty is empty."""
     top = float(np.nextafter(np.float32(1), np.float32(0)))  # below the value of the middle node alone
     found = {}
     for name, low in (("visible above 1/2", 0.5), ("visible at one node", top)):
         images = [steep_image(ramp, size, low, leaps=leaps) for leaps in (True, False)]
         found[name] = float(np.abs(images[0] - images[1]).max())
     return found
-
-
-STEEP = Entry(
-    name="occupancy under steep transfer functions",
-    question="Does space leaping lose anything if a transfer function rises within one spacing of float32?",
-    method="jaxvol.SpaceLeaping",
-    regime="width of the ramp, spacings of float32",
-    values=(2.0**22, 2.0**16, 2.0**10, 64.0, 8.0, 2.0, 1.0),
-    measure=steep,
-    metric="largest difference from the march without leaping",
-    judged="visible above 1/2",
-    limit=1e-6,
-    outcome="bounded",
-    does="Ranges of blocks are widened by the rounding of interpolation, so that what is called empty is "
-    "empty.",
-    picture=lambda ramp, size: steep_image(ramp, size, 0.5, leaps=True),
-    shows="the volume above 1/2, with leaping",
-    pictured=(2.0**22, 1.0),
-    scales=("log", "linear"),
-    size=48,
-)
-
-
-# -- gradients of what is leapt over ----------------------------------------------------------------------
 
 
 @jax.jit
@@ -148,39 +118,27 @@ def _gradients(volume: jv.Volume, camera: jv.Camera, extinction: Array) -> tuple
         levels = jnp.stack([extinction, extinction, jnp.full_like(extinction, 3.0)])
         transfer = jv.TransferFunction([0.0, 0.3, 1.0], np.ones((3, 3)), levels)
         march = jv.March(0.1, (*leaps, jv.AlphaCorrection()), max_samples=64)
-        return jnp.sum(
-            jv.render(volume, transfer, camera, march, outputs="rgba", adjoint=adjoint).rgba[..., 3]
-        )
+        how = {"outputs": "rgba", "adjoint": adjoint}
+        return jnp.sum(jv.render(volume, transfer, camera, march, **how).rgba[..., 3])
 
     slope = jax.grad(loss)
     return slope(extinction, (jv.SpaceLeaping(),), "replay"), slope(extinction, (), "direct")
 
 
-@cache
-def _surrounded(size: int) -> tuple[jv.Volume, jv.Camera]:
-    volume = jv.phantom("sphere", 25)
-    return volume, jv.Camera.looking_at(volume, size=(size, size))
-
-
-def leapt(extinction: float, size: int) -> dict[str, float]:
-    with_leaps, exact = _gradients(*_surrounded(16), jnp.asarray(extinction, jnp.float32))
-    return {"SpaceLeaping": float(abs(with_leaps - exact) / abs(exact))}
-
-
-LEAPT = Entry(
-    name="gradients of what is leapt over",
-    question="How transparent may a region be and still get a gradient under space leaping?",
-    method="jaxvol.SpaceLeaping",
-    regime="extinction of the region, per length",
-    values=(1.0, 1e-2, 1e-6, 1e-12, 1e-24, 1e-36, 0.0),
-    measure=leapt,
-    metric="relative error of the gradient",
-    judged="SpaceLeaping",
+@entry(
+    "jaxvol.SpaceLeaping",
+    "extinction of the region, per length",
+    (1.0, 1e-2, 1e-6, 1e-12, 1e-24, 1e-36, 0.0),
+    "relative error of the gradient",
+    "SpaceLeaping",
     limit=0.05,
-    does="What has any extinction above 0 is marched and has its gradient; what has none is leapt over and "
-    "has none, although it would. A fit that should make invisible regions visible must start above "
-    "0, or not leap.",
-    scales=("symlog", "linear"),
 )
+def gradients_of_what_is_leapt_over(extinction: float, size: int) -> dict[str, float]:
+    """How transparent may a region be and still get a gradient under space leaping?
 
-ENTRIES = (LOST, STEEP, LEAPT)
+    What has any extinction above 0 is marched and has its gradient; what has none is leapt over and has none,
+    although it would. A fit that should make invisible regions visible must start above 0, or not leap."""
+    volume = jv.phantom("sphere", 25)
+    camera = jv.Camera.looking_at(volume, size=(16, 16))
+    with_leaps, exact = _gradients(volume, camera, jnp.asarray(extinction, jnp.float32))
+    return {"SpaceLeaping": float(abs(with_leaps - exact) / abs(exact))}

@@ -1,108 +1,92 @@
-"""Where do scatterer templates fail? Printed energy, few packets, long and short mean free paths."""
+"""Where does light fail? Templates of printed energy, of few packets, of long and short mean free paths;
+shading of noise; adaptive strides."""
 
 from functools import cache
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates, scatterer_templates
+from jaxvol.lighting import (
+    ConstantLight,
+    DirectionalLight,
+    Phong,
+    ScattererTemplates,
+    scatterer_templates,
+)
+from jaxvol.metrics import rmse
 
 from ..printed_templates import printed_templates
-from .entry import Entry, colors
+from ..scenes import grid, on_cube
+from .entry import colors, cube, entry, rms, uniform
 
 
-COUNT = 8
-"""Templates over which numbers are averaged."""
+@entry(
+    "jaxvol.scatterer_template",
+    "opacity α",
+    (0.1, 0.3, 0.45, 0.55, 0.7, 0.8),
+    "energy of a template that begins with 1",
+    "printed, without flights",
+    limit=1.0,
+)
+def energy_of_templates_as_printed(opacity: float, size: int) -> dict[str, float]:
+    """At which opacity does a template hold more light than it was given?
 
-
-# -- energy as printed ------------------------------------------------------------------------------------
-
-
-def energy(opacity: float, size: int) -> dict[str, float]:
+    Equations (1) to (3) of the paper, to the letter, pass on α I where (1 - α) I is left: without the factors
+    of flight, energy grows as α / (1 - α). jaxvol's form, conserving, never exceeds 1."""
     material = jv.Material(opacity, 1.0)
     forms = {
-        "printed, without flights": printed_templates(material, 0, count=COUNT, merge=0.0, flights=False),
-        "printed": printed_templates(material, 0, count=COUNT, merge=0.0),
-        "conserving": scatterer_templates(material, 0, count=COUNT, merge=0.0),
+        "printed, without flights": printed_templates(material, 0, count=8, merge=0.0, flights=False),
+        "printed": printed_templates(material, 0, count=8, merge=0.0),
+        "conserving": scatterer_templates(material, 0, count=8, merge=0.0),
     }
     found = {name: float(jnp.mean(jnp.sum(each.intensity, axis=-1))) for name, each in forms.items()}
     return {**found, "α / (1 - α)": opacity / (1 - opacity)}
 
 
-ENERGY = Entry(
-    name="energy of templates as printed",
-    question="At which opacity does a template hold more light than it was given?",
-    method="jaxvol.scatterer_template",
-    regime="opacity α",
-    values=(0.1, 0.3, 0.45, 0.55, 0.7, 0.8),
-    measure=energy,
-    metric="energy of a template that begins with 1",
-    judged="printed, without flights",
+@entry(
+    "jaxvol.scatterer_template",
+    "packets",
+    (16.0, 8.0, 4.0, 3.0, 2.0, 1.0),
+    "distance of the centre of light from the sample, mean free paths",
+    "one template",
     limit=1.0,
-    does="Equations (1) to (3) of the paper, to the letter, pass on α I where (1 - α) I is left: without the "
-    "factors of flight, energy grows as α / (1 - α). jaxvol's form, conserving, never exceeds 1.",
-    scales=("linear", "log"),
 )
+def lopsided_templates(packets: float, size: int) -> dict[str, float]:
+    """How many packets does a template need not to lean to one side?
 
-
-# -- few packets ------------------------------------------------------------------------------------------
-
-
-def lopsided(packets: float, size: int) -> dict[str, float]:
+    One packet goes one way, and so does all that comes of it. By default there are four, spread evenly, which
+    still lean by 0.6 mean free paths at an opacity of 0.4; blending templates takes off most of that."""
     templates = scatterer_templates(jv.Material(0.4, 1.0), 0, count=32, packets=int(packets))
     light = np.asarray(templates.intensity, np.float64)
-    middle = np.einsum("mtn,mtnk->mtk", light, np.asarray(templates.offset)) / light.sum(
-        axis=-1, keepdims=True
-    )
+    middle = np.einsum("mtn,mtnk->mtk", light, np.asarray(templates.offset)) / light.sum(-1, keepdims=True)
     return {
         "one template": float(np.mean(np.linalg.norm(middle, axis=-1))),
         "blend of 32": float(np.linalg.norm(middle.mean(axis=1))),
     }
 
 
-LOPSIDED = Entry(
-    name="lopsided templates",
-    question="How many packets does a template need not to lean to one side?",
-    method="jaxvol.scatterer_template",
-    regime="packets",
-    values=(16.0, 8.0, 4.0, 3.0, 2.0, 1.0),
-    measure=lopsided,
-    metric="distance of the centre of light from the sample, mean free paths",
-    judged="one template",
-    limit=1.0,
-    does="One packet goes one way, and so does all that comes of it. By default there are four, spread "
-    "evenly, which still lean by 0.6 mean free paths at an opacity of 0.4; blending templates takes "
-    "off most of that.",
-)
-
-
-# -- mean free paths far from an object's size ------------------------------------------------------------
-
 RADIUS = 0.7
 LIGHTS = DirectionalLight((0.8, 0.5, -0.6), (2.0, 2.0, 2.0)), ConstantLight((0.15, 0.15, 0.15))
-WHITE = (1.0, 1.0, 1.0)
 
 
 @cache
 def _ball() -> jv.Volume:
-    line = np.linspace(-1, 1, 32)
-    away = np.sqrt(sum(part**2 for part in np.meshgrid(line, line, line, indexing="ij")))
-    return jv.Volume(np.clip((RADIUS - away) * 15.5 + 0.5, 0, 1).astype(np.float32), [2 / 31] * 3, [-1.0] * 3)
+    away = np.sqrt(sum(part**2 for part in grid(32)))
+    return on_cube(np.clip((RADIUS - away) * 15.5 + 0.5, 0, 1).astype(np.float32))
 
 
 @cache
-def ball(ratio: float, size: int, *, traced: bool, paths: int = 32) -> np.ndarray:
+def ball(ratio: float, size: int, *, traced: bool) -> np.ndarray:
     """A white ball whose mean free path is `ratio` times its diameter."""
     path = 2 * RADIUS * ratio
     material = jv.Material(0.2, path, 1.0)
     camera = jv.Camera((0.0, -4.0, 1.0), (0, 0, 0), (0, 0, 1), 26, size=(size, size))
-    transfer = jv.TransferFunction([0.4, 0.6], [WHITE, WHITE], [0.0, 1 / path])
+    transfer = jv.TransferFunction([0.4, 0.6], np.ones((2, 3)), [0.0, 1 / path])
     if traced:
-        image = jv.path_trace(
-            _ball(), transfer, camera, LIGHTS, paths=paths, key=0, materials=material
-        ).radiance
-        return np.asarray(image, np.float64)
+        how = {"paths": 32, "key": 0, "materials": material}
+        return np.asarray(jv.path_trace(_ball(), transfer, camera, LIGHTS, **how).radiance, np.float64)
     lighting = ScattererTemplates(material, LIGHTS, templates=2, photons=16, levels=4, blend=True)
     march = jv.March(1 / 24, (jv.AlphaCorrection(),), "midpoint")
     return colors(_ball(), transfer, camera, march, lighting=lighting)
@@ -112,9 +96,7 @@ def balls(ratio: float, size: int) -> dict[str, float]:
     seen, exact = (ball(ratio, size, traced=traced) for traced in (False, True))
     return {
         "total radiance": float(abs(np.log2(seen.sum() / exact.sum()))),
-        "pixels, scaled alike": float(
-            np.sqrt(np.mean((seen * exact.sum() / seen.sum() - exact) ** 2)) / np.sqrt(np.mean(exact**2))
-        ),
+        "pixels, scaled alike": rms(seen * exact.sum() / seen.sum() - exact) / rms(exact),
     }
 
 
@@ -126,42 +108,133 @@ def ball_picture(ratio: float, size: int) -> np.ndarray:
     return np.concatenate([seen, exact], axis=1) / white
 
 
-LONG = Entry(
-    name="long mean free paths",
-    question="How long may a mean free path be, against an object, for templates to light it as path tracing "
-    "does?",
-    method="jaxvol.lighting.ScattererTemplates",
-    regime="mean free path / diameter of a ball",
-    values=(0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0),
-    measure=balls,
-    metric="difference from path tracing (radiance: powers of 2)",
-    judged="pixels, scaled alike",
+@entry(
+    "jaxvol.lighting.ScattererTemplates",
+    "mean free path / diameter of a ball",
+    (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0),
+    "difference from path tracing (radiance: powers of 2)",
+    "pixels, scaled alike",
     limit=0.25,
-    does="The sum of all radiance stays near that of path tracing. But photons of a template lie outside a "
-    "ball that is thin against the mean free path, on all sides alike, so that its lit side is no "
-    "longer where it was.",
     picture=ball_picture,
     shows="templates, and path tracing beside them, as bright as the brighter of both in the latter",
     size=48,
 )
+def long_mean_free_paths(ratio: float, size: int) -> dict[str, float]:
+    """How long may a mean free path be, against an object, for templates to light it as path tracing does?
 
-SHORT = Entry(
-    name="short mean free paths",
-    question="How short may a mean free path be, against an object, for templates to be as bright as path "
-    "tracing is?",
-    method="jaxvol.lighting.ScattererTemplates",
-    regime="mean free path / diameter of a ball",
-    values=(1.0, 0.5, 0.2, 0.1, 0.05, 0.03),
-    measure=balls,
-    metric="difference from path tracing (radiance: powers of 2)",
-    judged="total radiance",
+    The sum of all radiance stays near that of path tracing. But photons of a template lie outside a ball that
+    is thin against the mean free path, on all sides alike, so that its lit side is no longer where it was."""
+    return balls(ratio, size)
+
+
+@entry(
+    "jaxvol.lighting.ScattererTemplates",
+    "mean free path / diameter of a ball",
+    (1.0, 0.5, 0.2, 0.1, 0.05, 0.03),
+    "difference from path tracing (radiance: powers of 2)",
+    "total radiance",
     limit=0.35,
-    does="A sphere of white matter is too dark by a quarter to a third, once it is several mean free paths "
-    "thick: the template of a sample near a curved face has more photons outside than on the flat one "
-    "that set its scale.",
     picture=ball_picture,
     shows="templates, and path tracing beside them, as bright as the brighter of both in the latter",
     size=32,
 )
+def short_mean_free_paths(ratio: float, size: int) -> dict[str, float]:
+    """How short may a mean free path be, against an object, for templates to be as bright as path tracing is?
 
-ENTRIES = (ENERGY, LOPSIDED, LONG, SHORT)
+    A sphere of white matter is too dark by a quarter to a third, once it is several mean free paths thick:
+    the template of a sample near a curved face has more photons outside than on the flat one that set its
+    scale."""
+    return balls(ratio, size)
+
+
+SIDE = 32
+RISE = 10.0
+"""Value units per voxel, at the surface."""
+
+
+def noisy_ball(noise: float) -> jv.Volume:
+    """A ball whose values fall by `RISE` per voxel from its middle, on [-1, 1]³. The noise has this standard
+    deviation, in units of the rise per voxel."""
+    axis, random = np.arange(SIDE) - (SIDE - 1) / 2, np.random.default_rng(0).normal(size=(SIDE,) * 3)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    data = RISE * (SIDE / 3 - np.sqrt(x**2 + y**2 + z**2) + noise * random)
+    return on_cube(data.astype(np.float32))
+
+
+def noise_picture(noise: float, size: int) -> np.ndarray:
+    volume = noisy_ball(noise)
+    transfer = jv.TransferFunction([-10.0, 10.0], np.ones((2, 3)), [0.0, 60.0])
+    camera = jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=(size, size)).zoom(1.6)
+    march = jv.March(0.02, (jv.SpaceLeaping(), jv.EarlyTermination(1e-3)))
+    return colors(volume, transfer, camera, march, lighting=Phong())
+
+
+@entry(
+    "jaxvol.lighting.Phong",
+    "noise, standard deviation / rise of values per voxel",
+    (0.01, 0.03, 0.1, 0.3, 1.0, 3.0),
+    "mean angle between a normal and that without noise, degrees",
+    "angle",
+    limit=10.0,
+    picture=noise_picture,
+    shows="the ball, under a head light",
+    pictured=(0.1, 1.0),
+)
+def normals_in_noise(noise: float, size: int) -> dict[str, float]:
+    """How much noise may values have before the normals of a surface are lost?
+
+    A central difference of noise is as large as that of a rise of 0.7 standard deviations per voxel;
+    interpolation halves it. Angles grow by some 28 degrees times the ratio, up to the 57 of random normals:
+    what is nearly homogeneous is shaded by its noise. Smooth such volumes."""
+    outward = np.random.default_rng(1).normal(size=(4096, 3))
+    outward /= np.linalg.norm(outward, axis=-1, keepdims=True)
+    points = jnp.asarray((SIDE - 1) / 2 + SIDE / 3 * outward, jnp.float32)
+    volume = noisy_ball(noise)
+
+    @jax.jit
+    @jax.vmap
+    def gradient(at: jax.Array) -> jax.Array:
+        return jnp.stack(volume.gradient((at[0], at[1], at[2])))
+
+    found = np.asarray(gradient(points), np.float64)
+    cosine = np.abs(np.sum(found * outward, axis=-1)) / np.linalg.norm(found, axis=-1)
+    return {"angle": float(np.rad2deg(np.mean(np.arccos(np.minimum(cosine, 1)))))}
+
+
+def lit_image(size: int, transforms: tuple[jv.Transform, ...], lit: bool, finer: int = 1) -> np.ndarray:
+    """A translucent cube of one value, lit from the side; a mean free path is a tenth of its side."""
+    sun = DirectionalLight((1.0, 0.3, 0.2), (3.0, 3.0, 3.0))
+    how = {"templates": 1, "packets": 2, "photons": 6, "levels": 3}
+    lighting = ScattererTemplates(jv.Material(0.3, 0.2), sun, **how) if lit else None
+    camera = jv.Camera.looking_at(cube(32), (0.4, -1.0, 0.5), size=(size, size)).zoom(1.3)
+    march = jv.March(1 / 32 / finer, (jv.AlphaCorrection(), *transforms), "midpoint")
+    return colors(cube(32), uniform(1.5, (0.9, 0.8, 0.7)), camera, march, lighting=lighting)
+
+
+@cache
+def _light_error(size: int, lit: bool, tolerance: float | None) -> float:
+    """RMSE of the cube, by adaptive strides or by cells of one step."""
+    transforms = () if tolerance is None else (jv.AdaptiveSampling(tolerance, 16),)
+    return rmse(lit_image(size, transforms, lit), lit_image(size, (), lit, finer=4))
+
+
+@entry(
+    "jaxvol.AdaptiveSampling",
+    "tolerance",
+    (0.1, 0.03, 0.01, 0.005, 0.002, 1e-3, 3e-4, 1e-4),
+    "RMSE of the image / tolerance",
+    "lit",
+    limit=1.0,
+    size=24,
+)
+def adaptive_strides_under_light(tolerance: float, size: int) -> dict[str, float]:
+    """What does adaptive sampling miss where light varies and values do not?
+
+    Strides follow from values and transfer function alone, so that in a cube of one value all cells are as
+    long as allowed, whatever the tolerance: without light that is exact, with light it is not.
+    Rendering.error does not count it."""
+    return {
+        "lit": _light_error(size, True, tolerance) / tolerance,
+        "lit, cells of one step": _light_error(size, True, None) / tolerance,
+        "unlit": _light_error(size, False, tolerance) / tolerance,
+    }

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, along_z, cube, finite, ray_opacities, signed, uniform, value_and_slope
+from .entry import along_z, cube, entry, finite, ray_opacities, signed, uniform, value_and_slope
 
 
 ALIGNED = (jv.AlphaCorrection(),)
@@ -22,49 +22,30 @@ def one_ray(volume: jv.Volume, extinction: Any, step: float, origin: Any, direct
     return ray_opacities(volume, uniform(extinction), rays, jv.March(step, ALIGNED))[0]
 
 
-# -- opaque cells -----------------------------------------------------------------------------------------
-
 ORIGIN, AHEAD = (0.1, 0.2, -3.0), (0.0, 0.0, 1.0)
 through = value_and_slope(lambda extinction: one_ray(cube(), extinction, 0.5, ORIGIN, AHEAD))
 """A cube of side 2, in four steps, by its extinction."""
 
 
-def opaque(depth: float, size: int) -> dict[str, float]:
-    """`depth`: optical depth of the cube."""
+@entry(
+    "jaxvol.render",
+    "optical depth of a ray",
+    (1.0, 3.0, 6.0, 9.0, 12.0, 14.0, 16.0, 18.0, 24.0, 40.0),
+    "error",
+    "gradient, relative",
+    limit=0.1,
+)
+def gradients_of_opaque_rays(depth: float, size: int) -> dict[str, float]:
+    """At which optical depth does the gradient by the extinction drown in rounding?
+
+    The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 cannot tell
+    from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not move."""
     extinction = np.float64(np.float32(depth / 2))
     value, slope = through(extinction)
     exact = 2 * np.exp(-2 * extinction)
     return {
         "gradient, relative": float(abs(slope - exact) / exact),
         "opacity": float(abs(value + np.expm1(-2 * extinction))),
-    }
-
-
-OPAQUE = Entry(
-    name="gradients of opaque rays",
-    question="At which optical depth does the gradient by the extinction drown in rounding?",
-    method="jaxvol.render",
-    regime="optical depth of a ray",
-    values=(1.0, 3.0, 6.0, 9.0, 12.0, 14.0, 16.0, 18.0, 24.0, 40.0),
-    measure=opaque,
-    metric="error",
-    judged="gradient, relative",
-    limit=0.1,
-    does="The opacity stays exact to rounding. Its derivative is the transmittance left, which float32 "
-    "cannot tell from 0 beside an opacity that rounds to 1: a fit that starts this opaque does not "
-    "move.",
-    scales=("linear", "log"),
-)
-
-
-def unbounded(extinction: float, size: int) -> dict[str, float]:
-    camera = along_z(8, 0.7)
-    found = _image_and_gradient(jv.phantom("sphere", 32), camera, jnp.asarray(extinction, jnp.float32))
-    value, slope = through(extinction)
-    exact = -np.expm1(-2 * np.float64(np.float32(extinction)))
-    return {
-        "not finite": 0.0 if finite((found, value, slope)) else np.nan,
-        "opacity of a cube": float(abs(value - exact)),
     }
 
 
@@ -80,30 +61,49 @@ def _image_and_gradient(volume: jv.Volume, camera: jv.Camera, extinction: Array)
     return image, gradient
 
 
-UNBOUNDED = Entry(
-    name="extinction without bound",
-    question="Do an image and its gradients stay finite for any extinction?",
-    method="jaxvol.TransferFunction",
-    regime="extinction, per length (the cube is 2 long)",
-    values=(1.0, 1e2, 1e4, 1e6, 1e12, 1e20, 1e30, 1e38),
-    measure=unbounded,
-    metric="error of the opacity; NaN if anything is not finite",
-    judged="not finite",
-    limit=0.0,
+@entry(
+    "jaxvol.TransferFunction",
+    "extinction, per length (the cube is 2 long)",
+    (1.0, 1e2, 1e4, 1e6, 1e12, 1e20, 1e30, 1e38),
+    "error of the opacity; NaN if anything is not finite",
+    "not finite",
     outcome="bounded",
-    does="Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to "
-    "voxels, camera and extinction are finite up to the largest float32.",
+    limit=0.0,
 )
+def extinction_without_bound(extinction: float, size: int) -> dict[str, float]:
+    """Do an image and its gradients stay finite for any extinction?
 
+    Opacity is 1 - exp(-extinction · width), which tends to 1. Image and gradients with respect to voxels,
+    camera and extinction are finite up to the largest float32."""
+    camera = along_z(8, 0.7)
+    found = _image_and_gradient(jv.phantom("sphere", 32), camera, jnp.asarray(extinction, jnp.float32))
+    value, slope = through(extinction)
+    exact = -np.expm1(-2 * np.float64(np.float32(extinction)))
+    return {
+        "not finite": 0.0 if finite((found, value, slope)) else np.nan,
+        "opacity of a cube": float(abs(value - exact)),
+    }
 
-# -- grazing exits ----------------------------------------------------------------------------------------
 
 past_edge = value_and_slope(lambda x: one_ray(cube(), 1.0, 0.25, (x, -1.5, 0.1), (1.0, 1.0, 0.0)))
 """A ray that cuts an edge of the cube, by its place x."""
 
 
-def grazing(length: float, size: int) -> dict[str, float]:
-    """`length`: of the ray within the cube, at its edge x = 1, y = -1."""
+@entry(
+    "jaxvol.AlphaCorrection",
+    "length inside / half the side of the cube",
+    (0.9, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 2e-7),
+    "error",
+    "opacity",
+    outcome="bounded",
+    limit=1e-6,
+)
+def grazing_exits(length: float, size: int) -> dict[str, float]:
+    """How short may the part of a ray inside the volume be?
+
+    The width of the cut cell is a difference of two distances, so its error is that of rounding them, however
+    short it is: some 1e-7 of the volume's size. The relative error of a nearly transparent pixel grows, that
+    of the gradient does not."""
     x = np.float64(np.float32(0.5 - length / np.sqrt(2)))
     value, slope = past_edge(x)
     exact = (0.5 - x) * np.sqrt(2)
@@ -114,26 +114,6 @@ def grazing(length: float, size: int) -> dict[str, float]:
     }
 
 
-GRAZING = Entry(
-    name="grazing exits",
-    question="How short may the part of a ray inside the volume be?",
-    method="jaxvol.AlphaCorrection",
-    regime="length inside / half the side of the cube",
-    values=(0.9, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 2e-7),
-    measure=grazing,
-    metric="error",
-    judged="opacity",
-    limit=1e-6,
-    outcome="bounded",
-    does="The width of the cut cell is a difference of two distances, so its error is that of rounding "
-    "them, however short it is: some 1e-7 of the volume's size. The relative error of a nearly "
-    "transparent pixel grows, that of the gradient does not.",
-)
-
-
-# -- exits at the end of a cell ---------------------------------------------------------------------------
-
-
 @value_and_slope
 def spaced(spacing: Array) -> Array:
     """Opacity of a cube of 8 spacings in steps of 1/4, by the spacing along the ray."""
@@ -142,8 +122,21 @@ def spaced(spacing: Array) -> Array:
     return one_ray(volume, 1.0, 0.25, ORIGIN, AHEAD)
 
 
-def at_end(part: float, size: int) -> dict[str, float]:
-    """`part`: of a step that the last cell is wide; 0 where the exit lies exactly at the end of a cell."""
+@entry(
+    "jaxvol.AlphaCorrection",
+    "width of the last cell e / step",
+    (0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 0.0),
+    "error",
+    "gradient, relative",
+    outcome="bounded",
+    limit=0.01,
+)
+def exits_at_the_end_of_a_cell(part: float, size: int) -> dict[str, float]:
+    """Does the gradient by what moves the exit hold as the last cell gets narrower?
+
+    The gradient is exact for any e, and where the exit lies exactly at the end of a cell: then the last cell
+    is not cut, but its width is the exit's to change. This happens in orthographic views along an axis with
+    steps of one voxel."""
     spacing = np.float64(np.float32(0.25 * (1 + part / 8)))
     value, slope = spaced(spacing)
     exact = np.exp(-8 * spacing)
@@ -151,26 +144,6 @@ def at_end(part: float, size: int) -> dict[str, float]:
         "gradient, relative": float(abs(slope - 8 * exact) / (8 * exact)),
         "opacity": float(abs(value - (1 - exact))),
     }
-
-
-AT_END = Entry(
-    name="exits at the end of a cell",
-    question="Does the gradient by what moves the exit hold as the last cell gets narrower?",
-    method="jaxvol.AlphaCorrection",
-    regime="width of the last cell e / step",
-    values=(0.5, 0.1, 1e-2, 1e-3, 1e-4, 1e-5, 0.0),
-    measure=at_end,
-    metric="error",
-    judged="gradient, relative",
-    limit=0.01,
-    outcome="bounded",
-    does="The gradient is exact for any e, and where the exit lies exactly at the end of a cell: then the "
-    "last cell is not cut, but its width is the exit's to change. This happens in orthographic views along "
-    "an axis with steps of one voxel.",
-    scales=("symlog", "log"),
-)
-
-# -- early termination ------------------------------------------------------------------------------------
 
 
 @cache
@@ -205,7 +178,23 @@ def terminated(left: float, factor: float, size: int) -> tuple[float, np.ndarray
     return float(slope), np.asarray(image, np.float64)
 
 
-def termination(left: float, size: int) -> dict[str, float]:
+@entry(
+    "jaxvol.EarlyTermination",
+    "opacity_left",
+    (1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 1 / 255, 0.02, 0.1),
+    "error (of gradients: relative)",
+    "opaque: gradient",
+    limit=0.05,
+    picture=lambda left, size: signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05),
+    shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
+    pictured=(1e-4, 0.1),
+    size=32,
+)
+def early_termination_in_gradients(left: float, size: int) -> dict[str, float]:
+    """How much transmittance may be left out before the gradient is wrong?
+
+    The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T log(1/T)
+    of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or none."""
     found = {}
     for name, factor in (("opaque: gradient", 1.0), ("translucent: gradient", 0.05)):
         exact, truth = terminated(NEVER, factor, size)
@@ -214,25 +203,3 @@ def termination(left: float, size: int) -> dict[str, float]:
         if factor == 1:
             found["opaque: image, largest"] = float(np.abs(image - truth).max())
     return found
-
-
-TERMINATION = Entry(
-    name="early termination in gradients",
-    question="How much transmittance may be left out before the gradient is wrong?",
-    method="jaxvol.EarlyTermination",
-    regime="opacity_left",
-    values=(1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 1 / 255, 0.02, 0.1),
-    measure=termination,
-    metric="error (of gradients: relative)",
-    judged="opaque: gradient",
-    limit=0.05,
-    does="The image errs by at most opacity_left. The gradient by the extinction of what is opaque lacks T "
-    "log(1/T) of every ray, with one sign, so that it is wrong by far more. For fits take 0.0001, or "
-    "none.",
-    picture=lambda left, size: signed(terminated(left, 1.0, size)[1] - terminated(NEVER, 1.0, size)[1], 0.05),
-    shows="error of the image of an opaque head phantom, ± 0.05 from blue to red",
-    pictured=(1e-4, 0.1),
-    size=32,
-)
-
-ENTRIES = (OPAQUE, UNBOUNDED, GRAZING, AT_END, TERMINATION)

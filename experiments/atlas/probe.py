@@ -1,6 +1,8 @@
-"""Where does the toroidal map fail? Short gaps of rays, and rays near the motor axis."""
+"""Where do scans fail? Short gaps of rays, rays near the motor axis, bricks to which a ray comes back."""
 
 import math
+from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,8 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from .entry import Entry, finite, signed, uniform
+from ..bricks import each_at_once
+from .entry import entry, finite, ray_opacities, rgba, signed, uniform
 
 
 DEGREES = math.pi / 180
@@ -18,16 +21,10 @@ EXTINCTION = 0.02
 STEP = 5.0
 
 
-def ones() -> jv.Volume:
-    return jv.Volume(np.ones((8, 8, 8), np.float32))
-
-
 def probe(a: float, b: float, depth: float) -> jv.ToroidalMap:
     half = math.pi / 2
     return jv.ToroidalMap(a, b, (half - TURN, half + TURN), (half - FAN, half + FAN), (0.0, depth))
 
-
-# -- gaps of rays -----------------------------------------------------------------------------------------
 
 SIZE = A + B + 100
 """Of the probe: from the motor axis to the deepest sample."""
@@ -37,9 +34,8 @@ SIZE = A + B + 100
 def _within(origins: Array, directions: Array) -> Array:
     """Lengths of rays within the sector, as the march sees them."""
     march = jv.March(STEP, (probe(A, B, 100.0), jv.AlphaCorrection()))
-    rendering = jv.render_rays(
-        ones(), uniform(EXTINCTION), origins, directions, march, outputs="rgba", adjoint="forward"
-    )
+    volume, how = jv.Volume(np.ones((8, 8, 8), np.float32)), {"outputs": "rgba", "adjoint": "forward"}
+    rendering = jv.render_rays(volume, uniform(EXTINCTION), origins, directions, march, **how)
     return -jnp.log1p(-rendering.rgba[..., 3]) / EXTINCTION
 
 
@@ -57,40 +53,35 @@ def _over_gaps(gaps: np.ndarray, turns: np.ndarray) -> np.ndarray:
     return (seen - lengths) / gaps
 
 
-def gap(ratio: float, size: int) -> dict[str, float]:
-    """`ratio`: length of the gap over the size of the probe."""
-    error = _over_gaps(np.array(ratio * SIZE), np.linspace(-0.8, 0.8, 24) * TURN)
-    return {"share of the gap": float(np.mean(error)), "rays": float(np.mean(error > 0.5))}
-
-
 def gap_picture(ratio: float, size: int) -> np.ndarray:
     gaps = ratio * SIZE * np.linspace(0.5, 1.5, size)
     return signed(_over_gaps(gaps[None], np.linspace(-0.8, 0.8, size)[:, None] * TURN), 1.0)
 
 
-GAPS = Entry(
-    name="gaps of rays under a toroidal map",
-    question="How short a gap, where a ray leaves the sector and enters it again, is missed?",
-    method="jaxvol.ToroidalMap",
-    regime="length of the gap over the size of the probe",
-    values=(0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4),
-    measure=gap,
-    metric="share of the gap that is taken for material; share of rays",
-    judged="share of the gap",
+@entry(
+    "jaxvol.ToroidalMap",
+    "length of the gap over the size of the probe",
+    (0.1, 0.03, 0.01, 3e-3, 1e-3, 3e-4, 1e-4),
+    "share of the gap that is taken for material; share of rays",
+    "share of the gap",
     limit=0.05,
-    does="Gaps are found ray by ray, whatever the step of the march, by steps that cannot pass a face. A ray "
-    "that is nowhere farther outside than some roundings of float32 counts as inside.",
     picture=gap_picture,
     shows="error of the length inside the sector over the length of the gap, rows by angle about the motor "
     "axis, columns by gap, from half to 1.5 times the stated length; red: missed",
-    scales=("log", "linear"),
 )
+def gaps_of_rays_under_a_toroidal_map(ratio: float, size: int) -> dict[str, float]:
+    """How short a gap, where a ray leaves the sector and enters it again, is missed?
 
+    Gaps are found ray by ray, whatever the step of the march, by steps that cannot pass a face. A ray that is
+    nowhere farther outside than some roundings of float32 counts as inside."""
+    error = _over_gaps(np.array(ratio * SIZE), np.linspace(-0.8, 0.8, 24) * TURN)
+    return {"share of the gap": float(np.mean(error)), "rays": float(np.mean(error > 0.5))}
 
-# -- near the motor axis ----------------------------------------------------------------------------------
 
 NEAR = (-10.0, 10.0, 50.0)
 """a, b and the range of depths of a probe whose near side touches the motor axis."""
+ORIGINS = np.array([[0.0, 0.0, -60.0], [0.0, -60.0, -80.0], [-60.0, 0.0, -12.0]])
+DIRECTIONS = np.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8], [1.0, 0.0, 0.2]])
 
 
 @jax.jit
@@ -99,14 +90,13 @@ def _near_axis(offset: Array) -> tuple[Array, tuple]:
 
     def loss(given: tuple[jv.ToroidalMap, Array, Array]) -> tuple[Array, Array]:
         map_, data, origins = given
-        directions = jnp.array([[0.0, 0.0, 1.0], [0.0, 0.6, 0.8], [1.0, 0.0, 0.2]])
-        volume = jv.Volume(data)
         march = jv.March(2.0, (map_, jv.AlphaCorrection()))
-        rgba = jv.render_rays(volume, uniform(EXTINCTION), origins, directions, march, outputs="rgba").rgba
-        return jnp.sum(rgba[..., 3]), rgba[..., 3]
+        rays = origins, jnp.asarray(DIRECTIONS, jnp.float32)
+        opacity = ray_opacities(jv.Volume(data), uniform(EXTINCTION), rays, march)
+        return jnp.sum(opacity), opacity
 
     shift = jnp.stack([0 * offset, offset, 0 * offset])[None]
-    origins = jnp.array([[0.0, 0.0, -60.0], [0.0, -60.0, -80.0], [-60.0, 0.0, -12.0]]) + shift
+    origins = jnp.asarray(ORIGINS, jnp.float32) + shift
     gradient, opacity = jax.grad(loss, has_aux=True)((probe(*NEAR), jnp.ones((8, 8, 8)), origins))
     return opacity, gradient
 
@@ -122,34 +112,62 @@ def _length(origin: np.ndarray, direction: np.ndarray) -> float:
     return float(5e-4 * np.sum(inside & (gamma >= 0) & (gamma <= depth)))
 
 
-def near_axis(offset: float, size: int) -> dict[str, float]:
+@entry(
+    "jaxvol.ToroidalMap",
+    "distance of rays from the axis (the fan is 50 deep)",
+    (10.0, 1.0, 0.1, 1e-2, 1e-4, 1e-8, 1e-20, 0.0),
+    "error of the opacity; NaN if anything is not finite",
+    "opacity",
+    outcome="bounded",
+    limit=2e-4,
+)
+def rays_near_the_motor_axis(offset: float, size: int) -> dict[str, float]:
+    """Do image and gradients stay finite and right where a fan touches its axis of rotation?
+
+    On the axis and at the apex, where an angle has no gradient, it is taken as 0. Image and gradients with
+    respect to probe, voxels and rays are finite."""
     opacity, gradient = _near_axis(jnp.asarray(offset, jnp.float32))
-    exact = [
-        -np.expm1(-EXTINCTION * _length(np.add(o, (0, offset, 0)), np.array(d)))
-        for o, d in (
-            ((0.0, 0.0, -60.0), (0.0, 0.0, 1.0)),
-            ((0.0, -60.0, -80.0), (0.0, 0.6, 0.8)),
-            ((-60.0, 0.0, -12.0), (1.0, 0.0, 0.2)),
-        )
-    ]
+    lengths = [_length(o + np.array((0, offset, 0)), d) for o, d in zip(ORIGINS, DIRECTIONS, strict=True)]
+    exact = -np.expm1(-EXTINCTION * np.array(lengths))
     error = float(np.abs(np.asarray(opacity, np.float64) - exact).max())
     return {"opacity": error if finite((opacity, gradient)) else np.nan}
 
 
-AXIS = Entry(
-    name="rays near the motor axis",
-    question="Do image and gradients stay finite and right where a fan touches its axis of rotation?",
-    method="jaxvol.ToroidalMap",
-    regime="distance of rays from the axis (the fan is 50 deep)",
-    values=(10.0, 1.0, 0.1, 1e-2, 1e-4, 1e-8, 1e-20, 0.0),
-    measure=near_axis,
-    metric="error of the opacity; NaN if anything is not finite",
-    judged="opacity",
-    limit=2e-4,
-    outcome="bounded",
-    does="On the axis and at the apex, where an angle has no gradient, it is taken as 0. Image and "
-    "gradients with respect to probe, voxels and rays are finite.",
-    scales=("symlog", "log"),
-)
+@cache
+def scan(depth: float, size: int) -> tuple[Any, ...]:
+    """Red near the probe and blue far from it, seen along the fan: rays pass the curved faces at small
+    angles, and most of them twice. `depth`: optical depth of the image's width."""
+    width, shape, half = 90.0, (24, 32, 48), math.pi / 2
+    volume = jv.Volume(np.broadcast_to(np.linspace(20, 250, shape[2]), shape).astype(np.uint8))
+    red, blue = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    fog = jv.TransferFunction(
+        [0, 120, 135, 255], [red, red, blue, blue], np.full(4, depth / width, np.float32)
+    )
+    camera = jv.Camera((300, 10, 45), (0, 0, 45), (0, 0, 1), size=(size, size), parallel_scale=width / 2)
+    fan = jv.ToroidalMap(10.0, 20.0, (half - 0.6, half + 0.6), (half - 0.9, half + 0.9), (0.0, 60.0))
+    return volume, fog, camera, jv.March(1.5, (fan,))
 
-ENTRIES = (GAPS, AXIS)
+
+def by_bricks(depth: float, size: int, method: Any) -> np.ndarray:
+    how = {"bricks": (1, 1, 3), "method": method, "outputs": "rgba"}
+    return np.asarray(jv.render_bricks(*scan(depth, size), **how).rgba)
+
+
+@entry(
+    "jaxvol.render_bricks",
+    "optical depth of the scan",
+    (0.01, 0.03, 0.1, 0.3, 1.0, 3.0),
+    "largest error of a pixel",
+    "naive",
+    picture=lambda depth, size: by_bricks(depth, size, each_at_once)[..., :3],
+    shows="a scan that is red near the probe (below) and blue far from it, each brick shown at once",
+    size=24,
+)
+def wrong_order(depth: float, size: int) -> dict[str, float]:
+    """From which optical depth on does it show that each brick of a scan is shown at once?
+
+    A ray that leaves a brick and comes back passes another one between. Shown at once (naive), both parts of
+    it in the first brick are blended at once, and what lies between them after or before both. "overlap" and
+    "reload" keep the order of the samples, and their error is that of rounding."""
+    truth, methods = rgba(*scan(depth, size)), {"naive": each_at_once, "overlap": "overlap"}
+    return {name: float(np.abs(by_bricks(depth, size, how) - truth).max()) for name, how in methods.items()}

@@ -1,7 +1,8 @@
-"""Where do jitters and steps fail? Rays without an empty sample, thin sheets, offsets near 1."""
+"""Where do jitters and steps fail? Rays without an empty sample, thin sheets, offsets near 1, and
+tolerances finer than the finest cell of adaptive sampling."""
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import jax
@@ -10,16 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxvol as jv
-from jaxvol.metrics import wood_grain_energy
+from jaxvol.metrics import rmse, wood_grain_energy
 
-from .entry import Entry, along_z, colors, cube, grey, of_field, opacities, shift_of, signed, uniform
+from .entry import along_z, colors, cube, entry, grey, of_field, opacities, shift_of, signed, uniform
 
 
 STEP = 2 / 128
-SEED = 0
-
-
-# -- rays without an empty sample -------------------------------------------------------------------------
+ALIGNED = jv.AlphaCorrection()
 
 
 class Hazy(jv.Field):
@@ -34,12 +32,11 @@ class Hazy(jv.Field):
         return jnp.where(x + 0.5 < self.share, jnp.maximum(plane, 0.1), plane)
 
 
-PLAIN = "ray casting"
 MARCHES = {
-    "converged": jv.March(STEP / 12, (jv.AlphaCorrection(), jv.EarlyTermination(1e-6)), "midpoint"),
-    PLAIN: jv.March(STEP, (jv.AlphaCorrection(),)),
-    "EmptySpaceJitter": jv.March(STEP, (jv.EmptySpaceJitter(SEED), jv.AlphaCorrection())),
-    "Jitter": jv.March(STEP, (jv.Jitter(SEED), jv.AlphaCorrection())),
+    "converged": jv.March(STEP / 12, (ALIGNED, jv.EarlyTermination(1e-6)), "midpoint"),
+    "ray casting": jv.March(STEP, (ALIGNED,)),
+    "EmptySpaceJitter": jv.March(STEP, (jv.EmptySpaceJitter(0), ALIGNED)),
+    "Jitter": jv.March(STEP, (jv.Jitter(0), ALIGNED)),
 }
 
 
@@ -55,32 +52,25 @@ def haze_error(share: float, size: int, march: str) -> np.ndarray:
     return hazy(share, size, march) - hazy(share, size, "converged")
 
 
-def haze(share: float, size: int) -> dict[str, float]:
-    plain = wood_grain_energy(haze_error(share, size, PLAIN))
-    names = "EmptySpaceJitter", "Jitter"
-    return {name: abs(wood_grain_energy(haze_error(share, size, name))) / plain for name in names}
-
-
-HAZE = Entry(
-    name="wood grain without empty samples",
-    question="How many rays may begin in visible material before EmptySpaceJitter leaves wood grain?",
-    method="jaxvol.EmptySpaceJitter",
-    regime="share of rays in haze from their first sample on",
-    values=(0.0, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0),
-    measure=haze,
-    metric="wood grain energy / that of ray casting",
-    judged="EmptySpaceJitter",
+@entry(
+    "jaxvol.EmptySpaceJitter",
+    "share of rays in haze from their first sample on",
+    (0.0, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0),
+    "wood grain energy / that of ray casting",
+    "EmptySpaceJitter",
     limit=0.1,
-    does="A ray that meets no transparent sample is not shifted: the wood grain that is left is the share "
-    "of such rays. Jitter breaks it there, too.",
     picture=lambda share, size: signed(haze_error(share, size, "EmptySpaceJitter"), 0.05),
     shows="error of EmptySpaceJitter, ± 0.05 from blue to red",
-    scales=("linear", "log"),
     size=96,
 )
+def wood_grain_without_empty_samples(share: float, size: int) -> dict[str, float]:
+    """How many rays may begin in visible material before EmptySpaceJitter leaves wood grain?
 
-
-# -- thin sheets ------------------------------------------------------------------------------------------
+    A ray that meets no transparent sample is not shifted: the wood grain that is left is the share of such
+    rays. Jitter breaks it there, too."""
+    plain = wood_grain_energy(haze_error(share, size, "ray casting"))
+    names = "EmptySpaceJitter", "Jitter"
+    return {name: abs(wood_grain_energy(haze_error(share, size, name))) / plain for name in names}
 
 
 class Sheet(jv.Field):
@@ -100,20 +90,19 @@ def sheet(ratio: float, size: int, jitter: bool) -> np.ndarray:
     """Opacity of an opaque sheet that is so many steps thick."""
     volume = of_field(Sheet(jnp.asarray(ratio * STEP, jnp.float32), True))
     transfer = jv.TransferFunction([0.4, 0.6], np.ones((2, 3)), [0.0, 1e4])
-    march = jv.March(STEP, (jv.Jitter(SEED), jv.AlphaCorrection()) if jitter else (jv.AlphaCorrection(),))
-    return opacities(volume, transfer, along_z(size), march)
+    return opacities(volume, transfer, along_z(size), MARCHES["Jitter" if jitter else "ray casting"])
 
 
 def surface(ratio: float, size: int, jitter: bool) -> np.ndarray:
     """Opacity of the isosurfaces on both sides of a sheet."""
     volume = of_field(Sheet(jnp.asarray(ratio * STEP, jnp.float32), False))
     transfer = jv.TransferFunction([0.0, 1.0], np.ones((2, 3)), [0.0, 1.0])
-    march = jv.March(STEP, (jv.EmptySpaceJitter(SEED),) if jitter else ())
+    march = jv.March(STEP, (jv.EmptySpaceJitter(0),) if jitter else ())
     return opacities(volume, transfer, along_z(size), march, compositing=jv.Isosurface(0.5))
 
 
 def missed(
-    image: Callable[[float, int, bool], np.ndarray], jittered: str, plain: str, ratio: float, size: int
+    image: Callable[[float, int, bool], np.ndarray], ratio: float, size: int, jittered: str, plain: str
 ) -> dict[str, float]:
     """Share of pixels that miss the sheet, with jitter and without."""
     return {
@@ -123,57 +112,46 @@ def missed(
     }
 
 
-SHEETS = Entry(
-    name="sheets thinner than a step",
-    question="How thin may an opaque sheet be before rays pass through it?",
-    method="jaxvol.March",
-    regime="thickness of the sheet, steps",
-    values=(4.0, 2.0, 1.25, 1.05, 0.95, 0.8, 0.5, 0.25, 0.1),
-    measure=partial(missed, sheet, "Jitter", "ray casting"),
-    metric="share of pixels that miss the sheet",
-    judged="Jitter",
+THIN = (
+    "thickness of the sheet, steps",
+    (4.0, 2.0, 1.25, 1.05, 0.95, 0.8, 0.5, 0.25, 0.1),
+    "share of pixels that miss the sheet",
+)
+
+
+@entry(
+    "jaxvol.March",
+    *THIN,
+    "Jitter",
     limit=0.001,
-    does="A sheet thinner than a step is met by as many rays as it is thick, in steps: as bands without "
-    "jitter, as noise with it. No quadrature sees what lies between two samples alike; a shorter step "
-    "does.",
     picture=lambda ratio, size: grey(sheet(ratio, size, True)),
     shows="opacity of the sheet under Jitter",
-    scales=("log", "linear"),
     size=64,
 )
+def sheets_thinner_than_a_step(ratio: float, size: int) -> dict[str, float]:
+    """How thin may an opaque sheet be before rays pass through it?
 
-SURFACES = Entry(
-    name="isosurfaces of thin sheets",
-    question="How thin may a sheet be before rays pass through both of its faces unseen?",
-    method="jaxvol.Isosurface",
-    regime="thickness of the sheet, steps",
-    values=(4.0, 2.0, 1.25, 1.05, 0.95, 0.8, 0.5, 0.25, 0.1),
-    measure=partial(missed, surface, "EmptySpaceJitter", "without jitter"),
-    metric="share of pixels that miss the sheet",
-    judged="EmptySpaceJitter",
+    A sheet thinner than a step is met by as many rays as it is thick, in steps: as bands without jitter, as
+    noise with it. No quadrature sees what lies between two samples alike; a shorter step does."""
+    return missed(sheet, ratio, size, "Jitter", "ray casting")
+
+
+@entry(
+    "jaxvol.Isosurface",
+    *THIN,
+    "EmptySpaceJitter",
     limit=0.001,
-    does="A cell that begins before the sheet and ends behind it has both ends below the value: rays miss a "
-    "sheet by as much as it is thinner than a step, in bands without jitter, as noise with it. A shorter "
-    "step sees it.",
     picture=lambda ratio, size: grey(surface(ratio, size, True)),
     shows="pixels that meet the sheet, under EmptySpaceJitter",
-    scales=("log", "linear"),
     size=64,
 )
+def isosurfaces_of_thin_sheets(ratio: float, size: int) -> dict[str, float]:
+    """How thin may a sheet be before rays pass through both of its faces unseen?
 
-
-# -- offsets near 1 ---------------------------------------------------------------------------------------
-
-
-def offset_error(left: float, size: int, transform: Any) -> np.ndarray:
-    """Error of the opacity of a cube of optical depth 2, by steps of 1/4, at the offset 1 - `left`."""
-    offset = np.float32(1) - np.float32(left)
-    camera = jv.Camera((0.1, 0.2, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.5)
-    march = jv.March(0.25, (shift_of(transform, offset), jv.AlphaCorrection()))
-    origins, directions = (np.asarray(part, np.float64) for part in camera.rays())
-    near, far = ((face - origins) / directions for face in (-np.sign(directions), np.sign(directions)))
-    length = far.min(axis=-1) - near.max(axis=-1)
-    return opacities(cube(), uniform(1.0), camera, march) - (1 - np.exp(-length))
+    A cell that begins before the sheet and ends behind it has both ends below the value: rays miss a sheet by
+    as much as it is thinner than a step, in bands without jitter, as noise with it. A shorter step sees
+    it."""
+    return missed(surface, ratio, size, "EmptySpaceJitter", "without jitter")
 
 
 BLUE = {
@@ -183,27 +161,79 @@ BLUE = {
 }
 
 
-def offsets(left: float, size: int) -> dict[str, float]:
-    return {name: float(np.abs(offset_error(left, size, each)).max()) for name, each in BLUE.items()}
+def offset_error(left: float, size: int, transform: Any) -> np.ndarray:
+    """Error of the opacity of a cube of optical depth 2, by steps of 1/4, at the offset 1 - `left`."""
+    offset = np.float32(1) - np.float32(left)
+    camera = jv.Camera((0.1, 0.2, -3), (0, 0, 0), (0, 1, 0), size=(size, size), parallel_scale=0.5)
+    march = jv.March(0.25, (shift_of(transform, offset), ALIGNED))
+    origins, directions = (np.asarray(part, np.float64) for part in camera.rays())
+    near, far = ((face - origins) / directions for face in (-np.sign(directions), np.sign(directions)))
+    length = far.min(axis=-1) - near.max(axis=-1)
+    return opacities(cube(), uniform(1.0), camera, march) - (1 - np.exp(-length))
 
 
-OFFSETS = Entry(
-    name="jitter offsets near 1",
-    question="Does the first cell survive an offset that rounds to a whole step?",
-    method="jaxvol.Jitter",
-    regime="1 - ξ",
-    values=(1.0, 0.5, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 2.0**-24),
-    measure=offsets,
-    metric="largest error of the opacity of a cube",
-    judged="Jitter, front residual",
+@entry(
+    "jaxvol.Jitter",
+    "1 - ξ",
+    (1.0, 0.5, 0.1, 0.01, 1e-3, 1e-4, 1e-5, 1e-6, 2.0**-24),
+    "largest error of the opacity of a cube",
+    "Jitter, front residual",
     limit=1e-5,
     outcome="bounded",
-    does="Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells "
-    "behind it always cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ "
-    "d.",
     picture=lambda left, size: signed(offset_error(left, size, BLUE["Jitter"]), 0.05),
     shows="error of the opacity under Jitter without front residual, ± 0.05 from blue to red",
     pictured=(1.0, 2.0**-24),
-    scales=("log", "log"),
-    size=16,
 )
+def jitter_offsets_near_1(left: float, size: int) -> dict[str, float]:
+    """Does the first cell survive an offset that rounds to a whole step?
+
+    Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells behind it
+    always cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ d."""
+    return {name: float(np.abs(offset_error(left, size, each)).max()) for name, each in BLUE.items()}
+
+
+@cache
+def _waves() -> jv.Volume:
+    """Values that rise and fall within eight voxels, in all directions."""
+    line = np.arange(33, dtype=np.float32)
+    x, y, z = np.meshgrid(line, line, line, indexing="ij")
+    data = 0.5 + 0.16 * (np.sin(0.8 * x) + np.sin(0.7 * y + 1) + np.sin(0.75 * z + 2))
+    return jv.Volume(data, [2 / 32] * 3, [-1.0] * 3)
+
+
+def waves_image(size: int, transforms: tuple[jv.Transform, ...], finer: int = 1) -> np.ndarray:
+    points = [(0.5, (0.2, 0.4, 0.9), 0.0), (0.7, (0.9, 0.7, 0.2), 0.5), (1.0, (0.9, 0.2, 0.2), 0.9)]
+    transfer = jv.TransferFunction.from_points(points, unit_distance=0.1)
+    camera = jv.Camera.looking_at(_waves(), (0.5, -0.9, 0.4), size=(size, size)).zoom(1.6)
+    return colors(_waves(), transfer, camera, jv.March(2 / 32 / finer, (ALIGNED, *transforms), "midpoint"))
+
+
+@cache
+def _waves_truth(size: int) -> np.ndarray:
+    return waves_image(size, (), 32)
+
+
+@entry(
+    "jaxvol.AdaptiveSampling",
+    "tolerance",
+    (0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 3e-5),
+    "RMSE of the image / tolerance",
+    "finest=1",
+    limit=1.0,
+    picture=lambda tolerance, size: signed(
+        waves_image(size, (jv.AdaptiveSampling(tolerance, 8),)) - _waves_truth(size), 0.05
+    ),
+    shows="error of the image with finest=1, ± 0.05 from blue to red",
+    pictured=(0.1, 1e-3),
+    size=32,
+)
+def tolerances_finer_than_the_finest_cell(tolerance: float, size: int) -> dict[str, float]:
+    """Down to which tolerance does adaptive sampling keep its promise?
+
+    No cell is shorter than a step, here a voxel / finest: below the error of an image of such cells the
+    tolerance means nothing. A shorter step moves the edge."""
+    found = {}
+    for finest in (1, 8):
+        image = waves_image(size, (jv.AdaptiveSampling(tolerance, 8 * finest),), finest)
+        found[f"finest={finest}"] = rmse(image, _waves_truth(size)) / tolerance
+    return found

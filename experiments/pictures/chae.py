@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+import jaxvol as jv
 from jaxvol.metrics import rmse
 
 from .. import minimum_distance
@@ -21,19 +22,18 @@ GREEN = (0.0, 0.7, 0.05)
 def chae_fig6(chosen: Namespace) -> Panels:
     """A part of the image without leaping, and under growing cells. Below, wrong pixels are green."""
     side, size = chosen.size, round(chosen.size * WHOLE)
-    make = minimum_distance.airway if chosen.data else minimum_distance.colon
-    scene = make(chosen.data, size, **({} if chosen.data else {"resolution": chosen.resolution}))
+    scene = minimum_distance.colon(None, size, chosen.resolution)
     left, top = (round(middle * size - side / 2) for middle in MIDDLE)
     part = slice(top, top + side), slice(left, left + side)
-    reference = frame(scene, minimum_distance.march(scene, None))
+    reference = frame(scene, minimum_distance.march(scene))
     whole = np.asarray(reference.image(BLACK))
     small = scene._replace(camera=replace(scene.camera, size=(side, side)))
     square = left * side / size, top * side / size, side / WHOLE
     upper = [panel(whole[part], "", "no leaping")]
-    overview = frame(small, minimum_distance.march(small, None)).image(BLACK)
+    overview = frame(small, minimum_distance.march(small)).image(BLACK)
     lower = [panel(overview, "the whole image", "", square)]
     for cell in CELLS:
-        rendering = frame(scene, minimum_distance.march(scene, minimum_distance.PUBLISHED, cell))
+        rendering = frame(scene, minimum_distance.march(scene, jv.SpaceLeaping("min_distance", cell)))
         image, off = np.asarray(rendering.image(BLACK)), minimum_distance.wrong(rendering, reference)
         upper.append(panel(image[part], "", f"R = {cell}"))
         caption = f"wrong {off.mean():.3%}, {off[part].sum()} pixels here"

@@ -9,15 +9,10 @@ import numpy as np
 
 import jaxvol as jv
 
-from ..bricks import phantom
-from ..bricks_paper import grid, probe
-from ..naive_bricks import each_at_once
+from ..bricks import each_at_once, grid, marching, phantom, probe
 from . import BLACK, Panels, panel
 
 
-# -- bricks in the wrong order ----------------------------------------------------------------------------
-
-SPLIT = 1, 1, 4
 WATER, FLESH, SKIN, BONE = (0.06, 0.22, 0.5), (0.8, 0.1, 0.05), (1.0, 0.8, 0.6), (1.0, 1.0, 0.9)
 POINTS = [
     *((12, WATER, 0.0), (24, WATER, 0.025), (40, WATER, 0.025)),
@@ -35,8 +30,7 @@ ORDERS: dict[str, Any] = {"wrong order: no overlap": each_at_once, "right order:
 def kim_fig8(chosen: Namespace) -> Panels:
     """A fetus in translucent tissue, cut into bricks along the beams; the right column is the difference."""
     volume, scan = phantom(chosen.resolution, "uint8", speckle=False)
-    first, last = scan.gamma_range
-    march = jv.March(2 * float(last - first) / (volume.shape[2] - 1), (scan,))
+    march = marching(scan, volume)
     scene = volume, jv.TransferFunction.from_points(POINTS)
     whole = jv.Camera(BESIDE, (0, 0, 100), (0, 0, 1), 19.0, size=(chosen.size,) * 2)
     side = chosen.size / ZOOM
@@ -45,20 +39,18 @@ def kim_fig8(chosen: Namespace) -> Panels:
     for camera in (whole, whole.zoom(ZOOM, CENTRE)):
         images, row = [], []
         for title, method in ORDERS.items():
-            how = {"bricks": SPLIT, "method": method, "outputs": "rgba"}
+            how: dict[str, Any] = {"bricks": (1, 1, 4), "method": method, "outputs": "rgba"}
             rendering = jv.render_bricks(*scene, camera, march, **how)
             images.append(np.asarray(rendering.image(BLACK)))
             assert rendering.bricks is not None
-            caption, first_row = f"{rendering.bricks.loads} bricks read", camera is whole
-            row.append(panel(images[-1], caption, title if first_row else "", square if first_row else None))
+            above, framed = ("", None) if rows else (title, square)
+            row.append(panel(images[-1], f"{rendering.bricks.loads} bricks read", above, framed))
         off = np.abs(images[0] - images[1])
         share = np.mean(off.max(-1) > 1 / 255)
         caption = f"largest {off.max():.2f}\n{share:.0%} of the pixels by > 1/255"
         rows.append([*row, panel(off, caption, "" if rows else "difference")])
     return rows
 
-
-# -- the order of bricks ----------------------------------------------------------------------------------
 
 SHAPE = 41, 21, 61
 EYE = 0.0, -820.0, 533.0

@@ -2,7 +2,7 @@
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,81 +30,39 @@ TISSUE = [
     (180, (0.90, 0.50, 0.40), 0.8),
     (230, (1.00, 0.80, 0.65), 0.9),
 ]
-CONTRAST = [
-    (60, (0.30, 0.02, 0.02), 0.0),
-    (120, (0.80, 0.20, 0.12), 0.12),
-    (230, (1.00, 0.60, 0.45), 0.25),
-]
+CONTRAST = [(60, (0.30, 0.02, 0.02), 0.0), (120, (0.80, 0.20, 0.12), 0.12), (230, (1.00, 0.60, 0.45), 0.25)]
 """Translucent, so that rays reach their exit."""
 
 
 class View(NamedTuple):
-    """A scene, and the part of its image that is zoomed: by how much, and its centre, as fractions of the
-    image's width and height from the top left."""
+    """A phantom, the part of it that is left, its transfer function, the step in voxels, from where it is
+    seen, and the zoom; and the part of the image that is zoomed: by how much, and its centre, as fractions of
+    the image's width and height from the top left."""
 
-    scene: Scene
+    phantom: str
+    part: tuple[float, float, float]
+    points: list[Any]
+    voxels: float
+    direction: tuple[float, float, float]
+    zoom: tuple[Any, ...]
     factor: float
     middle: tuple[float, float]
 
-    def scenes(self) -> dict[str, Scene]:
-        zoomed = self.scene.camera.zoom(self.factor, self.middle)
-        return {"whole": self.scene, "zoomed": self.scene._replace(camera=zoomed)}
+    def scenes(self, chosen: Namespace) -> dict[str, Scene]:
+        volume = cropped(jv.phantom(self.phantom, chosen.resolution), (0, 0, 0), self.part)
+        camera = jv.Camera.looking_at(volume, self.direction, size=(chosen.size,) * 2).zoom(*self.zoom)
+        transfer = jv.TransferFunction.from_points(self.points, unit_distance=0.03)
+        whole = Scene(volume, transfer, camera, self.voxels * float(volume.spacing[0]))
+        return {"whole": whole, "zoomed": whole._replace(camera=camera.zoom(self.factor, self.middle))}
 
 
-def camera(volume: jv.Volume, chosen: Namespace, direction: tuple, up: tuple = (0, 0, 1)) -> jv.Camera:
-    return jv.Camera.looking_at(volume, direction, up, size=(chosen.size,) * 2)
-
-
-def head(chosen: Namespace) -> View:
-    """The crown is cut off."""
-    if chosen.data:  # z grows towards the chin
-        volume = jv.load(chosen.data / "cthead_256x256x113_uint16le.raw.gz", spacing=(1, 1, 2))
-        volume = cropped(volume, (0, 0, 0.35), (1, 1, 1))
-        seen = camera(volume, chosen, (-0.5, -1, -0.75), (0, 0, -1)).zoom(1.4)
-        transfer = jv.preset("ct_skin_bone", clim=(0, 4000), unit_distance=0.1)
-        return View(Scene(volume, transfer, seen, 1.5), 3.3, (0.4, 0.45))
-    volume = cropped(jv.phantom("head", chosen.resolution), (0, 0, 0), (1, 1, 0.62))
-    seen = camera(volume, chosen, (0.5, -1, 0.75)).zoom(1.7, (0.52, 0.46))
-    transfer = jv.TransferFunction.from_points(SKIN, unit_distance=0.03)
-    return View(Scene(volume, transfer, seen, 1.5 * float(volume.spacing[0])), 3.3, (0.36, 0.48))
-
-
-def heart(chosen: Namespace) -> View:
-    """An engine, cut open; with real data, bones of a chest, whose faces all cut tissue."""
-    if chosen.data:
-        file = chosen.data / "lidc0314_airway_256x192x200_int16le.raw.gz"
-        volume = jv.load(file, spacing=(0.78125, 0.78125, 1))
-        seen = camera(volume, chosen, (0.4, -1, -0.6)).zoom(1.4)
-        return View(Scene(volume, jv.preset("ct_bone", unit_distance=0.2), seen, 1.5), 3.5, (0.5, 0.4))
-    volume = cropped(jv.phantom("engine", chosen.resolution), (0, 0, 0), (0.6, 1, 1))
-    seen = camera(volume, chosen, (1, -0.8, 0.5)).zoom(1.4)
-    transfer = jv.TransferFunction.from_points(METAL, unit_distance=0.03)
-    return View(Scene(volume, transfer, seen, 2 * float(volume.spacing[0])), 4, (0.55, 0.72))
-
-
-def kidney(chosen: Namespace) -> View:
-    """A colon in soft tissue, cut across; with real data, an engine."""
-    if chosen.data:
-        volume = cropped(jv.load(chosen.data / "engine_256x256x128_uint8.raw.gz"), (0, 0.3, 0), (1, 1, 1))
-        seen = camera(volume, chosen, (0.5, -1, -0.7), (0, 0, -1)).zoom(1.4)
-        return View(Scene(volume, jv.preset("engine", unit_distance=0.2), seen, 1.5), 4, (0.45, 0.5))
-    volume = cropped(jv.phantom("colon", chosen.resolution), (0, 0, 0), (1, 1, 0.6))
-    seen = camera(volume, chosen, (0.4, -0.8, 1)).zoom(1.3)
-    transfer = jv.TransferFunction.from_points(TISSUE, unit_distance=0.03)
-    return View(Scene(volume, transfer, seen, 1.5 * float(volume.spacing[0])), 4, (0.79, 0.43))
-
-
-def vessels(chosen: Namespace) -> View:
-    """The lower face cuts their root; with real data, the arteries of an aneurism."""
-    if chosen.data:
-        volume = cropped(jv.load(chosen.data / "aneurism_256x256x256_uint8.raw.gz"), (0, 0, 0.35), (1, 1, 1))
-        seen = camera(volume, chosen, (0.5, -1, 0.6)).zoom(1.5)
-        transfer = jv.TransferFunction.from_points(CONTRAST, 2.0)
-        return View(Scene(volume, transfer, seen, 2.0), 6, (0.5, 0.84))
-    volume = jv.phantom("vessels", chosen.resolution)
-    seen = camera(volume, chosen, (0.5, -1, 0.6)).zoom(1.5, (0.5, 0.52))
-    transfer = jv.TransferFunction.from_points(CONTRAST, unit_distance=0.03)
-    return View(Scene(volume, transfer, seen, 2 * float(volume.spacing[0])), 6, (0.5, 0.84))
+VIEWS = {
+    "head": View("head", (1, 1, 0.62), SKIN, 1.5, (0.5, -1, 0.75), (1.7, (0.52, 0.46)), 3.3, (0.36, 0.48)),
+    "heart": View("engine", (0.6, 1, 1), METAL, 2, (1, -0.8, 0.5), (1.4,), 4, (0.55, 0.72)),
+    "kidney": View("colon", (1, 1, 0.6), TISSUE, 1.5, (0.4, -0.8, 1), (1.3,), 4, (0.79, 0.43)),
+    "vessels": View("vessels", (1, 1, 1), CONTRAST, 2, (0.5, -1, 0.6), (1.5, (0.5, 0.52)), 6, (0.5, 0.84)),
+}
+"""A head whose crown is cut off, a cut engine, a colon in soft tissue, and vessels whose root is cut."""
 
 
 def left(scene: Scene) -> np.ndarray:
@@ -113,22 +71,23 @@ def left(scene: Scene) -> np.ndarray:
 
 
 def rendered(scene: Scene, march: jv.March) -> np.ndarray:
-    rendering = frame(scene, march)
-    assert not np.any(rendering.exhausted)
-    return np.asarray(rendering.image(BLACK))
+    return np.asarray(frame(scene, march).image(BLACK))
 
 
 def comparison(
-    view: View, methods: Sequence[str] = METHODS, region: Callable[[Scene], np.ndarray] = entered
+    view: str,
+    chosen: Namespace,
+    methods: Sequence[str] = METHODS,
+    region: Callable[[Scene], np.ndarray] = entered,
 ) -> Panels:
     """The view under every method, whole above and zoomed below, with its measures. `region`: the pixels
     whose boundary noise is measured."""
     rows: Panels = []
-    for look, scene in view.scenes().items():
+    for name, scene in VIEWS[view].scenes(chosen).items():
         truth, mask, row = rendered(scene, converged(scene.step)), region(scene), []
         for method in methods:
             image = rendered(scene, jv.March(scene.step, transforms(method)))
-            row.append(panel(image, measured(image, truth, mask), method if look == "whole" else ""))
+            row.append(panel(image, measured(image, truth, mask), method if name == "whole" else ""))
         rows.append(row)
     return rows
 
@@ -144,34 +103,14 @@ def measured(image: np.ndarray, truth: np.ndarray, region: np.ndarray) -> str:
     return f"wood grain {grain:.2g}\nboundary noise {noise}\nRMSE {rmse(image, truth):.2g}"
 
 
-def fig01(chosen: Namespace) -> Panels:
-    return comparison(head(chosen), (PLAIN, JITTER))
-
-
-def fig09(chosen: Namespace) -> Panels:
-    return comparison(head(chosen))
-
-
-def fig10(chosen: Namespace) -> Panels:
-    return comparison(heart(chosen))
-
-
-def fig11(chosen: Namespace) -> Panels:
-    return comparison(kidney(chosen))
-
-
-def fig12(chosen: Namespace) -> Panels:
-    return comparison(vessels(chosen), region=left)
-
-
 def fig13(chosen: Namespace) -> Panels:
     """The pixels that alignment changes, in green."""
-    view, row = vessels(chosen), []
+    view, row = VIEWS["vessels"], []
     side = chosen.size / view.factor
     x, y = (middle * chosen.size - side / 2 for middle in view.middle)
-    for look, scene in view.scenes().items():
+    for name, scene in view.scenes(chosen).items():
         aligned = left(scene)
         image = np.where(aligned[..., None], GREEN, rendered(scene, jv.March(scene.step, transforms(BOTH))))
         caption = f"{aligned.sum()} of {aligned.size} pixels, {aligned.mean():.1%}"
-        row.append(panel(image, caption, look, (x, y, side) if look == "whole" else None))
+        row.append(panel(image, caption, name, (x, y, side) if name == "whole" else None))
     return [row]

@@ -1,7 +1,7 @@
 """Pictures of scatterer templates (Lee, Kwon and Shin 2016, Figs. 4 to 6), and a gallery of all light."""
 
 from argparse import Namespace
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +16,7 @@ from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, HeadLight, Lighting, Phong, ScattererTemplates
 
 from ..lighting import FLESH, march
-from ..scenes import SCENES, Scene, skin_head
+from ..scenes import CT_HEAD, SCENES, Scene, grid, on_cube, skin_head
 from . import BLACK, Panels, panel
 
 
@@ -35,8 +35,7 @@ class Subject(NamedTuple):
 
 
 def lit(scene: Scene, lighting: Lighting | None) -> np.ndarray:
-    how = march(scene)
-    return np.asarray(jv.render(*scene[:3], how, lighting=lighting, outputs="rgba").image(BLACK))
+    return np.asarray(jv.render(*scene[:3], march(scene), lighting=lighting, outputs="rgba").image(BLACK))
 
 
 def uniform(color: Any, opacity: float, low: float, high: float, unit: float) -> jv.TransferFunction:
@@ -45,12 +44,10 @@ def uniform(color: Any, opacity: float, low: float, high: float, unit: float) ->
     return jv.TransferFunction.from_points(points, unit_distance=unit)
 
 
-def labelled(volume: jv.Volume, functions: Sequence[Any], camera: jv.Camera, step: float) -> Scene:
-    transfer = cast(Any, jv.LabelTransferFunction(functions))  # Scene: for VTK and Dr.Jit, not used here
-    return Scene(volume, transfer, camera, step)
+def labelled(volume: jv.Volume, functions: Sequence[Any], camera: jv.Camera) -> Scene:
+    transfer = cast(Any, jv.LabelTransferFunction([None, *functions]))
+    return Scene(volume, transfer, camera, float(volume.spacing.min()) / 2)
 
-
-# -- an ear before a head ---------------------------------------------------------------------------------
 
 GAP, THICK, RADIUS = 0.15, 0.06, 0.75
 """Gap between ear and head, thickness of the ear, radius of the head; the cube is 2 wide."""
@@ -59,13 +56,12 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 def ear(resolution: int, *, head: bool) -> jv.Volume:
     """An ear on the -y side of a head, or the ear alone."""
-    x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
+    x, y, z = grid(resolution)
     side = -0.35  # y of the head's side towards the ear
     thin = np.maximum(np.hypot(x, 0.7 * z) - 0.22, abs(y - side + GAP + THICK / 2) - THICK / 2)
     skull = np.sqrt(x**2 + (y - side - RADIUS) ** 2 + z**2) - RADIUS
     inside = np.minimum(thin, skull) if head else thin
-    spacing = 2 / (resolution - 1)
-    return jv.Volume(np.clip(0.5 - inside / spacing / 2, 0, 1), (spacing,) * 3, (-1.0,) * 3)
+    return on_cube(np.clip(0.5 - inside * (resolution - 1) / 4, 0, 1))
 
 
 def lee_fig4(chosen: Namespace) -> Panels:
@@ -86,8 +82,6 @@ def lee_fig4(chosen: Namespace) -> Panels:
         row.append(panel(image, f"brightness of the ear {(image[seen] @ LUMINANCE).mean():.3f}", title))
     return [row]
 
-
-# -- a hand -----------------------------------------------------------------------------------------------
 
 FINGERS = (  # joints from knuckle to tip, radius
     ([(-0.30, 0.0, 0.06), (-0.42, -0.05, 0.30), (-0.47, -0.02, 0.44), (-0.50, 0.03, 0.55)], 0.070),
@@ -133,23 +127,19 @@ def bones() -> list[Shape]:
 def lee_fig5(chosen: Namespace) -> Panels:
     volume = hand(chosen.resolution)
     transfer = jv.TransferFunction.from_points(HAND, unit_distance=0.05)
-    camera = jv.Camera.looking_at(volume, (-0.25, -1, 0.1), (0, 0, 1), size=(chosen.size,) * 2).zoom(1.75)
+    camera = jv.Camera.looking_at(volume, (-0.25, -1, 0.1), size=(chosen.size,) * 2).zoom(1.75)
     scene = Scene(volume, transfer, camera, float(volume.spacing[0]) / 2)
     materials = jv.Material(0.4, 0.04, 1.4, values=(20, 140)), jv.Material(0.7, 0.025, 1.5, values=(140, 256))
     sun = DirectionalLight((0.95, 0.05, -0.3), (34.0, 34.0, 34.0))
     lights = sun, ConstantLight((0.3, 0.3, 0.3))
+    hard: dict[str, Any] = {"occlusion": "hard", "templates": 1, "reach": REACH}
     columns = {
         "unlit": None,
         "Phong": Phong(DirectionalLight(sun.direction, (1.5, 1.5, 1.5)), ambient=0.15),
-        "hard, one template for each material": ScattererTemplates(
-            materials, lights, occlusion="hard", templates=1, reach=REACH
-        ),
+        "hard, one template for each material": ScattererTemplates(materials, lights, **hard),
         "soft, 4 templates blended": ScattererTemplates(materials, lights, **BLENDED),
     }
     return [[panel(lit(scene, lighting), "", title) for title, lighting in columns.items()]]
-
-
-# -- without and with templates ---------------------------------------------------------------------------
 
 
 def head(size: int, resolution: int) -> Subject:
@@ -159,28 +149,18 @@ def head(size: int, resolution: int) -> Subject:
 def frog(size: int, resolution: int) -> Subject:
     """A phantom whose translucent body and organs are a material each."""
     volume = jv.phantom("labels", resolution)
-    body = uniform((0.35, 0.65, 0.25), 0.12, 40, 100, 0.05)
-    organs = (
-        ((0.9, 0.45, 0.45), 0.8),
-        ((0.9, 0.45, 0.45), 0.8),
-        ((0.45, 0.08, 0.05), 0.9),
-        ((0.9, 0.7, 0.35), 0.9),
-    )
-    functions = [None, body, *(uniform(color, opacity, 40, 100, 0.05) for color, opacity in organs)]
-    materials = [
-        jv.Material(0.3, 0.08, 1.36, label=1),
-        *(jv.Material(0.4, 0.06, 1.38, label=label) for label in (2, 3)),
-        jv.Material(0.6, 0.04, 1.4, label=4),
-        jv.Material(0.5, 0.05, 1.4, label=5),
-    ]
-    camera = jv.Camera.looking_at(volume, (-0.3, -0.8, 1), (0, 0, 1), size=(size, size)).zoom(1.5)
-    scene = labelled(volume, functions, camera, float(volume.spacing[0]) / 2)
-    return Subject(scene, materials, (0.7, 0.5, -0.7))
+    colors = (0.35, 0.65, 0.25), (0.9, 0.45, 0.45), (0.9, 0.45, 0.45), (0.45, 0.08, 0.05), (0.9, 0.7, 0.35)
+    each = zip(colors, (0.12, 0.8, 0.8, 0.9, 0.9), strict=True)
+    functions = [uniform(color, opacity, 40, 100, 0.05) for color, opacity in each]
+    of = (0.3, 0.08, 1.36), (0.4, 0.06, 1.38), (0.4, 0.06, 1.38), (0.6, 0.04, 1.4), (0.5, 0.05, 1.4)
+    materials = [jv.Material(*how, label=label) for label, how in enumerate(of, 1)]
+    camera = jv.Camera.looking_at(volume, (-0.3, -0.8, 1), size=(size, size)).zoom(1.5)
+    return Subject(labelled(volume, functions, camera), materials, (0.7, 0.5, -0.7))
 
 
 def ct_head(folder: Path, size: int) -> Subject:
     """CT in Hounsfield units + 1000; z grows towards the chin, lengths in mm."""
-    volume = jv.load(folder / "cthead_256x256x113_uint16le.raw.gz", spacing=(1, 1, 2))
+    volume = jv.load(folder / CT_HEAD, spacing=(1, 1, 2))
     points = [
         (500, (0.60, 0.35, 0.25), 0.0),
         (800, (0.85, 0.50, 0.35), 0.7),
@@ -195,12 +175,8 @@ def ct_head(folder: Path, size: int) -> Subject:
 
 
 def lee_fig6(chosen: Namespace) -> Panels:
-    subjects = {
-        "the head phantom": head(chosen.size, chosen.resolution),
-        "a frog": frog(chosen.size, chosen.resolution),
-    }
-    if chosen.data:
-        subjects["CT of a head"] = ct_head(chosen.data, chosen.size)
+    sizes = chosen.size, chosen.resolution
+    subjects = {"the head phantom": head(*sizes), "a frog": frog(*sizes)}
     columns: dict[str, Any] = {
         "unlit": None,
         "hard, one of 8 for each pixel": {"occlusion": "hard"},
@@ -217,15 +193,10 @@ def lee_fig6(chosen: Namespace) -> Panels:
     return rows
 
 
-# -- all kinds of light -----------------------------------------------------------------------------------
-
-PATHS = 48
-
-
-def matter(scene: Scene, light: Color, opacity: float = 0.3, free_path: float = 2) -> Subject:
+def matter(scene: Scene, light: Color, free_path: float = 2) -> Subject:
     """A scene of one material. `free_path`: in voxels."""
     voxel = float(scene.volume.spacing.min())
-    return Subject(scene, [jv.Material(opacity, free_path * voxel, 1.4)], light)
+    return Subject(scene, [jv.Material(0.3, free_path * voxel, 1.4)], light)
 
 
 def tissues(folder: Path, size: int) -> Subject:
@@ -238,59 +209,50 @@ def tissues(folder: Path, size: int) -> Subject:
     voxel, colors = float(volume.spacing.min()), jv.colormap("tab20", (0, 20)).colors
     functions = [uniform(tuple(colors[3 * n % len(colors)]), 0.8, 60, 140, 2 * voxel) for n in range(1, 16)]
     camera = jv.Camera.looking_at(volume, (0.2, 0.3, -1), (0, -1, 0), size=(size, size)).zoom(1.3)
-    scene = labelled(volume, [None, *functions], camera, voxel / 2)
-    return matter(scene, (0.7, 0.6, 0.7), free_path=3)
+    return matter(labelled(volume, functions, camera), (0.7, 0.6, 0.7), free_path=3)
 
 
-def upright(scene: Scene) -> Scene:
-    """The same view with up and down exchanged."""
-    return scene._replace(camera=replace(scene.camera, view_up=-scene.camera.view_up))
-
-
-def subjects(folder: Path | None, size: int, resolution: int) -> dict[str, Callable[[], Subject]]:
+def subjects(folder: Path | None, size: int, resolution: int) -> Iterator[tuple[str, Subject]]:
     if folder is None:
-        return {
-            "the head phantom": lambda: head(size, resolution),
-            "a frog phantom": lambda: frog(size, resolution),
-        }
-    return {
-        "an engine (CT)": lambda: matter(SCENES["engine"](folder, size), (-0.3, 0.9, 0.8)),
-        "a bonsai (CT)": lambda: matter(upright(SCENES["bonsai"](folder, size)), (0.6, -0.9, -0.7)),
-        "a head (CT)": lambda: ct_head(folder, size),
-        "a chest (CT)": lambda: matter(SCENES["lidc0314_airway"](folder, size), (0.6, 0.9, -0.7)),
-        "a frog (labels)": lambda: tissues(folder, size),
-    }
+        yield "the head phantom", head(size, resolution)
+        yield "a frog phantom", frog(size, resolution)
+        return
+    bonsai = SCENES["bonsai"](folder, size)  # with up and down exchanged
+    bonsai = bonsai._replace(camera=replace(bonsai.camera, view_up=-bonsai.camera.view_up))
+    yield "an engine (CT)", matter(SCENES["engine"](folder, size), (-0.3, 0.9, 0.8))
+    yield "a bonsai (CT)", matter(bonsai, (0.6, -0.9, -0.7))
+    yield "a head (CT)", ct_head(folder, size)
+    yield "a chest (CT)", matter(SCENES["lidc0314_airway"](folder, size), (0.6, 0.9, -0.7))
+    yield "a frog (labels)", tissues(folder, size)
 
 
 def exposed(image: Any) -> np.ndarray:
     """An image with its own white: what 1 % of the pixels that show something exceed."""
     image = np.asarray(image)
     bright = image.max(-1)
-    seen = bright > 0.01 * bright.max()
-    return image / np.quantile(bright[seen], 0.99) if np.any(seen) else image
+    return image / np.quantile(bright[bright > 0.01 * bright.max()], 0.99)
 
 
 def gallery(chosen: Namespace) -> Panels:
     rows: Panels = []
-    for name, make in subjects(chosen.data, chosen.size, chosen.resolution).items():
-        scene, materials, direction = make()
+    for name, (scene, materials, direction) in subjects(chosen.data, chosen.size, chosen.resolution):
         lights = DirectionalLight(direction, (3.0, 3.0, 3.0)), ConstantLight((0.3, 0.3, 0.3))
         how = replace(march(scene), quadrature="midpoint")
-        emitted, phong, scattered = (
-            jv.render(*scene[:3], how, lighting=each, outputs="rgba").image(BLACK)
-            for each in (
-                None,
-                Phong((HeadLight((0.4, 0.4, 0.4)), DirectionalLight(direction))),
-                ScattererTemplates(tuple(materials), lights, templates=8, blend=True, reach=REACH),
-            )
-        )
-        traced = jv.path_trace(*scene[:3], lights, paths=4 if chosen.quick else PATHS).radiance
-        columns = {
-            "unlit": emitted,
-            "Phong": phong,
-            "scatterer templates": exposed(scattered),
-            "path traced": exposed(traced),
+        lightings = {
+            "unlit": None,
+            "Phong": Phong((HeadLight((0.4, 0.4, 0.4)), DirectionalLight(direction))),
+            "scatterer templates": ScattererTemplates(
+                tuple(materials), lights, templates=8, blend=True, reach=REACH
+            ),
         }
-        below = dict.fromkeys(columns, "") | {"unlit": name}
-        rows.append([panel(im, below[title], "" if rows else title) for title, im in columns.items()])
+        images: dict[str, Any] = {
+            title: np.asarray(jv.render(*scene[:3], how, lighting=each, outputs="rgba").image(BLACK))
+            for title, each in lightings.items()
+        }
+        paths = 4 if chosen.quick else 48
+        images["path traced"] = jv.path_trace(*scene[:3], lights, paths=paths).radiance
+        for title in ("scatterer templates", "path traced"):
+            images[title] = exposed(images[title])
+        below = dict.fromkeys(images, "") | {"unlit": name}
+        rows.append([panel(im, below[title], "" if rows else title) for title, im in images.items()])
     return rows

@@ -17,6 +17,7 @@ import jaxvol as jv
 from jaxvol._util.vec3 import golden_spiral
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, ScattererTemplate, ScattererTemplates
 
+from ..scenes import grid, on_cube
 from . import BLACK, Panels, panel
 
 
@@ -28,7 +29,7 @@ LEFT = DirectionalLight((1.0, 0.3, -0.4), (28.0, 28.0, 28.0))
 BESIDE = DirectionalLight((1.0, -0.25, -0.15), (28.0, 28.0, 28.0))
 ABOVE = DirectionalLight((0.7, 0.1, -0.8), (19.0, 19.0, 19.0))
 SKY = ConstantLight((1.0, 1.0, 1.0))
-Place = tuple[np.ndarray, np.ndarray, np.ndarray]
+Place = tuple[np.ndarray, ...]
 
 
 class Setup(NamedTuple):
@@ -50,9 +51,12 @@ def inside(distance: np.ndarray, voxel: float) -> np.ndarray:
     return np.clip(0.5 - distance / voxel / 2, 0, 1)
 
 
+def away(place: Place) -> np.ndarray:
+    return np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
+
+
 def ball(place: Place, voxel: float) -> np.ndarray:
-    x, y, z = place
-    return SKIN * inside(np.sqrt(x**2 + y**2 + z**2) - 0.8, voxel)
+    return SKIN * inside(away(place) - 0.8, voxel)
 
 
 def floor(place: Place, voxel: float) -> np.ndarray:
@@ -60,26 +64,19 @@ def floor(place: Place, voxel: float) -> np.ndarray:
 
 
 def below_a_ball(place: Place, voxel: float) -> np.ndarray:
-    x, y, z = place
-    above = SKIN * inside(np.sqrt(x**2 + y**2 + z**2) - 0.35, voxel)
-    return np.maximum(floor(place, voxel), above)
+    return np.maximum(floor(place, voxel), SKIN * inside(away(place) - 0.35, voxel))
 
 
 def layers(place: Place, voxel: float) -> np.ndarray:
     """A ball of skin with `DEEP` under one half of its surface, and `DEEPER` under that."""
-    x, y, z = place
-    r = np.sqrt(x**2 + y**2 + z**2)
-    half = inside(-z, voxel)
-    values = ball(place, voxel)
-    values = values + half * (DEEP - SKIN) * inside(r - 0.7, voxel)
-    return values + half * (DEEPER - DEEP) * inside(r - 0.53, voxel)
+    r, half = away(place), inside(-place[2], voxel)
+    deep, deeper = (DEEP - SKIN) * inside(r - 0.7, voxel), (DEEPER - DEEP) * inside(r - 0.53, voxel)
+    return ball(place, voxel) + half * deep + half * deeper
 
 
 def veiled(place: Place, voxel: float) -> np.ndarray:
     """A ball, and a veil without material before one half of it."""
-    x, y, z = place
-    r = np.sqrt(x**2 + y**2 + z**2)
-    veil = inside(-z, voxel) * inside(abs(r - 0.92) - 0.03, voxel)
+    veil = inside(-place[2], voxel) * inside(abs(away(place) - 0.92) - 0.03, voxel)
     return np.maximum(ball(place, voxel), VEIL * veil)
 
 
@@ -108,17 +105,10 @@ STEPS: dict[str, tuple[Setup, Setup]] = {
 }
 
 
-def around(far: float, count: int = 48) -> ScattererTemplate:
-    """Photons evenly in all directions, whose intensities add to 1."""
-    offset = jnp.asarray(far * golden_spiral(count))
-    return ScattererTemplate(offset[None], jnp.full((1, count), 1 / count))
-
-
 def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     """The image, and which pixels are visible."""
     spacing = 2 / (resolution - 1)
-    x, y, z = np.meshgrid(*[np.linspace(-1, 1, resolution)] * 3, indexing="ij")
-    volume = jv.Volume(setup.values((x, y, z), spacing), (spacing,) * 3, (-1.0,) * 3)
+    volume = on_cube(setup.values(grid(resolution), spacing))
     deep, deeper = setup.seen
     points = [(0.1, GREY, 0.0), (VEIL, GREY, 0.45), (0.4, GREY, 0.45), (0.5, PALE, 0.45), (0.9, PALE, 0.95)]
     points += [(1.3, PALE, 0.95), (1.7, deep, 0.95), (2.3, deep, 0.95), (2.7, deeper, 0.95)]
@@ -130,8 +120,9 @@ def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.nda
         jv.Material(0.5, FAR, 1.4, values=(0.4, 1.5)),
         jv.Material(opacity, FAR, index, values=(1.5, 4.0)),
     ]
-    one = around(FAR)
-    both = ScattererTemplate(*(jnp.stack([leaf] * 2) for leaf in (one.offset, setup.bright * one.intensity)))
+    count = 48  # photons evenly in all directions
+    offset = jnp.tile(FAR * golden_spiral(count), (2, 1, 1, 1))
+    both = ScattererTemplate(offset, jnp.full((2, 1, count), setup.bright / count))
     lighting = ScattererTemplates(materials, setup.lights, given=both, cutoff=setup.cutoff)
     rendering = jv.render(volume, transfer, camera, march, lighting=lighting)
     return np.asarray(rendering.image(BLACK)), np.asarray(rendering.rgba[..., 3] > 0.5)

@@ -1,4 +1,4 @@
-"""Do the scripts of paper_figs/ run, and do page and README show what is recorded?"""
+"""Are the figures of paper_figs/ made, and do page and README show what is recorded?"""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from experiments import record
 from experiments.marches import BOTH
 from jaxvol.app import cli
 from jaxvol.app.commands import pages
-from paper_figs import common, contents, fig09, index, kim_table1, kisti_table, table1
+from paper_figs import common, contents, index, records
 
 
 ROOT = Path(__file__).parents[2]
@@ -23,21 +23,20 @@ def test_scripts_compute_nothing():
         assert not {name.split(".")[0] for name in imports} & {"jax", "jaxvol", "scipy", "skimage"}, path.name
 
 
-def test_every_script_has_an_entry_and_every_entry_a_file():
-    entries = {entry.name for entry in contents.ENTRIES}
-    scripts = {path.stem for path in (ROOT / "paper_figs").glob("*.py")}
-    assert scripts - entries == {"__init__", "common", "contents", "index"}
+def test_every_figure_has_an_entry_and_every_entry_a_file():
+    assert set(index.FIGURES) == {entry.name for entry in contents.ENTRIES}
+    assert set(records.RECORDS) == {entry.name for entry in contents.ENTRIES if entry.record}
     assert {entry.file for entry in contents.ENTRIES} == {path.name for path in common.OUTPUT.iterdir()}
 
 
 def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     text = (ROOT / "paper_figs" / "README.md").read_text(encoding="utf-8")
-    assert table1.table(record.read(record.RESULTS / "overhead.json")["result"]) in text
-    assert kim_table1.table(record.read(record.RESULTS / "bricks.json")["result"]) in text
+    assert records.table1(record.read(record.RESULTS / "overhead.json")["result"]) in text
+    assert records.kim_table1(record.read(record.RESULTS / "bricks.json")["result"]) in text
     measured = record.read(record.RESULTS / "kisti.json")["result"]
-    for table in (kisti_table.table(measured, part) for part in ("shaded", "scenes")):
+    for table in (records.speed_ups(measured, part) for part in ("shaded", "scenes")):
         assert table in text
-    assert kisti_table.tested_every(measured) in text
+    assert records.tested_every(measured) in text
 
 
 def test_the_page_shows_what_the_records_hold_beside_what_the_papers_report(tmp_path):
@@ -90,6 +89,6 @@ def test_figures_are_measured_and_rendered_anew(tmp_path):
 
 @pytest.mark.slow
 def test_a_figure_is_drawn(tmp_path):
-    fig09.main(["--quick", "--output", str(tmp_path)])
+    index.FIGURES["fig09"](["--quick", "--output", str(tmp_path)])
     assert imread(tmp_path / "fig09.webp").std() > 10
     assert [path.name for path in tmp_path.iterdir()] == ["fig09.webp"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from experiments.naive_bricks import each_at_once
+from experiments.bricks import each_at_once
 from jaxvol.bricks import VoxelSource, summary
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 

@@ -146,7 +146,7 @@ def test_a_probe_is_found_from_images_twenty_percent_off_within_half_a_percent()
     """Spheres, wires and speckle, from two known cameras, with noise of 1 %, in converged references; from
     coarse to fine. The covariance says how far off the numbers are, and that the scene determines them."""
     scene, truth = experiment.phantom(48, seed=0)
-    targets = experiment.views(scene, truth, 24, experiment.NOISE, 0, 8)
+    targets = experiment.views(scene, truth, experiment.cameras(24), experiment.NOISE, 0, 8)
     start = experiment.moved(truth, np.array([1, -1, -1, 1, 1, 1, -1]))
     row = experiment.recovered(scene, targets, truth, start)
     assert row["worst"] < 0.005
@@ -158,7 +158,7 @@ def test_a_probe_is_found_from_images_twenty_percent_off_within_half_a_percent()
 @pytest.mark.slow
 def test_the_covariance_says_which_numbers_the_scene_leaves_open():
     """Of shells through a window, whose ends are not in view, the angles at which the beams end."""
-    found = experiment.VARIANTS["shells through a window"](24, 16, 0)["standard errors"]
+    found = experiment.left_open("shells through a window", 24, 16, 0)["standard errors"]
     left_open = [name for name, error in found.items() if not np.isfinite(error)]
     assert left_open == ["first β", "last β", "first σ", "last σ"]
     assert all(error > 0 for error in found.values())

@@ -1,0 +1,84 @@
+"""Pictures of scenes, as `experiments.pictures` renders them."""
+
+from argparse import Namespace
+from functools import partial
+
+from experiments import charts
+from experiments.harness import QUICK, Main, command
+from experiments.marches import JITTER, PLAIN
+from experiments.pictures import chae, kisti, kye, lee, lee_steps
+from experiments.pictures.kim import kim_fig8, order_of_bricks
+
+from .common import OUTPUT, pictures
+
+
+def chae_fig6(chosen: Namespace) -> str:
+    size = chosen.size * chae.WHOLE
+    return f"Chae and Shin, Fig. 6: part of an image of {size} x {size} pixels"
+
+
+FIG01 = "Fig. 1: wood grain, and noise on the cut face"
+FIG09 = "Fig. 9: the head; boundary noise is that of the cut face"
+FIG10 = "Fig. 10: a cut engine in place of the heart; boundary noise is that of the cut faces"
+FIG11 = "Fig. 11: a colon in soft tissue in place of the kidney; boundary noise is that of the cut face"
+FIG12 = "Fig. 12: vessels; boundary noise is that of the pixels that alignment changes"
+KIM = "Kim, Kwon and Shin, Fig. 8: bricks of a scan, in the wrong and the right order"
+KISTI = "KISTI report, Fig. V-1: a head and an engine under two transfer functions"
+STEPS = (
+    "Lee, Kwon and Shin: the steps of shading, one at a time. "
+    "Numbers: mean linear red, green and blue of what is visible"
+)
+EAR = "Lee, Kwon and Shin, Fig. 4: an ear, light from behind the head"
+HAND = "Lee, Kwon and Shin: a hand, light from the left"
+LIT = "Lee, Kwon and Shin, Fig. 6: light from the left"
+
+
+@command("Kim, Kwon and Shin, Fig. 6: the order of bricks.", OUTPUT, quick=QUICK)
+def kim_fig6(chosen: Namespace) -> None:
+    """The paper's scan in six bricks, in the plane of the motor's turn. The ray leaves a brick through its
+    curved face and comes back to it (the paper's Fig. 4); K reaches to the dashed chord of that face."""
+    found = order_of_bricks()
+    figure, ((axes,),) = charts.panels(1, 1, 6.4, 4.4)
+    blues, text = charts.plt.get_cmap("Blues"), {"textcoords": "offset points", "fontsize": 9}
+    for turn, (edge, middle) in enumerate(zip(found.edges, found.middles, strict=True), 1):
+        axes.fill(*edge.T, facecolor=blues(0.65 - 0.09 * turn), edgecolor="k", linewidth=1)
+        axes.plot(*zip(found.eye, middle, strict=True), color="0.5", linewidth=0.7, linestyle=":")
+        axes.plot(*middle, "k.", markersize=4)
+        axes.annotate(str(turn), tuple(middle), (4, 4), **text | {"fontsize": 13, "weight": "bold"})
+    axes.plot(*found.eye, "ks", markersize=8)
+    axes.annotate("camera", tuple(found.eye), (0, 9), ha="center", **text)
+    axes.plot(*found.chord[[0, 2]].T, "k--", linewidth=0.8)
+    axes.plot(*found.ray.T, "C3-", linewidth=1.2)
+    axes.annotate("ray", tuple(found.ray[1]), (4, 0), color="C3", **text)
+    axes.plot(0, 0, "k+", markersize=9)
+    axes.annotate("motor axis", (0, 0), (6, -3), **text)
+    axes.set_aspect("equal")
+    axes.set_xlabel("y, mm", fontsize=8)
+    axes.set_ylabel("z, mm", fontsize=8)
+    axes.tick_params(labelsize=8)
+    axes.set_title("Kim, Kwon and Shin, Fig. 6: bricks in the order of their centres' depth", fontsize=9)
+    charts.save(figure, chosen.output / "kim_fig6.webp")
+
+
+PICTURES: dict[str, Main] = {
+    "fig01": pictures(
+        "fig01",
+        "Fig. 1: wood grain, and noise on the cut face",
+        partial(kye.comparison, "head", methods=(PLAIN, JITTER)),
+    ),
+    "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head")),
+    "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart")),
+    "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney")),
+    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left)),
+    "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13),
+    "chae_fig6": pictures("chae_fig6", chae_fig6, chae.chae_fig6, resolution=256),
+    "kim_fig6": kim_fig6,
+    "kim_fig8": pictures("kim_fig8", KIM, kim_fig8, resolution=360),
+    "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, size=320, data=True),
+    "lee_fig_steps": pictures("lee_fig_steps", STEPS, lee_steps.lee_fig_steps, resolution=96),
+    "lee_fig4": pictures("lee_fig4", EAR, lee.lee_fig4, resolution=96),
+    "lee_fig5": pictures("lee_fig5", HAND, lee.lee_fig5, size=512),
+    "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=512),
+    "gallery": pictures("gallery", "Kinds of light", lee.gallery, resolution=128, data=True),
+}
+"""By the name of what is written."""

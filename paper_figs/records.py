@@ -1,0 +1,256 @@
+"""Charts and tables of what experiments recorded, beside what the papers report."""
+
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from experiments import charts, templates
+from experiments.harness import Main
+from experiments.kisti import BOTH as ERT_AND_ESS, BOTH_SKIPPED, ERT, ESS, NEITHER, REPORT, SKIPPED
+from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
+from experiments.minimum_distance import HIERARCHY, MAP, OF_VOXELS, PROVEN, PUBLISHED, VOXELS, named
+
+from .common import from_record, table_from_record
+
+
+# -- Kye 2013
+
+COLUMNS = (JITTER, EMPTY, BOTH)
+KYE = {  # seconds, 1024 x 1024 pixels, in the order of the table's columns
+    "head": (0.767, 0.771, 0.775, 0.775),
+    "heart": (3.728, 3.741, 3.739, 3.745),
+    "kidney": (1.768, 1.765, 1.771, 1.772),
+    "vessels": (1.192, 1.196, 1.199, 1.216),
+}
+
+
+def table1(result: dict[str, Any]) -> str:
+    """The record of `experiments/overhead.py` and the paper's table, as one Markdown table."""
+    lines = [
+        f"| volume | pixels | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
+        "|---|" + "---|" * (len(COLUMNS) + 4),
+    ]
+    each = [
+        (f"{name}, {said}", size, condition["volumes"][name][str(size)])
+        for said, condition in result["conditions"].items()
+        for size in result["sizes"]
+        for name in condition["volumes"]
+    ]
+    for name, size, rows in each:
+        cells = [f"{size}²", f"{rows[PLAIN]['seconds']:.3f} s"]
+        for column in COLUMNS:
+            ratio = rows[column]["ratio"]
+            cells.append(f"{ratio['median']:.3f} [{ratio['low']:.3f}, {ratio['high']:.3f}]")
+        cells += [f"{rows[march]['rmse']:.5f}" for march in (PLAIN, BOTH)]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    for name, (plain, *others) in KYE.items():
+        cells = ["1024²", f"{plain:.3f} s", *(f"{other / plain:.3f}" for other in others), "–", "–"]
+        lines.append(f"| *paper: {name}* | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+# -- Chae and Shin
+
+CHAE = 8, 0.47  # R, time over that of the distance map
+
+
+def chae_fig5(result: dict[str, Any], path: Path) -> None:
+    """A panel for each scene; below the points of the published method, their shares of wrong pixels."""
+    scenes, cells = result["scenes"], result["cells"]
+    figure, (axes,) = charts.panels(1, len(scenes), 4.2 * len(scenes) + 0.4, 3.6)
+    for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
+        for method, style in ((PUBLISHED, "C3o-"), (OF_VOXELS, "C1^-"), (PROVEN, "C0s-")):
+            ratios = [rows[named(method, cell)]["ratio"] for cell in cells]
+            low, high = ([r[end] for r in ratios] for end in ("low", "high"))
+            panel.plot(cells, [r["median"] for r in ratios], style, markersize=5, label=method)
+            panel.fill_between(cells, low, high, color=style[:2], alpha=0.2, linewidth=0)
+        for cell in cells:
+            wrong = rows[named(PUBLISHED, cell)]["wrong"]
+            panel.text(cell, 0.02, f"{wrong:.2%}", ha="center", fontsize=7, color="C3")
+        for method, color, line in ((MAP, "k", "--"), (VOXELS, "C1", "--"), (HIERARCHY, "C2", "-.")):
+            panel.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
+        off = rows[VOXELS]["ratio"]["median"] * CHAE[1]  # the paper's map is one of voxels
+        panel.plot(CHAE[0], off, "kx", markersize=8, label="the paper, off the distance map of voxels")
+        panel.set_xscale("log", base=2)
+        panel.set_xticks(cells, cells)
+        panel.set_ylim(bottom=0)
+        panel.set_xlabel("R, side of the grid's cells, pixels", fontsize=9)
+        panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map", fontsize=9)
+        panel.tick_params(labelsize=8)
+    axes[0].set_ylabel("time / that by the distance map", fontsize=9)
+    figure.suptitle("Bands: 95 % intervals. Red numbers: wrong pixels under min_distance", fontsize=9)
+    charts.legend_below(figure, axes[0], 3)
+    charts.save(figure, path)
+
+
+# -- Kim, Kwon and Shin 2008
+
+METHODS = ("overlap", "reload", "naive", "whole")
+
+
+def kim_table1(result: dict[str, Any]) -> str:
+    """A row for each split: overlap as printed, by the formula, and for the voxels that are measured; what
+    was read, loads, and rates, of the paper and ours."""
+    head = [
+        "β, σ, γ",
+        "*paper: overlap %*",
+        "formula, paper's unit %",
+        "formula, these voxels %",
+        "read: overlap / reload, times the volume",
+        "loads: overlap / reload",
+        "*paper: fps, proposed / reload*",
+        "fps: overlap / reload / naive / whole",
+        "time of reload / overlap",
+    ]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for name, row in result["splits"].items():
+        paper, overlap, reload = row["paper"], row["overlap"], row["reload"]
+        read = (method["read, times the volume"] for method in (overlap, reload))
+        rates = (1 / row[method]["seconds"] for method in METHODS)
+        ratio = reload["ratio to overlap"]
+        cells = [
+            name.replace(",", " × "),
+            f"*{paper['overlap']:.2f}*",
+            f"{row['formula']:.2f}",
+            f"{row['formula, of these voxels']:.2f}",
+            " / ".join(f"{times:.2f}" for times in read),
+            f"{overlap['loads']} / {reload['loads']}",
+            f"*{paper['proposed']:.2f} / {paper['reload']:.2f}*",
+            " / ".join(f"{rate:.2f}" for rate in rates),
+            f"{ratio['median']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]"
+            if row["repetitions"] > 1
+            else f"{ratio['median']:.2f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+BEST = "2,4,2"
+
+
+def kim_fig9(result: dict[str, Any], path: Path) -> None:
+    """Above the paper's rates, below ours, from the largest bricks to the smallest."""
+    rows = result["splits"]
+    names = sorted(rows, key=lambda name: (rows[name]["bricks"], name))
+    at = range(len(names))
+    figure, ((theirs,), (ours,)) = charts.panels(2, 1, 9, 5.6, sharex=True)
+    theirs.plot(at, [rows[n]["paper"]["proposed"] for n in names], "C0o-", label="proposed (overlap)")
+    theirs.plot(at, [rows[n]["paper"]["reload"] for n in names], "C1s-", label="reload")
+    for method, style in (("overlap", "C0o-"), ("reload", "C1s-"), ("naive", "C3x:")):
+        label = "naive, wrong" if method == "naive" else method
+        ours.plot(at, [1 / rows[n][method]["seconds"] for n in names], style, label=label)
+    whole = median(1 / rows[n]["whole"]["seconds"] for n in names)
+    ours.axhline(whole, color="0.5", linestyle="--", label="the whole volume at once")
+    for panel, title in ((theirs, "the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels"), (ours, None)):
+        voxels, image = result["voxels"], result["image"]
+        measured = f"measured: {' x '.join(map(str, voxels[::-1]))} voxels, {image[0]} x {image[1]} pixels"
+        panel.set_title(title or measured, fontsize=9)
+        panel.set_yscale("log")
+        panel.set_ylabel("frames per second", fontsize=8)
+        panel.legend(fontsize=7)
+        panel.tick_params(labelsize=7)
+        if BEST in names:
+            panel.axvline(names.index(BEST), color="0.8", linewidth=6, zorder=0)
+    labels = [f"{n}\n{rows[n]['bricks']}" for n in names]
+    ours.set_xticks(at, labels, fontsize=7)
+    ours.set_xlabel("split β,σ,γ and number of bricks; grey: the paper's best", fontsize=8)
+    charts.save(figure, path)
+
+
+# -- KISTI report
+
+
+def speed_ups(result: dict[str, Any], shading: str) -> str:
+    """One half of the record of `experiments/kisti.py`, "scenes" (unshaded) or "shaded", and the report's
+    table, as one Markdown table."""
+    sizes, scenes = [str(size) for size in result["sizes"]], result[shading]
+    lines = ["| | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
+
+    def line(name: str, cells: list[list[str]]) -> None:
+        lines.append(f"| {name} | " + " | ".join(" / ".join(cell) for cell in cells) + " |")
+
+    def of(method: str, form: str, *keys: str) -> list[list[str]]:
+        rows = [[scenes[scene][size][method] for size in sizes] for scene in REPORT]
+        for key in keys:
+            rows = [[row[key] for row in pair] for pair in rows]
+        return [[format(value, form) for value in pair] for pair in rows]
+
+    ours = {ERT: [ERT], ESS: [SKIPPED, ESS], ERT_AND_ESS: [BOTH_SKIPPED, ERT_AND_ESS]}
+    for method, forms in ours.items():
+        line(f"*report: {method}*", [[f"{gain:.2f}" for gain in REPORT[scene][method]] for scene in REPORT])
+        for form in forms:
+            if form not in scenes[next(iter(REPORT))][sizes[0]]:
+                continue
+            line(form, of(form, ".2f", "speed-up", "median"))
+            quotients = [
+                [
+                    f"{scenes[scene][size][form]['speed-up']['median'] / gain:.2f}"
+                    for size, gain in zip(sizes, REPORT[scene][method], strict=True)
+                ]
+                for scene in REPORT
+            ]
+            line(f"{form}, ours / report's", quotients)
+    line(f"seconds, {NEITHER}", of(NEITHER, ".3f", "seconds"))
+    line(f"RMSE, {NEITHER}", of(NEITHER, ".4f", "rmse"))
+    line(f"RMSE, {ERT_AND_ESS}", of(ERT_AND_ESS, ".4f", "rmse"))
+    return "\n".join(lines) + "\n"
+
+
+def tested_every(result: dict[str, Any]) -> str:
+    """What early termination gains where ended rays are looked for every so many samples."""
+    rows = result["ended rays are looked for every so many samples"]
+    counts = list(rows[next(iter(REPORT))])
+    lines = ["| samples | " + " | ".join(REPORT) + " |", "|---|" + "---|" * len(REPORT)]
+    for count in counts:
+        cells = [
+            f"{rows[scene][count]['speed-up']['median']:.2f} ({rows[scene][count]['seconds'][ERT]:.3f} s)"
+            for scene in REPORT
+        ]
+        lines.append(f"| {count} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def kisti_table(result: dict[str, Any]) -> str:
+    """All three."""
+    return "\n".join((speed_ups(result, "shaded"), speed_ups(result, "scenes"), tested_every(result)))
+
+
+# -- Lee, Kwon and Shin 2016
+
+LEE = {
+    "Table 1": (0.72760, 0.10492, 0.04836, 0.02219, 0.01002, 0.00454, 0.00206, 0.00945),
+    "Table 2": (0.18145, 0.12455, 0.12500, 0.12321, 0.05762, 0.05719, 0.05676, 0.02634),
+    "Table 3, material A": (0.12291, 0.12241, 0.07501, 0.07500, 0.48284, 0.48282, 0.03076, 0.03060),
+    "Table 3, material B": (0.22145, 0.17421, 0.17500, 0.17120, 0.04829, 0.04805, 0.04728, 0.01339),
+}
+"""Intensities as printed. 0.00945, 0.48284 and 0.48282 lack a zero: 0.000945, 0.048284, 0.048282."""
+
+
+def lee_tables(result: dict[str, Any]) -> str:
+    """All three tables as one Markdown table."""
+    lines = ["| | x | y | z | intensity | *paper* |", "|---|---|---|---|---|---|"]
+    for name, found in result["tables"].items():
+        for row, paper in enumerate(LEE[name.split(":")[0]]):
+            cells = ["–"] * 4
+            if row < len(found["photons"]):
+                *offset, light = found["photons"][row]
+                cells = [*(f"{c:.2f}" for c in offset), f"{light:.5f}"]
+            lines.append(f"| {'' if row else name} | {' | '.join(cells)} | *{paper:.5f}* |")
+        lines.append(f"| *{found['count']} photons* | | | | {found['energy']:.5f} | |")
+    return "\n".join(lines) + "\n"
+
+
+def lee_fig1(result: dict[str, Any], path: Path) -> None:
+    charts.save(templates.draw(result), path)
+
+
+RECORDS: dict[str, Main] = {
+    "table1": table_from_record("table1", "overhead", table1),
+    "chae_fig5": from_record("chae_fig5.webp", "minimum_distance", chae_fig5),
+    "kim_table1": table_from_record("kim_table1", "bricks", kim_table1),
+    "kim_fig9": from_record("kim_fig9.webp", "bricks", kim_fig9),
+    "kisti_table": table_from_record("kisti_table", "kisti", kisti_table),
+    "lee_fig1": from_record("lee_fig1.webp", "templates", lee_fig1),
+    "lee_tables": table_from_record("lee_tables", "templates", lee_tables),
+}
+"""By the name of what is written."""
