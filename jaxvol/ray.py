@@ -88,6 +88,9 @@ class Scene(NamedTuple):
         function that its mode puts in place of its own."""
         if not self.resolves:
             return self
+        if self.lighting is not None and not self.compositing.can_be_lit:
+            mode, light = type(self.compositing).__name__, described(self.lighting)
+            raise ValueError(f"lighting must be None under {mode}, which shows no single place; got {light}.")
         transfer, march = self.compositing.marched(self.transfer, self.march, self.volume)
         return self._replace(transfer=transfer, march=march, lighting=None)
 

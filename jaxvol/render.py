@@ -127,7 +127,7 @@ def render_rays(
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
 ) -> Rendering:
-    """Renders arbitrary rays. Other arguments are those of `render`.
+    """Renders arbitrary rays. All other arguments are as for `render`.
 
     Args:
         origins: (*rays, 3) world points where rays begin.

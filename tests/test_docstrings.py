@@ -35,7 +35,10 @@ def has(section, doc):
 
 def says(name, doc):
     """Whether an argument has a line of its own, or is spoken of."""
-    return f"`{name}`" in doc or re.search(rf"^    {re.escape(name)}: \S", doc, re.MULTILINE) is not None
+    return (
+        f"`{name}`" in doc
+        or re.search(rf"^    \*{{0,2}}{re.escape(name)}: \S", doc, re.MULTILINE) is not None
+    )
 
 
 def tree(thing) -> Any:
@@ -117,11 +120,14 @@ def test_a_gap_is_found():
 
 def public(module):
     """What users may name of a module: its own objects, neither submodules nor what it imports."""
+
+    def belongs(place):
+        return place.startswith("jaxvol") if hasattr(module, "__path__") else place == module.__name__
+
     return {
         name: value
         for name, value in vars(module).items()
-        if name == "PRESETS"
-        or (getattr(value, "__module__", "").startswith("jaxvol") and not name.startswith("_"))
+        if name == "PRESETS" or (not name.startswith("_") and belongs(getattr(value, "__module__", "")))
     }
 
 

@@ -77,11 +77,8 @@ class Traversal:
     at: Progress  # how far they have been marched
 
     def __init__(self, request: Request, shown: Scene):
-        marched, mode, outputs = shown, shown.compositing, request.outputs
-        if mode.resolves:  # without light: pixels are computed from what the march finds
-            transfer, march = mode.marched(shown.transfer, shown.march, shown.volume)
-            marched = shown._replace(transfer=transfer, march=march, lighting=None)
-            outputs = "depth" if outputs == "rgba" else outputs
+        marched, outputs = shown.marched, request.outputs
+        outputs = "depth" if shown.resolves and outputs == "rgba" else outputs
         assert isinstance(marched.source, Camera)
         self.request, self.source, self.scene = request, request.source, marched
         source, shape, counts = request.source, request.source.shape, request.counts

@@ -74,6 +74,12 @@ class Compositing(eqx.Module, Generic[State]):
         """Whether the pixel is computed after the march, from its final state."""
         return False
 
+    @property
+    def can_be_lit(self) -> bool:
+        """Whether lighting shades what is shown. Not where a `Weighting` has `resolved`: its cells are
+        marched without light, and what it shows lies at no one place."""
+        return not self.resolves
+
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         """The transfer function and the march for the cells of a mode that `resolves`; by default those that
         are given."""

@@ -156,8 +156,6 @@ class Average(Weighting):
         return worth
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
-        if classification.light is not None:
-            raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
         # of rays that only fill up a chunk, sums are 0, and derivatives must not be NaN
         mean = sums[0] / jnp.where(sums[3] == 0, 1, sums[3])
         return layer(*classification.classify(classification.searched((mean,))), self.thickness)

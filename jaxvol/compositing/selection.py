@@ -99,6 +99,10 @@ class Selection(Compositing[State]):
     def resolves(self) -> bool:
         return True
 
+    @property
+    def can_be_lit(self) -> bool:
+        return True
+
     def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
         depth = self.depth(state)
         none, chosen = jnp.zeros_like(depth), (~jnp.isinf(depth)).astype(depth.dtype)

@@ -68,7 +68,7 @@ def lit_colors(
 
     def one(ray: Ray, cell: Cell, color: Vec3, term: PyTree) -> Vec3:
         sample = _inline_sample(scene, ray, cell)._replace(color=color)
-        return shading.color(sample, shading.begin(around, sample), term)
+        return shader.color(sample, shading.begin(around, sample), term)
 
     each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
     return [each(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
@@ -154,7 +154,7 @@ def shaded_colors(
             """The colour of a sample without any term of light, and whether it needs one."""
             sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
             shared = shading.begin(around, sample)
-            color = shading.color(sample, shared, no_terms(shading, around, sample, shared))
+            color = light.color(sample, shared, no_terms(shading, around, sample, shared))
             return color, ~(sample.transmittance < thresholds[0])
 
         each = jax.vmap(jax.vmap(without_terms), in_axes=(None, 0, 0, 0))

@@ -93,8 +93,8 @@ def _chunk_vjp(
     shared, pull_begin, fixed_shared = jax.vjp(begin, moving, has_aux=True)
 
     def color(moving: PyTree, shared: PyTree, sums: PyTree) -> Vec3:
-        shading, _, samples = rebuilt(moving)
-        return jax.vmap(shading.color)(samples, eqx.combine(shared, fixed_shared), sums)
+        shading, around, samples = rebuilt(moving)
+        return jax.vmap(Shader(shading, around).color)(samples, eqx.combine(shared, fixed_shared), sums)
 
     shading, around = shader
     sums = needed_terms(shading, around, samples, eqx.combine(shared, fixed_shared))

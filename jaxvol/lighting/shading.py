@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from .._util.checks import check_answer
 from .._util.vec3 import Scalar, Vec3
 from ..scene.space import Space
 from ..scene.transfer import Classification, Measured, Transfer, classification_of
@@ -210,13 +211,20 @@ class Shader(NamedTuple):
     def __call__(self, sample: Sample) -> Vec3:
         """The shaded colour of a sample, or those of many, without terms that none needs."""
         shading, around = self
-        if self.inline:
-            sample = sample._replace(transmittance=jnp.ones_like(sample.transmittance))
+        if self.inline:  # told no more than the fast engine tells it
+            one, unknown = (jnp.full_like(sample.extinction, value) for value in (1, jnp.nan))
+            sample = sample._replace(measured=(), extinction=unknown, transmittance=one)
         if sample.extinction.ndim == 0:
             shared = shading.begin(around, sample)
-            return shading.color(sample, shared, _all_terms(shading, around, sample, shared))
+            return self.color(sample, shared, _all_terms(shading, around, sample, shared))
         shared = jax.vmap(partial(shading.begin, around))(sample)
-        return jax.vmap(shading.color)(sample, shared, needed_terms(shading, around, sample, shared))
+        return jax.vmap(self.color)(sample, shared, needed_terms(shading, around, sample, shared))
+
+    def color(self, sample: Sample, shared: PyTree, sums: PyTree) -> Vec3:
+        """`Shading.color`, whose answer is checked."""
+        color = self.shading.color(sample, shared, sums)
+        check_answer(self.shading, "color", color, sample.color)
+        return color
 
 
 def _all_terms(shading: Shading, around: Surroundings, sample: Sample, shared: PyTree) -> PyTree:

@@ -105,6 +105,8 @@ def scatterer_template(
     The paper's tables were made in this way; its equations (1) to (3) as printed hand on αI
     (`experiments/printed_templates.py`).
 
+    Where it fails: `experiments/stability.py`, "lopsided templates", "energy of templates as printed".
+
     Args:
         material: its opacity, mean free path λ and refractive index.
         key: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.

@@ -56,7 +56,8 @@ class ScattererTemplates(Lighting):
     is the `Optics.reflectance` of the sample's material. White half-spaces have 0.9 to 1.6 times the exact
     radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For darker colours,
     templates are too bright: in path tracing the colour darkens each of many scatterings, here it darkens the
-    sum once. It fails for long and for short mean free paths (`experiments/stability.py`).
+    sum once. Where it fails: `experiments/stability.py`, "long mean free paths",
+    "short mean free paths".
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would

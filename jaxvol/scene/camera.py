@@ -193,12 +193,12 @@ class Camera(eqx.Module):
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
-    def _column(self, column: Scalar | int) -> Scalar:
+    def _column(self, column: Any) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
         left, right, _, _ = self.window
         return left + (right - left) * (column / self.size[0])
 
-    def _row(self, row: Scalar | int) -> Scalar:
+    def _row(self, row: Any) -> Scalar:
         _, _, bottom, top = self.window
         return top - (top - bottom) * (row / self.size[1])
 

@@ -197,6 +197,17 @@ def average_that_is_lit():
     traced(lambda: jv.render(*SCENE, jv.March(0.11), compositing="average", lighting=Deferred(light)))
 
 
+class Gained(jv.Over):
+    """A mode with `resolved`, whose cells are marched without light."""
+
+    def resolved(self, classification, sums):
+        return 2 * sums
+
+
+def gained_that_is_lit():
+    traced(lambda: jv.render(*SCENE, jv.March(0.11), compositing=Gained(), lighting=jv.lighting.Phong()))
+
+
 def first_hits_of(mode):
     march = jv.March(0.11, (jv.SpaceLeaping("min_distance"),))
     return lambda: traced(lambda: jv.render(*SCENE, march, compositing=mode))
@@ -228,6 +239,7 @@ REFUSED = {
     ),
     "average, labels": (average_of_labels, "value alone; LabelTransferFunction reads more"),
     "average, light": (average_that_is_lit, "lighting must be None"),
+    "resolved, light": (gained_that_is_lit, "lighting must be None under Gained"),
     "jvp of replay": (lambda: derivative("replay", "jvp"), 'adjoint="forward"'),
     "grad of forward": (lambda: derivative("forward", "grad"), 'adjoint="replay"'),
     **{

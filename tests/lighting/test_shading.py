@@ -193,6 +193,50 @@ def test_samples_shaded_together_are_shaded_as_each_alone(occlusion):
         assert (np.max(found) > 0.01) == (bright > 0.05)
 
 
+class InPlace(Shading):
+    """Shades all samples in place, so that it is not told their extinction, which it uses."""
+
+    @property
+    def terms(self):
+        return 1
+
+    @property
+    def reads_gradient(self):
+        return True
+
+    @property
+    def farthest_read(self):
+        return 0.0
+
+    def term(self, around, sample, shared, number):
+        return sample.extinction
+
+    def color(self, sample, shared, sums) -> Any:
+        return scaled(sample.color, sums)
+
+
+class Stacked(InPlace):
+    """Answers with what is no colour."""
+
+    def color(self, sample, shared, sums) -> Any:
+        return jnp.stack(sample.color)
+
+
+def test_wrong_answers_are_named_and_what_is_not_told_is_nan():
+    volume, transfer, camera, march = scene_of()
+    with pytest.raises(ValueError, match=r"Stacked.color must return .*; got "):
+        jax.eval_shape(lambda: jv.render(volume, transfer, camera, march, lighting=Stacked()))
+
+    def alone(lighting):
+        shader = Shader.of(lighting, surroundings(volume, transfer))
+        pixel = jnp.zeros(2, jnp.int32)
+        return shader(sample_at(shader.around, jnp.asarray(volume.center), jnp.ones(()), pixel))
+
+    with pytest.raises(ValueError, match=r"Stacked.color must return .*; got "):
+        jax.eval_shape(lambda: alone(Stacked()))
+    assert np.isnan(jax.jit(lambda: alone(InPlace()))()).all()
+
+
 class CountedTerms(Shading):
     """Terms of 1 each, as many as of a fog."""
 

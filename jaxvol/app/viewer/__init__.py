@@ -55,8 +55,8 @@ def view(
         march: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
             voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`,
             `AlphaCorrection` and `EarlyTermination`.
-        lighting: the light that can be turned on, by default `Phong`; none where an average is composited,
-            which lies nowhere.
+        lighting: the light that can be turned on, by default `Phong`; none under a mode that shows no
+            single place, such as `Average`.
         lit: whether the light is on at first.
         compositing: as for `render`.
         background: linear RGB.

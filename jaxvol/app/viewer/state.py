@@ -14,7 +14,6 @@ from jaxtyping import Float
 from ..._util.checks import finite_array
 from ...compositing.blending import Compositing
 from ...compositing.modes import Mode, compositing_of
-from ...compositing.projections import Average
 from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
@@ -184,9 +183,9 @@ def initial(
         raise ValueError("the viewer's camera must be perspective; got one with a parallel_scale.")
     mode = compositing_of(compositing)
     mode.marched(transfer, given, volume)  # refuses what it cannot show
-    can_be_lit = not isinstance(mode, Average)
+    can_be_lit = mode.can_be_lit
     if lighting is not None and not can_be_lit:
-        raise ValueError("lighting must be None where an average is composited: it lies nowhere.")
+        raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
     r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = float(median_node_distance(given.locate(volume), blocks))

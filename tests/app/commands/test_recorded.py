@@ -231,7 +231,7 @@ BAD = {
     "no file": (said(), "which is not there"),
     "a device": (volume("/dev/zero"), "/dev/zero is no volume"),
     "a folder": (volume("folder"), "folder is no volume"),
-    "transfer": (said(transfer={"values": []}), "missing 2 required"),
+    "transfer": (said(transfer={"values": []}), "the transfer function in it: "),
     "transfer's numbers": (
         said(transfer={"values": ["a"], "colors": 1, "extinction": None}),
         "the transfer function in it: ",

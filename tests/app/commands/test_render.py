@@ -273,7 +273,7 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
     assert "3 of 2 x 2 x 1 bricks read, 99 bytes" in capsys.readouterr().out
     jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
     assert render(tmp_path / "v.npz", "--memory", "1M") == 2
-    assert "is not of a kind that is read in parts" in capsys.readouterr().err
+    assert "is not of a kind" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -298,7 +298,7 @@ def test_what_the_viewer_does_not_show_is_refused():
         ({"camera": parallel}, "perspective"),
         ({"camera": MARCH}, "camera must be"),
         ({"march": jv.March(20.0)}, r"march must .* from 0\.05 to 12\.8, 0\.0625 to 16 voxels, .* got one"),
-        ({"lighting": PHONG, "compositing": "average"}, "lighting must be None where an average"),
+        ({"lighting": PHONG, "compositing": "average"}, "lighting must be None under Average"),
         ({"volume": LABELS, "transfer": None, "compositing": "average"}, "LabelTransferFunction reads more"),
     ]
     bad += [({"background": each}, "background must") for each in ((1, 2), None, "white", (0, 0, math.inf))]
