@@ -133,8 +133,7 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 
 
 def steps_across(volume: Volume, march: March) -> int:
-    """Number of steps that suffices for any ray: across the volume's diagonal, and four
-    more."""
+    """Number of steps that suffices for any ray: those across the volume's diagonal, and four more."""
     with jax.ensure_compile_time_eval():
         diagonal = march.locate(volume).diagonal
         traced = is_traced(march.step, diagonal)
@@ -148,5 +147,6 @@ def steps_across(volume: Volume, march: March) -> int:
         )
     if not math.isfinite(steps):  # then nothing is marched, and the image is NaN
         return 1
-    # the first cell may begin a step early, one step finds the exit, and a jitter may shorten one more
+    # the first cell may begin a step early, one step finds the exit, a jitter may shorten one, and one is for
+    # rounding
     return min(math.ceil(steps) + 4, march.most_samples)

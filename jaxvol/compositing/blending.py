@@ -33,7 +33,7 @@ class Fragment(NamedTuple):
         alpha: opacity of its cell; 0 past the ray's end.
         depth: of the sample, past the ray's entry.
         cell: the piece of the ray that it stands for.
-        measured: what was read from the volume; for a `Weighting`, only the value.
+        measured: what was read from the volume, the value first; for a `Weighting`, the rest may be missing.
         color: as shaded; None for a `Selection`, or where only opacities are computed.
         valid: false past the ray's end, in gaps of the volume, and for cells of width 0.
     """
@@ -125,7 +125,7 @@ class Composite(eqx.Module):
 
 class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
-    override only `weight`, `slope` and `transmittance`, which work elementwise.
+    must override `weight` and `slope`; these, and `transmittance`, work elementwise.
 
     Weights depend only on the cells' opacities, are at least 0, and sum to at most 1. Where transforms
     divide cells, each piece has a weight. Parameters are static fields, or, if only `resolved` depends on
@@ -139,13 +139,13 @@ class Weighting(Compositing[Composite]):
 
     @abstractmethod
     def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        """Derivative of a loss by the optical depth τ of a cell, for the second march. The arguments suffice
-        for weights that do not depend on `before`, and for (constant - `before`) f(`alpha`).
+        """Derivative of a loss with respect to the optical depth τ of a cell, for the second march. The
+        arguments suffice only for weights f(`alpha`) or (constant - `before`) f(`alpha`).
 
         Args:
             alpha: opacity of the cell, 1 - exp(-τ), so that its own derivative is 1 - `alpha`.
             after: sum of the weights up to and including this cell's.
-            worth: derivative of the loss by the cell's weight.
+            worth: derivative of the loss with respect to the cell's weight.
             behind: sum over all cells behind this one of weight × worth.
         """
 
@@ -155,8 +155,8 @@ class Weighting(Compositing[Composite]):
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         """The pixel of a ray that is not transparent, from its Σ w c and Σ w, where it is computed after the
-        march by the given transfer function. JAX differentiates it, also of sums that are 0, which must not
-        give NaN."""
+        march. `classification`: of the transfer function that was given, not of that of `marched`. JAX also
+        differentiates it at sums of 0, where neither value nor derivative may be NaN."""
         return sums
 
     @property

@@ -216,9 +216,10 @@ class PacketTree:
                 continue
             opacity = float(material.opacity)
             if opacity <= self.faintest * self.packets:
+                advice = f"a threshold of at most {opacity / self.packets:.3g}" if opacity else "one above 0"
                 raise ValueError(
                     f"opacity {opacity:g} leaves no photon above threshold={self.threshold:g} with "
-                    f"packets={self.packets}; give a threshold of at most {opacity / self.packets:.3g}."
+                    f"packets={self.packets}; give {advice}."
                 )
             most = max(most, self.levels(opacity))
         return most if levels is None else integer("levels", levels, 1)

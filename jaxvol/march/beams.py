@@ -54,7 +54,7 @@ class View(NamedTuple):
     size: tuple[int, int]
     """(width, height)."""
     corner: tuple[Int[Array, ""], Int[Array, ""]]
-    """(column, row) of the image's first pixel, which keys random numbers."""
+    """(column, row) of the image's first pixel, as `Ray.pixel` counts them."""
     first_hit: Callable[[EmptySpaceIndex, Int[Array, "*rays"], Int[Array, "*rays"]], Float[Array, "*rays"]]
     """From an index to leap by, and columns and rows, to the distances of the first visible samples."""
 

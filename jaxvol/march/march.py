@@ -1,9 +1,9 @@
 """Where is the next sample, and which part of the ray does it stand for?
 
 A march is a step length d and a tuple of transforms. Without transforms it is Levoy's ray casting: samples at
-depths 0, d, 2d, … past the entry, each of which stands for the cell of width d behind it, up to the exit. A
-transform is one idea of one paper: it overrides one or two of these methods, the seams. At each seam the
-answers of all transforms are combined, so that they compose.
+depths 0, d, 2d, … from the entry to the exit, each of which stands for the cell of width d that begins there;
+the last may reach past the exit. A transform is one idea of one paper: it overrides one or two methods of
+`Transform`, the seams. At each seam the answers of all transforms are combined, so that they compose.
 
 How many steps long each cell is, one by default, is decided in `strides.py`.
 """
@@ -26,7 +26,8 @@ Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
 
 
 class Cell(eqx.Module):
-    """The piece of a ray that one sample stands for. `cut`: whether the volume's exit shortened it."""
+    """What one sample of a ray stands for: a cell, or a piece of one. `cut`: whether the volume's exit
+    shortened it."""
 
     front: Scalar
     width: Scalar
@@ -34,7 +35,7 @@ class Cell(eqx.Module):
 
 
 class Transform(eqx.Module):
-    """One change to a march. The defaults of the seams change nothing. All methods see one ray."""
+    """One change to a march. The defaults of the seams change nothing. Where a ray is given, it is one."""
 
     def locate(self, space: Space, volume: Volume) -> Space:
         """The space in which rays meet the volume, in place of `space`."""
@@ -45,7 +46,8 @@ class Transform(eqx.Module):
         return space
 
     def start(self, steps: Scalar, ray: Ray) -> Scalar:
-        """Steps from the entry to the front of the first cell; negative if `cut` trims what lies before."""
+        """Steps from the entry to the front of the first cell, at least -1, and below 0 only if `cut` removes
+        what lies before the entry. `steps`: the answer of the transforms before."""
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
@@ -63,8 +65,8 @@ class Transform(eqx.Module):
         return (cell,)
 
     joins: ClassVar[bool] = False
-    """Whether each piece that `cut` returns begins where the one in front of it ends, also from cell to cell,
-    except past the exit. Pieces that are integrated then share the value where they meet."""
+    """Whether pieces touch: each that `cut` returns begins where the one before it ends, also across two
+    cells, except past the exit. Pieces that are integrated then share the value where they meet."""
 
     ends_at_exit: ClassVar[bool] = False
     """Whether `cut` shortens what reaches past the exit."""
@@ -83,15 +85,15 @@ class March(eqx.Module):
         quadrature: how a cell's colour and extinction follow from the values along it.
             `"left"`: those at its front, as in the papers; the error falls with d.
             `"midpoint"`: those in its middle; the error falls with d².
-            `"preintegrated"`: the means over all values between those at its two ends, as if the value were
-            linear along it, the colour weighted by the extinction. The error falls with d², too, and narrow
+            `"preintegrated"`: as if the value were linear from its front to its back, the mean extinction,
+            and the mean of extinction × colour, divided by it. The error falls with d², too, and narrow
             peaks of the transfer function are not missed; where there are none, `"midpoint"` may be more
             accurate, in half to two thirds of the time. What a cell's front hides of its back is neglected:
             for an opacity α and optical depth τ, at most α τ / 8 times the difference of its colours.
             Extinction times the range of values must stay below 3e38 in float32. A cell has the label and
             the light of its middle.
-        max_samples: a ray's cells begin less than so many steps after its first one; an integer from 1 to
-            2²⁴, by default 131 072. Rays that need more are marked in `Rendering.exhausted`.
+        max_samples: the last cell of a ray begins less than so many steps after its first; an integer from
+            1 to 2²⁴, by default 131 072. Rays that need more are marked in `Rendering.exhausted`.
 
     What is thinner than a step is missed by a part of the rays. Where a march fails:
     `experiments/stability.py`, "sheets thinner than a step", "rays of very many samples",
@@ -179,7 +181,7 @@ class March(eqx.Module):
         shift = jnp.zeros_like(ray.length)
         for transform in self.transforms:
             shift = shift + _checked(transform, "shift", transform.shift(ray), shift)
-        # beyond, a sample would leave the cell that was found transparent
+        # so that the next sample begins within the cell that was found transparent, or at its end
         return jnp.clip(shift, -1, 0)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -188,7 +190,9 @@ class March(eqx.Module):
             divided = [transform.cut(piece, ray, volume) for piece in pieces]
             for cells in divided:
                 _check_kind(transform, "cut", cells, tuple)
-                for each in cells or (None,):
+                if not cells:
+                    raise ValueError(f"{type(transform).__name__}.cut must return at least one Cell; got ().")
+                for each in cells:
                     _check_kind(transform, "cut", each, Cell)
             pieces = tuple(each for cells in divided for each in cells)
         return pieces
@@ -223,7 +227,7 @@ class March(eqx.Module):
 
 
 def within(ray: Ray, depth: Scalar) -> Scalar:
-    """The depth, or that of the entry or the exit where it lies beyond."""
+    """The depth, clamped to the part of the ray from entry to exit."""
     # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
     depth = jnp.where(depth > 0, depth, 0)
     return jnp.where(depth < ray.length, depth, ray.length)

@@ -1,8 +1,8 @@
 """How many steps long is each cell of a ray? One, unless a `StrideControl` is among the march's transforms.
 
 Cells then come in runs: RUN in a row that are equally long. A run of stride s begins at a multiple of RUN s
-steps, counted from `Strides.phase` steps before the ray's first cell: of two runs that overlap, one holds the
-other, so that leaps do not change which runs are taken.
+steps, counted from `Strides.phase` steps before the ray's first cell. So runs are nested as in a binary tree:
+of two that overlap, one holds the other, and leaps do not change which runs are taken.
 
 Both engines make three calls: `predicted` prepares the march, once for each image, `begin` makes a ray's
 state, and `Strides.next` chooses the next run. Gradients take strides as given.
@@ -30,7 +30,7 @@ RUN = 4
 
 
 class Run(NamedTuple):
-    """RUN cells from depth `front` on, without `Transform.shift`, of `stride` steps each, a power of two."""
+    """RUN cells of `stride` steps each, a power of two, from depth `front` on, to which no shift is added."""
 
     front: Scalar
     stride: int
@@ -76,8 +76,9 @@ class Strides(eqx.Module):
     def next(
         self, march: March, ray: Ray, index: Any, ahead: Any, transmittance: Any, leaves: Any, finished: Any
     ) -> tuple["Strides", Int[Array, ""]]:
-        """The state in the run that holds the step `ahead` of `index`, up to which all is transparent, and
-        the steps from `index` to that run. `leaves`: whether the ray has left the volume there."""
+        """Chooses the run that holds the step `index + ahead`, before which all is transparent. Returns the
+        state there, and the steps from `index` to that run, 0 if it is the current one. `leaves`: whether the
+        ray has left the volume there. `finished`: whether it takes no more cells, so that none errs."""
         control = stride_control(march)
         assert control is not None
         march, control, ray, transmittance = jax.lax.stop_gradient((march, control, ray, transmittance))
@@ -168,10 +169,11 @@ def longest_run(march: March) -> int:
 
 
 def _phase(march: March, ray: Ray, control: StrideControl) -> Int[Array, ""] | None:
-    """Random where `start` or `shift` are, which move samples too little to break the wood grain of runs."""
+    """Random wherever `start` or `shift` are: these move samples by a step at most, which is too little to
+    turn the wood grain of long runs into noise."""
     if not march.overriding("start") and not march.may_shift:
         return None
-    # the lower digits of a part of a step, which are nearly independent of it; all of this is exact
+    # binary digits of the jitter from the sixth on, nearly independent of the jitter itself; without rounding
     part = 32 * jax.lax.stop_gradient(march.start(ray) - march.shift(ray))
     run = RUN * control.longest
     return jnp.floor((part - jnp.floor(part)) * run).astype(jnp.int32) & (run - 1)

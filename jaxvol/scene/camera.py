@@ -32,8 +32,8 @@ class Camera(eqx.Module):
         size: (width, height) of the image in pixels.
         window: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
             half heights of the whole view; by default all of it. Set by `crop` and `zoom`.
-        corner: (column, row) of the first pixel in the image that this one was cropped from, which keys
-            random numbers; by default (0, 0). Set by `crop`.
+        corner: (column, row) of the first pixel in the image that this one was cropped from, so that its
+            pixels keep their random numbers; by default (0, 0). Set by `crop`.
 
     Raises:
         ValueError: for a camera at its focal point, a `view_up` along the view direction, and an angle,
@@ -153,7 +153,8 @@ class Camera(eqx.Module):
         return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
     def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
-        """A camera that shows 1/`factor` of the image at the same image size, in the same perspective.
+        """A camera that shows 1/`factor` of the view's width and height at the same image size, in the same
+        perspective. Its `corner` is (0, 0): a crop that is zoomed is an image of its own.
 
         Args:
             factor: by which the image is magnified, > 0.

@@ -65,7 +65,8 @@ class LabelTransferFunction(Transfer):
         """
         found = self.shown
         for label, shown in self._changes("visible", visible):
-            found = found.at[label].set(flag(f"visible[{label}]", shown))
+            is_array = isinstance(shown, jax.Array) and shown.shape == () and shown.dtype == bool
+            found = found.at[label].set(shown if is_array else flag(f"visible[{label}]", shown))
         return eqx.tree_at(lambda transfer: transfer.shown, self, found)
 
     def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":

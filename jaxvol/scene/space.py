@@ -253,7 +253,8 @@ def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
 
 
 def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:
-    """`Volume.gradient`, by a world point: times the transposed Jacobian of `space.coordinate`."""
+    """Gradient of the value with respect to a world point: that of `Volume.gradient` times the transposed
+    Jacobian of `space.coordinate`."""
     coordinate, transpose = jax.vjp(space.coordinate, point)
     slopes = volume.gradient(coordinate)
     per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))

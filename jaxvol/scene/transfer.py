@@ -27,7 +27,7 @@ from .volume import Volume
 Measured: TypeAlias = tuple[Any, ...]
 """What a transfer function reads at a place: the value first, then whatever else it depends on. Of a cell
 that is integrated (`Classification.spanned`): the mean of the values at its ends, then what else is read in
-its middle, and what is read at its two ends."""
+its middle, and last two tuples, `front` and `back`: the value at each end, and what `search` found for it."""
 
 Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 """From `Measured` to colour (r, g, b) and extinction (1/length)."""
@@ -90,12 +90,14 @@ class Transfer(eqx.Module):
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         """An upper bound of the extinction (1/length) in each block, without a gradient; 0 only where that is
-        proven to be 0, and in blocks that hold NaN (`Blocks.unordered`). By default infinite."""
+        proven to be 0. Of blocks that hold NaN (`Blocks.unordered`) it may be anything: rays do not leap over
+        these. By default infinite."""
         return jnp.full(blocks.low.shape, jnp.inf)
 
     def integrator(self) -> Classify | None:
-        """The function from what is measured of a cell (`Measured`) to the means over all values between its
-        ends; None, the default, where they are unknown: `quadrature="preintegrated"` is refused."""
+        """The function from what is measured of a cell (`Measured`) to its mean extinction, and its mean of
+        extinction × colour divided by that, as if the value were linear between its ends; None, the default,
+        where they are unknown: `quadrature="preintegrated"` is refused."""
         return None
 
     def variation(self, windows: Windows) -> Variation:
@@ -103,9 +105,9 @@ class Transfer(eqx.Module):
         return Variation.unknown(windows)
 
     def search(self) -> Callable[[Measured], Measured] | None:
-        """Where a look-up is worth doing once for colour and extinction: from `Measured` to what the
-        classifier gets after it. With an `integrator` it depends only on the value. Overridden with `vjp`.
-        """
+        """A function from `Measured` to what is appended to it (such as the interval of the value), so that
+        `classifier` and `vjp` need not search again; None, the default, if nothing is. With an `integrator`
+        it depends only on the value. Overridden together with `vjp`."""
         return None
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
@@ -149,7 +151,7 @@ class TransferFunction(Transfer):
     Args:
         values: (n,) increasing control points, in value units; n ≥ 2. Two of them may be equal, and make a
             step: what lies below takes the first one's colour and extinction, what lies there or above the
-            second's. They carry no gradient.
+            second's. These have no gradient.
         colors: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
         extinction: (n,) at the points, in 1/length, ≥ 0; a width w has opacity `1 - exp(-extinction w)`.
 

@@ -26,7 +26,7 @@ class TransferFunction2D(Transfer):
     Args:
         values: (n,) increasing, in value units; n ≥ 2.
         magnitudes: (m,) increasing, in value units per world length; m ≥ 2. Two neighbours may be equal, and
-            make a step. They carry no gradient.
+            make a step. Values and magnitudes have no gradient.
         colors: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
         extinction: (n, m), in 1/length, ≥ 0.
 

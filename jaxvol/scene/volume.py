@@ -25,7 +25,7 @@ from .voxel_fetch import Fetch, OneByOne, Window, corners, flat_index, trilinear
 class Field(eqx.Module):
     """A user-defined scalar field in place of interpolated voxels: `Volume(data, field=...)`.
 
-    Its arrays are differentiable; of voxels, those that it reads by `volume.interpolated`. `SpaceLeaping`
+    Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`. `SpaceLeaping`
     leaps over no part of it, since its range is unknown.
     """
 
@@ -68,6 +68,7 @@ class Volume(eqx.Module):
     labels: Integer[Array, "nx ny nz"] | None
     field: Field | None
     fetch: Fetch
+    """How voxels are read. Internal."""
 
     def __init__(
         self,
@@ -99,14 +100,14 @@ class Volume(eqx.Module):
 
     @property
     def first(self) -> Vec3 | None:
-        """The node at which `data` begins, in the type of `spacing`, where it is only a part of the grid."""
+        """The node at which `data` begins, in the type of `spacing`; None if `data` is the whole grid."""
         if self.fetch.window is None:
             return None
         x, y, z = self.fetch.window.first.astype(self.spacing.dtype)
         return x, y, z
 
     def in_grid_order(self, of_data: Array) -> Array:
-        """An array that was computed from `data`, with its last three axes along x, y, z (`part_of`)."""
+        """Moves the last three axes of an array, which are those of `data`, into the order x, y, z."""
         if self.fetch.axes == XYZ:
             return of_data
         return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
@@ -154,12 +155,9 @@ class Volume(eqx.Module):
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
         """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one."""
-        labels, nearest = (
-            self._labels().reshape(-1),
-            [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate],
-        )
+        nearest = [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate]
         i, j, k = (jnp.clip(index, 0, n - 1) for index, n in zip(nearest, self.shape, strict=True))
-        return gather(labels, flat_index((i, j, k), self.shape)).astype(jnp.int32)
+        return gather(self._labels().reshape(-1), flat_index((i, j, k), self.shape)).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
         """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
@@ -222,7 +220,8 @@ def part_of(
     volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
     """The volume as a part of a grid of `whole` nodes that begins at the node `first`; beyond it, its faces
-    are read. Spacing, origin and direction are those of the whole. `axes`: of the array, as in `Window`."""
+    are read. Spacing, origin and direction are those of the whole. `axes`: as in `Window`; by default those
+    of `volume`."""
     window = Window(first, whole, volume.fetch.axes if axes is None else axes)
     return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=lambda leaf: leaf is None)
 

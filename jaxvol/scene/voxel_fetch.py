@@ -38,7 +38,7 @@ class Window(eqx.Module):
     whole: tuple[int, int, int] = eqx.field(static=True)
     """Number of nodes of the grid along x, y, z."""
     axes: Axes = eqx.field(static=True)
-    """Of the array in memory, which is data[z, y, x] for (2, 1, 0)."""
+    """Order of the array's axes in memory: (2, 1, 0) for data[z, y, x]."""
 
 
 class Fetch(eqx.Module):
@@ -83,7 +83,8 @@ class Fetch(eqx.Module):
         return flat_index(self.split(data, coordinate)[0], data.shape)
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
-        """The same for `slopes` at one node, whose index XLA computes on all threads if it lies in memory."""
+        """A fetch for one call of `slopes`, at the node whose flat index is `begin`: XLA computes the index
+        on one thread, unless it is given in memory."""
         return self
 
     def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:

@@ -87,7 +87,7 @@ def test_labels_are_hidden_and_shown_again_with_their_opacity():
         factors = np.array([2.0, 0.5, 1.0]) * [hidden.get(label, True) for label in range(3)]
         rgba = along_x(VOLUME, transfer.with_visibility(hidden))
         np.testing.assert_allclose(rgba, behind_each_other(WIDTHS * EXTINCTION * factors), atol=2e-5)
-    away = transfer.with_visibility({0: False, 1: False}).with_visibility({0: True, 1: True})
+    away = transfer.with_visibility({0: False, 1: False}).with_visibility({0: True, 1: jnp.array(True)})
     assert eqx.tree_equal(away.with_opacity({0: 1.0, 1: 1}), TRANSFER)
     # a factor is one of the optical depth, whatever the value: 1 - (1 - α)^f
     ramp = jv.TransferFunction.from_points([(0, RED, 0.0), (100, RED, 0.5), (200, RED, 0.9)])

@@ -202,6 +202,7 @@ BAD = [
         r"colors must have shape \(2, 3\); got shape \(2, 4\)",
     ),
     (lambda: jv.colormap("redd", (0, 1)), "cmap must be a .*; got 'redd'"),
+    (lambda: jv.colormap("viridi", (0, 1)), "cmap must be .*; got 'viridi'. Did you mean viridis"),
     (lambda: jv.colormap([], (0, 1)), r"cmap must be .*; got \[\]"),
     (lambda: jv.colormap([(255, 0, 0)], (0, 1)), r"cmap must be .* in \[0, 1\]; got \[\("),
     (lambda: jv.colormap("gray", (0, 1), n_colors=1), "n_colors must be an integer of at least 2"),

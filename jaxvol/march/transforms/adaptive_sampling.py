@@ -19,10 +19,11 @@ from ..strides import RUN, Run, StrideControl
 
 
 SHARE = 1 / 20
-"""Error of the image by predicted error of a block, measured (`experiments.adaptive_error`)."""
+"""Ratio of an image's error to the greatest e of a block (`AdaptiveSampling`), as measured by
+`experiments.adaptive_error`."""
 
 HIDDEN = 1 / 4
-"""The same of what the front of a cell hides of its back, which has one sign along a ray."""
+"""The same ratio for h, whose errors have one sign along a ray."""
 
 FARTHEST = 8
 """Blocks around its own that a run may touch."""
@@ -31,11 +32,16 @@ FARTHEST = 8
 class AdaptiveSampling(StrideControl):
     """Cells of 1, 2, 4, … steps: as long as what is predicted of their error stays below `tolerance`.
 
-    Take a block of 4³ voxels, of side ℓ, whose values, with those up to two nodes around it, range over R,
-    with second differences of at most H (per length²). Between the ends of a cell of width w the value leaves
-    the straight line by about δ = H w² / 8. While the value passes through R once, extinction and emission
-    change by V in total, C of it by the colour, and their slopes by K; C times the extinction is D
-    (`variation.Variation`). Then the optical depth along the block is wrong by about
+    Of a block of 4³ voxels, and up to two nodes around it, take (`variation.Windows`, `variation.Variation`)
+
+    - ℓ, the side of the block;
+    - R, the range of its values, and H, their greatest second difference, per length²;
+    - V, the total change of extinction and emission while the value passes through R once; C, the part of V
+      that is due to the colour; D, which is C times the extinction;
+    - K, the sum of all changes of their slopes over the value.
+
+    Between the ends of a cell of width w the value leaves the straight line by about δ = H w² / 8. Then the
+    optical depth along the block is wrong by about
 
         e = ℓ V min(1, δ / R) + q
 
@@ -56,7 +62,7 @@ class AdaptiveSampling(StrideControl):
 
     Args:
         tolerance: of the image's RMSE, > 0. It may be traced.
-        longest: the most steps of the march that a cell is long, a power of two up to 64.
+        longest: length of the longest cell, in steps of the march; a power of two up to 64.
 
     Under jitter, each ray's runs begin at a random depth, too. Strides, and `Rendering.error`, are constants
     to derivatives, and the image jumps where a stride changes: compare gradients with finite differences

@@ -45,8 +45,8 @@ class AlphaCorrection(Transform):
         ValueError: for `labels` that are not true or false, and when a volume without labels is rendered
             with `labels=True`.
 
-    Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit; labels are its
-    future work.
+    Source: Kye 2013, section 3.2 (sampling position alignment), for the cut at the exit; the paper names
+    labels as future work.
     """
 
     joins: ClassVar[bool] = True
@@ -62,7 +62,7 @@ class AlphaCorrection(Transform):
         reaches_past = back > ray.length
         # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
         left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
-        # of a cell that ends at the exit, too, the exit changes the width
+        # also if it ends exactly at the exit: its width, and the gradient of that, then depend on the exit
         cell = Cell(cell.front, jnp.where(back >= ray.length, left, cell.width), cell.cut | reaches_past)
         if self.labels:
             return _divided(cell, *_label_faces(cell, ray, volume))

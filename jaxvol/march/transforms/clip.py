@@ -35,8 +35,8 @@ class Clip(Transform):
     `box`, `origins` and `normals` are differentiable; where a face of the box coincides with one of the
     volume, the derivative is that of moving it inwards. Without `AlphaCorrection`, gradients miss the jumps
     of the image when a sample crosses a cut; `AlphaCorrection(labels=True)` takes the ends of gaps as fixed.
-    A ray within a plane is inside. Inside out, a film of less than 2e-6 of the volume's diagonal between its
-    face and the cut is taken for rounding, and not seen.
+    A ray that lies in a plane counts as inside. Inside out, a film of less than 2e-6 of the volume's diagonal
+    between a face of the volume and the cut is taken for rounding, and not seen.
 
     Where it fails: `experiments/stability.py`, "jitter behind cuts".
 

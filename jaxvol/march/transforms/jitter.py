@@ -23,7 +23,8 @@ Pattern = Literal["white", "blue"]
 
 class Noise(eqx.Module):
     """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel: `"white"`,
-    independent of its neighbours, or `"blue"`, from a repeated tile of 128 x 128 without low frequencies."""
+    independent of its neighbours, or `"blue"`, from a repeated tile of 128 x 128 without low frequencies.
+    Numbers of different streams are independent."""
 
     seed: UInt32[Array, ""]
     tile: Float[Array, "side side"] | None
@@ -55,8 +56,8 @@ class Jitter(Transform):
     Args:
         seed: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over.
         pattern: `"white"` (the paper's) or `"blue"`, whose low frequencies are suppressed.
-        front_residual: give the part that is left out a narrow cell of its own, from the entry to ξ d,
-            sampled at the entry. The noise on cut faces then falls to that of the sample's value.
+        front_residual: give what is left out a narrow cell of its own, from the entry to ξ d. Cut faces then
+            miss no thickness; what noise is left comes from where their values are sampled.
 
     Where it fails: `experiments/stability.py`, "jitter on cut faces", "jitter offsets near 1".
 

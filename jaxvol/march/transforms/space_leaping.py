@@ -21,7 +21,7 @@ from ..march import Transform
 Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
 
 LEAPS = 4
-"""Leaps from cell to cell between two segments."""
+"""Leaps from block to block between two segments."""
 
 
 class SpaceLeaping(Transform):
@@ -41,9 +41,10 @@ class SpaceLeaping(Transform):
             `"beam"`: as `"min_distance"`, but with a start that is proven for all of the pixels.
         cell: side of the square of pixels of the last two methods; at least 2.
 
-    What is leapt over has extinction 0, whose gradient only `adjoint="direct"` includes: `"forward"` takes it
-    as 0 where rays leap, `"replay"` also in front of and behind everything that a ray sees. A fit that should
-    make invisible regions visible must start above 0, or not leap.
+    What is leapt over has extinction 0, but the derivative of the image with respect to it is not 0. Only
+    `adjoint="direct"`, which does not leap, includes it; `"forward"` takes it as 0 where rays leap,
+    `"replay"` also in front of and behind everything that a ray sees. A fit that should make invisible
+    regions visible must start above 0, or not leap.
 
     Where it fails: `experiments/stability.py`, "sheets thinner than a cell of rays",
     "occupancy under steep transfer functions", "gradients of what is leapt over".
@@ -85,7 +86,7 @@ class SpaceLeaping(Transform):
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
     def _beam_starts(self, occupancy: Occupancy, view: View, column: Array, row: Array) -> Array:
-        """Up to which distances the beams of the cells that begin at these pixels meet nothing visible."""
+        """For each square of pixels, from its first one, up to where its rays meet nothing visible."""
         last = self.cell - 1
         column = jnp.stack([column, column + last, column, column + last], axis=-1)
         row = jnp.stack([row, row, row + last, row + last], axis=-1)

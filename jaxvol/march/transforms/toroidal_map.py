@@ -37,8 +37,9 @@ class ToroidalMap(Transform):
 
     The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
     coordinates are the probe's, with the origin on the motor axis. Of the gaps in which a ray is outside the
-    sector, as in its hollow near side, the first two are found. A ray less than 2e-6 of the probe's size
-    outside counts as inside, and so may one that runs along a face at less than 1e-5 of it.
+    sector, as in its hollow near side, the first two are found. A ray that is nowhere farther outside than
+    2e-6 of the probe's size counts as inside; one that runs along a face, outside by less than 1e-5 of that
+    size, may.
 
     Args:
         a: distance from the motor axis to the fan's apex, world length; negative if the apex lies behind the
