@@ -204,7 +204,7 @@ def normals_in_noise(noise: float, size: int) -> dict[str, float]:
 def lit_image(size: int, transforms: tuple[jv.Transform, ...], lit: bool, finer: int = 1) -> np.ndarray:
     """A translucent cube of one value, lit from the side; a mean free path is a tenth of its side."""
     sun = DirectionalLight((1.0, 0.3, 0.2), (3.0, 3.0, 3.0))
-    how = {"templates": 1, "packets": 2, "photons": 6, "levels": 3}
+    how: Any = {"templates": 1, "packets": 2, "photons": 6, "levels": 3}
     lighting = ScattererTemplates(jv.Material(0.3, 0.2), sun, **how) if lit else None
     camera = jv.Camera.looking_at(cube(32), (0.4, -1.0, 0.5), size=(size, size)).zoom(1.3)
     march = jv.March(1 / 32 / finer, (jv.AlphaCorrection(), *transforms), "midpoint")

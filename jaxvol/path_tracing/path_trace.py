@@ -52,6 +52,7 @@ class PathTraced(eqx.Module):
         exhausted: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
             contributed.
         paths: per pixel.
+        seed: of the last paths' random numbers.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -59,6 +60,7 @@ class PathTraced(eqx.Module):
     deviations: Float[Array, "height width 3"]
     exhausted: Bool[Array, "height width"]
     paths: int = eqx.field(static=True)
+    seed: UInt32[Array, ""]
 
     @property
     def standard_error(self) -> Float[Array, "height width 3"]:
@@ -87,15 +89,31 @@ class PathTraced(eqx.Module):
         return self.radiance + (1 - self.opacity[..., None]) * background
 
     def joined(self, other: "PathTraced") -> "PathTraced":
-        """The image by the paths of both, of the same scene and different keys. Source: Chan, Golub and
-        LeVeque 1983."""
+        """The image by the paths of both, of the same scene and different keys.
+
+        Args:
+            other: by another key.
+
+        Returns:
+            The image.
+
+        Raises:
+            ValueError: for the same key, whose paths would count twice, and for another size.
+
+        Source: Chan, Golub and LeVeque 1983.
+        """
+        if self.opacity.shape != other.opacity.shape:
+            sizes = f"{self.opacity.shape} and {other.opacity.shape}"
+            raise ValueError(f"other must be of the same size; got (height, width) {sizes}.")
+        if not is_traced(self.seed, other.seed) and self.seed == other.seed:
+            raise ValueError("other must be of another key; both hold the same paths.")
         paths = self.paths + other.paths
         share = other.paths / paths
         between = jnp.square(other.radiance - self.radiance) * (self.paths * share)
         radiance = self.radiance + (other.radiance - self.radiance) * share
         opacity = self.opacity + (other.opacity - self.opacity) * share
         deviations = self.deviations + other.deviations + between
-        return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths)
+        return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths, other.seed)
 
 
 def path_trace(
@@ -236,7 +254,7 @@ def _trace(
 
     *numbers, exhausted = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
     radiance, opacity, deviations = (jnp.where(valid, each, jnp.nan) for each in numbers)
-    return PathTraced(radiance, opacity, deviations, exhausted, paths)
+    return PathTraced(radiance, opacity, deviations, exhausted, paths, seed)
 
 
 def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:

@@ -398,5 +398,8 @@ def test_bad_arguments_are_named():
     fails("materials", materials=Material(0.5, 1.0, label=1))
     fails("labels", NOISE, jv.LabelTransferFunction([transfer]), camera, FURNACE)
     flat, rgb = jnp.zeros((4, 4)), jnp.zeros((4, 4, 3))
+    image = jv.PathTraced(rgb, flat, rgb, flat > 0, 2, jnp.uint32(0))
     with pytest.raises(ValueError, match="background"):
-        jv.PathTraced(rgb, flat, rgb, flat > 0, 2).image((1.0, 2.0))
+        image.image((1.0, 2.0))
+    with pytest.raises(ValueError, match="other must be of another key"):
+        image.joined(image)
