@@ -2,6 +2,7 @@
 shading of noise; adaptive strides."""
 
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp

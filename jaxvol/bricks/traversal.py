@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -119,10 +119,10 @@ class Traversal:
         """Each brick that rays need, and their cells there, while the next one is read. Before this one is
         asked for, `at` is set to where rays have come, and the brick dropped."""
         self.rays, self.at, given_back = rays, at, self.bytes_read
-        method: Any = self.request.method
+        method = self.request.method
         if not callable(method):
             method = in_order if self.margin.straight else METHODS[method]
-        schedule: Iterator[Load] = method(self)
+        schedule = cast(Schedule, method)(self)
         load = next(schedule, None)
         while load is not None:
             jax.block_until_ready(self.at)  # or two bricks, and what is made of both, would be in memory
