@@ -74,7 +74,11 @@ def registry() -> dict[str, Dataset]:
 
 
 def names() -> list[str]:
-    """Names of all datasets, sorted."""
+    """Names of all datasets.
+
+    Returns:
+        The names, sorted.
+    """
     return sorted(registry())
 
 

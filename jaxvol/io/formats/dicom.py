@@ -61,7 +61,7 @@ def read_dicom(path: Path) -> dict[str, Any]:
             f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
             f"{len(headers)}."
         )
-    grids = {file: [*h.GetSize(), *h.GetSpacing(), *h.GetDirection()] for file, h in headers.items()}
+    grids = {file: [*h.GetSize(), *h.GetSpacing()[:2], *h.GetDirection()] for file, h in headers.items()}
     first = next(iter(grids))
     for file, grid in grids.items():
         if not np.allclose(grid, grids[first], rtol=1e-4, atol=1e-4):

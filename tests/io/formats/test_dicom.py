@@ -62,7 +62,7 @@ def write_slice(path, values, position, direction=None, tags=None, compressor=No
 
 
 def write_series(folder, direction=None, **options):
-    """Slices under names in another order than theirs. **Returns** their paths, from the first on.
+    """Slices under names in another order than theirs. Returns their paths, from the first on.
 
     GDCM divides by the slope and subtracts the intercept as it writes, so that `VALUES` are read again."""
     folder.mkdir(exist_ok=True)
