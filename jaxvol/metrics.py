@@ -11,7 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from jaxtyping import Float64
 
-from ._util.checks import finite_array, integer, number
+from ._util import checks
 
 
 Image: TypeAlias = Float64[np.ndarray, "height width channels"]
@@ -59,7 +59,7 @@ def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     Raises:
         ValueError: as `rmse`, and for a `data_range` that is not positive.
     """
-    number("data_range", data_range, above=0)
+    checks.number("data_range", data_range, above=0)
     error = rmse(image, reference)
     return 20 * math.log10(data_range / error) if error > 0 else math.inf
 
@@ -82,7 +82,7 @@ def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     """
     from skimage.metrics import structural_similarity  # here, since it imports more slowly than jaxvol
 
-    number("data_range", data_range, above=0)
+    checks.number("data_range", data_range, above=0)
     image, reference = _pair(image, reference)
     _at_least("image", image, 7)
     mean = structural_similarity(reference, image, data_range=data_range, channel_axis=-1)
@@ -105,9 +105,9 @@ def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: fl
     Raises:
         ValueError: for a step or pixel size that is not positive, and slopes that are not finite.
     """
-    number("step", step, above=0)
-    number("pixel_size", pixel_size, above=0)
-    finite_array("depth_slope", depth_slope, (2,))
+    checks.number("step", step, above=0)
+    checks.number("pixel_size", pixel_size, above=0)
+    checks.finite_array("depth_slope", depth_slope, (2,))
     along_x, along_y = map(float, depth_slope)
     return pixel_size * along_x / step, pixel_size * along_y / step
 
@@ -147,8 +147,8 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
     if frequency is None:
         _at_least("error", error, BLOCK)
         return sum(_peaks(error[..., channel]) for channel in range(error.shape[-1]))
-    finite_array("frequency", frequency, (2,))
-    return _comb(error, frequency, integer("harmonics", harmonics, 1))
+    checks.finite_array("frequency", frequency, (2,))
+    return _comb(error, frequency, checks.integer("harmonics", harmonics, 1))
 
 
 def boundary_noise(image: Any, region: Any) -> float:

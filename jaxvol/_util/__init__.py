@@ -1,1 +1,1 @@
-"""Helpers that need nothing else of jaxvol: checks, files, arrays of voxels, tables, random numbers, XLA."""
+"""Helpers that need nothing of jaxvol but `xla`: checks, files, arrays of voxels, tables, random numbers."""

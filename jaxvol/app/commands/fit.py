@@ -58,5 +58,5 @@ def add_fit(commands: Any) -> None:
     parser.add_argument("--points", type=int, default=8, metavar="N", help=text)
     add_clim(parser)
     parser.add_argument("--max-steps", type=int, default=100, metavar="N", help="at most (default: 100)")
-    text = "save every step here; resume from here after an interruption"
+    text = "save the fit here as it goes on; resume from here after an interruption"
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help=text)

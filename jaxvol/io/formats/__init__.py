@@ -130,15 +130,25 @@ def read(path: str | os.PathLike[str] | Any, shape: Any = None, dtype: Any = Non
 def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
     labels = load(path)
-    here, there = (np.asarray(each.bounds) for each in (volume, labels))
+    here, there = map(_corners, (volume, labels))
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
-        raise ValueError(f"labels: {path} must lie where the volume does, within {here}; it has {there}.")
+        raise ValueError(
+            f"labels: {path} must lie where the volume does, with corners {here.tolist()}; it has "
+            f"{there.tolist()}."
+        )
     values = np.asarray(labels.data)
     if values.dtype.kind == "f":
         if not np.array_equal(values, np.rint(values)):
             raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
         values = values.astype(np.int64)
     return Volume(volume.data, volume.spacing, volume.origin, values, direction=volume.direction)
+
+
+def _corners(volume: Volume) -> np.ndarray:
+    """Where the first voxel lies in the world, and the last one along each axis."""
+    direction = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
+    edges = direction * np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
+    return np.asarray(volume.origin) + np.vstack([np.zeros(3), edges.T])
 
 
 def files_of(path: Path) -> list[Path]:

@@ -61,7 +61,7 @@ def read_dicom(path: Path) -> dict[str, Any]:
             f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
             f"{len(headers)}."
         )
-    grids = {file: [*h.GetSize(), *h.GetSpacing(), *h.GetDirection()] for file, h in headers.items()}
+    grids = {file: [*h.GetSize(), *h.GetSpacing()[:2], *h.GetDirection()] for file, h in headers.items()}
     first = next(iter(grids))
     for file, grid in grids.items():
         if not np.allclose(grid, grids[first], rtol=1e-4, atol=1e-4):
@@ -145,8 +145,21 @@ def _check_slice(path: Path, header: Any) -> None:
     n_bytes = int(_text(header, BITS)) // 8 if _text(header, BITS).isdecimal() else 1
     held = path.stat().st_size * (1 if syntax in PLAIN else MOST_COMPRESSED)
     check_size(path, held, math.prod(size) * n_bytes, more=True)
-    if missing := [tag for tag in PLACE if not _text(header, tag)]:
-        raise ValueError(f"path: {path} must say where it lies: it has no element ({missing[0]}).")
+    rows_and_columns = np.reshape(header.GetDirection(), (3, 3))[:, :2].T.ravel()
+    for tag, taken in zip(
+        PLACE, (header.GetOrigin(), rows_and_columns, header.GetSpacing()[1::-1]), strict=True
+    ):
+        text = _text(header, tag)
+        try:
+            told = np.array(text.split("\\"), float)
+        except ValueError:
+            told = np.empty(0)
+        # in place of what it cannot read, SimpleITK takes other numbers
+        if told.shape != (len(taken),) or not np.allclose(told, taken, rtol=1e-3, atol=1e-3):
+            raise ValueError(
+                f"path: {path} must say where it lies: element ({tag}) must be {len(taken)} numbers; got "
+                f"{text[:80]!r}, which SimpleITK takes for {np.round(taken, 4).tolist()}."
+            )
 
 
 def _text(header: Any, tag: str) -> str:

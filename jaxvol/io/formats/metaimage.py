@@ -69,15 +69,14 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
 
 def _numbers(path: Path, fields: dict[str, str], keys: tuple[str, ...], default: np.ndarray) -> np.ndarray:
     """The numbers of the first of these keys that is there, in the shape of `default`."""
-    text = next((fields[key] for key in keys if key in fields), None)
-    if text is None:
+    key = next((key for key in keys if key in fields), None)
+    if key is None:
         return default
     try:
-        return np.array(text.split(), float).reshape(default.shape)
+        return np.array(fields[key].split(), float).reshape(default.shape)
     except ValueError as fault:
-        raise ValueError(
-            f"path: {path}: {keys[0]} must be {default.size} numbers; got {text[:80]!r}."
-        ) from fault
+        got = fields[key][:80]
+        raise ValueError(f"path: {path}: {key} must be {default.size} numbers; got {got!r}.") from fault
 
 
 def _natural(text: str) -> int:

@@ -62,7 +62,7 @@ def write_slice(path, values, position, direction=None, tags=None, compressor=No
 
 
 def write_series(folder, direction=None, **options):
-    """Slices under names in another order than theirs. **Returns** their paths, from the first on.
+    """Slices under names in another order than theirs. Returns their paths, from the first on.
 
     GDCM divides by the slope and subtracts the intercept as it writes, so that `VALUES` are read again."""
     folder.mkdir(exist_ok=True)
@@ -159,6 +159,11 @@ def no_place(folder, paths):
     paths[3].write_bytes(content.replace(b"\x20\x00\x32\x00", b"\x20\x00\x33\x00", 1))
 
 
+def misspell(paths, element):
+    for path in paths:
+        edit(path, element, lambda rest: rest[:4] + b"a" + rest[5:])
+
+
 def huge(folder, paths):
     """65 500 rows and columns in 1.5 kB."""
     for path in paths:
@@ -194,7 +199,15 @@ BAD = {
         lambda folder, paths: edit(
             paths[3], b"\x20\x00", lambda rest: rest.replace(b"\x20\x00\x32\x00", b"\x20\x00\x33\x00", 1)
         ),
-        r"say where it lies: it has no element \(0020\|0032\)",
+        r"say where it lies: element \(0020\|0032\) must be 3 numbers; got ''",
+    ),
+    "no numbers as spacing": (
+        lambda folder, paths: misspell(paths, b"\x28\x00\x30\x00"),
+        r"element \(0028\|0030\) must be 2 numbers; got 'a",
+    ),
+    "no numbers as directions": (
+        lambda folder, paths: misspell(paths, b"\x20\x00\x37\x00"),
+        r"element \(0020\|0037\) must be 6 numbers; got 'a",
     ),
     "HTJ2K": (unreadable, r"is stored in the transfer syntax 1\.2\.840\.10008\.1\.2\.4\.201, which"),
     "huge sizes": (huge, "cannot be read|cut short"),

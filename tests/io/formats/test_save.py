@@ -89,8 +89,13 @@ def test_labels_come_from_another_file(tmp_path):
     np.testing.assert_array_equal(volume.labels, ramp("uint8") % 7)
     np.testing.assert_array_equal(volume.data, ramp("int16"))
     write_itk(tmp_path / "moved.nrrd", ramp("uint8"), SPACING, (0, 0, 0), turn)
+    # the other way round, and within the same bounds
+    low, steps = np.asarray(volume.bounds)[::2], (np.array(ramp().shape) - 1) * SPACING
+    other = low - np.minimum(turn.T * steps, 0).sum(axis=1)
+    write_itk(tmp_path / "turned.nrrd", ramp("uint8"), SPACING, other, turn.T)
     write_itk(tmp_path / "halves.nrrd", ramp("float32") / 2, SPACING, ORIGIN, turn)
-    for name, message in (("moved", "must lie where the volume does"), ("halves", "must hold integers")):
+    away, kind = "must lie where the volume does", "must hold integers"
+    for name, message in (("moved", away), ("turned", away), ("halves", kind)):
         with pytest.raises(ValueError, match=rf"labels: .*{name}\.nrrd {message}"):
             jv.load(tmp_path / "ct.nrrd", labels=tmp_path / f"{name}.nrrd")
     np.save(tmp_path / "ct.npy", ramp("uint8"))
