@@ -102,6 +102,7 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
     # A ray may come back into the volume and leave it before the next of these points: this counts, too.
     returns = [(back, _located(rays, back)) for _, back in rays.gaps]
+    returns = jax.tree.map(lambda of_rays: of_rays[None, None], returns)
     number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
     def depths(index: Int[Array, "cells *rays"]) -> Float[Array, "points cells *rays"]:
@@ -153,7 +154,7 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
         start, low, high = state
         index = start[None] + number
         coordinate, inside = points(index)
-        counts = inside & (enters[None] & (index <= (until + beyond)[None]) & (index >= 0))
+        counts = inside & (enters[None] & (index <= (until + beyond)[None]) & (index >= 0))[None]
         point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
         low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
         high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
