@@ -25,9 +25,7 @@ from ..xla.compiling import compiled
 
 Node = tuple[int, int, int]
 
-SLACK = (
-    3  # steps by which jitter may move samples away from where their cells begin, and one more for rounding
-)
+SLACK = 3  # steps by which jitter may move samples from where their cells begin, and one more for rounding
 EDGE = 16  # bricks are at least so many cells long, and of a multiple of these, where the volume is
 MOST_BRICKS = 2**16  # that a user may ask for: each is searched for along all rays
 

@@ -26,12 +26,7 @@ from .sources import SPACE, VoxelSource
 
 Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 
-METADATA = (
-    "zarr.json",
-    ".zarray",
-    ".zgroup",
-    ".zattrs",
-)  # a Zarr array or group has at least one of these files
+METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")  # a Zarr array or group has at least one of them
 LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
 CACHE = 2**24  # bytes of decoded chunks and indices of shards that are kept, for boxes that share them
 
@@ -171,12 +166,15 @@ def _zarr_array(path: Path, *, axes: Any = None, missing: Any = "error", **how: 
 
 def _ome_zarr_levels(path: Path, **options: Any) -> tuple[VoxelSource, ...]:
     """The levels of the first image in an OME-Zarr group, finest first, in the unit of the file."""
+    if own := [name for name in ("spacing", "origin", "axes") if name in options]:
+        raise TypeError(f"{', '.join(own)}: the OME-Zarr image {path} has its own.")
     try:
         from yaozarrs import v04, v05
     except ImportError as fault:
         raise ImportError(f'{path} is read by yaozarrs: pip install "jaxvol[bricks]".') from fault
     zarr3 = (path / "zarr.json").is_file()
-    metadata = _read_json(path / ("zarr.json" if zarr3 else ".zattrs"))
+    file = path / ("zarr.json" if zarr3 else ".zattrs")
+    metadata = _read_json(file) if file.is_file() else {}
     try:
         model, content = (v05.Image, metadata["attributes"]["ome"]) if zarr3 else (v04.Image, metadata)
         image: Any = model.model_validate(content).multiscales[0]

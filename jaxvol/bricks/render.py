@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import Arrayable, integer
+from .._util.checks import Arrayable, described, integer
 from .._util.memory import memory_of_device
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
@@ -129,6 +129,8 @@ def render_bricks(
     for name, given, known in words:
         if not isinstance(given, str) or given not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
+    if progress is not None and not callable(progress):
+        raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')

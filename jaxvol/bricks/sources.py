@@ -16,7 +16,7 @@ import numpy as np
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, described, finite_array, integer
-from .._util.voxels import DTYPES, check_shape, check_type
+from .._util.voxels import DTYPES, WHOLE, check_shape, check_type
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 
@@ -73,7 +73,14 @@ class VoxelSource:
                 "source must not be traced: bricks have no gradients to voxels (jv.render has), and are not "
                 "read inside jax.jit and jax.vmap. Pass traced spacing and origin to render_bricks itself."
             )
-        if not all(hasattr(array, attribute) for attribute in ("shape", "dtype", "__getitem__")):
+        try:
+            is_array = all(hasattr(array, attribute) for attribute in ("shape", "dtype", "__getitem__"))
+        except Exception as fault:  # of whatever library, such as h5py where the file is closed
+            raise ValueError(
+                f"source must be an array that can be read; got {described(array)} ({fault}). Keep its file "
+                "open."
+            ) from fault
+        if not is_array:
             raise ValueError(
                 f"source must be an array, a Volume, a VoxelSource or a path; got {described(array)}."
             )
@@ -108,11 +115,11 @@ class VoxelSource:
         self._summary: Any = None  # found by `summary.summary_of`
 
     def _file_state(self) -> tuple[int, int] | None:
-        """Size and time of the file under a read-only memory map."""
-        if self._map is not None and self._map.mode == "r":
+        """Size of the file under a memory map, and the time of the last change where the map is read-only."""
+        if self._map is not None:
             with suppress(OSError, TypeError):  # the file was removed, or has no name: only the map has it
                 found = os.stat(self._map.filename)  # pyright: ignore[reportArgumentType]
-                return found.st_size, found.st_mtime_ns
+                return found.st_size, found.st_mtime_ns if self._map.mode == "r" else 0
         return None
 
     def check_unchanged(self) -> None:
@@ -136,14 +143,18 @@ class VoxelSource:
             not write to it.
 
         Raises:
-            ValueError: for a box that is empty or exceeds the volume; for voxels that are NaN or infinite;
-                where the array raises anything; and if the file under a memory map was written to since the
-                source was made.
+            ValueError: for a box that is empty or exceeds the volume; for voxels that are NaN, infinite, or
+                whole numbers that float32 does not hold; where the array raises anything or returns another
+                shape; and if the file under a memory map was written to since the source was made.
         """
-        box = tuple(map(operator.index, low)), tuple(map(operator.index, high))
-        if not all(0 <= a < b <= n for a, b, n in zip(*box, self.shape, strict=True)):
+        try:
+            box = tuple(map(operator.index, low)), tuple(map(operator.index, high))
+            within = all(0 <= a < b <= n for a, b, n in zip(*box, self.shape, strict=True))
+        except (TypeError, ValueError):
+            within = False
+        if not within:
             raise ValueError(
-                "low and high must be the corners of a box of at least one voxel within "
+                "low and high must be the corners of a box of at least one voxel, three integers each within "
                 f"{self.shape}, `high` exclusive; got {low!r} and {high!r}."
             )
         if self._in_memory:
@@ -186,26 +197,40 @@ class VoxelSource:
             yield (x[0], y[0], z[0]), (x[1], y[1], z[1])
 
     def _read_at_once(self, box: Box, axes: Axes) -> np.ndarray:
-        index: list[Any] = list(self._index)
+        index, size = list[Any](self._index), dict[int, int]()
         for a, b, axis in zip(*box, self._place, strict=True):
-            index[axis] = slice(a, b)
+            index[axis], size[axis] = slice(a, b), b - a
+        where = f"from {box[0]} to {box[1]}"
         try:
             given = self.array[tuple(index)]
             found = np.asarray(given)
         except Exception as fault:  # of whatever library
             raise ValueError(
-                f"{self.name}: the voxels from {box[0]} to {box[1]} cannot be read ({fault}). Fetch it "
-                'again, or pass missing="fill" if the chunks of Zarr were left out that hold the fill value.'
+                f"{self.name}: the voxels {where} cannot be read ({fault}). Fetch it again; or, where Zarr "
+                'left out chunks of only the fill value, pass missing="fill".'
             ) from fault
+        expected = tuple(size[axis] for axis in sorted(size))
+        if found.shape != expected:
+            raise ValueError(
+                f"{self.name}: the voxels {where} must have the shape {expected}; its array returns "
+                f"{found.shape}."
+            )
         if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
-            raise ValueError(f"{self.name}: voxels from {box[0]} to {box[1]} are masked. Fill them first.")
+            raise ValueError(f"{self.name}: voxels {where} are masked. Fill them first.")
+        if self.dtype == np.float32 and found.dtype.kind in "iu":
+            (least, most), (low, high) = WHOLE["float32"], (int(found.min()), int(found.max()))
+            if low < least or high > most:
+                raise ValueError(
+                    f"{self.name}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds "
+                    f"exactly; got {found.dtype} from {low} to {high} {where}."
+                )
         rank = [sorted(self._place).index(axis) for axis in self._place]
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             voxels = np.ascontiguousarray(found.transpose(permuted(rank, axes)), self.dtype)
         if self.dtype.kind not in "iu" and not np.isfinite(voxels).all():
             raise ValueError(
-                f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite from "
-                f"{box[0]} to {box[1]}. Replace them first."
+                f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite "
+                f"{where}. Replace them first."
             )
         return voxels
 

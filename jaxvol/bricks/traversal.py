@@ -14,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Int
 
+from .._util.files import MOST_VOXELS
 from .._util.memory import give_back
 from ..engine import devices
 from ..engine.tiling import RenderOptions, Tiling
@@ -27,7 +28,7 @@ from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
 from .cells import BrickCells, CurvedRays, Visit, curved_cells, padded, straight_cells
-from .grid import MOST_VOXELS, BrickGrid, Margin, Node, divided, split, stored_shape
+from .grid import BrickGrid, Margin, Node, divided, split, stored_shape
 from .sources import READERS, VoxelSource
 from .summary import summary_of
 
@@ -39,9 +40,7 @@ Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
 BEAMS = 32  # of curved rays, searched at a time: it takes as long as the longest of these
-BATCH = (
-    72  # `Tiling.batch` on a CPU: few rays meet a brick, and the last batch lasts as long as its longest ray
-)
+BATCH = 72  # `Tiling.batch` on a CPU: few rays meet a brick; the last batch lasts as long as its longest ray
 KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
 
 

@@ -222,6 +222,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
         "farthest_read",
     ),
     ({"compositing": "over!"}, "compositing must be one of"),
+    ({"progress": 5}, "progress must be a function"),
     ({"own": "bricks"}, "devices="),
     (
         {"own": "bricks", "devices": jax.devices(), "march": jv.March(1.0, (jv.EmptySpaceJitter(0),))},

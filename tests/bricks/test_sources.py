@@ -114,6 +114,14 @@ def kinds_of_arrays(data, folder):
         yield file.create_dataset("b", data=turned), {"axes": "zxy"}
 
 
+def test_an_array_of_a_file_that_is_closed_is_refused(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        array = file.create_dataset("a", data=voxels())
+    with pytest.raises(ValueError, match=r"source must be an array that can be read; .*Keep its file open"):
+        source_of(array)
+
+
 def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatch):
     monkeypatch.setattr(sources, "AT_ONCE", 3000)
     data = voxels("int16")
@@ -145,6 +153,13 @@ def test_axes_beside_space_are_not_what_is_read_in_layers(monkeypatch):
 
 def test_what_an_array_returns_is_checked():
     data = voxels("uint8", (8, 8, 8))
+
+    class Clipped(OfOurOwn):
+        def __getitem__(self, box):
+            return self.data[box][:1]
+
+    with pytest.raises(ValueError, match=r"must have the shape \(4, 4, 4\).*its array returns \(1, 4, 4\)"):
+        source_of(Clipped(data)).read((0, 0, 0), (4, 4, 4))
     masked = OfOurOwn(np.ma.masked_equal(data, data[1, 2, 3]))
     with pytest.raises(ValueError, match=r"from \(0, 0, 0\) to \(8, 8, 8\) are masked"):
         source_of(masked).read((0, 0, 0), (8, 8, 8))
@@ -189,6 +204,9 @@ def test_memory_maps_are_read_and_not_held(tmp_path):
     source = source_of(written)
     written[:] = data
     assert_reads(source, data)
+    os.truncate(tmp_path / "other", 100)  # to read it would end the process
+    with pytest.raises(ValueError, match="changed after it was opened"):
+        source.read((0, 0, 0), (1, 1, 1))
 
 
 def test_spacing_and_origin(tmp_path):
@@ -230,6 +248,7 @@ def test_types_that_no_volume_has_are_converted_or_refused():
 @pytest.mark.parametrize(
     ("dtype", "wrong", "message"),
     [
+        (np.int64, 2**24 + 1, r"from -2\*\*24 to 2\*\*24.*from 0 to 16777217 from \(19, 2, 0\)"),
         (np.float16, np.nan, r"must be finite.* from \(19, 2, 0\)"),
         (np.float32, np.inf, r"must be finite.* from \(19, 2, 0\)"),
         (ml_dtypes.bfloat16, -np.inf, r"must be finite.* from \(19, 2, 0\)"),
@@ -253,6 +272,9 @@ def test_what_is_no_box_is_refused():
     for low, high in (((0, 0, 0), (24, 17, 31)), ((-1, 0, 0), (2, 2, 2)), ((3, 3, 3), (3, 4, 4))):
         with pytest.raises(ValueError, match="low and high must be the corners of a box"):
             source.read(low, high)
+    for low in ((0, 0), 0, (0.5, 0, 0), None):
+        with pytest.raises(ValueError, match=r"corners of a box .* three integers each"):
+            source.read(low, (1, 1, 1))
 
 
 def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_path):

@@ -133,6 +133,10 @@ def test_what_is_no_zarr_array_or_cannot_be_read_says_so(tmp_path, monkeypatch):
     zarr.create_group(tmp_path / "e")
     with pytest.raises(ValueError, match=r"does not follow OME-Zarr 0\.5"):
         source_of(tmp_path / "e")
+    zarr.create_group(tmp_path / "g", zarr_format=2)
+    (tmp_path / "g" / ".zattrs").unlink(missing_ok=True)
+    with pytest.raises(ValueError, match=r"does not follow OME-Zarr 0\.4 .*such as its folder 0"):
+        source_of(tmp_path / "g")
     zarr.create_group(tmp_path / "f", attributes={"ome": {"bioformats2raw.layout": 3}})
     with pytest.raises(ValueError, match="such as its folder 0"):
         source_of(tmp_path / "f")
@@ -188,6 +192,8 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
         assert_reads(source, data)
         np.testing.assert_allclose(source.spacing, np.array([0.3, 0.4, 2.0]) * 2**number)
         np.testing.assert_allclose(source.origin, np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
+    with pytest.raises(TypeError, match=r"^spacing, origin: the OME-Zarr image .* has its own"):
+        levels_of(path, spacing=(3, 4, 10), origin=(1, 1, 1))
     # transformations of all levels come after their own
     outer = [{"type": "scale", "scale": [10] * len(axes)}]
     outer += [{"type": "translation", "translation": [3] * len(axes)}]
