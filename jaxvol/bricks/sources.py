@@ -147,11 +147,10 @@ class VoxelSource:
                 whole numbers that float32 does not hold; where the array raises anything or returns another
                 shape; and if the file under a memory map was written to since the source was made.
         """
-        try:
+        box, within = ((), ()), False
+        with suppress(TypeError, ValueError):
             box = tuple(map(operator.index, low)), tuple(map(operator.index, high))
             within = all(0 <= a < b <= n for a, b, n in zip(*box, self.shape, strict=True))
-        except (TypeError, ValueError):
-            within = False
         if not within:
             raise ValueError(
                 "low and high must be the corners of a box of at least one voxel, three integers each within "
