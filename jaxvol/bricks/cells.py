@@ -28,7 +28,7 @@ Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " b
 through them to it. The masks are of all bricks, and of what lies outside of the volume."""
 
 CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
-"""Rays, where their march has come to, and to which cell of each ray bricks have been found."""
+"""Rays, at their entries but for which are finished, and to which cell of each ray bricks have been found."""
 
 
 class BrickCells(NamedTuple):
