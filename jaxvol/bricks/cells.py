@@ -28,7 +28,7 @@ Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " b
 through them to it. The masks are of all bricks, and of what lies outside of the volume."""
 
 CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
-"""Rays, where their march has come to, and to which cell of each ray bricks have been found."""
+"""Rays, at their entries but for which are finished, and to which cell of each ray bricks have been found."""
 
 
 class BrickCells(NamedTuple):
@@ -101,22 +101,25 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
     fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
     # A ray may come back into the volume and leave it before the next of these points: this counts, too.
-    returns = [_Return.of(grid, rays, back) for _, back in rays.gaps]
+    returns = [(back, _located(rays, back)) for _, back in rays.gaps]
+    returns = jax.tree.map(lambda of_rays: of_rays[None, None], returns)
     number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
+    def depths(index: Int[Array, "cells *rays"]) -> Float[Array, "points cells *rays"]:
+        return jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
+
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
-        depth = jnp.stack([(offset[None] + index.astype(offset.dtype)) * march.step for offset in offsets])
-        return jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        depth, end = depths(index), depths(index + 1)
+        found = jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        every = [found]
+        for back, located in returns:
+            within = (depth <= back) & (back < end)
+            every += [jax.tree.map(lambda a, b, within=within: jnp.where(within, a, b), located, found)]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *every)
 
     def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
         coordinate, inside = points(index)
-        found = jnp.where(inside, grid.brick_of(coordinate), grid.number)
-        more = [
-            jnp.where(back.within(index, offset, march.step), back.brick, grid.number)
-            for back in returns
-            for offset in fronts
-        ]
-        return jnp.concatenate([found, jnp.stack(more)]) if more else found
+        return jnp.where(inside, grid.brick_of(coordinate), grid.number)
 
     def ahead(index: Int[Array, "cells *rays"]) -> Bool[Array, "cells *rays"]:
         front = index.astype(rays.length.dtype) * march.step
@@ -142,20 +145,19 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
 
     first, _ = while_in(empty, reached, ~at.finished)
     here = jnp.any(bricks(first[None])[:, 0] == brick, axis=0)
-    # where its points lie in several bricks, the first one that is visited takes the cell
+    # where its points lie in several bricks, the cell belongs to the first one that is visited
     enters = ~at.finished & here & ahead(first[None])[0]
-    _, until = while_in(passable, first, enters)
+    _, until = while_in(passable, first + 1, enters)
     until = jnp.maximum(until, first + 1)
 
     def widen(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         start, low, high = state
         index = start[None] + number
         coordinate, inside = points(index)
-        counts = enters[None] & (index <= (until + beyond)[None]) & (index >= 0)
-        low, high = _around(low, high, coordinate, inside & counts[None])
-        for back in returns:
-            held = [back.within(index, offset, march.step) & counts for offset in fronts]
-            low, high = _around(low, high, back.coordinate, jnp.any(jnp.stack(held), axis=(0, 1)))
+        counts = inside & (enters[None] & (index <= (until + beyond)[None]) & (index >= 0))[None]
+        point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
+        low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
+        high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
         return start + CHUNK, low, high
 
     nothing = jnp.full(3, jnp.inf, rays.length.dtype)
@@ -171,36 +173,3 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
 def _located(rays: Ray, depth: Float[Array, "*rays"]) -> tuple[Vec3, Bool[Array, "*rays"]]:
     """Grid coordinates of points on rays, and whether these lie in the volume."""
     return vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)
-
-
-class _Return(NamedTuple):
-    """Where rays come back into the volume: depth, grid coordinate and brick, and whether they do."""
-
-    depth: Float[Array, "*rays"]
-    coordinate: Vec3
-    brick: Int[Array, "*rays"]
-    there: Bool[Array, "*rays"]
-
-    @classmethod
-    def of(cls, grid: BrickGrid, rays: Ray, depth: Float[Array, "*rays"]) -> "_Return":
-        known = jnp.isfinite(depth)
-        depth = jnp.where(known, depth, 0)
-        coordinate, inside = _located(rays, depth)
-        return cls(depth, coordinate, grid.brick_of(coordinate), known & inside)
-
-    def within(
-        self, index: Int[Array, "cells *rays"], offset: Float[Array, "*rays"], step: Float[Array, ""]
-    ) -> Bool[Array, "cells *rays"]:
-        """Whether that is in cells that begin at `offset` + index."""
-        front, back = ((offset[None] + (index + more).astype(offset.dtype)) * step for more in (0, 1))
-        return self.there[None] & (front <= self.depth[None]) & (self.depth[None] < back)
-
-
-def _around(
-    low: Float[Array, "3"], high: Float[Array, "3"], coordinate: Vec3, counts: Bool[Array, "..."]
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """A box, and the points that count."""
-    point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
-    low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
-    high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
-    return low, high

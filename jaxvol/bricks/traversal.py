@@ -18,7 +18,7 @@ from .._util.files import MOST_VOXELS
 from .._util.memory import give_back
 from ..engine import devices
 from ..engine.tiling import RenderOptions, Tiling
-from ..engine.wavefront import CellRange
+from ..engine.wavefront import CellRange, with_fields
 from ..march.march import March
 from ..ray import Progress, Scene
 from ..scene.camera import Camera
@@ -73,6 +73,7 @@ class Traversal:
     without voxels."""
 
     rays: Ray
+    start: Progress  # at their entries
     at: Progress  # how far they have been marched
 
     def __init__(self, request: Request, shown: Scene):
@@ -117,7 +118,7 @@ class Traversal:
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
         """Each brick that rays need, and their cells there, while the next one is read. Before this one is
         asked for, `at` is set to where rays have come, and the brick dropped."""
-        self.rays, self.at, given_back = rays, at, self.bytes_read
+        self.rays, self.start, self.at, given_back = rays, at, at, self.bytes_read
         method = self.request.method
         if not callable(method):
             method = in_order if self.margin.straight else METHODS[method]
@@ -159,7 +160,9 @@ class Traversal:
         """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
         visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty)
         mesh, march = self.options.tiling.devices, self.scene.march
-        found = _curved(mesh, self.grid, beyond, march, (self.rays, self.at, reached), visit)
+        # with their shift still ahead, or a cell that waits for a brick would leave it when its ray shifts
+        at = with_fields(self.start, finished=self.at.finished)
+        found = _curved(mesh, self.grid, beyond, march, (self.rays, at, reached), visit)
         return found if bool(found.any) else None
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:

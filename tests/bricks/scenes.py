@@ -195,7 +195,7 @@ SHEETS = jv.TransferFunction.from_points(
     [(0.2, RED, 0.0), (0.25, RED, 0.05), (0.5, RED, 0.05), (0.55, BLUE, 0.05), (1.0, BLUE, 0.05)], 0.5
 )
 FROM_THE_SIDE = jv.Camera((120, 10, 40), (11.5, 7.5, 28), (0, 0, 1), 30.0, size=SIZE)
-CURVED = jv.March(0.5, (Bent(jnp.asarray(0.12)), jv.Jitter(0)))
+CURVED = jv.March(0.5, (Bent(jnp.asarray(0.12)), jv.EmptySpaceJitter(0)))
 
 
 @cache
