@@ -252,7 +252,7 @@ def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, reques
         )
     traversal = Traversal(request, scene)
     options, whole = traversal.options, of_all_outputs(rendering, cotangent)
-    if not scene.march.leaps:  # the gradient by an extinction of 0 is not 0
+    if not scene.march.leaps:  # the gradient with respect to an extinction of 0 is not 0
         traversal.visible = np.ones_like(traversal.visible)
     sums, replay = _begin_vjp(scene, perturbed, options, rendering, whole)
     for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
