@@ -42,7 +42,7 @@ class Material(eqx.Module):
             Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
             tracing. Scatterer templates need an opacity above 0, see their `threshold`.
         mean_free_path: λ, the mean distance between scatterings, world length, > 0.
-        refractive_index: > 0; 1 in air.
+        refractive_index: positive; 1 in air.
         values: (low, high), the range of volume values that are this material, low < high.
         label: the volume's label for this material. Without `values` or `label`, it is everywhere.
 

@@ -45,7 +45,7 @@ class Phong(Shading):
         ambient: ≥ 0. Names and defaults are those of `vtkVolumeProperty`.
         diffuse: ≥ 0.
         specular: ≥ 0.
-        specular_power: > 0.
+        specular_power: positive.
 
     Raises:
         ValueError: for other lights, and for numbers that are negative, NaN or infinite.
