@@ -10,6 +10,7 @@ Demmel et al. 2012). A residual of n + 1 numbers with the Jacobian [R; 0] thus r
 exactly, for any solver; unlike JᵀJ, it does not square the condition number.
 """
 
+import inspect
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, cast
@@ -95,8 +96,10 @@ class ImageResidual(eqx.Module):
         compositing: Mode | Compositing[Any] | Any = "over",
         blur: Arrayable | None = None,
     ):
-        if not callable(scene):
-            raise ValueError(f"scene must be a function of parameters and camera; got {scene!r}.")
+        try:
+            inspect.signature(scene).bind(None, None)
+        except TypeError as fault:
+            raise ValueError(f"scene must be a function of (parameters, camera); got {scene!r}.") from fault
         self.scene = cast(Any, scene)
         self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)

@@ -301,6 +301,7 @@ BAD = [
     (lambda: images(BLANK.astype(np.uint8)), r"views\[0\]: .*, floats .*; got uint8.*from_srgb"),
     (lambda: images(view=1), r"views\[0\] must be a pair .*got a tuple"),
     (lambda: images(scene=3), "scene must be a function"),
+    (lambda: images(scene=lambda transfer: transfer), r"scene must be a function of \(parameters, camera\)"),
     (lambda: images(blur=-0.1), "blur must not be negative"),
     (lambda: jv.ImageResidual(seen, []), "views must hold at least one pair"),
     (lambda: jv.ImageResidual(seen, [BLANK]), r"views\[0\] must be a pair"),
