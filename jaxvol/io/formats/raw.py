@@ -46,9 +46,8 @@ def raw_header(
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
             f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
-            f'and dtype="uint8" (--shape, --dtype), or name it name_XxYxZ_dtype.raw, or put {path.name}.json in '
-            "its folder with "
-            '{"size": [nx, ny, nz], "type": "uint8"}.'
+            'and dtype="uint8" (--shape, --dtype), or name it name_XxYxZ_dtype.raw, or put '
+            f'{path.name}.json in its folder with {{"size": [nx, ny, nz], "type": "uint8"}}.'
         )
     shape, dtype = fields.pop("shape"), fields.pop("dtype")
     try:
