@@ -129,10 +129,10 @@ def number(
     )
 
 
-def not_negative(name: str, value: Arrayable) -> Array:
-    """`value` as a finite scalar of at least 0."""
-    message = f"{name} must not be negative; got {{got}}."
-    return require(finite_array(name, value, ()), lambda scalar: scalar >= 0, message)
+def not_negative(name: str, value: Arrayable, shape: tuple[int, ...] = ()) -> Array:
+    """`value` as an array of finite numbers of at least 0; by default a scalar."""
+    array = finite_array(name, value, shape)
+    return require(array, lambda v: v >= 0, f"{name} must not be negative; got {{got}}.")
 
 
 def increasing(name: str, value: Arrayable) -> Array:

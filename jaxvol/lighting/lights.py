@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, finite_array, require
+from .._util.checks import Arrayable, finite_array, not_negative, require
 from .._util.vec3 import Scalar, Vec3, apart
 
 
@@ -145,9 +145,3 @@ def lights_of(lights: Any, excluded: type[Light] = HeadLight) -> tuple[Light, ..
                 f"lights must hold jaxvol lights, of any kind but {excluded.__name__}; got {light!r}."
             )
     return tuple(several)
-
-
-def not_negative(name: str, value: Arrayable, shape: tuple[int, ...]) -> Array:
-    """`value` as an array of numbers ≥ 0."""
-    array = finite_array(name, value, shape)
-    return require(array, lambda v: v >= 0, f"{name} must not be negative; got {{got}}.")

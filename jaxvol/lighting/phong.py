@@ -5,11 +5,11 @@ from typing import Any, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
 
-from .._util.checks import Arrayable, number
+from .._util.checks import Arrayable, not_negative, number
 from .._util.vec3 import Vec3, dot, plus, scaled, times
 from ..scene.space import world_gradient
 from ..xla.memory import packed_pair, unpacked_pair
-from .lights import ConstantLight, HeadLight, Light, lights_of, not_negative
+from .lights import ConstantLight, HeadLight, Light, lights_of
 from .shading import Sample, Shading, Surroundings
 
 
@@ -69,9 +69,9 @@ class Phong(Shading):
         specular_power: Arrayable = 10.0,
     ):
         self.lights = lights_of(HeadLight() if lights is None else lights, excluded=ConstantLight)
-        self.ambient = not_negative("ambient", ambient, ())
-        self.diffuse = not_negative("diffuse", diffuse, ())
-        self.specular = not_negative("specular", specular, ())
+        self.ambient = not_negative("ambient", ambient)
+        self.diffuse = not_negative("diffuse", diffuse)
+        self.specular = not_negative("specular", specular)
         self.specular_power = number("specular_power", specular_power, above=0)
 
     @property

@@ -10,6 +10,8 @@ from ..bricks.opening import Openable, source_of
 from ..bricks.render import budget, scene_of
 from ..bricks.sources import VoxelSource
 from ..bricks.traversal import Request, Traversal
+from ..compositing.blending import Compositing
+from ..lighting.shading import Lighting
 from ..march.march import March
 from ..scene.camera import Camera
 from ..scene.rendering import BrickReport
@@ -40,16 +42,24 @@ def read_within(volume: Openable, memory: Any) -> tuple[Volume, VoxelSource, int
 
 
 def with_bricks(
-    source: VoxelSource, transfer: Transfer, camera: Camera, march: March, stride: int, **how: Any
+    source: VoxelSource,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
+    stride: int,
+    *,
+    memory: int,
+    compositing: Compositing[Any],
+    lighting: Lighting | None,
 ) -> tuple[March, BrickReport]:
     """The march that was planned for a copy of every n-th voxel, with steps of 1/n, and shorter ones if
-    bricks fit only then; and the bricks. `how`: `memory`, `compositing` and `lighting`."""
+    bricks fit only then; and the bricks."""
     finer = stride
     while True:
         shorter = March(jnp.asarray(march.step) / finer, march.transforms, march.quadrature)
         try:
-            scene = scene_of(source, transfer, camera, shorter, how["compositing"], how["lighting"])
-            return shorter, Traversal(Request(source, how["memory"]), scene).report()
+            scene = scene_of(source, transfer, camera, shorter, compositing, lighting)
+            return shorter, Traversal(Request(source, memory), scene).report()
         except TooLittleMemory:  # what is read around a brick is a number of steps
             if finer == stride * 2**HALVED:
                 raise

@@ -228,8 +228,8 @@ def plan(
         parts.append(Part("EarlyTermination", bool(share), f"{opaque:.1%} of the pixels become opaque"))
     bricks = None
     if source is not None and room is not None and stride > 1:
-        how = {"memory": room, "compositing": scene.compositing, "lighting": lighting}
-        march, bricks = with_bricks(source, transfer, camera, march, stride, **how)
+        seen: Any = {"compositing": scene.compositing, "lighting": lighting}
+        march, bricks = with_bricks(source, transfer, camera, march, stride, memory=room, **seen)
     return Plan(
         march=march,
         volume=volume,
