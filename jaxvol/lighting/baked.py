@@ -105,7 +105,7 @@ def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighti
     ratios = jnp.stack(chosen.fold(chunk, (zeros, zeros, zeros)), axis=-1).reshape(nx, ny, nz, 3)
     known = visible.astype(ratios.dtype).reshape(nx, ny, nz, 1)
     for _ in range(DILATION):  # each node that borders known ones gets the mean of their ratios
-        total, number = _sum_neighbors(ratios * known), _sum_neighbors(known)
+        total, number = sum_neighbors(ratios * known), sum_neighbors(known)
         ratios = jnp.where(known > 0, ratios, total / jnp.maximum(number, 1))
         known = (number > 0).astype(ratios.dtype)
     # XLA's maximum of a large array skips NaN on CPUs
@@ -116,7 +116,7 @@ def bake(shading: Shading, around: Surroundings, resolution: int) -> BakedLighti
     return BakedLighting(words, highest, (nx, ny, nz))
 
 
-def _sum_neighbors(values: Float[Array, "nx ny nz c"]) -> Float[Array, "nx ny nz c"]:
+def sum_neighbors(values: Float[Array, "nx ny nz c"]) -> Float[Array, "nx ny nz c"]:
     """Sum over each node and its 26 neighbours."""
     for window in ((3, 1, 1, 1), (1, 3, 1, 1), (1, 1, 3, 1)):
         values = jax.lax.reduce_window(values, 0.0, jax.lax.add, window, (1, 1, 1, 1), "SAME")

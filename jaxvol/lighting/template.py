@@ -9,9 +9,10 @@ volume rendering (2016), section 3.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any, Literal, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -19,11 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from .._util.checks import integer, number
+from .._util.checks import Arrayable, integer, number
 from .._util.vec3 import Scalar, golden_spiral, turned
 from ..xla.platform import is_traced
 from .materials import Material, Optics, materials_of, optics_of, smoothstep
+from .random_walks import unit_walks
 
+
+Form = Literal["published", "transport"]
 
 FADES = 0.8
 """A photon fades out between the threshold and this fraction of it."""
@@ -38,10 +42,12 @@ class ScattererTemplate(eqx.Module):
     Attributes:
         offset: from the sample, world length.
         intensity: the fraction of the light that each photon holds; 0 for padding.
+        parent: the photon from which light comes to each, -1 for the first; None where it is not kept.
     """
 
     offset: Float[Array, "*templates n 3"]
     intensity: Float[Array, "*templates n"]
+    parent: Int[Array, "*templates n"] | None = None
 
     def sorted(self) -> "ScattererTemplate":
         """The same photons, brightest first."""
@@ -92,6 +98,8 @@ def scatterer_template(
     threshold: float = 0.01,
     merge: float = MERGE,
     levels: int | None = None,
+    form: Form | Any = "published",
+    anisotropy: Arrayable = 0.0,
 ) -> ScattererTemplate:
     """Simulate how light spreads around a point inside a material.
 
@@ -118,6 +126,12 @@ def scatterer_template(
         merge: photons closer than this fraction of λ are merged, as in the paper's tables.
         levels: of the tree; required if the opacity is traced. By default as many as leave photons above the
             threshold.
+        form: `"published"`, or `"transport"`, which is ours: the photons are the vertices of `packets` random
+            walks, the first of them the point itself, and keep their `parent`. Flights are as long as above;
+            directions follow the phase function, and nothing is merged. Of the light, α (1 - α)^k is at the
+            k-th vertices, so that the sum over photons inside a homogeneous object, all of whose ancestors are
+            inside, estimates multiple scattering without bias.
+        anisotropy: g of the phase function (Henyey and Greenstein), in (-1, 1), for `"transport"`.
 
     Returns:
         A `ScattererTemplate`, differentiable in the material's mean free path, opacity and refractive index
@@ -127,9 +141,8 @@ def scatterer_template(
         ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
             a traced opacity, intensities are then NaN.
     """
-    tree = PacketTree(packets, threshold)
-    levels = tree.levels_of((material,), levels)
-    return tree.template(material.optics, _key(key), levels, merge)
+    of_template, levels = _simulation((material,), packets, threshold, merge, levels, form, anisotropy)
+    return of_template(material.optics, _key(key), levels)
 
 
 def scatterer_templates(
@@ -141,6 +154,8 @@ def scatterer_templates(
     threshold: float = 0.01,
     merge: float = MERGE,
     levels: int | None = None,
+    form: Form | Any = "published",
+    anisotropy: Arrayable = 0.0,
 ) -> ScattererTemplate:
     """Several templates for each of several materials, simulated at once.
 
@@ -152,6 +167,8 @@ def scatterer_templates(
         threshold: as for `scatterer_template`.
         merge: as for `scatterer_template`.
         levels: as for `scatterer_template`.
+        form: as for `scatterer_template`.
+        anisotropy: as for `scatterer_template`.
 
     Returns:
         A `ScattererTemplate` with leading axes (materials, count).
@@ -160,15 +177,77 @@ def scatterer_templates(
         ValueError: as `scatterer_template` does.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
-    tree = PacketTree(packets, threshold)
-    levels = tree.levels_of(materials, levels)
+    of_template, levels = _simulation(materials, packets, threshold, merge, levels, form, anisotropy)
 
     def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
-        return tree.template(optics, draws, levels, merge)
+        return of_template(optics, draws, levels)
 
     several = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)), in_axes=(0, 0, None))
     return several(optics_of(materials), jnp.arange(len(materials)), jnp.arange(count))
+
+
+def _simulation(
+    materials: Sequence[Material],
+    packets: int,
+    threshold: float,
+    merge: float,
+    levels: int | None,
+    form: Any,
+    anisotropy: Arrayable,
+) -> tuple[Callable[[Optics, PRNGKeyArray, int], ScattererTemplate], int]:
+    """What simulates one template, and its number of levels."""
+    check_form(form)
+    tree = PacketTree(packets, threshold)
+    g = number("anisotropy", anisotropy, above=-1, below=1)
+    if form == "transport":
+        return partial(walk_template, packets=tree.packets, anisotropy=g), scatterings(
+            materials, tree.threshold, levels
+        )
+    if not isotropic(anisotropy):
+        raise ValueError(f'anisotropy is of form="transport"; form="published" follows refraction; got {g}.')
+    return partial(tree.template, merge=merge), tree.levels_of(materials, levels)
+
+
+def isotropic(anisotropy: Any) -> bool:
+    """Whether an anisotropy is known to be 0 when a program is traced."""
+    return isinstance(anisotropy, int | float | np.number) and anisotropy == 0
+
+
+def check_form(form: Any) -> None:
+    """Raise `ValueError` for what is no `Form`."""
+    if form not in get_args(Form):
+        raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
+
+
+def scatterings(materials: Sequence[Material], threshold: float, levels: int | None) -> int:
+    """Number of scatterings of a random walk: as given, or after which less than `threshold` of the light is
+    left in any of the materials. **Raises** `ValueError` where that depends on a traced opacity, or is never."""
+    if levels is not None:
+        return integer("levels", levels, 1)
+    if is_traced([material.opacity for material in materials]):
+        raise ValueError("levels must be given where opacity is traced: the length of walks depends on it.")
+    least = min(float(material.opacity) for material in materials)
+    if least == 0:
+        raise ValueError("levels must be given for a material of opacity 0, in which no light is absorbed.")
+    return 1 if least == 1 else max(1, math.ceil(math.log(threshold) / math.log(1 - least)))
+
+
+def walk_template(
+    optics: Optics, key: PRNGKeyArray, levels: int, packets: int, anisotropy: Scalar
+) -> ScattererTemplate:
+    """The template of `form="transport"`."""
+    directions, lengths = unit_walks(key, 1, packets, levels, anisotropy)
+    vertices = jnp.cumsum(directions[0] * lengths[0, ..., None], axis=1) * optics.mean_free_path
+    by_level = jnp.moveaxis(vertices, 0, 1).reshape(-1, 3)
+    k = jnp.repeat(jnp.arange(1, levels + 1), packets)
+    light = optics.opacity * (1 - optics.opacity) ** k.astype(by_level.dtype) / packets
+    parents = jnp.maximum(jnp.arange(1, k.size + 1) - packets, 0)
+    return ScattererTemplate(
+        jnp.concatenate([jnp.zeros((1, 3), by_level.dtype), by_level]),
+        jnp.concatenate([optics.opacity[None], light]),
+        jnp.concatenate([jnp.full(1, -1), parents]),
+    )
 
 
 Packets: TypeAlias = tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, " n"]]

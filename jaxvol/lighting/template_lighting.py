@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import flag, integer, is_flag, number
+from .._util.checks import Arrayable, flag, integer, is_flag, number
 from ..march.march import March, Transform
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
@@ -27,7 +27,20 @@ from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
 from .photons import Occlusion, PhotonShading
 from .shading import Lighting, Shading, Surroundings
-from .template import PacketTree, ScattererTemplate, scatterer_templates
+from .template import (
+    Form,
+    PacketTree,
+    ScattererTemplate,
+    check_form,
+    isotropic,
+    scatterer_templates,
+    scatterings,
+)
+from .transport import Transport
+
+
+NODES = 48
+"""Nodes of the grid of `form="transport"`, along the volume's longest side."""
 
 
 class ScattererTemplates(Lighting):
@@ -59,6 +72,23 @@ class ScattererTemplates(Lighting):
     sum once. Where it fails: `experiments/stability.py`, "long mean free paths",
     "short mean free paths".
 
+    **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths found from
+    path-traced images are the true ones. The medium is that of `path_trace` with these materials: the
+    extinction is 1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the transfer
+    function's, and samples in no material are lit, too. (Only the rays of the camera meet the transfer
+    function's extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices
+    of random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
+    counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
+    half-space's reflectance. Where the medium changes along a flight, weights make up for it. Light that was
+    scattered before is computed on a grid of `baked` nodes, of which each turns a template at random; direct
+    light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`, `occlusion`, `reach`, `cutoff`
+    and `given` are of the published form alone.
+    Its bias: the light of the last `levels`, at most `threshold` of all; the grid, whose nodes should be no
+    further apart than the mean free path; optical depths along flights, by Simpson's rule, which miss gaps
+    narrower than a flight; with anisotropy, the directions of scattered light up to spherical harmonics of
+    order 2. What it is against path tracing: `docs/methods.md`. Points at which the extinction becomes 0 do
+    not move under the derivative; edges of materials do.
+
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
     show, since invisible points are not lit.
@@ -82,14 +112,17 @@ class ScattererTemplates(Lighting):
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
             misses the photons that are skipped.
         seed: of the templates, and of their choice for each pixel.
-        baked: false, or the number of nodes, along the volume's longest side, of a grid on which the light of
+        baked: of the published form: false, or the number of nodes, along the volume's longest side, of a grid on which the light of
             all templates is computed once and then fetched, as long as volume, transfer function and lighting
-            stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
-        packets: of the templates, see `scatterer_template`.
+            stay the same; if any of them is traced, it is computed for each image. It carries no gradient. Of `"transport"`:
+            the number of nodes, by default 48; kept in the same way, and it carries gradients.
+        packets: of the templates, see `scatterer_template`; by default 4, and 8 for `"transport"`.
         threshold: of the templates.
         levels: of the templates.
         given: templates to use as they are instead of simulated ones, with leading axes (materials,
             templates). Then nothing depends on the materials' mean free paths.
+        form: `"published"`, or `"transport"`: see above.
+        anisotropy: g of the phase function, in (-1, 1), for `"transport"`.
 
     Raises:
         ValueError: for invalid arguments, missing `levels`, a material of which no photon is above the
@@ -110,6 +143,8 @@ class ScattererTemplates(Lighting):
     threshold: float = eqx.field(static=True)
     levels: int = eqx.field(static=True)
     baked: int = eqx.field(static=True)
+    anisotropy: Float[Array, ""] | None
+    form: Form = eqx.field(static=True)
 
     def __init__(
         self,
@@ -124,11 +159,24 @@ class ScattererTemplates(Lighting):
         cutoff: float | None = None,
         seed: int = 0,
         baked: int | bool | Any = False,
-        packets: int = 4,
+        packets: int | None = None,
         threshold: float = 0.01,
         levels: int | None = None,
         given: ScattererTemplate | Any | None = None,
+        form: Form | Any = "published",
+        anisotropy: Arrayable = 0.0,
     ):
+        check_form(form)
+        if form == "transport":
+            published = {"blend": blend, "photons": photons, "occlusion": occlusion, "reach": tuple(reach)}
+            _check_unused({**published, "cutoff": cutoff, "given": given})
+        elif not isotropic(anisotropy):
+            raise ValueError(f'anisotropy is of form="transport"; got {anisotropy!r} for form="published".')
+        packets = (8 if form == "transport" else 4) if packets is None else packets
+        self.form = form
+        self.anisotropy = (
+            None if isotropic(anisotropy) else number("anisotropy", anisotropy, above=-1, below=1)
+        )
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         if occlusion not in get_args(Occlusion):
@@ -144,6 +192,10 @@ class ScattererTemplates(Lighting):
         self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
         tree = PacketTree(packets, threshold)
         self.packets, self.threshold, self.given = tree.packets, tree.threshold, given
+        if form == "transport":
+            self.baked = self.baked or NODES
+            self.levels, self.photons = scatterings(self.materials, self.threshold, levels), 0
+            return
         if given is None:
             self.levels = tree.levels_of(self.materials, levels)
             available = tree.capacity(self.levels)
@@ -172,6 +224,9 @@ class ScattererTemplates(Lighting):
         return float(np.max(np.linalg.norm(offset, axis=-1))) * max(1.0, *self.reach) * stretched
 
     def for_image(self, around: Surroundings) -> Shading:
+        if self.form == "transport":
+            how = self.anisotropy, self.seed, self.templates, self.packets, self.levels
+            return Transport(around, self.materials, self.lights, *how).solved(self.baked)
         if self.baked:
             return _baked(self, around).for_image(around)
         return PhotonShading(
@@ -196,15 +251,35 @@ class ScattererTemplates(Lighting):
         return blended.brightest(self.photons * self.templates)
 
 
+_DEFAULTS = {
+    "blend": False,
+    "photons": None,
+    "occlusion": "soft",
+    "reach": (2.0, 4.0),
+    "cutoff": None,
+    "given": None,
+}
+
+
+def _check_unused(options: dict[str, Any]) -> None:
+    """Raise `ValueError` for what the published form alone has."""
+    for name, value in options.items():
+        if value is not _DEFAULTS[name] and value != _DEFAULTS[name]:
+            raise ValueError(f'{name} is of form="published"; got {value!r} for form="transport".')
+
+
 @eqx.filter_jit
-def _baked(lighting: ScattererTemplates, around: Surroundings) -> BakedLighting:
+def _baked(lighting: ScattererTemplates, around: Surroundings) -> Shading:
+    if lighting.form == "transport":
+        return lighting.for_image(around)
     unbaked = replace(lighting, blend=True, cutoff=0.0, baked=False)
     return bake(unbaked.for_image(around), around, lighting.baked)
 
 
 def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:
-    """The lighting, with light that is to be baked computed once for all images of a scene; where anything is
-    traced, it is left to `for_image`."""
+    """The lighting, with light that lies on a grid computed once for all images of a scene. Where anything is
+    traced, it is computed for this image: of the transport form here, so that JAX differentiates a program of
+    its own, and else by `for_image`."""
     if isinstance(lighting, Deferred):
         return Deferred(with_baked_light(lighting.lighting, volume, transfer, march))
     if not isinstance(lighting, ScattererTemplates) or not lighting.baked:
@@ -213,7 +288,9 @@ def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, mar
     spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
     inputs = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
     if is_traced(inputs, volume.data):
-        return lighting
+        if lighting.form == "published":
+            return lighting
+        return _baked(lighting, Surroundings(volume, transfer, march.locate(volume)))
     cache = memoized(volume.data, _bake_cache)
     if not cache or not _same(cache["inputs"], inputs):
         with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`

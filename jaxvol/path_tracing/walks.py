@@ -19,7 +19,7 @@ from ..scene.space import Affine
 from ..scene.volume import Volume
 from ..xla.memory import in_memory
 from .medium import Medium
-from .phase import phase, sample_phase, scattered
+from ..lighting.phase import phase, sample_phase, scattered
 from .tracking import Candidate, Flight, fly
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxvol.path_tracing.phase import phase, sample_phase, scattered
+from jaxvol.lighting.phase import phase, sample_phase, scattered
 
 
 ANISOTROPIES = np.array([-0.95, -0.5, -1e-4, 0.0, 1e-6, 0.3, 0.9, 0.99], np.float32)

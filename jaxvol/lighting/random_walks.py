@@ -1,0 +1,49 @@
+"""Templates of `form="transport"`: the vertices of random walks, in a medium without end.
+
+The light scattered at a point x of a homogeneous medium towards the camera is, in expectation,
+
+    ω p E(x) + ω Σ_k ω^k p E(y_k)          ω: albedo; p: phase function; E: irradiance that arrives there
+
+where y_1, y_2, … are the vertices of a random walk from x with exponential flights of mean λ, whose directions
+follow the phase function, and which ends where it leaves the medium.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from .._util.vec3 import Scalar, apart, golden_spiral, turned
+from .phase import sample_phase
+
+
+def unit_walks(
+    key: PRNGKeyArray, count: int, walks: int, levels: int, anisotropy: Scalar
+) -> tuple[Float[Array, "count walks levels 3"], Float[Array, "count walks levels"]]:
+    """Directions and lengths, in mean free paths, of the flights of random walks, in sets of `walks`.
+
+    The first directions of a set are spread evenly over the sphere. Lengths and turns of each level are
+    stratified over all walks: as few are kept, drawn one by one their mean length would be off by 1/√number."""
+    number = count * walks
+    rotate, shuffle, within = jax.random.split(key, 3)
+    q, r = jnp.linalg.qr(jax.random.normal(rotate, (count, 3, 3)))
+    q = q * jnp.sign(jnp.diagonal(r, axis1=1, axis2=2))[:, None]
+    spread = jnp.asarray(golden_spiral(walks), q.dtype)
+    first = jnp.sum(spread[None, :, None] * q[:, None], axis=-1).reshape(number, 3)
+    ranks = jnp.broadcast_to(jnp.arange(number, dtype=q.dtype), (levels, 3, number))
+    ranks = jax.random.permutation(shuffle, ranks, axis=-1, independent=True)
+    u = (ranks + jax.random.uniform(within, (levels, 3, number), q.dtype)) / number
+
+    def flight(
+        direction: Float[Array, "number 3"], u: Float[Array, "3 number"]
+    ) -> tuple[Float[Array, "number 3"], tuple[Array, Array]]:
+        turn = sample_phase(anisotropy, u[1], u[2])
+        after = jnp.stack(turned(turn, apart(direction.T)), axis=-1)
+        after = after / jnp.linalg.norm(after, axis=-1, keepdims=True)
+        return after, (direction, -jnp.log1p(-u[0]))
+
+    _, (directions, lengths) = jax.lax.scan(flight, first, u)
+    shape = levels, count, walks
+    return (
+        jnp.moveaxis(directions.reshape(*shape, 3), 0, 2),
+        jnp.moveaxis(lengths.reshape(shape), 0, 2),
+    )
