@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._util.vec3 import Scalar, apart, golden_spiral, turned
+from .._util.vec3 import Scalar, golden_spiral, turned
 from .phase import sample_phase
 
 
@@ -37,7 +37,8 @@ def unit_walks(
         direction: Float[Array, "number 3"], u: Float[Array, "3 number"]
     ) -> tuple[Float[Array, "number 3"], tuple[Array, Array]]:
         turn = sample_phase(anisotropy, u[1], u[2])
-        after = jnp.stack(turned(turn, apart(direction.T)), axis=-1)
+        x, y, z = direction.T
+        after = jnp.stack(turned(turn, (x, y, z)), axis=-1)
         after = after / jnp.linalg.norm(after, axis=-1, keepdims=True)
         return after, (direction, -jnp.log1p(-u[0]))
 

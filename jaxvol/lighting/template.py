@@ -201,9 +201,8 @@ def _simulation(
     tree = PacketTree(packets, threshold)
     g = number("anisotropy", anisotropy, above=-1, below=1)
     if form == "transport":
-        return partial(walk_template, packets=tree.packets, anisotropy=g), scatterings(
-            materials, tree.threshold, levels
-        )
+        levels = scatterings(materials, tree.threshold, levels)
+        return lambda optics, draws, levels: walk_template(optics, draws, levels, tree.packets, g), levels
     if not isotropic(anisotropy):
         raise ValueError(f'anisotropy is of form="transport"; form="published" follows refraction; got {g}.')
     return partial(tree.template, merge=merge), tree.levels_of(materials, levels)
@@ -233,6 +232,7 @@ def scatterings(materials: Sequence[Material], threshold: float, levels: int | N
     return 1 if least == 1 else max(1, math.ceil(math.log(threshold) / math.log(1 - least)))
 
 
+@partial(jax.jit, static_argnums=(2, 3))
 def walk_template(
     optics: Optics, key: PRNGKeyArray, levels: int, packets: int, anisotropy: Scalar
 ) -> ScattererTemplate:

@@ -44,9 +44,13 @@ LOCAL_STEPS = 4
 LOCAL = 1.5
 """Length of these, in the grid's spacing."""
 
-OWN = 0.5
-"""Where there are several materials, the share of flights whose length is drawn from the extinction where they
-begin; the others' is drawn from the mean free path of any material."""
+OWN = 0.6
+"""Share of flights whose length is drawn from the extinction where they begin. The others' is drawn from the
+mean free path of any material, or from that of thin matter, so that no weight is large where a flight goes on
+in thinner matter, or beyond a cavity."""
+
+THIN = 4
+"""Mean free paths of thin matter along the diagonal of the volume."""
 
 NODES = 2**9, 2**12
 """Nodes at a time for walks, and for what is simpler."""
@@ -249,9 +253,9 @@ class _Grid(NamedTuple):
 
         def one(number: Int[Array, ""]) -> Array:
             around = jax.vmap(lambda offset: self.transport.at(self.point(number, apart(offset))))(offsets)
-            seen = around.extinction > 0
-            rate = jnp.sum(jnp.where(seen, around.rate, 0)) / jnp.maximum(jnp.sum(seen), 1)
-            return jnp.stack([around.extinction[0], rate, jnp.any(seen).astype(rate.dtype)])
+            seen = (around.extinction > 0).astype(around.rate.dtype)
+            rate = jnp.sum(seen * around.rate) / jnp.maximum(jnp.sum(seen), 1)
+            return jnp.stack([around.extinction[0], rate, jnp.max(seen)])
 
         found = self.mapped(one, jnp.arange(self.size), NODES[1])
         rate, known = (found[:, i].reshape(*self.shape, 1) for i in (1, 2))
@@ -302,8 +306,8 @@ class _Grid(NamedTuple):
         flights = jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(
             number_of_walks, levels, 4
         )
-        each_rate = [1 / material.mean_free_path for material in transport.materials]
-        several = len(each_rate) > 1
+        thin = THIN / jax.lax.stop_gradient(around.space.diagonal)
+        each_rate = [thin, *(1 / material.mean_free_path for material in transport.materials)]
         sky, seed, sources = transport.sky, jnp.uint32(transport.seed), located(transport.lights)
 
         def one(number: Int[Array, ""]) -> Array:
@@ -325,12 +329,8 @@ class _Grid(NamedTuple):
                     along_template = row[0], row[1], row[2]
                     x, y, z = (dot(axis, along_template) for axis in axes)
                     direction = x, y, z
-                    rate = own
-                    if several:
-                        u = hashed_uniforms_4(word, index.astype(jnp.uint32), level.astype(jnp.uint32), seed)[
-                            0
-                        ]
-                        rate = _proposed(own, each_rate, u.astype(rate.dtype))
+                    u = hashed_uniforms_4(word, index.astype(jnp.uint32), level.astype(jnp.uint32), seed)[0]
+                    rate = _proposed(own, each_rate, u.astype(own.dtype))
                     distance = row[3] / jnp.maximum(rate, LEAST)
                     density = _density(own, each_rate, distance)
                     both = jax.vmap(lambda s: transport.at(along(point, direction, s)))(
@@ -383,18 +383,14 @@ def _proposed(own: Scalar, rates: list[Scalar], u: Scalar) -> Scalar:
     """The rate of collisions at which a flight's length is drawn, of those that `_density` mixes."""
     chosen = own
     for i, rate in enumerate(rates):
-        least = OWN + (1 - OWN) * i / len(rates)
-        chosen = jnp.where(u >= least, rate, chosen)
+        chosen = jnp.where(u >= OWN + (1 - OWN) * i / len(rates), rate, chosen)
     return chosen
 
 
 def _density(own: Scalar, rates: list[Scalar], distance: Scalar) -> Scalar:
     """Density of the length of a flight."""
-    density = own * jnp.exp(-own * distance)
-    if len(rates) == 1:
-        return density
     others = sum(rate * jnp.exp(-rate * distance) for rate in rates) / len(rates)
-    return OWN * density + (1 - OWN) * others
+    return OWN * own * jnp.exp(-own * distance) + (1 - OWN) * others
 
 
 def _rotation(u: Scalar, v: Scalar, w: Scalar) -> tuple[Vec3, Vec3, Vec3]:

@@ -1,0 +1,219 @@
+"""Do templates by transport carry light as path tracing does? Against closed forms, path tracing, and
+differences.
+
+All images are of one structure, so that light and image have one program each.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.lighting import (
+    ConstantLight,
+    Deferred,
+    DirectionalLight,
+    Material,
+    PointLight,
+    ScattererTemplates,
+    scatterer_template,
+    scatterer_templates,
+)
+
+from ..scenes import slow
+
+
+SIDE = 10
+CAMERA = jv.Camera((3.0, -4.0, 2.0), (0, 0, 0), (0, 0, 1), 30, size=(8, 8))
+MARCH = jv.March(0.1, (jv.AlphaCorrection(),), "midpoint")
+NIGHT = DirectionalLight((0, 0, 1), (0, 0, 0)), PointLight((9, 9, 9), (0, 0, 0)), ConstantLight((0, 0, 0))
+SUN, LAMP = DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)), PointLight((2.0, -2.0, 2.0), (3.0, 4.0, 2.0))
+SKY = ConstantLight((0.5, 1.0, 0.7))
+VALUES = [0.0, 10.0, 20.0, 60.0, 100.0]
+LEVELS = 24
+
+
+def lit(*lights: Any) -> tuple[Any, ...]:
+    """These lights, and a dark one of every other kind."""
+    return tuple(next((one for one in lights if type(one) is type(out)), out) for out in NIGHT)
+
+
+def nested(inner: float = 80.0, outer: float = 40.0) -> jv.Volume:
+    """A ball in a ball, around the origin; air around them."""
+    x = np.linspace(-1, 1, SIDE)
+    far = np.sqrt(sum(axis**2 for axis in np.meshgrid(x, x, x, indexing="ij")))
+    data = outer * np.clip((0.85 - far) * 6, 0, 1) + (inner - outer) * np.clip((0.5 - far) * 6, 0, 1)
+    step = 2 / (SIDE - 1)
+    return jv.Volume(data.astype(np.float32), (step,) * 3, (-1.0, -1.0, -1.0))
+
+
+def transfer(thin: float, color: Any = (0.8, 0.5, 0.9), least: float = 0.0) -> jv.TransferFunction:
+    extinction = [least, least, thin, thin, 2 * thin]
+    return jv.TransferFunction(VALUES, [color] * 5, extinction)
+
+
+def materials(outer: float, inner: float, opacity: float = 0.1) -> tuple[Material, ...]:
+    return Material(opacity, outer, values=(10, 60)), Material(opacity, inner, values=(60, 200))
+
+
+def light_of(of_materials: Any, lights: Any, **how: Any) -> ScattererTemplates:
+    how = {"baked": SIDE, "levels": LEVELS, "packets": 8, "anisotropy": jnp.float32(0.0)} | how
+    return ScattererTemplates(of_materials, lights, form="transport", **how)
+
+
+def image(volume: Any, function: Any, lighting: Any, adjoint: Any = "replay") -> Any:
+    rendered = jv.render(volume, function, CAMERA, MARCH, lighting=lighting, adjoint=adjoint)
+    return rendered.image((0.0, 0.0, 0.0))
+
+
+# ---------------------------------------------------------------- templates
+
+
+def test_a_walk_has_the_light_of_its_scatterings_and_keeps_parents():
+    template = scatterer_template(Material(0.3, 2.0), 0, packets=5, levels=6, form="transport")
+    assert template.parent is not None and template.intensity.shape == (31,)
+    level = np.repeat(np.arange(7), [1, 5, 5, 5, 5, 5, 5])
+    expected = 0.3 * 0.7**level / np.where(level == 0, 1, 5)
+    np.testing.assert_allclose(template.intensity, expected, rtol=1e-6)
+    np.testing.assert_array_equal(template.offset[0], 0)
+    parent = np.asarray(template.parent)
+    assert parent[0] == -1 and np.all(level[parent[1:]] == level[1:] - 1)
+    np.testing.assert_array_equal(parent[6:] % 5, np.arange(6, 31) % 5)  # each walk stays its own
+    twice = scatterer_template(Material(0.3, 4.0), 0, packets=5, levels=6, form="transport")
+    np.testing.assert_allclose(twice.offset, 2 * template.offset, rtol=1e-6)
+
+
+@pytest.mark.parametrize("anisotropy", [0.0, 0.6])
+def test_flights_have_the_mean_free_path_and_turns_the_mean_cosine(anisotropy):
+    how: dict[str, Any] = {"count": 4, "packets": 64, "levels": 4, "form": "transport"}
+    found = scatterer_templates(Material(0.5, 3.0), 1, **how, anisotropy=anisotropy)
+    vertices = np.asarray(found.offset)[0, :, 1:].reshape(4, 4, 64, 3)
+    flights = np.diff(vertices, axis=1, prepend=0.0)
+    length = np.linalg.norm(flights, axis=-1)
+    np.testing.assert_allclose(length.mean(), 3.0, rtol=0.01)
+    np.testing.assert_allclose((length**2).mean(), 2 * 3.0**2, rtol=0.05)
+    unit = flights / length[..., None]
+    cosine = np.sum(unit[:, 1:] * unit[:, :-1], axis=-1)
+    np.testing.assert_allclose(cosine.mean(), anisotropy, atol=0.02)
+    np.testing.assert_allclose(unit[:, 0].mean(axis=(0, 1)), 0, atol=0.02)
+
+
+# ---------------------------------------------------------------- light
+
+
+def test_in_a_white_furnace_matter_is_as_bright_as_the_sky():
+    # thin enough that all light leaves within the levels of a walk
+    function = transfer(0.8, (1.0, 1.0, 1.0))
+    lighting = light_of(materials(1.2, 0.8, 0.0), lit(SKY))
+    rgba = jv.render(nested(), function, CAMERA, MARCH, lighting=lighting).rgba
+    expected = np.asarray(rgba[..., 3:]) * np.asarray(SKY.radiance)
+    assert expected.max() > 0.3
+    np.testing.assert_allclose(rgba[..., :3], expected, atol=2e-4)
+
+
+@pytest.mark.parametrize("lights", [(SUN,), (LAMP,), (SKY,)], ids=["sun", "lamp", "sky"])
+@pytest.mark.parametrize("anisotropy", [0.0, 0.5])
+def test_light_is_that_of_path_tracing(lights, anisotropy):
+    volume, function, of_materials = nested(), transfer(2.0), materials(0.5, 0.25)
+    found = np.asarray(image(volume, function, light_of(of_materials, lit(*lights), anisotropy=jnp.float32(anisotropy))))
+    how: dict[str, Any] = {"materials": of_materials, "anisotropy": anisotropy, "paths": 1024}
+    traced = jv.path_trace(volume, function, CAMERA, lit(*lights), **how)
+    expected, error = (np.asarray(each) for each in (traced.radiance, traced.standard_error))
+    total = np.sqrt((error**2).sum(axis=(0, 1))) / expected.sum(axis=(0, 1))
+    ratio = found.sum(axis=(0, 1)) / expected.sum(axis=(0, 1))
+    print(lights, anisotropy, ratio, total)
+    assert np.all(total < 0.012)
+    np.testing.assert_allclose(ratio, 1, atol=0.05)
+
+
+# ---------------------------------------------------------------- derivatives
+
+
+def test_gradients_are_those_of_differences_in_all_adjoints():
+    # visible everywhere, since points where the extinction becomes 0 do not move under the derivative
+    scene = nested(), transfer(2.0, least=0.5), materials(0.5, 0.25), lit(SUN, LAMP, SKY), jnp.float32(0.3)
+    weights = np.random.default_rng(0).normal(size=(8, 8, 3)).astype(np.float32)
+
+    def total(scene: Any, adjoint: Any = "replay") -> Any:
+        volume, function, of_materials, lights, g = scene
+        lighting = light_of(of_materials, lights, anisotropy=g)
+        return jnp.sum(weights * image(volume, function, lighting, adjoint))
+
+    leaves = {
+        "mean free path": (lambda s: s[2][1].mean_free_path, 0.01),
+        "opacity": (lambda s: s[2][0].opacity, 0.02),
+        "anisotropy": (lambda s: s[4], 0.05),
+        "extinction": (lambda s: s[1].extinction, 0.02),
+        "colours": (lambda s: s[1].colors, 0.02),
+        "irradiance": (lambda s: s[3][0].irradiance, 0.1),
+        "direction": (lambda s: s[3][0].direction, 0.02),
+        "intensity": (lambda s: s[3][1].intensity, 0.1),
+        "radiance": (lambda s: s[3][2].radiance, 0.1),
+        "voxels": (lambda s: s[0].data, 0.2),
+    }
+    gradient = eqx.filter_grad(total)(scene)
+    moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
+    pushed = jax.jit(lambda tangent: jax.jvp(lambda m: total(eqx.combine(m, fixed), "forward"), (moving,), (tangent,))[1])
+    value = eqx.filter_jit(total)
+    for name, (where, step) in leaves.items():
+        leaf = where(scene)
+        along = np.random.default_rng(1).normal(size=leaf.shape).astype(np.float32)
+        ends = [float(value(eqx.tree_at(where, scene, leaf + sign * step * along))) for sign in (1, -1)]
+        expected = (ends[0] - ends[1]) / (2 * step)
+        reverse = float(np.sum(np.asarray(where(gradient)) * along))
+        tangent = eqx.tree_at(where, jax.tree.map(jnp.zeros_like, moving), jnp.asarray(along))
+        forward = float(pushed(tangent))
+        print(name, expected, reverse, forward)
+        np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-5, err_msg=name)
+        np.testing.assert_allclose(reverse, expected, rtol=0.03, atol=1e-3, err_msg=name)
+
+
+# ---------------------------------------------------------------- use
+
+
+def test_light_is_computed_once_for_all_images_of_a_scene(monkeypatch):
+    from jaxvol.lighting import template_lighting
+
+    calls = []
+    solved = template_lighting._baked
+    monkeypatch.setattr(template_lighting, "_baked", lambda *given: calls.append(1) or solved(*given))
+    scene = nested(), transfer(0.8, (1.0, 1.0, 1.0)), light_of(materials(1.2, 0.8, 0.0), lit(SKY))
+    first, again = (np.asarray(image(*scene)) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    assert len(calls) == 1
+    image(*scene[:2], light_of(materials(1.1, 0.8, 0.0), lit(SKY)))
+    assert len(calls) == 2
+
+
+@slow
+def test_a_ray_that_sees_one_surface_is_lit_alike_where_it_is_shaded_once():
+    volume, function = nested(), transfer(60.0)
+    lighting = light_of(materials(1 / 60, 1 / 60), lit(SUN))
+    whole, once = (np.asarray(image(volume, function, one)) for one in (lighting, Deferred(lighting)))
+    middle = whole[3:5, 3:5]
+    np.testing.assert_allclose(once[3:5, 3:5].mean(), middle.mean(), rtol=0.25)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"blend": True}, {"photons": 3}, {"occlusion": "hard"}, {"reach": (2.0,)}, {"cutoff": 0.1}],
+    ids=lambda option: next(iter(option)),
+)
+def test_options_of_the_published_form_are_refused(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        light_of(materials(1.0, 1.0), lit(SUN), **option)
+
+
+def test_wrong_forms_and_unknown_lengths_are_refused():
+    with pytest.raises(ValueError, match="form must be one of published, transport"):
+        ScattererTemplates(materials(1.0, 1.0), SUN, form="diffusion")
+    with pytest.raises(ValueError, match="anisotropy is of form"):
+        ScattererTemplates(materials(1.0, 1.0), SUN, anisotropy=0.3)
+    with pytest.raises(ValueError, match="levels must be given for a material of opacity 0"):
+        ScattererTemplates(materials(1.0, 1.0, 0.0), SUN, form="transport")
+    with pytest.raises(ValueError, match="anisotropy must be"):
+        light_of(materials(1.0, 1.0), lit(SUN), anisotropy=1.0)
