@@ -27,7 +27,7 @@ from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
 from .photons import Occlusion, PhotonShading
 from .shading import Lighting, Shading, Surroundings
-from .template import PacketTree, ScattererTemplate, scatterer_templates
+from .template import PacketTree, ScattererTemplate, ThresholdOn, scatterer_templates
 
 
 class ScattererTemplates(Lighting):
@@ -87,7 +87,8 @@ class ScattererTemplates(Lighting):
             stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
         packets: of the templates, see `scatterer_template`.
         threshold: of the templates.
-        levels: of the templates.
+        threshold_on: of the templates; the paper's is `"level"`.
+        levels: of the templates; one number, or one for each material.
         given: templates to use as they are instead of simulated ones, with leading axes (materials,
             templates). Then nothing depends on the materials' mean free paths.
 
@@ -108,7 +109,8 @@ class ScattererTemplates(Lighting):
     seed: int = eqx.field(static=True)
     packets: int = eqx.field(static=True)
     threshold: float = eqx.field(static=True)
-    levels: int = eqx.field(static=True)
+    threshold_on: ThresholdOn = eqx.field(static=True)
+    levels: tuple[int, ...] = eqx.field(static=True)
     baked: int = eqx.field(static=True)
 
     def __init__(
@@ -126,7 +128,8 @@ class ScattererTemplates(Lighting):
         baked: int | bool | Any = False,
         packets: int = 4,
         threshold: float = 0.01,
-        levels: int | None = None,
+        threshold_on: ThresholdOn | Any = "photon",
+        levels: int | Sequence[int] | None = None,
         given: ScattererTemplate | Any | None = None,
     ):
         self.materials, self.lights = materials_of(materials), lights_of(lights)
@@ -142,12 +145,13 @@ class ScattererTemplates(Lighting):
         self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
         # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
-        tree = PacketTree(packets, threshold)
-        self.packets, self.threshold, self.given = tree.packets, tree.threshold, given
+        tree = PacketTree(packets, threshold, threshold_on)
+        self.packets, self.threshold, self.threshold_on = tree.packets, tree.threshold, tree.threshold_on
+        self.given = given
         if given is None:
             self.levels = tree.levels_of(self.materials, levels)
-            available = tree.capacity(self.levels)
-            if not is_traced([each.opacity for each in self.materials]):
+            available = tree.capacity(max(self.levels))
+            if not tree.whole_levels and not is_traced([each.opacity for each in self.materials]):
                 opacities = [float(each.opacity) for each in self.materials]
                 available = min(available, max(tree.capacity(tree.levels(a), a) for a in opacities))
         else:
@@ -159,7 +163,7 @@ class ScattererTemplates(Lighting):
                     f"given must hold templates of {len(self.materials)} materials, intensities of shape "
                     f"(materials, templates, n); got {shape}."
                 )
-            self.templates, self.levels, available = shape[1], 0, shape[-1]
+            self.templates, self.levels, available = shape[1], (), shape[-1]
         self.photons = available if photons is None else min(available, integer("photons", photons, 1))
 
     @property
@@ -188,7 +192,8 @@ class ScattererTemplates(Lighting):
         templates = self.given
         if templates is None:
             how: Any = {"packets": self.packets, "threshold": self.threshold, "levels": self.levels}
-            templates = scatterer_templates(self.materials, self.seed, count=self.templates, **how)
+            how |= {"count": self.templates, "threshold_on": self.threshold_on}
+            templates = scatterer_templates(self.materials, self.seed, **how)
             templates = templates.normalized()  # restores the energy that the threshold has cut off
         if not self.blend:
             return templates.brightest(self.photons)
