@@ -230,9 +230,7 @@ class PacketTree:
             return 1
         return 1 + math.floor(math.log(self.faintest * self.packets / opacity) / math.log(1 - opacity) + 1e-9)
 
-    def levels_of(
-        self, materials: Sequence[Material], levels: int | Sequence[int] | None
-    ) -> tuple[int, ...]:
+    def levels_of(self, materials: Sequence[Material], levels: int | Sequence[int] | None) -> tuple[int, ...]:
         """The number of levels of each material, by default as many as its opacity allows. **Raises**
         `ValueError` for an opacity that leaves no photon, for one that is traced, if no number is given, and
         for too many photons."""

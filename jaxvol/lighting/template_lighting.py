@@ -25,9 +25,10 @@ from .baked import BakedLighting, bake
 from .deferred import Deferred
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
-from .photons import Occlusion, PhotonShading
+from .photons import Interpolation, Occlusion, PhotonShading
 from .shading import Lighting, Shading, Surroundings
 from .template import PacketTree, ScattererTemplate, ThresholdOn, scatterer_templates
+from .voxel_photons import VoxelPhotons
 
 
 class ScattererTemplates(Lighting):
@@ -77,6 +78,9 @@ class ScattererTemplates(Lighting):
             differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
             points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
             photons that become hidden or change their material.
+        interpolation: of what is read at the places of photons. `"nearest"`: the nearest voxel tells it, as in
+            the paper, in less time. For hard occlusion, voxels of 8- or 16-bit integers, transfer functions
+            of the value alone, and materials by values.
         reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
             for thin parts in front of others.
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
@@ -105,6 +109,7 @@ class ScattererTemplates(Lighting):
     blend: bool = eqx.field(static=True)
     photons: int = eqx.field(static=True)
     occlusion: Occlusion = eqx.field(static=True)
+    interpolation: Interpolation = eqx.field(static=True)
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
     packets: int = eqx.field(static=True)
@@ -122,6 +127,7 @@ class ScattererTemplates(Lighting):
         blend: bool | Any = False,
         photons: int | None = None,
         occlusion: Occlusion | Any = "soft",
+        interpolation: Interpolation | Any = "linear",
         reach: Sequence[float] = (2.0, 4.0),
         cutoff: float | None = None,
         seed: int = 0,
@@ -140,6 +146,14 @@ class ScattererTemplates(Lighting):
         if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
             raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
         self.occlusion, self.reach, self.seed = occlusion, tuple(multiples.tolist()), integer("seed", seed, 0)
+        self.interpolation = interpolation
+        if interpolation not in get_args(Interpolation):
+            expected = ", ".join(get_args(Interpolation))
+            raise ValueError(f"interpolation must be one of {expected}; got {interpolation!r}.")
+        if interpolation == "nearest" and occlusion != "hard":
+            raise ValueError(
+                'interpolation="nearest" needs occlusion="hard"; soft occlusion reads no voxels.'
+            )
         cutoff = 0.02 * (occlusion == "hard") if cutoff is None else cutoff
         skips = is_traced(cutoff) or cutoff != 0
         self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
@@ -178,13 +192,14 @@ class ScattererTemplates(Lighting):
     def for_image(self, around: Surroundings) -> Shading:
         if self.baked:
             return _baked(self, around).for_image(around)
-        return PhotonShading(
+        shading = PhotonShading(
             *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
             blended=self.templates if self.blend else 1,
             occlusion=self.occlusion,
             reach=self.reach,
             seed=self.seed,
         )
+        return shading if self.interpolation == "linear" else VoxelPhotons.of(shading, around)
 
     def simulated(self) -> ScattererTemplate:
         """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
