@@ -30,6 +30,7 @@ STEPS = (
     "Lee, Kwon and Shin: the steps of shading, one at a time. "
     "Numbers: mean linear red, green and blue of what is visible"
 )
+PRINTED = "Lee, Kwon and Shin: steps 4 and 5. Numbers: mean linear red, green and blue of what is visible"
 EAR = "Lee, Kwon and Shin, Fig. 4: an ear, light from behind the head"
 HAND = "A hand, light from the left"
 LIT = "Lee, Kwon and Shin, Fig. 6: light from the left"
@@ -64,8 +65,8 @@ def kim_fig6(chosen: Namespace) -> None:
 
 @command("Lee, Kwon and Shin, Fig. 5: Snell's wave between two media.", OUTPUT, quick=QUICK)
 def lee_fig5(chosen: Namespace) -> None:
-    """Left, wave fronts from the sample (+), at equal times; dotted, where they would be in A alone. Right, the
-    photons of a template that was grown in A: those that lie in B (rings) are moved (discs)."""
+    """Left, wave fronts from the sample (+), at equal times; dotted, where they would be in A alone. Right,
+    the photons of a template that was grown in A: those that lie in B (rings) are moved (discs)."""
     found, plane = lee_wave.wave(), lee_wave.PLANE
     figure, ((waves, photons),) = charts.panels(1, 2, 9, 4.7)
     for before, after in zip(found.fronts, found.moved_fronts, strict=True):
@@ -109,6 +110,7 @@ PICTURES: dict[str, Main] = {
     "kim_fig8": pictures("kim_fig8", KIM, kim_fig8, resolution=360),
     "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, size=320, data=True),
     "lee_fig_steps": pictures("lee_fig_steps", STEPS, lee_steps.lee_fig_steps, resolution=96),
+    "lee_printed": pictures("lee_printed", PRINTED, lee_steps.lee_printed, resolution=96, size=320),
     "lee_fig4": pictures("lee_fig4", EAR, lee.lee_fig4, resolution=96, size=384, data=True),
     "lee_fig5": lee_fig5,
     "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=512, data=True),

@@ -16,7 +16,7 @@ from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, HeadLight, Lighting, Phong, ScattererTemplates
 
 from ..lighting import FLESH, march
-from ..scenes import CT_HEAD, SCENES, Scene, grid, on_cube, skin_head
+from ..scenes import CT_HEAD, SCENES, Scene, cropped, grid, on_cube, skin_head
 from . import BLACK, Panel, Panels, panel
 
 
@@ -90,16 +90,20 @@ def ear_row(scene: Scene, materials: Any, lights: Any, ear: np.ndarray) -> list[
     return row
 
 
-EAR: Any = (0.0, 0.0, 0.0)
+EAR_OF_CT = (186.0, 150.0, 130.0)
+EAR_PART = (0.72, 0.5, 0.46), (0.77, 0.68, 0.7)
+"""Where the left ear of the CT head is, mm, and the part of the volume that holds it."""
 
 
 def ear_of_ct(folder: Path, size: int) -> Panels:
-    """The left ear of a head, CT; the light comes from the other side of the head."""
-    (volume, transfer, _, step), materials, _ = ct_head(folder, size)
-    camera = jv.Camera.looking_at(volume, (1, -0.35, 0), (0, 0, -1), size=(size, size)).zoom(1.3)
-    lights = DirectionalLight((1.0, 0.1, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
+    """The ear is turned to the camera; the light comes from the other side of the head."""
+    (volume, transfer, _, step), _, _ = ct_head(folder, size)
+    place = tuple(x + 400 * d for x, d in zip(EAR_OF_CT, (0.94, -0.33, 0.0), strict=True))
+    camera = jv.Camera(place, EAR_OF_CT, (0, 0, -1), view_angle=15, size=(size, size))
     scene = Scene(volume, transfer, camera, step)
-    return [ear_row(scene, materials, lights, np.ones((size, size), bool))]
+    ear = jv.render(cropped(volume, *EAR_PART), transfer, camera, march(scene)).rgba[..., 3]
+    lights = DirectionalLight((1.0, 0.1, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
+    return [ear_row(scene, jv.Material(0.5, 1.5, 1.4), lights, np.asarray(ear > 0.9))]
 
 
 FINGERS = (  # joints from knuckle to tip, radius

@@ -159,8 +159,7 @@ class PhotonShading(Shading):
     def lit(
         self, color: Scalar, inner: Scalar, brightness: Sequence[Scalar], irradiance: Sequence[Scalar]
     ) -> Scalar:
-        """One channel of a sample's light, from its colour, the inner colour, and of each light the brightness of
-        its lit side and the irradiance."""
+        """One channel of a sample's light. Brightness and irradiance are those of each light."""
         return (color + inner) * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
 
     def counted(self, seen: Scalar, shows: Scalar, there: "Medium") -> tuple[Scalar, Scalar]:

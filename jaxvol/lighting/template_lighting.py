@@ -49,6 +49,11 @@ class ScattererTemplates(Lighting):
        offset, and adds its colour with α' / α times its intensity.
     6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
+    As printed, steps 4 and 5 are others: a photon adds the light's colour times its intensity, however little
+    light reaches the sample, and in another material its intensity itself is scaled. Here s is lit like c, so
+    that shadows stay dark, and only s is scaled, so that no sample gets more light than arrives.
+    (`experiments/printed_templates.py` has the printed ones, `paper_figs` shows both.)
+
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
     inwards, a sample is lit entirely as that material.
 
@@ -78,9 +83,9 @@ class ScattererTemplates(Lighting):
             differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
             points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
             photons that become hidden or change their material.
-        interpolation: of what is read at the places of photons. `"nearest"`: the nearest voxel tells it, as in
-            the paper, in less time. For hard occlusion, voxels of 8- or 16-bit integers, transfer functions
-            of the value alone, and materials by values.
+        interpolation: at the places of photons. `"nearest"`: the nearest voxel tells what is there, as in the
+            paper, in less time. For hard occlusion, voxels of 8- or 16-bit integers, transfer functions of
+            the value alone, and materials by values.
         reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
             for thin parts in front of others.
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient

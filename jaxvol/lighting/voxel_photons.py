@@ -1,6 +1,7 @@
-"""What does each photon add to a sample, if the nearest voxel tells what is at its place? The published form:
-hard occlusion, tested at voxels. A place then takes one fetch and one look-up in a table by the voxel's value,
-where `photons` interpolates eight voxels and classifies the result.
+"""What does each photon add to a sample, if the nearest voxel tells what is at its place?
+
+The published form: hard occlusion, tested at voxels. A place takes one fetch and one look-up in a table by
+the voxel's value, where `photons` interpolates eight voxels and classifies the result.
 """
 
 import functools
@@ -19,7 +20,7 @@ from .shading import Sample, Shading, Surroundings
 
 
 VISIBLE = 128
-"""Bit of a voxel's class that tells that something is visible there; the bits below are its material's number."""
+"""Bit of a voxel's class that tells that something is visible there; below it is the material's number."""
 
 HIDDEN = VISIBLE << 1
 """Bit that tells that something is visible at any of a photon's places."""
@@ -136,8 +137,8 @@ class VoxelPhotons(Shading):
         return x, y, z, self.photons.unless_skipped(sample, intensity)
 
     def _ratios(self, own: Int[Array, ""], there: Int[Array, ""]) -> tuple[Scalar, Scalar]:
-        """Of two materials, the ratios of the speed of light and of the opacity there to the sample's; 1 if one
-        of them is none."""
+        """The ratios of the speed of light and of the opacity there to the sample's; 1 if one of both materials
+        is none."""
         optics, none = self.photons.optics, len(self.photons.materials)
         index = [self._of(optics.refractive_index, material) for material in (own, there)]
         opacity = [self._of(optics.opacity, material) for material in (own, there)]
