@@ -229,8 +229,8 @@ ENTRIES = (
         "Fig. 4: an ear before a head",
         "A thin part before a thick one shines though no light reaches it, unless photons are tested at "
         "multiples of their distance as well.",
-        "CT of a head, the light behind it. The brightness of the ear falls with the second test. Unlit, every "
-        "sample emits its colour.",
+        "CT of a head, the light behind it. The brightness of the ear falls with the second test. Unlit, "
+        "every sample emits its colour.",
         data=True,
     ),
     Entry(

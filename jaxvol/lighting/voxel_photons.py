@@ -137,8 +137,8 @@ class VoxelPhotons(Shading):
         return x, y, z, self.photons.unless_skipped(sample, intensity)
 
     def _ratios(self, own: Int[Array, ""], there: Int[Array, ""]) -> tuple[Scalar, Scalar]:
-        """The ratios of the speed of light and of the opacity there to the sample's; 1 if one of both materials
-        is none."""
+        """The ratios of the speed of light and of the opacity there to the sample's; 1 if either is of no
+        material."""
         optics, none = self.photons.optics, len(self.photons.materials)
         index = [self._of(optics.refractive_index, material) for material in (own, there)]
         opacity = [self._of(optics.opacity, material) for material in (own, there)]

@@ -42,9 +42,17 @@ def lit(materials: Any = HALF, lights: Any = SUN, **how):
     return lambda: ScattererTemplates(materials, lights, **how)
 
 
+AT_VOXELS = lit(interpolation="nearest", occlusion="hard", given=PAIR)
+
 BAD = {
     # templates
     "packets": (grown(packets=0), "packets must be an integer of at least 1"),
+    "threshold on": (grown(threshold_on="tree"), "threshold_on must be one of photon, level; got 'tree'"),
+    "too many photons": (
+        grown(Material(0.1, 1.0), packets=1, threshold_on="level"),
+        'threshold_on="level" keeps 22 levels of packets=1 whole, more than 4096 photons',
+    ),
+    "levels of other materials": (grown(levels=(1, 2)), r"levels must be one number, or 1; got \(1, 2\)"),
     "threshold 0": (grown(threshold=0.0), "threshold must be"),
     "threshold 1": (grown(threshold=1.0), "threshold must be"),
     "opacity too low": (
@@ -62,6 +70,15 @@ BAD = {
         "levels must be given where opacity is traced",
     ),
     "count": (lambda: scatterer_templates(HALF, 0, count=0), "count must be an integer of at least 1"),
+    "interpolation": (
+        lit(interpolation="cubic"),
+        "interpolation must be one of linear, nearest; got 'cubic'",
+    ),
+    "soft at voxels": (lit(interpolation="nearest"), 'interpolation="nearest" needs occlusion="hard"'),
+    "voxels of floats": (
+        lambda: shaded(AT_VOXELS(), VOLUME, TRANSFER, np.zeros((1, 3))),
+        'interpolation="nearest" takes voxels of 8- or 16-bit integers; got float32',
+    ),
     "photons kept": (lambda: PAIR.brightest(0), "photons must be an integer"),
     # materials
     "opacity below 0": (lambda: Material(-0.1, 1.0), r"opacity must be in \[0, 1\]; got -0.1"),
