@@ -103,7 +103,7 @@ def ear_of_ct(folder: Path, size: int) -> Panels:
     scene = Scene(volume, transfer, camera, step)
     ear = jv.render(cropped(volume, *EAR_PART), transfer, camera, march(scene)).rgba[..., 3]
     lights = DirectionalLight((1.0, 0.1, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
-    return [ear_row(scene, jv.Material(0.5, 1.5, 1.4), lights, np.asarray(ear > 0.9))]
+    return [ear_row(scene, jv.Material(0.5, 1.5, 1.4), lights, np.asarray(ear > 0.3))]
 
 
 FINGERS = (  # joints from knuckle to tip, radius
@@ -205,7 +205,7 @@ def lee_fig6(chosen: Namespace) -> Panels:
         subjects = {"a head (CT)": ct_head(folder, sizes[0]), "a frog (labels)": tissues(folder, sizes[0])}
     columns: dict[str, Any] = {
         "unlit": None,
-        "hard, one of 8 for each pixel": {"occlusion": "hard"},
+        "hard, one of 8 for each pixel": {"occlusion": "hard", "threshold_on": "level"},
         "soft, 4 templates blended": BLENDED,
     }
     rows: Panels = []

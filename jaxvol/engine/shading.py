@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Int
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing.blending import Composite, Weighting
 from ..compositing.selection import Selection
-from ..lighting.shading import Sample, Shader
+from ..lighting.shading import Sample, Shader, no_terms
 from ..march.march import Cell
 from ..ray import Progress, Scene, stopped
 from ..scene.space import Ray
@@ -153,7 +153,9 @@ def shaded_colors(
         def without_terms(ray: Ray, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
             """The colour of a sample without any term of light, and whether it needs one."""
             sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
-            return shading.dark(around, sample), ~(sample.transmittance < thresholds[0])
+            shared = shading.begin(around, sample)
+            color = light.color(sample, shared, no_terms(shading, around, sample, shared))
+            return color, ~(sample.transmittance < thresholds[0])
 
         each = jax.vmap(jax.vmap(without_terms), in_axes=(None, 0, 0, 0))
         found = [each(ray, *piece) for piece in seen]

@@ -151,11 +151,6 @@ class PhotonShading(Shading):
         )
         return red, green, blue
 
-    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
-        # without what `color` computes of the material, and multiplies by 0
-        of_materials = self.shares(around, around.space.coordinate(sample.point), sample.measured[0])
-        return scaled(sample.color, 1 - _matter(of_materials))
-
     def lit(
         self, color: Scalar, inner: Scalar, brightness: Sequence[Scalar], irradiance: Sequence[Scalar]
     ) -> Scalar:

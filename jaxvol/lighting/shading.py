@@ -172,11 +172,6 @@ class Shading(Lighting):
     def color(self, sample: Sample, shared: PyTree, sums: PyTree) -> Vec3:
         """The shaded colour. `sums`: over all terms; None where `terms` is 0."""
 
-    def dark(self, around: "Surroundings", sample: Sample) -> Vec3:
-        """The shaded colour of a sample that needs no term (`skips_hidden`). Overridden to save time."""
-        shared = self.begin(around, sample)
-        return self.color(sample, shared, no_terms(self, around, sample, shared))
-
 
 def lit_classification(
     volume: Volume, transfer: Transfer, space: Space, lighting: Lighting | None, *, integrated: bool = False

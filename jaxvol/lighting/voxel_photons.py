@@ -67,7 +67,8 @@ class VoxelPhotons(Shading):
         def class_of(value: Scalar) -> UInt8[Array, ""]:
             of_materials = photons.shares(around, (value, value, value), value)
             _, extinction = around.classification.classify(around.classification.searched((value,)))
-            return (_number(of_materials) + VISIBLE * (extinction > 0)).astype(jnp.uint8)
+            visible = jnp.where(extinction > 0, VISIBLE, 0)
+            return (_number(of_materials) + visible).astype(jnp.uint8)
 
         return cls(photons, rows.transpose(2, 1, 0).reshape(4, -1), jax.vmap(class_of)(values))
 
@@ -126,9 +127,6 @@ class VoxelPhotons(Shading):
 
     def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
         return self.photons.color(sample, shared.photons, sums)
-
-    def dark(self, around: Surroundings, sample: Sample) -> Vec3:
-        return self.photons.dark(around, sample)
 
     def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> tuple[Scalar, ...]:
         """Offset and intensity of a photon; of intensity 0 if it is skipped."""

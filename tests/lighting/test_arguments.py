@@ -52,7 +52,7 @@ BAD = {
         grown(Material(0.1, 1.0), packets=1, threshold_on="level"),
         'threshold_on="level" keeps 22 levels of packets=1 whole, more than 4096 photons',
     ),
-    "levels of other materials": (grown(levels=(1, 2)), r"levels must be one number, or 1; got \(1, 2\)"),
+    "levels of other materials": (lit(levels=(1, 2)), r"levels must be one number, or 1; got \(1, 2\)"),
     "threshold 0": (grown(threshold=0.0), "threshold must be"),
     "threshold 1": (grown(threshold=1.0), "threshold must be"),
     "opacity too low": (
