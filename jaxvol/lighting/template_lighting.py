@@ -59,11 +59,12 @@ class ScattererTemplates(Lighting):
 
     **Scale.** The paper's sum E b (c + s) has no unit. Here the intensities of a template sum to 1 (except
     for `given` ones), and k R turns the sum into radiance on the scale of `path_trace`: k = 4 / (3π), and R
-    is the `Optics.reflectance` of the sample's material. White half-spaces have 0.9 to 1.6 times the exact
-    radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For darker colours,
-    templates are too bright: in path tracing the colour darkens each of many scatterings, here it darkens the
-    sum once. Where it fails: `experiments/stability.py`, "long mean free paths",
-    "short mean free paths".
+    is the `Optics.reflectance` of the sample's material. Under soft occlusion, white half-spaces have 0.9 to
+    1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`),
+    and a head 1.3 times that of path tracing; under hard occlusion the head has 0.4 to 0.5 times. For darker
+    colours, templates are too bright: in path tracing the colour darkens each of many scatterings, here it
+    darkens the sum once. Where it fails: `experiments/stability.py`, "long mean free paths", "short mean
+    free paths".
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
