@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import jaxvol as jv
 from jaxvol._util.vec3 import Scalar
 from jaxvol.lighting import ScattererTemplates
-from jaxvol.lighting.photons import Medium, PhotonShading
+from jaxvol.lighting.photons import PhotonShading
 from jaxvol.lighting.shading import Shading, Surroundings
 from jaxvol.lighting.template import PacketTree
 
@@ -63,8 +63,8 @@ class PrintedShading(PhotonShading):
     ) -> Scalar:
         return sum((color * b + inner) * light for b, light in zip(brightness, irradiance, strict=True))
 
-    def counted(self, seen: Scalar, shows: Scalar, there: Medium) -> tuple[Scalar, Scalar]:
-        return seen * there.ratio, shows * there.share * there.ratio
+    def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+        return seen * ratio, shows * ratio
 
 
 class PrintedSteps(ScattererTemplates):

@@ -131,7 +131,8 @@ class PhotonShading(Shading):
                 if self._soft
                 else step(extinctions[0], 0.0)
             )
-            return self.counted(intensity * self._visible(offset, extinctions), intensity * matter, there)
+            seen = intensity * self._visible(offset, extinctions)
+            return self.counted(seen, intensity * matter * there.share, there.ratio)
 
         read = around.stored(lambda: [around.measured(place) for place in places()])
         seen, shows = around.stored(weights)
@@ -157,10 +158,10 @@ class PhotonShading(Shading):
         """One channel of a sample's light. Brightness and irradiance are those of each light."""
         return (color + inner) * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
 
-    def counted(self, seen: Scalar, shows: Scalar, there: "Medium") -> tuple[Scalar, Scalar]:
-        """For how much a photon counts in a medium: for the brightness, if it is seen, and for the inner
-        colour, if matter shows there."""
-        return seen, shows * there.share * there.ratio
+    def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+        """For how much a photon counts, by the `ratio` of opacities of its medium: for the brightness, and for
+        the inner colour."""
+        return seen, shows * ratio
 
     def _photon(self, sample: Sample, shared: PhotonsOfSample, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
         """Offset and intensity of a photon, blended by the materials' shares; of intensity 0 if skipped."""

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from .._util.vec3 import Scalar, Vec3, along, scaled
 from ..scene.transfer import Transfer
 from ..xla.memory import gather
-from .photons import Medium, PhotonShading, PhotonsOfSample
+from .photons import PhotonShading, PhotonsOfSample
 from .shading import Sample, Shading, Surroundings
 
 
@@ -110,12 +110,9 @@ class VoxelPhotons(Shading):
 
         def weights() -> tuple[list[Scalar], Scalar]:
             there = what & VISIBLE - 1 if material is None else material
-            share = jnp.where(there == none, 0, jnp.ones_like(intensity))
-            seen, shows = (
-                jnp.where(what & bit == wanted, intensity, 0)
-                for bit, wanted in ((HIDDEN, 0), (VISIBLE, VISIBLE))
-            )
-            seen, shows = of.counted(seen, shows, Medium(share, ratio, speed, speed))
+            seen = jnp.where(what & HIDDEN == 0, intensity, 0)
+            shows = jnp.where((what & VISIBLE == VISIBLE) & (there != none), intensity, 0)
+            seen, shows = of.counted(seen, shows, ratio)
             return [seen * of.lit_side(offset, light) for light in shared.photons.lights], shows
 
         indices = around.stored(places)
