@@ -159,7 +159,7 @@ class PhotonShading(Shading):
         return (color + inner) * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
 
     def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-        """For how much a photon counts for brightness and inner colour, by its medium's `ratio` of opacities."""
+        """How much a photon counts for brightness and inner colour, by the `ratio` of opacities there."""
         return seen, shows * ratio
 
     def _photon(self, sample: Sample, shared: PhotonsOfSample, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
