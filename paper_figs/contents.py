@@ -249,7 +249,7 @@ ENTRIES = (
         "with templates, about 2.2 times the time of a frame.",
         "CT of a head, and the labels of a frog, in place of Visible Korean. The noise of the middle column "
         "comes from one template for each pixel; blending removes it. Time, under the paper's conditions: "
-        "TIMES the unlit frame (`experiments/published_light.py`).",
+        "3.8 times the unlit frame (`experiments/published_light.py`).",
         data=True,
     ),
     Entry(
