@@ -205,7 +205,7 @@ def lee_fig6(chosen: Namespace) -> Panels:
         subjects = {"a head (CT)": ct_head(folder, sizes[0]), "a frog (labels)": tissues(folder, sizes[0])}
     columns: dict[str, Any] = {
         "unlit": None,
-        "hard, one of 8 for each pixel": {"occlusion": "hard", "threshold_on": "level"},
+        "hard, one of 8 for each pixel": {"occlusion": "hard"},
         "soft, 4 templates blended": BLENDED,
     }
     rows: Panels = []
