@@ -61,7 +61,8 @@ class PrintedShading(PhotonShading):
     def lit(
         self, color: Scalar, inner: Scalar, brightness: Sequence[Scalar], irradiance: Sequence[Scalar]
     ) -> Scalar:
-        return sum((color * b + inner) * light for b, light in zip(brightness, irradiance, strict=True))
+        lit = color * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
+        return lit + inner * sum(irradiance)
 
     def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
         return seen * ratio, shows * ratio

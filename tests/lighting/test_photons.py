@@ -154,7 +154,7 @@ def test_each_step_is_that_of_the_paper(occlusion):
 def test_each_step_at_voxels_is_that_at_interpolated_nodes():
     """Places in the table above are nodes. Voxels are ten times the values, in 8 bits."""
     transfer = jv.TransferFunction(10 * TRANSFER.values, TRANSFER.colors, TRANSFER.extinction)
-    ten = [eqx.tree_at(lambda m: m.values, each, 10 * each.values) for each in MATERIALS[:2]]
+    ten = [eqx.tree_at(lambda m: m.values, each, replace_fn=lambda v: 10 * v) for each in MATERIALS[:2]]
     photons = jax.tree.map(lambda leaf: leaf[:2], given(PAIR))
     for name, (places, light, (brightness, inner), _) in STEPS.items():
         lighting = ScattererTemplates(
