@@ -4,9 +4,10 @@ The head phantom under opaque skin, lit from the side. Each frame is rendered in
 with one that `lighting.Phong` shades; its time is the median of their ratios. Beside it stands the image's
 RMSE against one that blends many templates under soft occlusion and lights all samples.
 
-The published form is hard occlusion, with all photons that templates hold, on all samples. Lee, Kwon and Shin
-report 20-24 frames per second with it and 42-56 without light, which is 2.2 times the time; the goal for
-baked light is 1.2 times. Also measured: the error of deferred light under skin that is more and more
+Times are multiples of the unlit frame. The paper's own, 2.2 (Lee, Kwon and Shin 2016: 20-24 frames per
+second in place of 42-56), is of several materials and 56-63 photons a template, where there are one and 16-19
+here: `published_light.py` measures under its conditions. The goal for baked light is 1.2 times. Also
+measured: the error of deferred light under skin that is more and more
 translucent.
 """
 

@@ -1,36 +1,30 @@
-"""Scatterer templates by equations (1) to (3) of Lee, Kwon and Shin (2016) as printed.
+"""Scatterer templates as Lee, Kwon and Shin (2016) print them, where the library differs.
 
-The energy I of a packet that arrives after a flight of length Δx is multiplied by exp(-Δx / λ) cos θ, where
-the cosine of the angle of incidence θ is drawn uniformly; then αI is handed on where (1 - α) I is left. So a
-template does not hold the energy that it was given: without the factors of flight it holds α / (1 - α), more
-than 1 for α > ½. The paper's tables were not made in this way (`jaxvol.scatterer_template`).
+`PrintedTree`: equations (1) to (3). The energy I of a packet that arrives after a flight of length Δx is
+multiplied by exp(-Δx / λ) cos θ, where the cosine of the angle of incidence θ is drawn uniformly; then αI is
+handed on where (1 - α) I is left. So a template does not hold the energy that it was given: without the
+factors of flight it holds α / (1 - α), more than 1 for α > ½. The paper's tables were not made in this way
+(`jaxvol.scatterer_template`).
+
+`PrintedSteps`: steps 4 and 5 of shading. A photon adds its colour under the light's full irradiance, however
+little light reaches the sample; and in another material its intensity, not just its colour, is scaled by the
+ratio of opacities.
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 import jaxvol as jv
+from jaxvol._util.vec3 import Scalar
+from jaxvol.lighting import ScattererTemplates
+from jaxvol.lighting.photons import PhotonShading
+from jaxvol.lighting.shading import Shading, Surroundings
 from jaxvol.lighting.template import PacketTree
-
-
-class LevelTree(PacketTree):
-    """With the paper's threshold: levels whose brightest possible photon is below it are left out, others are
-    kept whole. One packet at an opacity of 50 % then leaves the paper's 56 to 63 photons."""
-
-    @property
-    def faintest(self) -> float:
-        return self.threshold
-
-    @property
-    def max_width(self) -> float:
-        return math.inf
-
-    def faded(self, opacity: Any, light: Any) -> Any:
-        return light
 
 
 @dataclass
@@ -61,3 +55,23 @@ def printed_templates(
     keys = jax.vmap(lambda number: jax.random.fold_in(key, number))(jnp.arange(count))
     each = jax.vmap(lambda key: tree.template(material.optics, key, levels, merge))(keys)
     return jax.tree.map(lambda leaf: leaf[None], each)
+
+
+class PrintedShading(PhotonShading):
+    def lit(
+        self, color: Scalar, inner: Scalar, brightness: Sequence[Scalar], irradiance: Sequence[Scalar]
+    ) -> Scalar:
+        lit = color * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
+        return lit + inner * sum(irradiance)
+
+    def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+        return seen * ratio, shows * ratio
+
+
+class PrintedSteps(ScattererTemplates):
+    """`ScattererTemplates` under interpolated occlusion, with steps 4 and 5 as printed."""
+
+    def for_image(self, around: Surroundings) -> Shading:
+        ours = super().for_image(around)
+        assert isinstance(ours, PhotonShading)
+        return PrintedShading(*(getattr(ours, field.name) for field in fields(ours)))

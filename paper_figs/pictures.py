@@ -3,10 +3,12 @@
 from argparse import Namespace
 from functools import partial
 
+import numpy as np
+
 from experiments import charts
 from experiments.harness import QUICK, Main, command
 from experiments.marches import JITTER, PLAIN
-from experiments.pictures import chae, kisti, kye, lee, lee_steps
+from experiments.pictures import chae, kisti, kye, lee, lee_steps, lee_wave
 from experiments.pictures.kim import kim_fig8, order_of_bricks
 
 from .common import OUTPUT, pictures
@@ -28,8 +30,9 @@ STEPS = (
     "Lee, Kwon and Shin: the steps of shading, one at a time. "
     "Numbers: mean linear red, green and blue of what is visible"
 )
+PRINTED = "Lee, Kwon and Shin: steps 4 and 5. Numbers: mean linear red, green and blue of what is visible"
 EAR = "Lee, Kwon and Shin, Fig. 4: an ear, light from behind the head"
-HAND = "Lee, Kwon and Shin: a hand, light from the left"
+HAND = "A hand, light from the left"
 LIT = "Lee, Kwon and Shin, Fig. 6: light from the left"
 
 
@@ -60,6 +63,37 @@ def kim_fig6(chosen: Namespace) -> None:
     charts.save(figure, chosen.output / "kim_fig6.webp")
 
 
+@command("Lee, Kwon and Shin, Fig. 5: Snell's wave between two media.", OUTPUT, quick=QUICK)
+def lee_fig5(chosen: Namespace) -> None:
+    """Left, wave fronts from the sample (+), at equal times; dotted, where they would be in A alone. Right,
+    the photons of a template that was grown in A: those that lie in B (rings) are moved (discs)."""
+    found, plane = lee_wave.wave(), lee_wave.PLANE
+    figure, ((waves, photons),) = charts.panels(1, 2, 9, 4.7)
+    for before, after in zip(found.fronts, found.moved_fronts, strict=True):
+        in_b = before[:, 0] > plane
+        waves.plot(*np.where(in_b[:, None], before, np.nan).T, color="0.6", linewidth=0.8, linestyle=":")
+        waves.plot(*np.where(in_b[:, None], np.nan, before).T, "C0-", linewidth=1.2)
+        waves.plot(*np.where(in_b[:, None], after, np.nan).T, "C1-", linewidth=1.2)
+    in_b, size = found.photons[:, 0] > plane, 4000 * found.intensity
+    how = {"linewidths": 0, "alpha": 0.6}
+    photons.scatter(*found.photons[~in_b].T, size[~in_b], "C0", label="in A, where they are", **how)
+    photons.scatter(*found.photons[in_b].T, size[in_b], facecolors="none", edgecolors="0.6", linewidths=0.6)
+    photons.scatter(*found.moved_photons[in_b].T, size[in_b], "C1", label="in B, moved", **how)
+    for panel, title in ((waves, "wave fronts at equal times"), (photons, "photons of a template of A")):
+        panel.axvspan(plane, 1, color="0.93", zorder=0)
+        panel.plot(0, 0, "k+", markersize=10)
+        panel.set(xlim=(-0.55, 0.75), ylim=(-0.65, 0.65), aspect="equal", xlabel="x", ylabel="y")
+        panel.text(-0.5, -0.6, f"A: n = {lee_wave.INDICES[0]:g}", fontsize=9)
+        panel.text(0.74, -0.6, f"B: n = {lee_wave.INDICES[1]:g}", fontsize=9, ha="right")
+        panel.set_title(title)
+    photons.legend(loc="upper left")
+    ratio = lee_wave.INDICES[0] / lee_wave.INDICES[1]
+    figure.suptitle(
+        f"Lee, Kwon and Shin, Fig. 5: in B light travels {ratio:.4f} times as far as in A", fontsize=9
+    )
+    charts.save(figure, chosen.output / "lee_fig5.webp")
+
+
 PICTURES: dict[str, Main] = {
     "fig01": pictures(
         "fig01",
@@ -76,9 +110,11 @@ PICTURES: dict[str, Main] = {
     "kim_fig8": pictures("kim_fig8", KIM, kim_fig8, resolution=360),
     "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, size=320, data=True),
     "lee_fig_steps": pictures("lee_fig_steps", STEPS, lee_steps.lee_fig_steps, resolution=96),
-    "lee_fig4": pictures("lee_fig4", EAR, lee.lee_fig4, resolution=96),
-    "lee_fig5": pictures("lee_fig5", HAND, lee.lee_fig5, size=512),
-    "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=512),
+    "lee_printed": pictures("lee_printed", PRINTED, lee_steps.lee_printed, resolution=96, size=320),
+    "lee_fig4": pictures("lee_fig4", EAR, lee.lee_fig4, resolution=96, size=384, data=True),
+    "lee_fig5": lee_fig5,
+    "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=512, data=True),
+    "lee_hand": pictures("lee_hand", HAND, lee.lee_hand, size=512),
     "gallery": pictures("gallery", "Kinds of light", lee.gallery, resolution=128, data=True),
 }
 """By the name of what is written."""

@@ -226,8 +226,12 @@ LEE = {
 """Intensities as printed. 0.00945, 0.48284 and 0.48282 lack a zero: 0.000945, 0.048284, 0.048282."""
 
 
+PHOTONS = dict.fromkeys(("Table 1", "Table 2"), "*56 to 63 photons*")
+"""How many the paper has at an opacity of 50 %; it does not say from how many packets."""
+
+
 def lee_tables(result: dict[str, Any]) -> str:
-    """All three tables as one Markdown table."""
+    """All three tables as one Markdown table. In brackets, the fewest and most photons of many templates."""
     lines = ["| | x | y | z | intensity | *paper* |", "|---|---|---|---|---|---|"]
     for name, found in result["tables"].items():
         for row, paper in enumerate(LEE[name.split(":")[0]]):
@@ -236,7 +240,9 @@ def lee_tables(result: dict[str, Any]) -> str:
                 *offset, light = found["photons"][row]
                 cells = [*(f"{c:.2f}" for c in offset), f"{light:.5f}"]
             lines.append(f"| {'' if row else name} | {' | '.join(cells)} | *{paper:.5f}* |")
-        lines.append(f"| *{found['count']} photons* | | | | {found['energy']:.5f} | |")
+        fewest, most = found["counts of many"]
+        counts = f"*{found['count']} photons ({fewest} to {most})*"
+        lines.append(f"| {counts} | | | | {found['energy']:.5f} | {PHOTONS.get(name.split(':')[0], '')} |")
     return "\n".join(lines) + "\n"
 
 

@@ -16,8 +16,8 @@ from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, HeadLight, Lighting, Phong, ScattererTemplates
 
 from ..lighting import FLESH, march
-from ..scenes import CT_HEAD, SCENES, Scene, grid, on_cube, skin_head
-from . import BLACK, Panels, panel
+from ..scenes import CT_HEAD, SCENES, Scene, cropped, grid, on_cube, skin_head
+from . import BLACK, Panel, Panels, panel
 
 
 Color = tuple[float, float, float]
@@ -66,6 +66,8 @@ def ear(resolution: int, *, head: bool) -> jv.Volume:
 
 def lee_fig4(chosen: Namespace) -> Panels:
     """The light comes from behind the head. Below, the mean brightness of the ear's pixels."""
+    if chosen.data is not None:
+        return ear_of_ct(chosen.data, chosen.size)
     whole, alone = (ear(chosen.resolution, head=head) for head in (True, False))
     points = [(0.1, (0.8, 0.5, 0.38), 0.0), (0.9, (0.8, 0.5, 0.38), 0.9)]
     transfer = jv.TransferFunction.from_points(points, unit_distance=0.05)
@@ -74,13 +76,34 @@ def lee_fig4(chosen: Namespace) -> Panels:
     seen = np.asarray(jv.render(alone, transfer, camera, march(scene)).rgba[..., 3] > 0.9)
     lights = DirectionalLight((0.0, -1.0, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
     flesh = jv.Material(0.5, 0.045, 1.4)
+    return [ear_row(scene, flesh, lights, seen)]
+
+
+def ear_row(scene: Scene, materials: Any, lights: Any, ear: np.ndarray) -> list[Panel]:
+    """Unlit; by photons alone; and with photons tested at multiples of their distance."""
     how: dict[str, Any] = {"occlusion": "hard", "templates": 8, "blend": True, "packets": 8, "cutoff": 0.001}
     row = []
     for title, reach in {"unlit": None, "photons alone": (), "tested at 2, 4, 8 times": REACH}.items():
-        lighting = None if reach is None else ScattererTemplates(flesh, lights, reach=reach, **how)
+        lighting = None if reach is None else ScattererTemplates(materials, lights, reach=reach, **how)
         image = lit(scene, lighting)
-        row.append(panel(image, f"brightness of the ear {(image[seen] @ LUMINANCE).mean():.3f}", title))
-    return [row]
+        row.append(panel(image, f"brightness of the ear {(image[ear] @ LUMINANCE).mean():.3f}", title))
+    return row
+
+
+EAR_OF_CT = (186.0, 150.0, 130.0)
+EAR_PART = (0.72, 0.5, 0.46), (0.77, 0.68, 0.7)
+"""Where the left ear of the CT head is, mm, and the part of the volume that holds it."""
+
+
+def ear_of_ct(folder: Path, size: int) -> Panels:
+    """The ear is turned to the camera; the light comes from the other side of the head."""
+    (volume, transfer, _, step), _, _ = ct_head(folder, size)
+    place = tuple(x + 400 * d for x, d in zip(EAR_OF_CT, (0.94, -0.33, 0.0), strict=True))
+    camera = jv.Camera(place, EAR_OF_CT, (0, 0, -1), view_angle=15, size=(size, size))
+    scene = Scene(volume, transfer, camera, step)
+    ear = jv.render(cropped(volume, *EAR_PART), transfer, camera, march(scene)).rgba[..., 3]
+    lights = DirectionalLight((1.0, 0.1, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
+    return [ear_row(scene, jv.Material(0.5, 1.5, 1.4), lights, np.asarray(ear > 0.3))]
 
 
 FINGERS = (  # joints from knuckle to tip, radius
@@ -124,7 +147,7 @@ def bones() -> list[Shape]:
     return found
 
 
-def lee_fig5(chosen: Namespace) -> Panels:
+def lee_hand(chosen: Namespace) -> Panels:
     volume = hand(chosen.resolution)
     transfer = jv.TransferFunction.from_points(HAND, unit_distance=0.05)
     camera = jv.Camera.looking_at(volume, (-0.25, -1, 0.1), size=(chosen.size,) * 2).zoom(1.75)
@@ -177,6 +200,9 @@ def ct_head(folder: Path, size: int) -> Subject:
 def lee_fig6(chosen: Namespace) -> Panels:
     sizes = chosen.size, chosen.resolution
     subjects = {"the head phantom": head(*sizes), "a frog": frog(*sizes)}
+    if chosen.data is not None:
+        folder = chosen.data
+        subjects = {"a head (CT)": ct_head(folder, sizes[0]), "a frog (labels)": tissues(folder, sizes[0])}
     columns: dict[str, Any] = {
         "unlit": None,
         "hard, one of 8 for each pixel": {"occlusion": "hard"},

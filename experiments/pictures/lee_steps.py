@@ -17,6 +17,7 @@ import jaxvol as jv
 from jaxvol._util.vec3 import golden_spiral
 from jaxvol.lighting import ConstantLight, DirectionalLight, Light, ScattererTemplate, ScattererTemplates
 
+from ..printed_templates import PrintedSteps
 from ..scenes import grid, on_cube
 from . import BLACK, Panels, panel
 
@@ -105,7 +106,9 @@ STEPS: dict[str, tuple[Setup, Setup]] = {
 }
 
 
-def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+def render(
+    setup: Setup, resolution: int, size: int, kind: type[ScattererTemplates] = ScattererTemplates
+) -> tuple[np.ndarray, np.ndarray]:
     """The image, and which pixels are visible."""
     spacing = 2 / (resolution - 1)
     volume = on_cube(setup.values(grid(resolution), spacing))
@@ -123,9 +126,22 @@ def render(setup: Setup, resolution: int, size: int) -> tuple[np.ndarray, np.nda
     count = 48  # photons evenly in all directions
     offset = jnp.tile(FAR * golden_spiral(count), (2, 1, 1, 1))
     both = ScattererTemplate(offset, jnp.full((2, 1, count), setup.bright / count))
-    lighting = ScattererTemplates(materials, setup.lights, given=both, cutoff=setup.cutoff)
+    lighting = kind(materials, setup.lights, given=both, cutoff=setup.cutoff)
     rendering = jv.render(volume, transfer, camera, march, lighting=lighting)
     return np.asarray(rendering.image(BLACK)), np.asarray(rendering.rgba[..., 3] > 0.5)
+
+
+def lee_printed(chosen: Namespace) -> Panels:
+    """Steps 4 and 5, by the library and as printed, under the same light."""
+    rows: Panels = []
+    for title in ("4: colour of the same material", "5: of another material"):
+        setup, row = STEPS[title][1], []
+        for name, kind in (("ours", ScattererTemplates), ("as printed", PrintedSteps)):
+            image, visible = render(setup, chosen.resolution, chosen.size, kind)
+            mean = " ".join(f"{part:.2f}" for part in image[visible].mean(axis=0))
+            row.append(panel(image, f"step {title}: {setup.caption}\n{mean}", "" if rows else name))
+        rows.append(row)
+    return rows
 
 
 def lee_fig_steps(chosen: Namespace) -> Panels:

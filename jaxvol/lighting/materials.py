@@ -13,6 +13,10 @@ from .._util.vec3 import Scalar, Vec3
 from ..scene.volume import Volume
 
 
+EDGE = 0.1
+"""A material with soft edges fades in and out over this fraction of its value range."""
+
+
 class Optics(NamedTuple):
     """Optical properties of a material; arrays for several materials."""
 

@@ -5,12 +5,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from .._util.vec3 import Scalar, Vec3, scaled
-from .materials import Material, shares
+from .materials import EDGE, Material, shares
 from .shading import Surroundings
-
-
-EDGE = 0.1
-"""A material fades in and out over this fraction of its value range."""
 
 
 class Scattering(NamedTuple):

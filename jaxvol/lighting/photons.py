@@ -15,15 +15,15 @@ from .._util.noise import hashed_uniforms
 from .._util.vec3 import Scalar, Vec3, along, dot, scaled
 from ..xla.memory import gather
 from .lights import Arriving, Light
-from .materials import Material, Optics, shares, smoothstep, step
+from .materials import EDGE, Material, Optics, shares as shares_of, smoothstep, step
 from .shading import ClassifiedPoint, Sample, Shading, Surroundings
 from .template import ScattererTemplate
 
 
 Occlusion = Literal["soft", "hard"]
 
-EDGE = 0.1
-"""With soft occlusion, a material fades in and out over this fraction of its value range."""
+Interpolation = Literal["linear", "nearest"]
+"""Names as in VTK (`vtkVolumeProperty`)."""
 
 LIT_SIDE_COSINE = 0.25
 """With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
@@ -33,7 +33,7 @@ WHITE = 4 / (3 * math.pi)
 light around it: half of the photons of a sample on its face are inside, so that E b (c + s) = 3/4 π L c."""
 
 
-class _Shared(NamedTuple):
+class PhotonsOfSample(NamedTuple):
     """What all photons of a sample have in common. `mixture`: the materials' shares, scaled to sum to 1.
     `template`: the one in use, if there are several."""
 
@@ -42,6 +42,16 @@ class _Shared(NamedTuple):
     optics: Optics
     template: Int[Array, ""] | None
     lights: tuple[Arriving, ...]
+
+
+class Medium(NamedTuple):
+    """What is at a photon's place: the materials' total share, the ratio of the opacity there to that at the
+    sample, mean free path and refractive index; of no material, those at the sample."""
+
+    share: Scalar
+    ratio: Scalar
+    mean_free_path: Scalar
+    refractive_index: Scalar
 
 
 class PhotonShading(Shading):
@@ -79,8 +89,8 @@ class PhotonShading(Shading):
     def skips_hidden(self) -> bool:
         return self.cutoff is not None
 
-    def begin(self, around: Surroundings, sample: Sample) -> _Shared:
-        material_shares = self._shares(around, around.space.coordinate(sample.point), sample.measured[0])
+    def begin(self, around: Surroundings, sample: Sample) -> PhotonsOfSample:
+        material_shares = self.shares(around, around.space.coordinate(sample.point), sample.measured[0])
         template = None
         if (count := self.templates.intensity.shape[1]) > 1:
             u, _, _ = hashed_uniforms(*sample.pixel, jnp.uint32(self.seed), jnp.float32)
@@ -89,9 +99,11 @@ class PhotonShading(Shading):
         mixture = tuple(share / jnp.where(total > 0, total, 1) for share in material_shares)
         optics = _blend(self.optics, mixture, Optics(*(jnp.ones_like(total),) * 3))
         lights = tuple(light.at(sample.point, sample.direction) for light in self.lights)
-        return _Shared(material_shares, mixture, optics, template, lights)
+        return PhotonsOfSample(material_shares, mixture, optics, template, lights)
 
-    def term(self, around: Surroundings, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> Any:
+    def term(
+        self, around: Surroundings, sample: Sample, shared: PhotonsOfSample, number: Int[Array, ""]
+    ) -> Any:
         # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
         # photon of a single template costs nothing, as it is the same for all samples.
         several, medium = len(self.materials) > 1, None
@@ -100,7 +112,7 @@ class PhotonShading(Shading):
         else:
             offset, intensity = self._photon(sample, shared, number)
         if several:
-            offset, medium = self._refracted(around, sample, shared, offset)
+            offset, medium = self.refracted(around, sample, shared, offset)
 
         def places() -> list[Vec3]:
             return [_displaced(sample, offset, times) for times in (1.0, *self.reach)]
@@ -108,33 +120,46 @@ class PhotonShading(Shading):
         def weights() -> tuple[Scalar, Scalar]:
             """How much of the photon is seen, and how much the colour at its place counts."""
             points = [around.classified(*each) for each in zip(places(), read, strict=True)]
-            inner, path = self._medium(around, shared, points[0])[:2] if medium is None else medium
+            there = self._medium(around, shared, points[0]) if medium is None else medium
             extinctions = [point.extinction for point in points]
             # soft: the opacity of one mean free path there
-            matter = -jnp.expm1(-extinctions[0] * path) if self._soft else step(extinctions[0], 0.0)
-            return intensity * self._visible(offset, extinctions), intensity * inner * matter
+            matter = (
+                -jnp.expm1(-extinctions[0] * there.mean_free_path)
+                if self._soft
+                else step(extinctions[0], 0.0)
+            )
+            seen = intensity * self._visible(offset, extinctions)
+            return self.counted(seen, intensity * matter * there.share, there.ratio)
 
         read = around.stored(lambda: [around.measured(place) for place in places()])
         seen, shows = around.stored(weights)
-        brightness = tuple(seen * self._lit_side(offset, light) for light in shared.lights)
+        brightness = tuple(seen * self.lit_side(offset, light) for light in shared.lights)
         color, _ = around.classification.classify(read[0])
         return brightness, scaled(color, shows)
 
-    def color(self, sample: Sample, shared: _Shared, sums: Any) -> Vec3:
+    def color(self, sample: Sample, shared: PhotonsOfSample, sums: Any) -> Vec3:
         brightness, inner = sums
         # 1 from a material's soft edge inwards, since an unlit part of the colour would look like emission
         matter = _matter(shared.shares)
         scale = matter * WHITE * shared.optics.reflectance
+        irradiance = [[light.irradiance[i] for light in shared.lights] for i in range(3)]
         red, green, blue = (
-            c * (1 - matter)
-            + scale
-            * (c + s)
-            * sum(b * light.irradiance[i] for b, light in zip(brightness, shared.lights, strict=True))
-            for i, (c, s) in enumerate(zip(sample.color, inner, strict=True))
+            c * (1 - matter) + scale * self.lit(c, s, brightness, arriving)
+            for c, s, arriving in zip(sample.color, inner, irradiance, strict=True)
         )
         return red, green, blue
 
-    def _photon(self, sample: Sample, shared: _Shared, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
+    def lit(
+        self, color: Scalar, inner: Scalar, brightness: Sequence[Scalar], irradiance: Sequence[Scalar]
+    ) -> Scalar:
+        """One channel of a sample's light. Brightness and irradiance are those of each light."""
+        return (color + inner) * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
+
+    def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+        """How much a photon counts for brightness and inner colour, by the `ratio` of opacities there."""
+        return seen, shows * ratio
+
+    def _photon(self, sample: Sample, shared: PhotonsOfSample, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
         """Offset and intensity of a photon, blended by the materials' shares; of intensity 0 if skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
@@ -151,40 +176,40 @@ class PhotonShading(Shading):
                 _sum([share * one for share, one in zip(shared.mixture, several, strict=True)])
                 for several in zip(*each, strict=True)
             )
-        if self.cutoff is not None:
-            skipped = sample.transmittance * intensity * self.blended < self.cutoff
-            intensity = jnp.where(skipped, 0, intensity)
-        return (x, y, z), intensity
+        return (x, y, z), self.unless_skipped(sample, intensity)
 
-    def _refracted(
-        self, around: Surroundings, sample: Sample, shared: _Shared, offset: Vec3
-    ) -> tuple[Vec3, tuple[Scalar, Scalar]]:
-        """The offset of a photon that is moved by refraction into the material at its place; the factor by
-        which the colour there counts, and the mean free path there."""
-        own = shared.optics
+    def unless_skipped(self, sample: Sample, intensity: Scalar) -> Scalar:
+        """The intensity of a photon; 0 where it is below the cut-off."""
+        if self.cutoff is None:
+            return intensity
+        return jnp.where(sample.transmittance * intensity * self.blended < self.cutoff, 0, intensity)
+
+    def refracted(
+        self, around: Surroundings, sample: Sample, shared: PhotonsOfSample, offset: Vec3
+    ) -> tuple[Vec3, "Medium"]:
+        """The offset of a photon that is moved by refraction into the material at its place, and the medium
+        there."""
         read = around.stored(lambda: around.measured(_displaced(sample, offset)))
 
-        def moved() -> tuple[Vec3, tuple[Scalar, Scalar]]:
-            there = around.classified(_displaced(sample, offset), read)
-            matter, path, optics = self._medium(around, shared, there)
-            ratio = optics.opacity / jnp.where(own.opacity == 0, 1, own.opacity)
-            inner = jnp.where(own.opacity == 0, 0, ratio) * matter
+        def moved() -> tuple[Vec3, Medium]:
+            there = self._medium(around, shared, around.classified(_displaced(sample, offset), read))
             # the template is stretched by the ratio of the speeds of light
-            return scaled(offset, own.refractive_index / optics.refractive_index), (inner, path)
+            return scaled(offset, shared.optics.refractive_index / there.refractive_index), there
 
         return around.stored(moved)
 
-    def _medium(
-        self, around: Surroundings, shared: _Shared, there: ClassifiedPoint
-    ) -> tuple[Scalar, Scalar, Optics]:
-        """Total share of the materials at a place, which falls to 0 outside of the volume; mean free path and
-        all optics there."""
-        each = tuple(there.inside * share for share in self._shares(around, there.coordinate, there.value))
-        optics = _blend(self.optics, each, shared.optics)
-        return _sum(each), optics.mean_free_path, optics
+    def _medium(self, around: Surroundings, shared: PhotonsOfSample, there: ClassifiedPoint) -> "Medium":
+        """What scatters light at a place; the volume's outside has none of the materials."""
+        each = tuple(there.inside * share for share in self.shares(around, there.coordinate, there.value))
+        own, optics = shared.optics, _blend(self.optics, each, shared.optics)
+        ratio = jnp.ones_like(own.opacity)
+        if len(self.materials) > 1:
+            exists = own.opacity != 0
+            ratio = jnp.where(exists, optics.opacity / jnp.where(exists, own.opacity, 1), 0)
+        return Medium(_sum(each), ratio, optics.mean_free_path, optics.refractive_index)
 
-    def _shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        return shares(self.materials, around.volume, coordinate, value, edge=EDGE if self._soft else 0.0)
+    def shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
+        return shares_of(self.materials, around.volume, coordinate, value, edge=EDGE if self._soft else 0.0)
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
         """Visibility of a photon from the sample, from the extinctions at its place and at `reach`."""
@@ -194,16 +219,15 @@ class PhotonShading(Shading):
         depth = sum(piece * extinction for piece, extinction in zip(pieces, extinctions, strict=True))
         return jnp.exp(-depth * _norm(offset))
 
-    def _lit_side(self, offset: Vec3, light: Arriving) -> Scalar:
+    def lit_side(self, offset: Vec3, light: Arriving) -> Scalar:
         """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
         if light.toward is None:
             return jnp.ones_like(offset[0])
-        length = _norm(offset)
         # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
-        near = dot(offset, light.toward) - length**2 / (2 * light.distance)
+        near = dot(offset, light.toward) - dot(offset, offset) / (2 * light.distance)
         if not self._soft:
             return step(near, 0.0)
-        return smoothstep(0.5 + near / length / (2 * LIT_SIDE_COSINE))
+        return smoothstep(0.5 + near / _norm(offset) / (2 * LIT_SIDE_COSINE))
 
 
 def _sum(terms: Sequence[Scalar]) -> Scalar:

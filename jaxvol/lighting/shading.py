@@ -32,6 +32,9 @@ T = TypeVar("T")
 TOGETHER = 8
 """Most terms of many samples computed at a time, so that kernels do enough work for their launch."""
 
+FEW_TOGETHER = 4
+"""The same where few terms are needed, so that fewer are computed that are not."""
+
 
 class Sample(NamedTuple):
     """A sample to be shaded.
@@ -249,7 +252,8 @@ def needed_terms(shading: Shading, around: Surroundings, samples: Sample, shared
         return None
 
     looped = replace(around, tables=around.classification)
-    together = math.ceil(shading.terms / math.ceil(shading.terms / TOGETHER))
+    most = FEW_TOGETHER if shading.skips_hidden else TOGETHER
+    together = math.ceil(shading.terms / math.ceil(shading.terms / most))
 
     def add(group: Int[Array, ""], sums: PyTree) -> PyTree:
         here = looped.in_memory_by(group >= 0, samples)

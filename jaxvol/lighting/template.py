@@ -32,6 +32,11 @@ Form = Literal["published", "transport"]
 FADES = 0.8
 """A photon fades out between the threshold and this fraction of it."""
 
+ThresholdOn = Literal["photon", "level"]
+
+MOST_PHOTONS = 2**12
+"""Most photons of a template whose levels are kept whole."""
+
 MERGE = 0.01
 """Photons closer than this fraction of the mean free path are merged into one."""
 
@@ -96,6 +101,7 @@ def scatterer_template(
     *,
     packets: int = 4,
     threshold: float = 0.01,
+    threshold_on: ThresholdOn | Any = "photon",
     merge: float = MERGE,
     levels: int | None = None,
     form: Form | Any = "published",
@@ -107,11 +113,13 @@ def scatterer_template(
     opacity α, αI is absorbed and becomes a photon; of the rest I' = (1 - α) I, `I' cos θ'` is refracted by an
     angle θ', into a direction uniformly distributed over the cone within the critical angle of total
     reflection between the material and air; and `I' (1 - cos θ')` is reflected into any direction of the
-    half-space it came from. A packet whose photon would be fainter than the threshold ends.
+    half-space it came from. Packets, or whole levels of the tree, end at the threshold.
 
     So all parts add up to I, and a template's energy falls short of 1 only by what the threshold cuts off.
     The paper's tables were made in this way; its equations (1) to (3) as printed hand on αI
-    (`experiments/printed_templates.py`).
+    (`experiments/printed_templates.py`). Its count of 56 to 63 photons, at an opacity of 50 % and a threshold
+    of 0.01, is that of `threshold_on="level"`: 63 of one packet (six levels), 60 of four (four levels each,
+    whose photons are a quarter as bright), less those that were merged.
 
     Where it fails: `experiments/stability.py`, "lopsided templates", "energy of templates as printed".
 
@@ -120,12 +128,16 @@ def scatterer_template(
         key: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.
         packets: how many packets share the light, of energy 1, at the origin. Their directions are spread
             evenly and rotated at random. One packet makes a lopsided template.
-        threshold: in (0, 1), of a photon's intensity. A photon fades out between this and 0.8 times this,
-            instead of vanishing at once. The first photons are the brightest, of α / `packets` each: with a
-            threshold above 1.25 times that, a template is empty.
+        threshold: in (0, 1), of a photon's intensity. The first photons are the brightest, of α / `packets`
+            each: with a threshold above 1.25 times that (by levels, above that), a template is empty.
+        threshold_on: what is compared with the threshold. `"photon"`: each photon, which fades out between
+            this and 0.8 times this, instead of vanishing at once. `"level"`: the brightest possible photon
+            of a level k, α (1 - α)^k / `packets`; levels from there on are left out and others kept whole,
+            as in the paper. Nothing fades: how many levels there are is fixed when the template is made, and
+            depends on nothing that is traced.
         merge: photons closer than this fraction of λ are merged, as in the paper's tables.
-        levels: of the tree; required if the opacity is traced. By default as many as leave photons above the
-            threshold.
+        levels: of the tree; required if the opacity is traced. By default as many as may hold photons above
+            the threshold.
         form: `"published"`, or `"transport"`, which is ours: the photons are the vertices of `packets` random
             walks, the first of them the point itself, and keep their `parent`. Flights are as long as above;
             directions follow the phase function, and nothing is merged. Of the light, α (1 - α)^k is at the
@@ -139,10 +151,12 @@ def scatterer_template(
 
     Raises:
         ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
-            a traced opacity, intensities are then NaN.
+            a traced opacity, intensities are then NaN. For whole levels of more than 4096 photons.
     """
-    of_template, levels = _simulation((material,), packets, threshold, merge, levels, form, anisotropy)
-    return of_template(material.optics, _key(key), levels)
+    of_template, levels = _simulation(
+        (material,), packets, threshold, threshold_on, merge, levels, form, anisotropy
+    )
+    return of_template(material.optics, _key(key), max(levels), None)
 
 
 def scatterer_templates(
@@ -152,8 +166,9 @@ def scatterer_templates(
     count: int = 8,
     packets: int = 4,
     threshold: float = 0.01,
+    threshold_on: ThresholdOn | Any = "photon",
     merge: float = MERGE,
-    levels: int | None = None,
+    levels: int | Sequence[int] | None = None,
     form: Form | Any = "published",
     anisotropy: Arrayable = 0.0,
 ) -> ScattererTemplate:
@@ -165,8 +180,10 @@ def scatterer_templates(
         count: templates per material.
         packets: as for `scatterer_template`.
         threshold: as for `scatterer_template`.
+        threshold_on: as for `scatterer_template`.
         merge: as for `scatterer_template`.
-        levels: as for `scatterer_template`.
+        levels: as for `scatterer_template`; one number for all materials, or, of the published form, one for
+            each.
         form: as for `scatterer_template`.
         anisotropy: as for `scatterer_template`.
 
@@ -177,35 +194,54 @@ def scatterer_templates(
         ValueError: as `scatterer_template` does.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
-    of_template, levels = _simulation(materials, packets, threshold, merge, levels, form, anisotropy)
+    of_template, levels = _simulation(
+        materials, packets, threshold, threshold_on, merge, levels, form, anisotropy
+    )
 
-    def one(optics: Optics, material: Int[Array, ""], template: Int[Array, ""]) -> ScattererTemplate:
+    def one(
+        optics: Optics, own_levels: Int[Array, ""], material: Int[Array, ""], template: Int[Array, ""]
+    ) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
-        return of_template(optics, draws, levels)
+        return of_template(optics, draws, max(levels), own_levels)
 
-    several = jax.vmap(jax.vmap(one, in_axes=(None, None, 0)), in_axes=(0, 0, None))
-    return several(optics_of(materials), jnp.arange(len(materials)), jnp.arange(count))
+    several = jax.vmap(jax.vmap(one, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
+    numbers = jnp.arange(len(materials))
+    return several(optics_of(materials), jnp.asarray(levels), numbers, jnp.arange(count))
 
 
 def _simulation(
     materials: Sequence[Material],
     packets: int,
     threshold: float,
+    threshold_on: Any,
     merge: float,
-    levels: int | None,
+    levels: Any,
     form: Any,
     anisotropy: Arrayable,
-) -> tuple[Callable[[Optics, PRNGKeyArray, int], ScattererTemplate], int]:
-    """What simulates one template, and its number of levels."""
+) -> tuple[Callable[..., ScattererTemplate], tuple[int, ...]]:
+    """What simulates one template, from its optics, key, the most levels of any and its own number; and the
+    number of levels of each material."""
     check_form(form)
-    tree = PacketTree(packets, threshold)
-    g = number("anisotropy", anisotropy, above=-1, below=1)
+    tree = PacketTree(packets, threshold, threshold_on)
     if form == "transport":
-        levels = scatterings(materials, tree.threshold, levels)
-        return lambda optics, draws, levels: walk_template(optics, draws, levels, tree.packets, g), levels
+        g = number("anisotropy", anisotropy, above=-1, below=1)
+
+        def walks(optics: Optics, draws: PRNGKeyArray, most: int, _: Any) -> ScattererTemplate:
+            return walk_template(optics, draws, most, tree.packets, g)
+
+        return walks, (scatterings(materials, tree.threshold, levels),) * len(materials)
+    check_isotropic(anisotropy)
+
+    def photons(optics: Optics, draws: PRNGKeyArray, most: int, own: Any) -> ScattererTemplate:
+        return tree.template(optics, draws, most, merge, own if tree.whole_levels else None)
+
+    return photons, tree.levels_of(materials, levels)
+
+
+def check_isotropic(anisotropy: Any) -> None:
+    """Raise `ValueError` for an anisotropy with the published form, whose directions follow refraction."""
     if not isotropic(anisotropy):
-        raise ValueError(f'anisotropy is of form="transport"; form="published" follows refraction; got {g}.')
-    return partial(tree.template, merge=merge), tree.levels_of(materials, levels)
+        raise ValueError(f'anisotropy is of form="transport"; got {anisotropy!r} for form="published".')
 
 
 def isotropic(anisotropy: Any) -> bool:
@@ -260,20 +296,30 @@ class PacketTree:
 
     packets: int = 4
     threshold: float = 0.01
+    threshold_on: ThresholdOn | Any = "photon"
 
     def __post_init__(self):
         self.packets = integer("packets", self.packets, 1)
         self.threshold = float(number("threshold", self.threshold, above=0, below=1))
+        if self.threshold_on not in get_args(ThresholdOn):
+            raise ValueError(
+                f"threshold_on must be one of {', '.join(get_args(ThresholdOn))}; got {self.threshold_on!r}."
+            )
+
+    @property
+    def whole_levels(self) -> bool:
+        """Whether the threshold ends levels, not photons."""
+        return self.threshold_on == "level"
 
     @property
     def faintest(self) -> float:
-        """Intensity below which there is no photon."""
-        return FADES * self.threshold
+        """Intensity below which there is no photon, or no level whose brightest possible photon has it."""
+        return self.threshold if self.whole_levels else FADES * self.threshold
 
     @property
     def max_width(self) -> float:
         """Most packets of a level: as many as can be above the threshold, as their energies sum to 1."""
-        return math.floor(1 / self.faintest + 1e-9)
+        return math.inf if self.whole_levels else math.floor(1 / self.faintest + 1e-9)
 
     def levels(self, opacity: float) -> int:
         """Number of levels that may hold a photon above the threshold. The brightest possible photon of level
@@ -282,10 +328,11 @@ class PacketTree:
             return 1
         return 1 + math.floor(math.log(self.faintest * self.packets / opacity) / math.log(1 - opacity) + 1e-9)
 
-    def levels_of(self, materials: Sequence[Material], levels: int | None) -> int:
-        """The given number of levels, by default the most of any material. **Raises** `ValueError` for an
-        opacity that leaves no photon, and for one that is traced, if no number is given."""
-        most = 1
+    def levels_of(self, materials: Sequence[Material], levels: int | Sequence[int] | None) -> tuple[int, ...]:
+        """The number of levels of each material, by default as many as its opacity allows. **Raises**
+        `ValueError` for an opacity that leaves no photon, for one that is traced, if no number is given, and
+        for too many photons."""
+        found = []
         for material in materials:
             if is_traced(material.opacity):
                 if levels is None:
@@ -295,13 +342,24 @@ class PacketTree:
                 continue
             opacity = float(material.opacity)
             if opacity <= self.faintest * self.packets:
-                advice = f"a threshold of at most {opacity / self.packets:.3g}" if opacity else "one above 0"
+                advice = f"a threshold below {opacity / self.packets:.3g}" if opacity else "one above 0"
                 raise ValueError(
                     f"opacity {opacity:g} leaves no photon above threshold={self.threshold:g} with "
                     f"packets={self.packets}; give {advice}."
                 )
-            most = max(most, self.levels(opacity))
-        return most if levels is None else integer("levels", levels, 1)
+            found.append(self.levels(opacity))
+        if isinstance(levels, Sequence):
+            if len(levels) != len(materials):
+                raise ValueError(f"levels must be one number, or {len(materials)}; got {levels!r}.")
+            found = [integer("levels", each, 1) for each in levels]
+        elif levels is not None:
+            found = [integer("levels", levels, 1)] * len(materials)
+        if self.whole_levels and self.packets * 2.0 ** max(found) > MOST_PHOTONS:
+            raise ValueError(
+                f'threshold_on="level" keeps {max(found)} levels of packets={self.packets} whole, more than '
+                f"{MOST_PHOTONS} photons; give a higher threshold, or fewer levels."
+            )
+        return tuple(found)
 
     def capacity(self, levels: int, opacity: float | None = None) -> int:
         """Upper bound of a template's photons: in each level at most twice as many as in the one before, and,
@@ -309,15 +367,21 @@ class PacketTree:
         total = 0
         for k in range(levels):
             most = self.max_width
-            if opacity is not None:
+            if opacity is not None and not self.whole_levels:
                 most = math.floor((1 - opacity) ** k * opacity / self.faintest + 1e-9)
             total += min(self.packets * 2 ** min(k, 64), most)
         return int(min(total, self.max_width))
 
     def template(
-        self, optics: Optics, key: PRNGKeyArray, levels: int, merge: float = MERGE
+        self,
+        optics: Optics,
+        key: PRNGKeyArray,
+        levels: int,
+        merge: float = MERGE,
+        own_levels: Int[Array, ""] | None = None,
     ) -> ScattererTemplate:
-        """The photons of a tree of so many levels, merged and sorted; NaN if a traced opacity leaves none."""
+        """The photons of a tree of so many levels, merged and sorted; NaN if a traced opacity leaves none.
+        `own_levels`: of this material, if it has fewer than others."""
         origin, draws = jax.random.split(key)
         # evenly spread over the sphere and rotated at random, so that each alone is uniformly distributed
         q, r = jnp.linalg.qr(jax.random.normal(origin, (3, 3)))
@@ -334,6 +398,8 @@ class PacketTree:
             flight = -jnp.log1p(-u[0])
             position = position + flight[:, None] * direction
             light, passed = self.energies(optics.opacity, light, flight, u[1])
+            if own_levels is not None:
+                light = jnp.where(level < own_levels, light, 0)
             cosine = 1 - u[2] * cone
             after = (
                 jnp.concatenate([position] * 2),
@@ -371,6 +437,8 @@ class PacketTree:
 
     def faded(self, opacity: Scalar, light: Scalar) -> Scalar:
         """The energy of packets, less of those whose photons fade out."""
+        if self.whole_levels:
+            return light
         return light * smoothstep((opacity * light / self.threshold - FADES) / (1 - FADES))
 
 

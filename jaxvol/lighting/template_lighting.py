@@ -25,18 +25,21 @@ from .baked import BakedLighting, bake
 from .deferred import Deferred
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
-from .photons import Occlusion, PhotonShading
+from .photons import Interpolation, Occlusion, PhotonShading
 from .shading import Lighting, Shading, Surroundings
 from .template import (
     Form,
     PacketTree,
     ScattererTemplate,
+    ThresholdOn,
     check_form,
+    check_isotropic,
     isotropic,
     scatterer_templates,
     scatterings,
 )
 from .transport import Transport
+from .voxel_photons import VoxelPhotons
 
 
 NODES = 48
@@ -61,16 +64,22 @@ class ScattererTemplates(Lighting):
        offset, and adds its colour with α' / α times its intensity.
     6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
+    As printed, steps 4 and 5 are others: a photon adds the light's colour times its intensity, however little
+    light reaches the sample, and in another material its intensity itself is scaled. Here s is lit like c, so
+    that shadows stay dark, and only s is scaled, so that no sample gets more light than arrives.
+    (`experiments/printed_templates.py` has the printed ones, `paper_figs` shows both.)
+
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
     inwards, a sample is lit entirely as that material.
 
     **Scale.** The paper's sum E b (c + s) has no unit. Here the intensities of a template sum to 1 (except
     for `given` ones), and k R turns the sum into radiance on the scale of `path_trace`: k = 4 / (3π), and R
-    is the `Optics.reflectance` of the sample's material. White half-spaces have 0.9 to 1.6 times the exact
-    radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`). For darker colours,
-    templates are too bright: in path tracing the colour darkens each of many scatterings, here it darkens the
-    sum once. Where it fails: `experiments/stability.py`, "long mean free paths",
-    "short mean free paths".
+    is the `Optics.reflectance` of the sample's material. Under soft occlusion, white half-spaces have 0.9 to
+    1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`),
+    and a head 1.3 times that of path tracing; under hard occlusion the head has 0.4 to 0.5 times. For darker
+    colours, templates are too bright: in path tracing the colour darkens each of many scatterings, here it
+    darkens the sum once. Where it fails: `experiments/stability.py`, "long mean free paths", "short mean
+    free paths".
 
     **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths found from
     path-traced images are the true ones. The medium is that of `path_trace` with these materials: the
@@ -107,18 +116,22 @@ class ScattererTemplates(Lighting):
             differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
             points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
             photons that become hidden or change their material.
+        interpolation: at the places of photons. `"nearest"`: the nearest voxel tells what is there, as in the
+            paper, in less time. For hard occlusion, voxels of 8- or 16-bit integers, transfer functions of
+            the value alone, and materials by values.
         reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
             for thin parts in front of others.
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
             misses the photons that are skipped.
         seed: of the templates, and of their choice for each pixel.
-        baked: of the published form: false, or the number of nodes, along the volume's longest side, of a grid on which the light of
+        baked: false, or the number of nodes, along the volume's longest side, of a grid on which the light of
             all templates is computed once and then fetched, as long as volume, transfer function and lighting
-            stay the same; if any of them is traced, it is computed for each image. It carries no gradient. Of `"transport"`:
-            the number of nodes, by default 48; kept in the same way, and it carries gradients.
+            stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
+            With `"transport"`: the number of nodes, by default 48; its light carries gradients.
         packets: of the templates, see `scatterer_template`; by default 4, and 8 for `"transport"`.
         threshold: of the templates.
-        levels: of the templates.
+        threshold_on: of the templates; the paper's is `"level"`.
+        levels: of the templates; one number, or one for each material.
         given: templates to use as they are instead of simulated ones, with leading axes (materials,
             templates). Then nothing depends on the materials' mean free paths.
         form: `"published"`, or `"transport"`: see above.
@@ -137,11 +150,13 @@ class ScattererTemplates(Lighting):
     blend: bool = eqx.field(static=True)
     photons: int = eqx.field(static=True)
     occlusion: Occlusion = eqx.field(static=True)
+    interpolation: Interpolation = eqx.field(static=True)
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
     packets: int = eqx.field(static=True)
     threshold: float = eqx.field(static=True)
-    levels: int = eqx.field(static=True)
+    threshold_on: ThresholdOn = eqx.field(static=True)
+    levels: tuple[int, ...] = eqx.field(static=True)
     baked: int = eqx.field(static=True)
     anisotropy: Float[Array, ""] | None
     form: Form = eqx.field(static=True)
@@ -155,13 +170,15 @@ class ScattererTemplates(Lighting):
         blend: bool | Any = False,
         photons: int | None = None,
         occlusion: Occlusion | Any = "soft",
+        interpolation: Interpolation | Any = "linear",
         reach: Sequence[float] = (2.0, 4.0),
         cutoff: float | None = None,
         seed: int = 0,
         baked: int | bool | Any = False,
         packets: int | None = None,
         threshold: float = 0.01,
-        levels: int | None = None,
+        threshold_on: ThresholdOn | Any = "photon",
+        levels: int | Sequence[int] | None = None,
         given: ScattererTemplate | Any | None = None,
         form: Form | Any = "published",
         anisotropy: Arrayable = 0.0,
@@ -169,9 +186,9 @@ class ScattererTemplates(Lighting):
         check_form(form)
         if form == "transport":
             published = {"blend": blend, "photons": photons, "occlusion": occlusion, "reach": tuple(reach)}
-            _check_unused({**published, "cutoff": cutoff, "given": given})
-        elif not isotropic(anisotropy):
-            raise ValueError(f'anisotropy is of form="transport"; got {anisotropy!r} for form="published".')
+            _check_unused({**published, "cutoff": cutoff, "interpolation": interpolation, "given": given})
+        else:
+            check_isotropic(anisotropy)
         packets = (8 if form == "transport" else 4) if packets is None else packets
         self.form = form
         self.anisotropy = (
@@ -185,21 +202,30 @@ class ScattererTemplates(Lighting):
         if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
             raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
         self.occlusion, self.reach, self.seed = occlusion, tuple(multiples.tolist()), integer("seed", seed, 0)
+        self.interpolation = interpolation
+        if interpolation not in get_args(Interpolation):
+            expected = ", ".join(get_args(Interpolation))
+            raise ValueError(f"interpolation must be one of {expected}; got {interpolation!r}.")
+        if interpolation == "nearest" and occlusion != "hard":
+            raise ValueError(
+                'interpolation="nearest" needs occlusion="hard"; soft occlusion reads no voxels.'
+            )
         cutoff = 0.02 * (occlusion == "hard") if cutoff is None else cutoff
         skips = is_traced(cutoff) or cutoff != 0
         self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
         # True: 64 nodes, fine enough for light that scatters over several voxels
         self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
-        tree = PacketTree(packets, threshold)
-        self.packets, self.threshold, self.given = tree.packets, tree.threshold, given
+        tree = PacketTree(packets, threshold, threshold_on)
+        self.packets, self.threshold, self.threshold_on = tree.packets, tree.threshold, tree.threshold_on
+        self.given = given
         if form == "transport":
-            self.baked = self.baked or NODES
-            self.levels, self.photons = scatterings(self.materials, self.threshold, levels), 0
+            self.baked, self.photons = self.baked or NODES, 0
+            self.levels = (scatterings(self.materials, self.threshold, levels),)
             return
         if given is None:
             self.levels = tree.levels_of(self.materials, levels)
-            available = tree.capacity(self.levels)
-            if not is_traced([each.opacity for each in self.materials]):
+            available = tree.capacity(max(self.levels))
+            if not tree.whole_levels and not is_traced([each.opacity for each in self.materials]):
                 opacities = [float(each.opacity) for each in self.materials]
                 available = min(available, max(tree.capacity(tree.levels(a), a) for a in opacities))
         else:
@@ -211,7 +237,7 @@ class ScattererTemplates(Lighting):
                     f"given must hold templates of {len(self.materials)} materials, intensities of shape "
                     f"(materials, templates, n); got {shape}."
                 )
-            self.templates, self.levels, available = shape[1], 0, shape[-1]
+            self.templates, self.levels, available = shape[1], (), shape[-1]
         self.photons = available if photons is None else min(available, integer("photons", photons, 1))
 
     @property
@@ -225,17 +251,18 @@ class ScattererTemplates(Lighting):
 
     def for_image(self, around: Surroundings) -> Shading:
         if self.form == "transport":
-            how = self.anisotropy, self.seed, self.templates, self.packets, self.levels
+            how = self.anisotropy, self.seed, self.templates, self.packets, *self.levels
             return Transport(around, self.materials, self.lights, *how).solved(self.baked)
         if self.baked:
             return _baked(self, around).for_image(around)
-        return PhotonShading(
+        shading = PhotonShading(
             *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
             blended=self.templates if self.blend else 1,
             occlusion=self.occlusion,
             reach=self.reach,
             seed=self.seed,
         )
+        return shading if self.interpolation == "linear" else VoxelPhotons.of(shading, around)
 
     def simulated(self) -> ScattererTemplate:
         """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
@@ -243,7 +270,8 @@ class ScattererTemplates(Lighting):
         templates = self.given
         if templates is None:
             how: Any = {"packets": self.packets, "threshold": self.threshold, "levels": self.levels}
-            templates = scatterer_templates(self.materials, self.seed, count=self.templates, **how)
+            how |= {"count": self.templates, "threshold_on": self.threshold_on}
+            templates = scatterer_templates(self.materials, self.seed, **how)
             templates = templates.normalized()  # restores the energy that the threshold has cut off
         if not self.blend:
             return templates.brightest(self.photons)
@@ -257,6 +285,7 @@ _DEFAULTS = {
     "occlusion": "soft",
     "reach": (2.0, 4.0),
     "cutoff": None,
+    "interpolation": "linear",
     "given": None,
 }
 

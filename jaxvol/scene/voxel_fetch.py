@@ -78,6 +78,17 @@ class Fetch(eqx.Module):
         i, j, k = (jnp.clip(index, 0, n - 2) for index, n in zip(past, data.shape, strict=True))
         return (i, j, k), fraction
 
+    def nearest(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+        """The node nearest to a grid coordinate, as an index into the flattened array; -1 outside of the
+        grid."""
+        node, inside = [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate], jnp.array(True)
+        for index, n in zip(node, self.shape(data), strict=True):
+            inside &= (index >= 0) & (index < n)
+        if self.window is not None:
+            past = [node[axis] - self.window.first[axis] for axis in self.axes]
+            node = [jnp.clip(index, 0, n - 1) for index, n in zip(past, data.shape, strict=True)]
+        return jnp.where(inside, flat_index((node[0], node[1], node[2]), data.shape), -1)
+
     def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
         """The node below a grid coordinate, as an index into the flattened array."""
         return flat_index(self.split(data, coordinate)[0], data.shape)

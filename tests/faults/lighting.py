@@ -47,6 +47,21 @@ FAULTS: list[Fault] = [
         ("lighting/test_template.py::test_a_conserving_template_holds_what_the_threshold_leaves",),
     ),
     Fault(
+        "light: materials have as many levels as the one that has most",
+        "lighting.template:PacketTree.template",
+        lambda f: lambda self, optics, key, levels, merge, own=None: f(self, optics, key, levels, merge),
+        (
+            "lighting/test_template.py::"
+            "test_whole_levels_are_those_of_each_material_and_depend_on_nothing_traced",
+        ),
+    ),
+    Fault(
+        "light: photons at voxels are not moved by refraction",
+        "lighting.voxel_photons:VoxelPhotons._ratios",
+        lambda f: lambda self, *of: (f(self, *of)[0] ** 0, f(self, *of)[1]),
+        (f"{PHOTONS}test_each_step_at_voxels_is_that_at_interpolated_nodes",),
+    ),
+    Fault(
         "light: baked while something is traced, it is kept as tracers",
         "lighting.template_lighting:computed_now",
         lambda f: lambda function, *of: function(*of),

@@ -42,14 +42,22 @@ def lit(materials: Any = HALF, lights: Any = SUN, **how):
     return lambda: ScattererTemplates(materials, lights, **how)
 
 
+AT_VOXELS = lit(interpolation="nearest", occlusion="hard", given=PAIR)
+
 BAD = {
     # templates
     "packets": (grown(packets=0), "packets must be an integer of at least 1"),
+    "threshold on": (grown(threshold_on="tree"), "threshold_on must be one of photon, level; got 'tree'"),
+    "too many photons": (
+        grown(Material(0.1, 1.0), packets=1, threshold_on="level"),
+        'threshold_on="level" keeps 22 levels of packets=1 whole, more than 4096 photons',
+    ),
+    "levels of other materials": (lit(levels=(1, 2)), r"levels must be one number, or 1; got \(1, 2\)"),
     "threshold 0": (grown(threshold=0.0), "threshold must be"),
     "threshold 1": (grown(threshold=1.0), "threshold must be"),
     "opacity too low": (
         grown(FAINT),
-        "opacity 0.031 leaves no photon above threshold=0.01.*packets=4.*a threshold of at most 0.00775",
+        "opacity 0.031 leaves no photon above threshold=0.01.*packets=4.*a threshold below 0.00775",
     ),
     "opacity too low, levels given": (grown(FAINT, levels=3), "opacity 0.031 leaves no photon"),
     "one opacity too low": (
@@ -62,6 +70,15 @@ BAD = {
         "levels must be given where opacity is traced",
     ),
     "count": (lambda: scatterer_templates(HALF, 0, count=0), "count must be an integer of at least 1"),
+    "interpolation": (
+        lit(interpolation="cubic"),
+        "interpolation must be one of linear, nearest; got 'cubic'",
+    ),
+    "soft at voxels": (lit(interpolation="nearest"), 'interpolation="nearest" needs occlusion="hard"'),
+    "voxels of floats": (
+        lambda: shaded(AT_VOXELS(), VOLUME, TRANSFER, np.zeros((1, 3))),
+        'interpolation="nearest" takes voxels of 8- or 16-bit integers; got float32',
+    ),
     "photons kept": (lambda: PAIR.brightest(0), "photons must be an integer"),
     # materials
     "opacity below 0": (lambda: Material(-0.1, 1.0), r"opacity must be in \[0, 1\]; got -0.1"),
@@ -137,7 +154,7 @@ def test_bad_input_is_named(case):
 
 
 def test_the_threshold_that_is_advised_leaves_photons():
-    assert PacketTree(threshold=0.00775).levels(0.031) > 1
+    assert PacketTree(threshold=0.0077).levels(0.031) > 1
 
 
 def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.printed_templates import LevelTree, PrintedTree
+from experiments.printed_templates import PrintedTree
 from jaxvol.lighting import (
     DirectionalLight,
     Material,
@@ -192,8 +192,9 @@ def test_many_templates_are_those_grown_one_by_one():
 
 def test_a_threshold_on_levels_gives_the_papers_count():
     """Six levels, of which the last one's brightest possible photon holds 0.5^6: a full tree of 63 photons,
-    the most that the paper counts. Merging leaves 56 to 63."""
-    half, tree = Material(0.5, 1.0, INDEX), LevelTree(packets=1)
+    the most that the paper counts. Merging leaves 56 to 63. Four packets have four levels each, 60 photons:
+    at 4 bytes each, the paper's 240 bytes."""
+    half, tree = Material(0.5, 1.0, INDEX), PacketTree(packets=1, threshold_on="level")
     grown = jax.jit(lambda key, merge: tree.template(half.optics, key, 6, merge).intensity, static_argnums=1)
     whole = np.asarray(grown(KEY, 0))
     assert np.sum(whole > 0) == 63
@@ -204,9 +205,27 @@ def test_a_threshold_on_levels_gives_the_papers_count():
     assert counts.max() <= 63
     # at a threshold just above a level's brightest possible photon, that level is left out
     for threshold, photons in ((0.01, 63), (0.0157, 31)):
-        tree = LevelTree(1, threshold)
+        tree = PacketTree(1, threshold, "level")
         assert tree.capacity(tree.levels(0.5)) == photons
     assert capacity(half, packets=1) == 63
+    assert capacity(half, threshold_on="level") == 60
+
+
+def test_whole_levels_are_those_of_each_material_and_depend_on_nothing_traced():
+    """Each level k holds α (1 - α)^k, whatever is refracted."""
+    opacities, levels = (0.5, 0.7), (4, 3)
+
+    def totals_of(opacities):
+        materials = [Material(opacity, 1.0, INDEX) for opacity in opacities]
+        return scatterer_templates(materials, 0, count=1, threshold_on="level", levels=levels).intensity.sum(
+            -1
+        )
+
+    assert PacketTree(threshold_on="level").levels_of([Material(a, 1.0) for a in opacities], None) == levels
+    found, slopes = jax.jit(lambda a: (totals_of(a), jax.jacfwd(totals_of)(a)))(jnp.asarray(opacities))
+    for i, (opacity, number) in enumerate(zip(opacities, levels, strict=True)):
+        np.testing.assert_allclose(found[i, 0], 1 - (1 - opacity) ** number, rtol=1e-5)
+        np.testing.assert_allclose(slopes[i, 0, i], number * (1 - opacity) ** (number - 1), rtol=1e-4)
 
 
 def test_merging_makes_the_papers_brightest_photon():
