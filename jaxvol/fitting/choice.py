@@ -27,6 +27,7 @@ from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, fit
 from .residuals import ImageResidual, check_residual
+from .uncertainty import MISFIT
 
 
 RESOLUTION = 1e-4
@@ -136,7 +137,8 @@ def choose(
 
     Returns:
         A `Choice`, with the evidence for each candidate. If the largest is chosen, a larger one may be better
-        still. Undetermined directions are counted there, in place of the warnings of `fit`.
+        still. Undetermined directions are counted there, in place of the warnings of `fit`; whether the chosen
+        model fits is in `fit.uncertainty.reduced_chi_squared`.
 
     Raises:
         ValueError: for no candidates, candidates that do not grow or have no start, no held-out views, a view
@@ -159,6 +161,7 @@ def choose(
             how["checkpoint"] = file.with_name(f"{file.stem}-{at + 1}{file.suffix}")
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=UNDETERMINED)
+            warnings.filterwarnings("ignore", message=MISFIT)
             fits.append(fit(_of_model(training, candidate), start, **how))
         parameters = fits[-1].parameters
         entries = (_entries(_of_model(view, candidate), parameters) for view in validation)

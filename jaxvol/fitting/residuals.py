@@ -7,13 +7,14 @@ large to hold, but a Gauss–Newton or Levenberg–Marquardt step needs only the
 
 which is (n + 1, n + 1) and is computed tile by tile, by QR of the triangle so far and the tile's rows (TSQR,
 Demmel et al. 2012). A residual of n + 1 numbers with the Jacobian [R; 0] thus replaces that of all pixels
-exactly, for any solver; unlike JᵀJ, it does not square the condition number.
+exactly, for any solver; unlike JᵀJ, it does not square the condition number. The scores Jᵢ rᵢ, whose outer
+products tell how much the estimate varies, are reduced in the same pass.
 """
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, cast
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -25,20 +26,23 @@ from jaxtyping import Array, Float
 from .._util.checks import Arrayable, described, finite_array, not_negative
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
+from ..path_tracing import PathTraced
 from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera
 from ..scene.transfer import Transfer
 from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
+from .noise import Noise, given_variances, path_traced_view
 
 
 TANGENTS = 64
 """Columns of the Jacobian computed at once: a march keeps its state for each of them."""
 
 
-Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]], PyTree]
-"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items."""
+Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, "pixels channels"]], PyTree]
+"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items. Noise may
+be correlated between the entries of a pixel."""
 
 
 def check_residual(residual: Any) -> None:
@@ -66,9 +70,15 @@ class ImageResidual(eqx.Module):
             `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit. The solver
             chooses the adjoint.
         views: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
-            `background`, or (height, width, 4), as `Rendering.rgba`.
+            `background`, or (height, width, 4), as `Rendering.rgba`; or a `PathTraced`, which is put before
+            `background`.
         background: linear RGB behind the volume, for three-channel images.
         compositing: as in `render`.
+        noise: standard deviation of the noise of the references: a number; or a list with a number, an array
+            like the image or one that broadcasts to it, or None, for each view. Where it is not given, it is
+            the standard error of a view that is a `PathTraced` of more than one path, and else unknown. If it
+            is known for all views, `fit` compares it with the residual, and warns of a model that does not
+            fit. It doesn't weight the residual.
         blur: compare blurred images: standard deviation of a Gaussian, as a fraction of the image's height,
             for `fit_coarse_to_fine`. Whole images are then differentiated at once. Pixels beyond the border
             do not count. Standard errors are too small, since the noise of blurred pixels is not independent:
@@ -76,7 +86,7 @@ class ImageResidual(eqx.Module):
 
     Raises:
         ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or
-            infinite pixels, a negative `blur`, and a scene that returns something else; and when it is
+            infinite pixels, a negative `blur`, `noise` that is negative, infinite or of another shape, and a scene that returns something else; and when it is
             fitted, for blurred images that `max_jacobian` leaves no room for.
     """
 
@@ -85,6 +95,8 @@ class ImageResidual(eqx.Module):
     """Stacked views of the same size and kind."""
     background: Float[Array, "3"]
     compositing: Compositing[Any]
+    noise: Noise | None
+    """None if it is unknown for any view."""
     blur: Float[Array, ""] | None
 
     def __init__(
@@ -94,6 +106,7 @@ class ImageResidual(eqx.Module):
         background: Arrayable = (1.0, 1.0, 1.0),
         *,
         compositing: Mode | Compositing[Any] | Any = "over",
+        noise: Arrayable | Sequence[Arrayable | None] | None = None,
         blur: Arrayable | None = None,
     ):
         try:
@@ -108,8 +121,12 @@ class ImageResidual(eqx.Module):
         if not views:
             raise ValueError("views must hold at least one pair (camera, image); got none.")
         by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
-        for number, view in enumerate(views):
-            camera, image = _view(number, view)
+        read = [_view(number, view, self.background) for number, view in enumerate(views)]
+        given = given_variances(noise, [image.shape for _, image, _ in read])
+        known = [own if told is None else told for (*_, own), told in zip(read, given, strict=True)]
+        every = [variance for variance in known if variance is not None]
+        self.noise = Noise.of(every) if len(every) == len(read) else None
+        for camera, image, _ in read:
             by_kind.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
         self.groups = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *views) for views in by_kind.values()]
 
@@ -178,7 +195,7 @@ class ImageResidual(eqx.Module):
                 for axis, n in enumerate((height, width)):
                     kernel = _blurring(n, self.blur * height)
                     difference = jnp.moveaxis(jnp.tensordot(kernel, difference, axes=(1, axis)), 0, axis)
-            return difference.reshape(-1)
+            return difference.reshape(-1, channels)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return residual, (jnp.asarray(view), jnp.asarray(piece * rows))
@@ -192,19 +209,36 @@ def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
     return jax.nn.softmax(-(away**2) / 2, axis=1)
 
 
-def _view(number: int, view: Any) -> tuple[Camera, Array]:
+def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera, Array, np.ndarray | None]:
+    """Camera, image, and the variance of its noise if the image is path-traced."""
     if not isinstance(view, tuple | list) or len(view) != 2 or not isinstance(view[0], Camera):
         raise ValueError(f"views[{number}] must be a pair (camera, image); got {described(view)}.")
-    camera, name = view[0], f"views[{number}]: the image"
-    if (kind := np.asarray(view[1]).dtype).kind not in "fV":  # V: JAX's own 8- and 16-bit floats
+    camera, given = view
+    variance, name = None, f"views[{number}]: the image"
+    if isinstance(given, PathTraced):
+        given, variance = path_traced_view(given, background)
+    if (kind := np.asarray(given).dtype).kind not in "fV":  # V: JAX's own 8- and 16-bit floats
         raise ValueError(
             f"{name} must be linear RGB, floats in [0, 1]; got {kind}. Convert a picture file with "
             "jv.read_views, or its pixels with jv.from_srgb(image / 255)."
         )
-    image = finite_array(name, view[1], (*camera.size[::-1], None)).astype(jnp.float32)
+    image = finite_array(name, given, (*camera.size[::-1], None)).astype(jnp.float32)
     if image.shape[2] not in (3, 4):
         raise ValueError(f"{name} must have 3 or 4 channels; got {image.shape[2]}.")
-    return camera, image
+    return camera, image, variance
+
+
+class Triangles(NamedTuple):
+    """What a least-squares fit keeps of a residual of m entries and its Jacobian.
+
+    Attributes:
+        residual: the triangle R of [J r], whose last column replaces the residual.
+        scores: the triangle S of the scores, the gradients of each pixel's part of the loss (that is, Σ Jᵢ rᵢ
+            over its entries i): SᵀS is the sum of their outer products.
+    """
+
+    residual: Float[Array, "numbers numbers"]
+    scores: Float[Array, "free free"]
 
 
 class Problem(eqx.Module):
@@ -240,12 +274,13 @@ class Problem(eqx.Module):
         return cls(residual, free, count, tile, least_squares)
 
     def __call__(self, y: FreeVariables, _: Any = None) -> tuple[Array, tuple[Array, FreeVariables, Any]]:
-        """What a solver minimises; and the loss, its point, and the triangle there."""
+        """What a solver minimises; and the loss, its point, and the triangles there."""
         if not self.least_squares:
             loss = self.loss(y)
             return loss, (loss, y, None)
-        triangle = self.condensed(y)
-        return triangle[:, -1], (jnp.sum(triangle[:, -1] ** 2) / 2, y, triangle)
+        triangles = self.condensed(y)
+        column = triangles.residual[:, -1]
+        return column, (jnp.sum(column**2) / 2, y, triangles)
 
     def loss(self, free: FreeVariables) -> Float[Array, ""]:
         """Half the sum of squares. Its gradient is summed tile by tile, in reverse mode."""
@@ -270,29 +305,35 @@ class Problem(eqx.Module):
 
         return loss(free)
 
-    def condensed(self, free: FreeVariables) -> Float[Array, "numbers numbers"]:
+    def condensed(self, free: FreeVariables) -> Triangles:
         """The triangle [R c; 0 ρ], whose last column of n + 1 numbers replaces the residual, in value and
-        derivative. Forward mode."""
+        derivative, and that of the scores, without derivative. Forward mode."""
 
         @jax.custom_jvp
-        def condensed(free: FreeVariables) -> Array:
+        def condensed(free: FreeVariables) -> Triangles:
             flat, unravel = ravel_pytree(free)
 
-            def add(function: Any, triangle: Array, item: Any) -> Array:
+            def add(function: Any, triangles: Triangles, item: Any) -> Triangles:
                 def residual(flat: Array) -> Array:
                     return function(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
 
-                return jnp.linalg.qr(jnp.concatenate([triangle, _jacobian(residual, flat)]), mode="r")
+                rows = _jacobian(residual, flat)
+                scores = jnp.sum(rows[..., :-1] * rows[..., -1:], axis=1)
+                both = zip(triangles, (rows.reshape(-1, flat.size + 1), scores), strict=True)
+                return Triangles(*(jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in both))
 
-            triangle = self._accumulate(add, jnp.zeros((flat.size + 1, flat.size + 1), flat.dtype))
+            zeros = (jnp.zeros((n, n), flat.dtype) for n in (flat.size + 1, flat.size))
+            triangle, scores = self._accumulate(add, Triangles(*zeros))
             # QR's row signs are arbitrary; fixed here, so that they do not jump from step to step
-            return triangle * jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
+            signs = jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
+            return Triangles(triangle * signs, scores)
 
         @condensed.defjvp
-        def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Array, Array]:
-            triangle = condensed(*primal)
+        def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Triangles, Triangles]:
+            triangle, scores = condensed(*primal)
             change = triangle[:, :-1] @ ravel_pytree(*tangent)[0]
-            return triangle, jnp.zeros_like(triangle).at[:, -1].set(change)
+            changes = jnp.zeros_like(triangle).at[:, -1].set(change), jnp.zeros_like(scores)
+            return Triangles(triangle, scores), Triangles(*changes)
 
         return condensed(free)
 
@@ -302,13 +343,15 @@ class Problem(eqx.Module):
             tiles = self.residual.tiles(self.tile)
         else:
             own: Any = self.residual
-            tiles = [(lambda parameters, *_: ravel_pytree(own(parameters))[0], jnp.zeros(1))]
+            tiles = [(lambda parameters, *_: ravel_pytree(own(parameters))[0][:, None], jnp.zeros(1))]
         for function, items in tiles:
             total, _ = jax.lax.scan(lambda sum, item, f=function: (add(f, sum, item), None), total, items)
         return total
 
 
-def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Array, "entries numbers"]:
+def _jacobian(
+    f: Callable[[Array], Float[Array, "pixels channels"]], at: Float[Array, " n"]
+) -> Float[Array, "pixels channels numbers"]:
     """[J r] by forward mode, at most `TANGENTS` columns at a time."""
     n = at.size
     chunk = min(n, TANGENTS)
@@ -316,5 +359,5 @@ def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Arra
     directions = jnp.eye(chunks * chunk, n, dtype=at.dtype).reshape(chunks, chunk, n)
     push = jax.vmap(lambda direction: jax.jvp(f, (at,), (direction,)), out_axes=(None, 0))
     value, columns = jax.lax.map(push, directions)
-    columns = columns.reshape(chunks * chunk, -1)[:n]
-    return jnp.concatenate([columns, value[:1]]).T
+    columns = columns.reshape(chunks * chunk, *value.shape[1:])[:n]
+    return jnp.moveaxis(jnp.concatenate([columns, value[:1]]), 0, -1)

@@ -1,10 +1,15 @@
-"""How well do the images determine the parameters? Covariance from the triangle of a least-squares fit.
+"""How well do the images determine the parameters? Covariance from the triangles of a least-squares fit.
 
-If residuals are independent and of equal variance σ², estimated by Σ r² / (m - n), the covariance of the free
-variables around the truth is σ² (JᵀJ)⁻¹ to first order, with JᵀJ = RᵀR; that of the parameters follows from
-the Jacobian of the bijections.
+To first order, a fit errs by (JᵀJ)⁻¹ Jᵀ e if the references err by e. So its covariance is
+(JᵀJ)⁻¹ Jᵀ cov(e) J (JᵀJ)⁻¹, with JᵀJ = RᵀR. For noise that is independent from pixel to pixel, Jᵀ cov(e) J is
+estimated by Σ gₚ gₚᵀ · m / (m - n), with the scores gₚ = Σ Jᵢ rᵢ over the entries of pixel p, whatever the
+variance of each entry, and however the colours of a pixel are correlated: the "sandwich" (Huber 1967; White
+1980; for clusters, Liang and Zeger 1986). If all entries are independent and of equal variance σ², estimated
+by Σ r² / (m - n), the covariance is σ² (JᵀJ)⁻¹. The covariance of the parameters follows from the Jacobian of
+the bijections.
 """
 
+import warnings
 from typing import NamedTuple
 
 import jax
@@ -13,6 +18,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Float
 
 from .constraints import Free, FreeVariables
+from .noise import Noise
+from .residuals import Triangles
 
 
 SHARE = 0.5
@@ -22,45 +29,63 @@ TOUCHED = 0.01
 """A variance is infinite if the parameter's share in an undetermined direction of length 1 exceeds this."""
 
 
+MISFIT = "The model does not fit"
+"""How the warning of a misfit begins, for those who tell it otherwise."""
+
+
 class Uncertainty(NamedTuple):
-    """Uncertainty of fitted parameters.
+    """Uncertainty of fitted parameters that is due to noise of the references.
+
+    If the model can't make the references, the parameters are biased, and neither covariance knows by how
+    much: of a misfit whose norm is k times the standard deviation σ of the noise, a parameter may be off by up
+    to k standard errors. What is too small to be seen in χ² of m entries may still hide (2 m)^¼ of them.
 
     Attributes:
-        covariance: in the order of `names`. If a direction that the residual does not determine changes a
-            parameter, its variance is infinite and its covariances are NaN.
+        covariance: in the order of `names`, for noise that is independent from pixel to pixel, whatever its
+            variance in each ("sandwich", Huber–White). If a direction that the residual does not determine
+            changes a parameter, its variance is infinite and its covariances are NaN.
         names: such as `.extinction[3]`.
         undetermined: for each such direction, the parameters that it changes most.
+        covariance_of_equal_noise: if all entries of the residual have independent noise of equal variance;
+            otherwise wrong: too small where only some pixels are noisy, and these show the parameters.
+        reduced_chi_squared: how many times larger the mean square of the residual is than the noise,
+            Σ r² / Σ σ² · m / (m - n) with m entries of σ > 0 and n parameters, so that pixels without noise,
+            such as the background of a path-traced image, don't count: about 1 if the model fits. None if the
+            noise of the references is unknown, and then nothing is known about misfit, either.
     """
 
     covariance: Float[np.ndarray, "parameters parameters"]
     names: list[str]
     undetermined: list[list[str]]
+    covariance_of_equal_noise: Float[np.ndarray, "parameters parameters"]
+    reduced_chi_squared: float | None
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Square roots of the variances, by name."""
+        """Square roots of the variances in `covariance`, by name."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 def uncertainty(
-    triangle: Float[np.ndarray, "n n"], count: int, free: Free, at: FreeVariables, scale: float = 0.0
+    triangles: Triangles, count: int, free: Free, at: FreeVariables, scale: float, chi_squared: float | None
 ) -> Uncertainty:
-    """Uncertainty of the parameters `free.forward(at)`, from the triangle [R c; 0 ρ] there, the number of
-    residuals, and the norm `scale` of the compared data.
+    """Uncertainty of the parameters `free.forward(at)`, from the triangles there, the number of entries of the
+    residual, the norm `scale` of the compared data, and the reduced χ².
 
     A direction is undetermined if its singular value is below n ε times the largest one, or times that norm,
     with ε of the float type: within rounding, the residual does not depend on it."""
-    n = triangle.shape[0] - 1
     flat, unravel = ravel_pytree(at)
     jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
-    factor = np.asarray(triangle, np.float64)
-    # with as many parameters as residuals, none are left to estimate the variance from
-    variance = np.sum(factor[:, -1] ** 2) / (count - n) if count > n else np.inf
+    factor, scores = (np.asarray(triangle, np.float64) for triangle in triangles)
+    n = len(scores)
     _, singular, directions = np.linalg.svd(factor[:n, :n])
-    determined = singular > n * np.finfo(triangle.dtype).eps * singular.max(initial=scale)
+    determined = singular > n * np.finfo(triangles.residual.dtype).eps * singular.max(initial=scale)
     effects = jac @ directions.T  # of each direction, on the parameters
     spread = effects[:, determined] / singular[determined]
-    covariance = variance * (spread @ spread.T) if np.isfinite(variance) else np.full((len(jac),) * 2, np.inf)
+    left = count - n  # with as many parameters as entries, none are left to estimate variances from
+    equal = spread * np.sqrt(np.sum(factor[:, -1] ** 2) / left if left > 0 else np.inf)
+    each = (spread / singular[determined]) @ (directions[determined] @ scores.T)
+    each = each * np.sqrt(count / left if left > 0 else np.inf)
     names = free.names(at)
     # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
     # the parameter is undetermined
@@ -68,6 +93,28 @@ def uncertainty(
     share = np.abs((jac / np.where(norm > 0, norm, 1)) @ directions[~determined].T)
     undetermined = [[names[i] for i in np.flatnonzero(row >= SHARE * row.max())] for row in share.T]
     touched = np.any(share > TOUCHED, axis=1)
+    covariance, of_equal = (_covariance(factor, touched, left) for factor in (each, equal))
+    return Uncertainty(covariance, names, undetermined, of_equal, chi_squared)
+
+
+def _covariance(factor: np.ndarray, touched: np.ndarray, left: int) -> Float[np.ndarray, "n n"]:
+    """F Fᵀ, infinite for parameters that an undetermined direction has `touched`, and if no entries are left."""
+    if left <= 0:
+        return np.full((len(factor),) * 2, np.inf)
+    covariance = factor @ factor.T
     covariance[touched] = covariance[:, touched] = np.nan
     covariance[touched, touched] = np.inf
-    return Uncertainty(covariance, names, undetermined)
+    return covariance
+
+
+def warn_of_misfit(noise: Noise | None, chi_squared: float | None, message: str | None, level: int) -> None:
+    """Warn if noise does not explain the residual. `message`: how the fit ended, if it did not converge."""
+    if noise is None or chi_squared is None or chi_squared <= noise.largest_by_chance:
+        return
+    because = "" if message is None else f", or the fit is not at its minimum ({message})"
+    warnings.warn(
+        f"{MISFIT} the references{because}: the residual is {chi_squared**0.5:.3g} times as large as their noise "
+        f"(reduced chi-squared {chi_squared:.4g}; noise alone stays below {noise.largest_by_chance:.3g}). Standard "
+        "errors do not cover the bias that this causes.",
+        stacklevel=level + 1,
+    )
