@@ -1,10 +1,10 @@
 """Do reported standard errors cover the truth?
 
 A model that can make the references is fitted to them, with other noise for each of 40 seeds. The truth
-should lie within two standard errors in some 95 % of the fits. Two models: opacities and colours of three materials
-of the head phantom (twelve numbers), by their transfer function; and the mean free path of a ball lit by
-scatterer templates. Three kinds of noise: equal in all pixels; proportional to how bright they are, tenfold
-from black to the brightest, in each colour of its own; and as that of a path tracer, proportional to the
+should lie within two standard errors in some 95 % of the fits. Two models: opacities and colours of three
+materials of the head phantom (twelve numbers), by their transfer function; and the mean free path of a ball
+lit by scatterer templates. Three kinds of noise: equal in all pixels; growing with brightness, tenfold from
+black to the brightest pixel, in each colour of its own; and as that of a path tracer, proportional to the
 brightness and the same in all three colours, so that the background has none.
 
 Two standard errors are compared: that of `standard_errors` (the sandwich), and that for equal noise. The

@@ -137,8 +137,8 @@ def choose(
 
     Returns:
         A `Choice`, with the evidence for each candidate. If the largest is chosen, a larger one may be better
-        still. Undetermined directions are counted there, in place of the warnings of `fit`; whether the chosen
-        model fits is in `fit.uncertainty.reduced_chi_squared`.
+        still. Undetermined directions are counted there, in place of the warnings of `fit`; whether a model
+        fits is in `fit.uncertainty.reduced_chi_squared`.
 
     Raises:
         ValueError: for no candidates, candidates that do not grow or have no start, no held-out views, a view

@@ -321,5 +321,5 @@ def _report(run: _Run, problem: Problem, result: Any, max_steps: int) -> Fit:
     stats = {"num_steps": len(run.losses), "max_steps": max_steps}
     solution = optx.Solution(run.best, result, None, stats, run.state)
     found = Fit(problem.free.forward(run.best), solution, np.asarray(run.losses), estimate)
-    warn_of_misfit(noise, chi_squared, None if found.success else found.message, level=3)
+    warn_of_misfit(noise, chi_squared, None if found.success else found.message)
     return found

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import described, finite_array, require
+from .._util.checks import described, not_negative
 from ..path_tracing import PathTraced
 
 
@@ -65,33 +65,31 @@ class Noise(eqx.Module):
 
 def path_traced_view(
     traced: PathTraced, background: Float[Array, "3"]
-) -> tuple[Array, Float[np.ndarray, "height width 3"] | None]:
+) -> tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width 3"] | None]:
     """The image over a background, and the variance of its pixels; None for a single path, which has none.
 
     A path that meets nothing shows the background b, and brings no radiance L. So with A the opacity, the
-    mean of n paths has the variance var L + [b² A (1 - A) - 2 b L (1 - A)] / (n - 1).
+    mean of n paths has the variance var L + [b² A (1 - A) - 2 b L (1 - A)] / (n - 1), where var L is the square
+    of `PathTraced.standard_error`.
     """
-    image = traced.image(background)
+    given = traced.radiance, traced.deviations, traced.opacity[..., None], background
+    radiance, deviations, opacity, behind = (np.asarray(each, np.float64) for each in given)
+    image = radiance + (1 - opacity) * behind
     if traced.paths < 2:
         return image, None
-    radiance, error, seen = (
-        np.asarray(each, np.float64) for each in (traced.radiance, traced.standard_error, background)
-    )
-    opacity = np.asarray(traced.opacity, np.float64)[..., None]
-    of_background = seen * (1 - opacity) * (seen * opacity - 2 * radiance) / (traced.paths - 1)
-    # the three terms are of one sample's paths, and so at least 0, up to rounding
-    return image, np.maximum(error**2 + of_background, 0)
+    of_background = behind * (1 - opacity) * (behind * opacity - 2 * radiance)
+    # the sum is a variance of paths, and so at least 0, up to rounding
+    return image, np.maximum(deviations / traced.paths + of_background, 0) / (traced.paths - 1)
 
 
 def given_variances(
     noise: Any, shapes: Sequence[tuple[int, ...]]
 ) -> list[Float[np.ndarray, "height width channels"] | None]:
-    """Variances of the pixels of each view, from the standard deviations that a user gave; None if unknown."""
+    """Variances of the pixels of each view, from standard deviations that a user gives; None if unknown."""
     several = isinstance(noise, list | tuple)
-    if several and len(noise) != len(shapes):
-        raise ValueError(
-            f"noise must be a number, or a list with an entry for each of {len(shapes)} views; got {described(noise)}."
-        )
+    if (several and len(noise) != len(shapes)) or (not several and np.ndim(noise) > 0):
+        expected = f"a number, or a list with an entry for each of {len(shapes)} views"
+        raise ValueError(f"noise must be {expected}; got {described(noise)}.")
     each = list(noise) if several else [noise] * len(shapes)
     names = [f"noise[{view}]" if several else "noise" for view in range(len(shapes))]
     return [_variance(name, sigma, shape) for name, sigma, shape in zip(names, each, shapes, strict=True)]
@@ -100,11 +98,9 @@ def given_variances(
 def _variance(name: str, sigma: Any, shape: tuple[int, ...]) -> np.ndarray | None:
     if sigma is None:
         return None
-    array = finite_array(name, sigma, (None,) * np.ndim(sigma))
-    require(array, lambda v: v >= 0, f"{name} must not be negative; got {{got}}.")
+    array = not_negative(name, sigma, (None,) * np.ndim(sigma))
     try:
         return np.broadcast_to(np.asarray(array, np.float64) ** 2, shape)
     except ValueError as fault:
-        raise ValueError(
-            f"{name} must be a number, or an array like its image, {shape}; got shape {array.shape}."
-        ) from fault
+        expected = f"a number, or an array like its image, {shape}"
+        raise ValueError(f"{name} must be {expected}; got shape {array.shape}.") from fault

@@ -41,8 +41,8 @@ TANGENTS = 64
 
 
 Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, "pixels channels"]], PyTree]
-"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items. Noise may
-be correlated between the entries of a pixel."""
+"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items. Noise
+may be correlated between the entries of a pixel."""
 
 
 def check_residual(residual: Any) -> None:
@@ -86,8 +86,9 @@ class ImageResidual(eqx.Module):
 
     Raises:
         ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or
-            infinite pixels, a negative `blur`, `noise` that is negative, infinite or of another shape, and a scene that returns something else; and when it is
-            fitted, for blurred images that `max_jacobian` leaves no room for.
+            infinite pixels, a negative `blur`, `noise` that is negative, infinite or of another shape, and a
+            scene that returns something else; and when it is fitted, for blurred images that `max_jacobian`
+            leaves no room for.
     """
 
     scene: SceneFunction

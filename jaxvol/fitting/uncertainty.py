@@ -36,9 +36,9 @@ MISFIT = "The model does not fit"
 class Uncertainty(NamedTuple):
     """Uncertainty of fitted parameters that is due to noise of the references.
 
-    If the model can't make the references, the parameters are biased, and neither covariance knows by how
-    much: of a misfit whose norm is k times the standard deviation σ of the noise, a parameter may be off by up
-    to k standard errors. What is too small to be seen in χ² of m entries may still hide (2 m)^¼ of them.
+    If the model cannot make the references, the parameters are biased, and neither covariance knows by how
+    much. A misfit whose norm is k times the standard deviation of (equal) noise may shift a parameter by up
+    to k standard errors. So what is too small to show in χ² of m entries, a k of (2 m)^¼, may still do harm.
 
     Attributes:
         covariance: in the order of `names`, for noise that is independent from pixel to pixel, whatever its
@@ -69,8 +69,8 @@ class Uncertainty(NamedTuple):
 def uncertainty(
     triangles: Triangles, count: int, free: Free, at: FreeVariables, scale: float, chi_squared: float | None
 ) -> Uncertainty:
-    """Uncertainty of the parameters `free.forward(at)`, from the triangles there, the number of entries of the
-    residual, the norm `scale` of the compared data, and the reduced χ².
+    """Uncertainty of the parameters `free.forward(at)`, from the triangles there, the number of entries of
+    the residual, the norm `scale` of the compared data, and the reduced χ².
 
     A direction is undetermined if its singular value is below n ε times the largest one, or times that norm,
     with ε of the float type: within rounding, the residual does not depend on it."""
@@ -98,7 +98,7 @@ def uncertainty(
 
 
 def _covariance(factor: np.ndarray, touched: np.ndarray, left: int) -> Float[np.ndarray, "n n"]:
-    """F Fᵀ, infinite for parameters that an undetermined direction has `touched`, and if no entries are left."""
+    """F Fᵀ; infinite for parameters that an undetermined direction `touched`, or if no entries are left."""
     if left <= 0:
         return np.full((len(factor),) * 2, np.inf)
     covariance = factor @ factor.T
@@ -107,14 +107,14 @@ def _covariance(factor: np.ndarray, touched: np.ndarray, left: int) -> Float[np.
     return covariance
 
 
-def warn_of_misfit(noise: Noise | None, chi_squared: float | None, message: str | None, level: int) -> None:
+def warn_of_misfit(noise: Noise | None, chi_squared: float | None, message: str | None) -> None:
     """Warn if noise does not explain the residual. `message`: how the fit ended, if it did not converge."""
     if noise is None or chi_squared is None or chi_squared <= noise.largest_by_chance:
         return
     because = "" if message is None else f", or the fit is not at its minimum ({message})"
     warnings.warn(
-        f"{MISFIT} the references{because}: the residual is {chi_squared**0.5:.3g} times as large as their noise "
-        f"(reduced chi-squared {chi_squared:.4g}; noise alone stays below {noise.largest_by_chance:.3g}). Standard "
-        "errors do not cover the bias that this causes.",
-        stacklevel=level + 1,
+        f"{MISFIT} the references{because}: the residual is {chi_squared**0.5:.3g} times as large as "
+        f"noise (reduced chi-squared {chi_squared:.4g}; of noise alone below {noise.largest_by_chance:.3g}). "
+        "Standard errors do not cover the bias that this causes.",
+        stacklevel=4,  # whoever calls `fit`
     )
