@@ -69,8 +69,8 @@ def path_traced_view(
     """The image over a background, and the variance of its pixels; None for a single path, which has none.
 
     A path that meets nothing shows the background b, and brings no radiance L. So with A the opacity, the
-    mean of n paths has the variance var L + [b² A (1 - A) - 2 b L (1 - A)] / (n - 1), where var L is the square
-    of `PathTraced.standard_error`.
+    mean of n paths has the variance var L + [b² A (1 - A) - 2 b L (1 - A)] / (n - 1), where var L is that of
+    the mean radiance, the square of `PathTraced.standard_error`.
     """
     given = traced.radiance, traced.deviations, traced.opacity[..., None], background
     radiance, deviations, opacity, behind = (np.asarray(each, np.float64) for each in given)
