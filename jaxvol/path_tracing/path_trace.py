@@ -1,10 +1,10 @@
 """Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,8 +22,11 @@ from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import compiled
+from ..xla.differentiation import forward_only
 from ..xla.platform import is_traced
+from .fixed_paths import check_voxels, with_constant_paths
 from .lanes import walk_all
+from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
 from .medium import Medium
 from .walks import Walk, WalkResult, WalkScene, Words, step
 
@@ -34,11 +37,11 @@ LANES = 2**13
 WALKS_PER_LANE = 128
 """Walks that each lane of a batch runs, one after the other."""
 
-NOT_DIFFERENTIABLE = (
-    "path_trace has no derivative, but an input carries a tangent here (jax.grad, jax.jvp). Differentiate "
-    "lighting.ScattererTemplates instead, or apply jax.lax.stop_gradient to the inputs."
+FORWARD_ONLY = (
+    "path_trace has derivatives in forward mode only (jax.jvp, jax.jacfwd), but is differentiated in reverse mode "
+    "here (jax.grad, jax.vjp, jax.jacrev)."
 )
-"""Error message: how often and where a path collides jumps with the extinction."""
+"""Error message: a reverse pass would have to keep or repeat all that happens along each path."""
 
 
 class PathTraced(eqx.Module):
@@ -53,6 +56,7 @@ class PathTraced(eqx.Module):
             contributed.
         paths: per pixel.
         seed: of the last paths' random numbers.
+        groups: of each group of paths, its mean of `radiance` and, last, of `opacity`; None for one group.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -61,6 +65,7 @@ class PathTraced(eqx.Module):
     exhausted: Bool[Array, "height width"]
     paths: int = eqx.field(static=True)
     seed: UInt32[Array, ""]
+    groups: Float[Array, "groups height width 4"] | None = None
 
     @property
     def standard_error(self) -> Float[Array, "height width 3"]:
@@ -129,6 +134,7 @@ def path_trace(
     max_scatterings: int | Any = 2**20,
     antialias: bool | Any = False,
     lanes: int | Any = None,
+    groups: int | Any = 1,
 ) -> PathTraced:
     """Image of a volume that scatters light any number of times.
 
@@ -177,9 +183,6 @@ def path_trace(
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
-    volume, transfer, camera, lights, materials, anisotropy = eqxi.nondifferentiable(
-        (volume, transfer, camera, lights, materials, anisotropy), msg=NOT_DIFFERENTIABLE
-    )
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):
@@ -189,12 +192,17 @@ def path_trace(
     limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
+    groups = integer("groups", groups, 1)
+    if paths % groups:
+        raise ValueError(f"groups must divide paths; got groups = {groups} and paths = {paths}.")
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
-    blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
-    inputs = volume, blocks, transfer, materials, lights, anisotropy, camera
+    volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials)
+    blocks = Blocks.of(jax.lax.stop_gradient(volume), slopes=transfer.reads_gradient)
+    inputs = Inputs(volume, transfer, materials, lights, anisotropy)
+    how = How(paths, groups, lanes, pixels, antialias)
     limit = jnp.asarray(limit, jnp.int32)
-    return _trace(inputs, words_of(volume), limit, seed, paths, lanes, pixels, antialias)
+    return forward_only(_traced(inputs, (camera, blocks, words_of(volume), limit, seed), how), FORWARD_ONLY)
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -208,30 +216,81 @@ def _seed(key: Any) -> UInt32[Array, ""]:
     return jax.random.bits(key, (), jnp.uint32)
 
 
-@compiled
-def _trace(
-    inputs: tuple[Any, ...],
-    words: UInt32[Array, " voxels"] | None,
-    max_scatterings: Int[Array, ""],
-    seed: UInt32[Array, ""],
-    paths: int,
-    lanes: int,
-    pixels: int,
-    antialias: bool,
-) -> PathTraced:
-    """Trace the image in batches of `pixels`. `words`: the volume's packed voxels."""
+class Inputs(NamedTuple):
+    """What an image may be differentiated with respect to, at least in part."""
+
+    volume: Volume
+    transfer: Transfer
+    materials: tuple[Material, ...]
+    lights: tuple[Light, ...]
+    anisotropy: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class How:
+    """Static arguments. `pixels`: of a batch."""
+
+    paths: int
+    groups: int
+    lanes: int
+    pixels: int
+    antialias: bool
+    sampling: Sampling = OF_IMAGES
+
+
+Constants: TypeAlias = tuple[
+    Camera, Blocks, UInt32[Array, " voxels"] | None, Int[Array, ""], UInt32[Array, ""]
+]
+"""Camera, ranges of blocks, the volume's packed voxels, `max_scatterings`, and the seed."""
+
+
+@eqx.filter_custom_jvp
+def _traced(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
+    return _trace(inputs, constants, how)
+
+
+@_traced.def_jvp
+def _(primals: tuple[Inputs, Constants, How], tangents: tuple[Any, Any, Any]) -> tuple[PathTraced, Any]:
+    inputs, constants, how = primals
+    traced, moving = _traced(*primals), tangents[0]
+    if not jax.tree.leaves(moving):
+        return traced, jax.tree.map(lambda _: None, traced)
+    if jax.tree.leaves(moving.volume):
+        check_voxels(inputs.transfer, inputs.materials)
+    how = replace(how, sampling=OF_DERIVATIVES)
+    radiance, opacity, groups = _derivative(inputs, moving, constants, how)
+    return traced, PathTraced(radiance, opacity, None, None, traced.paths, None, groups)
+
+
+def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, how: How) -> tuple[Any, ...]:
+    """Derivative of radiance, opacity and groups along tangents, None where these are 0."""
+    perturbed = jax.tree.map(lambda _, tangent: tangent is not None, inputs, tangents)
+    moving, fixed = eqx.partition(inputs, perturbed)
+
+    def image(moving: Inputs) -> tuple[Any, ...]:
+        traced = _traced_by(eqx.combine(moving, fixed), constants, how)
+        return traced.radiance, traced.opacity, traced.groups
+
+    return jax.jvp(image, (moving,), (tangents,))[1]
+
+
+def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
+    """Trace the image in batches of pixels."""
     # float64 becomes float32, whose rounding is far below the noise
-    volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
-        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, inputs
+    (volume, transfer, materials, lights, anisotropy), (camera, blocks, words, max_scatterings, seed) = (
+        jax.tree.map(
+            lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, (inputs, constants)
+        )
     )
     packed, (width, height) = with_words(volume, words), camera.size
-    medium = Medium.of(packed, blocks, transfer, materials)
-    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings)
+    medium = Medium.of(packed, blocks, transfer, materials, how.sampling)
+    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings, how.sampling)
     # Checked here, since comparisons in the walks would hide a NaN. The values of a volume with its own field
     # are unknown and its ranges infinite, which is not an error.
     ranges = blocks if volume.field is None else None
     valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
     valid &= all_finite((materials, lights, anisotropy, camera))
+    paths, pixels = how.paths, how.pixels
     batches, count = -(-width * height // pixels), pixels * paths
 
     def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
@@ -239,22 +298,32 @@ def _trace(
             pixel, path = number * pixels + index // paths, index % paths
             alive = valid & (index < count) & (pixel < width * height)
             words = pixel.astype(jnp.uint32), path.astype(jnp.uint32), jnp.broadcast_to(seed, index.shape)
-            return jax.vmap(partial(_begin, scene, camera, antialias))(words, alive)
+            return jax.vmap(partial(_begin, scene, camera, how.antialias))(words, alive)
 
-        results = walk_all(begin, partial(step, scene), count, lanes)
+        results = walk_all(begin, partial(step, scene), count, how.lanes)
         results = jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results)
         radiance = jnp.stack(results.radiance, axis=-1)
         mean = radiance.mean(axis=1)
-        opacity = results.met.astype(mean.dtype).mean(axis=1)
+        opacity = results.opacity.mean(axis=1)
         deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
-        return mean, opacity, deviations, results.exhausted.any(axis=1)
+        numbers = mean, opacity, deviations, results.exhausted.any(axis=1)
+        if how.groups == 1:
+            return numbers
+        each = jnp.concatenate([radiance, results.opacity[..., None]], axis=-1)
+        return *numbers, each.reshape(pixels, how.groups, -1, 4).mean(axis=2)
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
-    *numbers, exhausted = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
-    radiance, opacity, deviations = (jnp.where(valid, each, jnp.nan) for each in numbers)
-    return PathTraced(radiance, opacity, deviations, exhausted, paths, seed)
+    found = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
+    radiance, opacity, deviations, exhausted, *groups = found
+    numbers = radiance, opacity, deviations, *(jnp.moveaxis(each, 2, 0) for each in groups)
+    # also of a derivative all numbers
+    radiance, opacity, deviations, *groups = (jnp.where(valid, each, jnp.nan * each) for each in numbers)
+    return PathTraced(radiance, opacity, deviations, exhausted, paths, seed, *groups)
+
+
+_trace, _derivative = compiled(_traced_by), compiled(_derivative_of, in_turn=False)
 
 
 def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
@@ -273,4 +342,5 @@ def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, aliv
     zero, result = jnp.zeros_like(flight.depth), WalkResult.zeros(())
     black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
     steps, to_light, alive = jnp.zeros((), jnp.int32), jnp.zeros((), bool), alive & (ray.length > 0)
-    return Walk(words, steps, flight, to_light, direction, white, black, zero, result, alive)
+    importance = None if scene.sampling.importance is None else zero + 1
+    return Walk(words, steps, flight, to_light, direction, white, importance, black, zero, result, alive)
