@@ -46,7 +46,9 @@ OF_DERIVATIVES = Sampling(2, 0.25, 0.25)
 @jax.custom_jvp
 def likelihood(probability: Scalar) -> Scalar:
     """1, with the derivative of `probability / q`, of a probability and the constant q equal to it."""
-    return jnp.ones_like(probability)
+    # JAX 0.10 fails to compile a batch of this where the derivative has a batch axis and the value none
+    one = jnp.ones_like(probability)
+    return jnp.where(probability > 0, one, one)
 
 
 @likelihood.defjvp
