@@ -5,7 +5,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from ..lighting.materials import Material
 from ..scene.camera import Camera
@@ -38,15 +38,8 @@ def with_constant_paths(
     volume = constant(place, eqx.tree_at(_field_of, without_voxels(volume), None, is_leaf=_is_none))
     volume = eqx.tree_at(_field_of, with_voxels(volume, data), field, is_leaf=_is_none)
 
-    def one(part: Any) -> Any:
-        if not isinstance(part, TransferFunction | TransferFunction2D):
-            return part
-        lines = constant("the control points' values of transfer", _lines_of(part), "they are constants")
-        return eqx.tree_at(_lines_of, part, lines)
-
-    transfer = jax.tree.map(
-        one, transfer, is_leaf=lambda p: isinstance(p, TransferFunction | TransferFunction2D)
-    )
+    lines = constant("the control points' values of transfer", _lines_of(transfer), "they are constants")
+    transfer = eqx.tree_at(_lines_of, transfer, lines) if lines else transfer
     edges = constant("the values of materials", [m.values for m in materials], "the medium jumps there")
     materials = tuple(
         eqx.tree_at(lambda m: m.values, material, edge, is_leaf=_is_none)
@@ -57,24 +50,20 @@ def with_constant_paths(
 
 def check_voxels(transfer: Transfer, materials: tuple[Material, ...]) -> None:
     """Raises `RuntimeError` if jumps of the medium move with the voxels."""
+    what = "path_trace has no derivative with respect to voxels"
     if materials:
-        raise RuntimeError(
-            "path_trace has no derivative with respect to the volume's voxels where there are materials, since "
-            f"these end at values and where transfer shows something. {REMEDY}"
-        )
-    for part in jax.tree.leaves(
-        transfer, is_leaf=lambda p: isinstance(p, TransferFunction | TransferFunction2D)
-    ):
-        for line in _lines_of(part) if isinstance(part, TransferFunction | TransferFunction2D) else ():
-            if not is_traced(line) and bool(jnp.any(line[..., 1:] == line[..., :-1])):
-                raise RuntimeError(
-                    "path_trace has no derivative with respect to the volume's voxels where transfer has a step "
-                    f"(two equal values), since it moves with them. {REMEDY}"
-                )
+        reason = "which end at values of the volume, or where the transfer function shows nothing"
+        raise RuntimeError(f"{what} where there are materials, {reason}. {REMEDY}")
+    if any(not is_traced(line) and np.any(np.diff(line) == 0) for line in _lines_of(transfer)):
+        raise RuntimeError(f"{what} under a transfer function with a step (two equal values). {REMEDY}")
 
 
-def _lines_of(transfer: Any) -> list[Any]:
-    return [transfer.values, *([transfer.magnitudes] if isinstance(transfer, TransferFunction2D) else [])]
+def _lines_of(transfer: Transfer) -> list[Any]:
+    """Control points' values, and magnitudes, of all tables in a transfer function."""
+    tables = TransferFunction | TransferFunction2D
+    parts = jax.tree.leaves(transfer, is_leaf=lambda part: isinstance(part, tables))
+    found: list[Any] = [part.values for part in parts if isinstance(part, tables)]
+    return found + [part.magnitudes for part in parts if isinstance(part, TransferFunction2D)]
 
 
 def _field_of(volume: Volume) -> Any:

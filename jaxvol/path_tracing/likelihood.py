@@ -5,11 +5,11 @@ probability p of what was drawn enters as the weight p / q, where q is the const
 mean over paths is then the image as a function of the parameters, and so are its derivatives.
 
 Where the extinction is 0, nothing collides, although the derivative there is not 0; and near 0, or near a
-majorant, p / q has a derivative of unbounded variance. So the paths of a derivative are drawn with a `Sampling`
-of their own. (A weight of 0 may have a derivative that is not.)
+majorant, p / q has a derivative of unbounded variance. So the paths of a derivative are drawn with a
+`Sampling` of their own. (A weight of 0 may have a derivative that is not.)
 
-Sources: Vicini, Speierer and Jakob, "Path Replay Backpropagation", 2021; Nimier-David et al., "Unbiased Inverse
-Volume Rendering with Differential Trackers", 2022.
+Sources: Vicini, Speierer and Jakob, "Path Replay Backpropagation", 2021; Nimier-David et al., "Unbiased
+Inverse Volume Rendering with Differential Trackers", 2022.
 """
 
 from typing import Any, NamedTuple

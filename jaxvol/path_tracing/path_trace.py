@@ -38,8 +38,8 @@ WALKS_PER_LANE = 128
 """Walks that each lane of a batch runs, one after the other."""
 
 FORWARD_ONLY = (
-    "path_trace has derivatives in forward mode only (jax.jvp, jax.jacfwd), but is differentiated in reverse mode "
-    "here (jax.grad, jax.vjp, jax.jacrev)."
+    "path_trace has derivatives in forward mode only; take jax.jacfwd or jax.jvp in place of jax.grad, "
+    "jax.vjp or jax.jacrev."
 )
 """Error message: a reverse pass would have to keep or repeat all that happens along each path."""
 
@@ -56,7 +56,7 @@ class PathTraced(eqx.Module):
             contributed.
         paths: per pixel.
         seed: of the last paths' random numbers.
-        groups: of each group of paths, its mean of `radiance` and, last, of `opacity`; None for one group.
+        groups: of each group of paths, the mean radiance and, last, opacity; None for one group.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -86,12 +86,24 @@ class PathTraced(eqx.Module):
         Raises:
             ValueError: for another shape.
         """
-        background = jnp.asarray(background, self.radiance.dtype)
-        if background.shape not in ((3,), self.radiance.shape):
-            shapes = f"(3,) or {self.radiance.shape}"
-            raise ValueError(f"background must have shape {shapes}; got {background.shape}.")
-        background = jnp.broadcast_to(background, self.radiance.shape)
-        return self.radiance + (1 - self.opacity[..., None]) * background
+        return self.radiance + (1 - self.opacity[..., None]) * _background(background, self.radiance)
+
+    def images(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "groups height width 3"]:
+        """Linear RGB over a background, by each group of paths: independent images, whose mean is `image`.
+
+        Args:
+            background: as for `image`.
+
+        Returns:
+            The images.
+
+        Raises:
+            ValueError: for another shape, and for paths in one group.
+        """
+        if self.groups is None:
+            raise ValueError("images are by groups of paths; call path_trace(..., groups=) with 2 or more.")
+        background = _background(background, self.radiance)
+        return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background
 
     def joined(self, other: "PathTraced") -> "PathTraced":
         """The image by the paths of both, of the same scene and different keys.
@@ -119,6 +131,37 @@ class PathTraced(eqx.Module):
         opacity = self.opacity + (other.opacity - self.opacity) * share
         deviations = self.deviations + other.deviations + between
         return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths, other.seed)
+
+
+def _background(background: Any, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+    background = jnp.asarray(background, image.dtype)
+    if background.shape not in ((3,), image.shape):
+        raise ValueError(f"background must have shape (3,) or {image.shape}; got {background.shape}.")
+    return jnp.broadcast_to(background, image.shape)
+
+
+def mean_and_standard_error(groups: Any) -> tuple[Any, Any]:
+    """Estimate and its standard error, from independent estimates by groups of paths.
+
+    Args:
+        groups: a tree of arrays whose first axis is that of groups: `PathTraced.images`, what is computed of
+            each, or their derivatives.
+
+    Returns:
+        Mean, and standard error of the mean, of each array. The latter itself has a relative error of
+        1 / sqrt(2 (groups - 1)).
+
+    Raises:
+        ValueError: for fewer than two groups.
+    """
+    few = {len(leaf) for leaf in jax.tree.leaves(groups) if len(leaf) < 2}
+    if few:
+        raise ValueError(f"groups must be 2 or more along the first axis; got {few.pop()}.")
+
+    def error(leaf: Array) -> Array:
+        return jnp.std(leaf, axis=0, ddof=1) / np.sqrt(leaf.shape[0])
+
+    return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), groups), jax.tree.map(error, groups)
 
 
 def path_trace(
@@ -150,7 +193,25 @@ def path_trace(
     Random numbers have 24 bits, so free paths longer than 16.6 mean free paths within a block of voxels, of
     probability 6e-8, are never drawn.
 
-    Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`.
+    **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
+    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit, and
+    voxels without materials. They are unbiased: decisions stay as drawn, and the probability of each enters as
+    a weight, whose mean has the derivative. The image is the same as without. All derivatives that
+    `jax.jacfwd` asks for at once are by the same paths:
+
+        def images(extinction):
+            transfer = jv.TransferFunction(values, colors, extinction)
+            return jv.path_trace(volume, transfer, camera, lights, paths=256, groups=16).images()
+
+        derivative, error = mean_and_standard_error(jax.jacfwd(images)(extinction))
+
+    Their noise is greater than that of the image, and grows with the number of collisions of a path: in very
+    thick media of high albedo, take many paths. At a colour of 0 or 1, where the albedo is clipped, and an
+    extinction of 0, derivatives are one-sided. They are NaN with respect to an extinction of 0 inside a
+    material, which would appear all at once. `deviations` and the `standard_error` count as constants.
+
+    Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`. Of derivatives: Vicini, Speierer
+    and Jakob 2021; Nimier-David et al. 2022; see `likelihood`.
 
     Args:
         volume: on its own grid; curved grids (`ToroidalMap`) are not supported.
@@ -171,6 +232,9 @@ def path_trace(
             scattered at most that many times, and `exhausted` marks the pixels that lack some.
         antialias: let rays pass through random points of their pixels.
         lanes: paths that are traced side by side. Memory grows with it; the result does not change.
+        groups: that paths are split into, a divisor of `paths`. Several keep an image each, of 16 bytes
+            a pixel, and as much for each derivative, so that whatever is computed of them has a standard error:
+            see `PathTraced.images` and `mean_and_standard_error`.
 
     Returns:
         A `PathTraced`, with the standard error of each pixel.
@@ -178,8 +242,11 @@ def path_trace(
     Raises:
         ValueError: for arguments out of these ranges, no lights, a transfer function without a majorant, and
             labels where the volume has none.
-        RuntimeError: if it is differentiated with respect to any of its inputs. It may be called in a
-            function that is differentiated with respect to something else.
+            Also if it is differentiated in reverse mode (`jax.grad`).
+        RuntimeError: if it is differentiated with respect to what moves paths or jumps of the medium: the
+            camera, the volume's place, directions and positions of lights, the control points' values of the
+            transfer function, the values of materials, and voxels where there are materials or a transfer
+            function has a step (unless it is traced).
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
