@@ -12,7 +12,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,6 +22,7 @@ from jaxtyping import Array
 
 from .._util.checks import described, integer, not_negative
 from ..xla.trees import PyTree
+from . import checkpoints
 from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, fit
@@ -157,8 +157,7 @@ def choose(
         start = candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters)
         how = {**options, "constraints": candidate.constraints, "where": candidate.where}
         if checkpoint is not None:
-            file = Path(checkpoint)
-            how["checkpoint"] = file.with_name(f"{file.stem}-{at + 1}{file.suffix}")
+            how["checkpoint"] = checkpoints.numbered(checkpoint, at)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=UNDETERMINED)
             warnings.filterwarnings("ignore", message=MISFIT)
@@ -171,7 +170,11 @@ def choose(
     if not any(map(math.isfinite, losses)):
         raise ValueError("held_out must have finite residuals for one candidate at least; got none.")
     best = int(np.nanargmin(losses))
-    norm = training.scale() if isinstance(training, ImageResidual) else math.sqrt(2 * fits[0].losses[0])
+    norm = (
+        training.references.scale()
+        if isinstance(training, ImageResidual)
+        else math.sqrt(2 * fits[0].losses[0])
+    )
     rows, chosen = [], best
     for at, (candidate, own, loss) in enumerate(zip(candidates, fits, losses, strict=True)):
         error = standard_error(found[at], found[best], block)
@@ -221,9 +224,9 @@ def _entries(residual: Any, parameters: PyTree) -> Array:
     """Of one view; (height, width, channels) of an image."""
     if not isinstance(residual, ImageResidual):
         return ravel_pytree(residual(parameters))[0]
-    ((function, items),) = residual.tiles(residual.count())
+    ((function, items),) = residual.tiles(residual.references.count())
     entries = jax.lax.map(lambda item: function(parameters, item, "replay"), items)
-    return entries.reshape(residual.groups[0][1].shape[1:])
+    return entries.reshape(residual.references.groups[0][1].shape[1:])
 
 
 def _list(name: str, given: Any) -> list[Any]:
@@ -255,10 +258,10 @@ def _residuals(residual: Any, views: Any, held_out: list[Any]) -> tuple[Any, lis
     if isinstance(residual, ImageResidual):
         if views is not None:
             raise ValueError("views must not be given with an ImageResidual, which has views of its own.")
-        how = {"background": residual.background, "compositing": residual.compositing}
+        how = {"background": residual.references.background, "compositing": residual.compositing}
         training, validation = residual, [ImageResidual(residual.scene, [view], **how) for view in held_out]
         # another picture by the same camera tells nothing of other views
-        fitted, others = residual.cameras(), [view[0] for view in held_out]
+        fitted, others = residual.references.cameras(), [view[0] for view in held_out]
     else:
         check_residual(residual)
         fitted, others = _list("views", views), held_out

@@ -23,17 +23,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, described, finite_array, not_negative
+from .._util.checks import Arrayable, described, not_negative
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
-from ..path_tracing import PathTraced
 from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera
 from ..scene.transfer import Transfer
 from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
-from .noise import Noise, given_variances, path_traced_view
+from .noise import Noise
+from .references import References
 
 
 TANGENTS = 64
@@ -52,6 +52,14 @@ def check_residual(residual: Any) -> None:
             "residual must be an ImageResidual, or a function from parameters to arrays; "
             f"got {described(residual)}. The order is fit(residual, parameters)."
         )
+
+
+def check_scene(scene: Any) -> None:
+    """Reject what cannot be called with parameters and a camera."""
+    try:
+        inspect.signature(scene).bind(None, None)
+    except TypeError as fault:
+        raise ValueError(f"scene must be a function of (parameters, camera); got {scene!r}.") from fault
 
 
 SceneFunction = Callable[[Any, Camera], tuple[Any, ...]]
@@ -92,12 +100,8 @@ class ImageResidual(eqx.Module):
     """
 
     scene: SceneFunction
-    groups: list[tuple[Camera, Float[Array, "views height width channels"]]]
-    """Stacked views of the same size and kind."""
-    background: Float[Array, "3"]
+    references: References
     compositing: Compositing[Any]
-    noise: Noise | None
-    """None if it is unknown for any view."""
     blur: Float[Array, ""] | None
 
     def __init__(
@@ -110,49 +114,20 @@ class ImageResidual(eqx.Module):
         noise: Arrayable | Sequence[Arrayable | None] | None = None,
         blur: Arrayable | None = None,
     ):
-        try:
-            inspect.signature(scene).bind(None, None)
-        except TypeError as fault:
-            raise ValueError(f"scene must be a function of (parameters, camera); got {scene!r}.") from fault
+        check_scene(scene)
         self.scene = cast(Any, scene)
-        self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
         self.blur = None if blur is None else not_negative("blur", blur)
-        views = list(views) if isinstance(views, Iterable) else []
-        if not views:
-            raise ValueError("views must hold at least one pair (camera, image); got none.")
-        by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
-        read = [_view(number, view, self.background) for number, view in enumerate(views)]
-        given = given_variances(noise, [image.shape for _, image, _ in read])
-        known = [own if told is None else told for (*_, own), told in zip(read, given, strict=True)]
-        every = [variance for variance in known if variance is not None]
-        self.noise = Noise.of(every) if len(every) == len(read) else None
-        for camera, image, _ in read:
-            by_kind.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
-        self.groups = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *views) for views in by_kind.values()]
+        self.references = References.of(views, background, noise)
 
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
         sigma = None if blur is None else not_negative("blur", blur)
         return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
 
-    def cameras(self) -> list[Camera]:
-        """Cameras of all views."""
-        each = ((cameras, view) for cameras, images in self.groups for view in range(len(images)))
-        return [jax.tree.map(lambda leaf, view=view: leaf[view], cameras) for cameras, view in each]
-
-    def count(self) -> int:
-        """Total number of entries."""
-        return sum(images.size for _, images in self.groups)
-
-    def scale(self) -> float:
-        """Norm of the compared data: changes within its rounding carry no information."""
-        squares = sum(float(jnp.sum(images**2)) for _, images in self.groups)
-        return math.sqrt(squares / self.count())
-
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most `most` entries."""
-        return [self._tiles(*group, most) for group in self.groups]
+        return [self._tiles(*group, most) for group in self.references.groups]
 
     def _tiles(self, cameras: Camera, images: Array, most: int) -> Tiles:
         views, height, width, channels = images.shape
@@ -164,7 +139,7 @@ class ImageResidual(eqx.Module):
             )
         pieces = math.ceil(height / min(height, most // (width * channels)))
         rows = math.ceil(height / pieces)
-        weight = 1 / math.sqrt(self.count())
+        weight = 1 / math.sqrt(self.references.count())
 
         def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
@@ -186,7 +161,7 @@ class ImageResidual(eqx.Module):
                 camera = camera.part(0, first, (camera.size[0], rows))
             how: Any = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
-            rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
+            rendered = rendering.rgba if channels == 4 else rendering.image(self.references.background)
             row = first + jnp.arange(rows)
             reference = images[view, jnp.minimum(row, height - 1)]
             # the last piece may reach past the image
@@ -208,25 +183,6 @@ def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
     at = jnp.arange(n, dtype=sigma.dtype)
     away = (at[:, None] - at[None, :]) / jnp.maximum(sigma, 1e-3)
     return jax.nn.softmax(-(away**2) / 2, axis=1)
-
-
-def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera, Array, np.ndarray | None]:
-    """Camera, image, and the variance of its noise if the image is path-traced."""
-    if not isinstance(view, tuple | list) or len(view) != 2 or not isinstance(view[0], Camera):
-        raise ValueError(f"views[{number}] must be a pair (camera, image); got {described(view)}.")
-    camera, given = view
-    variance, name = None, f"views[{number}]: the image"
-    if isinstance(given, PathTraced):
-        given, variance = path_traced_view(given, background)
-    if (kind := np.asarray(given).dtype).kind not in "fV":  # V: JAX's own 8- and 16-bit floats
-        raise ValueError(
-            f"{name} must be linear RGB, floats in [0, 1]; got {kind}. Convert a picture file with "
-            "jv.read_views, or its pixels with jv.from_srgb(image / 255)."
-        )
-    image = finite_array(name, given, (*camera.size[::-1], None)).astype(jnp.float32)
-    if image.shape[2] not in (3, 4):
-        raise ValueError(f"{name} must have 3 or 4 channels; got {image.shape[2]}.")
-    return camera, image, variance
 
 
 class Triangles(NamedTuple):
@@ -257,7 +213,9 @@ class Problem(eqx.Module):
     def of(cls, residual: Any, free: Free, y: FreeVariables, most: int, least_squares: bool) -> "Problem":
         """With as large tiles as fit into `most` bytes; without Jacobian, all of the residual."""
         images = isinstance(residual, ImageResidual)
-        count = residual.count() if images else size(eqx.filter_eval_shape(residual, free.forward(y)))
+        count = (
+            residual.references.count() if images else size(eqx.filter_eval_shape(residual, free.forward(y)))
+        )
         row = (size(y) + 1) * 4
         if count == 0:
             raise ValueError("residual must return at least one number; got none.")
@@ -273,6 +231,17 @@ class Problem(eqx.Module):
                 "ImageResidual is split into tiles. Raise max_jacobian, or use one."
             )
         return cls(residual, free, count, tile, least_squares)
+
+    @property
+    def noise(self) -> Noise | None:
+        """Of the references, if it is known. Noise of blurred pixels is not independent."""
+        known = isinstance(self.residual, ImageResidual) and self.residual.blur is None
+        return self.residual.references.noise if known else None
+
+    @property
+    def scale(self) -> float:
+        """Norm of the references; 0 for a function."""
+        return self.residual.references.scale() if isinstance(self.residual, ImageResidual) else 0.0
 
     def __call__(self, y: FreeVariables, _: Any = None) -> tuple[Array, tuple[Array, FreeVariables, Any]]:
         """What a solver minimises; and the loss, its point, and the triangles there."""
@@ -318,7 +287,7 @@ class Problem(eqx.Module):
                 def residual(flat: Array) -> Array:
                     return function(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
 
-                rows = _jacobian(residual, flat)
+                rows = jacobian(residual, flat)
                 scores = jnp.sum(rows[..., :-1] * rows[..., -1:], axis=1)
                 both = zip(triangles, (rows.reshape(-1, flat.size + 1), scores), strict=True)
                 return Triangles(*(jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in both))
@@ -350,7 +319,7 @@ class Problem(eqx.Module):
         return total
 
 
-def _jacobian(
+def jacobian(
     f: Callable[[Array], Float[Array, "pixels channels"]], at: Float[Array, " n"]
 ) -> Float[Array, "pixels channels numbers"]:
     """[J r] by forward mode, at most `TANGENTS` columns at a time."""

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from .constraints import Free, FreeVariables
 from .noise import Noise
@@ -66,45 +66,68 @@ class Uncertainty(NamedTuple):
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
-def uncertainty(
-    triangles: Triangles, count: int, free: Free, at: FreeVariables, scale: float, chi_squared: float | None
-) -> Uncertainty:
-    """Uncertainty of the parameters `free.forward(at)`, from the triangles there, the number of entries of
-    the residual, the norm `scale` of the compared data, and the reduced χ².
+class Spreads(NamedTuple):
+    """How noise of the references moves the free variables.
+
+    Attributes:
+        each: F, with covariance F Fᵀ, for noise of any variance in each pixel.
+        equal: for noise of equal variance in all entries.
+        undetermined: directions, of length 1, that the residual does not determine, in rows.
+    """
+
+    each: Float[np.ndarray, "free numbers"]
+    equal: Float[np.ndarray, "free determined"]
+    undetermined: Float[np.ndarray, "directions free"]
+
+
+def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
+    """From the triangles, the number of entries of the residual, and the norm `scale` of the compared data.
 
     A direction is undetermined if its singular value is below n ε times the largest one, or times that norm,
     with ε of the float type: within rounding, the residual does not depend on it."""
-    flat, unravel = ravel_pytree(at)
-    jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
     factor, scores = (np.asarray(triangle, np.float64) for triangle in triangles)
-    n = len(scores)
+    n = scores.shape[1]
     _, singular, directions = np.linalg.svd(factor[:n, :n])
     determined = singular > n * np.finfo(triangles.residual.dtype).eps * singular.max(initial=scale)
-    effects = jac @ directions.T  # of each direction, on the parameters
-    spread = effects[:, determined] / singular[determined]
-    left = count - n  # with as many parameters as entries, none are left to estimate variances from
-    equal = spread * np.sqrt(np.sum(factor[:, -1] ** 2) / left if left > 0 else np.inf)
-    each = (spread / singular[determined]) @ (directions[determined] @ scores.T)
-    each = each * np.sqrt(count / left if left > 0 else np.inf)
+    inverse = directions[determined].T / singular[determined]
+    left = max(count - n, 1)
+    each = (inverse / singular[determined]) @ (directions[determined] @ scores.T) * np.sqrt(count / left)
+    equal = inverse * np.sqrt(np.sum(factor[:, -1] ** 2) / left)
+    return Spreads(each, equal, directions[~determined])
+
+
+def uncertainty(
+    triangles: Triangles,
+    count: int,
+    free: Free,
+    at: FreeVariables,
+    scale: float,
+    chi_squared: float | None,
+    own: Float[Array, "free free"] | None = None,
+) -> Uncertainty:
+    """Uncertainty of the parameters `free.forward(at)`, from what `spreads` takes there, the reduced χ², and
+    the fit's `own` covariance, if it is random."""
+    flat, unravel = ravel_pytree(at)
+    jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
+    each, equal, undetermined = spreads(triangles, count, scale)
     names = free.names(at)
     # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
     # the parameter is undetermined
     norm = np.linalg.norm(jac, axis=1, keepdims=True)
-    share = np.abs((jac / np.where(norm > 0, norm, 1)) @ directions[~determined].T)
-    undetermined = [[names[i] for i in np.flatnonzero(row >= SHARE * row.max())] for row in share.T]
+    share = np.abs((jac / np.where(norm > 0, norm, 1)) @ undetermined.T)
+    moved = [[names[i] for i in np.flatnonzero(row >= SHARE * row.max())] for row in share.T]
     touched = np.any(share > TOUCHED, axis=1)
-    covariance, of_equal = (_covariance(factor, touched, left) for factor in (each, equal))
-    return Uncertainty(covariance, names, undetermined, of_equal, chi_squared)
+    more = 0.0 if own is None else jac @ np.asarray(own, np.float64) @ jac.T
 
+    def covariance(spread: np.ndarray) -> np.ndarray:
+        if count <= flat.size:  # no entries are left to estimate variances from
+            return np.full((len(jac),) * 2, np.inf)
+        found = (jac @ spread) @ (jac @ spread).T + more
+        found[touched] = found[:, touched] = np.nan
+        found[touched, touched] = np.inf
+        return found
 
-def _covariance(factor: np.ndarray, touched: np.ndarray, left: int) -> Float[np.ndarray, "n n"]:
-    """F Fᵀ; infinite for parameters that an undetermined direction `touched`, or if no entries are left."""
-    if left <= 0:
-        return np.full((len(factor),) * 2, np.inf)
-    covariance = factor @ factor.T
-    covariance[touched] = covariance[:, touched] = np.nan
-    covariance[touched, touched] = np.inf
-    return covariance
+    return Uncertainty(covariance(each), names, moved, covariance(equal), chi_squared)
 
 
 def warn_of_misfit(noise: Noise | None, chi_squared: float | None, message: str | None) -> None:

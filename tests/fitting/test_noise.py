@@ -80,7 +80,7 @@ def test_noise_is_known_only_if_it_is_given_or_of_several_paths_for_all_views(ba
 
     def noise(*images, **how):
         views = [(camera, image) for image in images]
-        return jv.ImageResidual(ball.scene, views, (0, 0, 0), **how).noise
+        return jv.ImageResidual(ball.scene, views, (0, 0, 0), **how).references.noise
 
     error = np.asarray(many.standard_error)
     total = float(np.sum(error**2))
