@@ -48,7 +48,8 @@ class Fit(eqx.Module):
     Attributes:
         parameters: the best ones found, as a tree like the starting parameters.
         solution: optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
-        losses: half the sum of squared residuals at the solver's point after each step.
+        losses: half the sum of squared residuals at the solver's point after each step; of a
+            `PathTracedResidual`, samples of it, which may be negative.
         uncertainty: `covariance`, `names`, `standard_errors`, `undetermined` directions and
             `reduced_chi_squared`, for a least-squares solver; else None.
     """
@@ -305,6 +306,7 @@ class _Run(eqx.Module):
     losses: list[float] = eqx.field(static=True)
 
     own: ClassVar[None] = None
+    loss_error: ClassVar[float] = 0.0
     """The fit is not random."""
 
     @classmethod
@@ -366,10 +368,13 @@ def _allow_promotion() -> Iterator[None]:
 
 
 def _report(run: "_Run | SampledRun", problem: Problem | SampledProblem, limits: Limits, result: Any) -> Fit:
-    estimate, squares = None, 2 * run.loss * problem.count  # the loss is of the mean square
-    left = None if problem.noise is None else problem.noise.reduced_chi_squared(squares, size(run.best))
+    estimate, chi_squared, slack = None, None, None
+    if problem.noise is not None:
+        # of Σ r², as the loss is half the mean square; and what is uncertain of it, as three standard errors
+        squares = 2 * problem.count * run.loss, 6 * problem.count * run.loss_error
+        chi_squared, slack = (problem.noise.reduced_chi_squared(each, size(run.best)) for each in squares)
     if run.triangles is not None:
-        about = problem.free, run.best, problem.scale, left
+        about = problem.free, run.best, problem.scale, chi_squared
         estimate = uncertainty(run.triangles, problem.count, *about, run.own)
         if estimate.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in estimate.undetermined[:6])
@@ -382,5 +387,6 @@ def _report(run: "_Run | SampledRun", problem: Problem | SampledProblem, limits:
     stats["message"] = run.message(problem, limits, result)
     solution = optx.Solution(run.best, result, None, stats, run.state)
     found = Fit(problem.free.forward(run.best), solution, np.asarray(run.losses), estimate)
-    warn_of_misfit(problem.noise, left, None if found.success else found.message)
+    if problem.noise is not None and chi_squared is not None and slack is not None:
+        warn_of_misfit(problem.noise, chi_squared, slack, None if found.success else found.message)
     return found

@@ -1,12 +1,12 @@
 """Path-traced images minus reference images: a residual of which only noisy samples can be computed."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int
 
@@ -21,8 +21,8 @@ from .references import References
 from .residuals import check_scene, jacobian
 
 
-HELD = 6
-"""Jacobians that are held at once: by two halves of the paths, means over two epochs and both, and a copy."""
+HELD = 8
+"""Jacobians that are held at once: by two halves of the paths, means over two epochs and both, and copies."""
 
 
 class PathTracedResidual(eqx.Module):
@@ -30,10 +30,8 @@ class PathTracedResidual(eqx.Module):
     step.
 
     Its square is larger than that of the mean image's residual, by the noise of the paths, which depends on
-    the parameters, and so does its gradient. `fit` therefore takes all products between two halves of the
-    paths, which are independent: of residuals and of derivatives r and J, the gradient
-    (J₁ᵀ r₂ + J₂ᵀ r₁) / 2, the curvature (J₁ᵀ J₂ + J₂ᵀ J₁) / 2, and the loss r₁ᵀ r₂ / 2, which may be
-    negative.
+    the parameters, and so does its gradient. `fit` therefore takes all products between halves of the paths,
+    which are independent, and the losses that it tells of single steps may be negative.
 
     What is free must be differentiable by the path tracer: see `path_trace`.
 
@@ -86,23 +84,6 @@ class Sample(NamedTuple):
     rows: Float[Array, "2 pixels 3 numbers"]
 
     @property
-    def gradient(self) -> Float[Array, " free"]:
-        """Of the loss, unbiased."""
-        (first, second) = self.rows.reshape(2, -1, self.rows.shape[-1])
-        return (first[:, :-1].T @ second[:, -1] + second[:, :-1].T @ first[:, -1]) / 2
-
-    @property
-    def curvature(self) -> Float[Array, "free free"]:
-        """Unbiased estimate of JᵀJ, which need not be positive."""
-        (first, second) = self.rows.reshape(2, -1, self.rows.shape[-1])[..., :-1]
-        return (first.T @ second + second.T @ first) / 2
-
-    @property
-    def squares(self) -> Float[Array, " free"]:
-        """Squared norm of each column of J, the noise of the paths included."""
-        return jnp.sum(jnp.mean(self.rows[..., :-1], axis=0) ** 2, axis=(0, 1))
-
-    @property
     def loss(self) -> Float[Array, ""]:
         """Half the sum of squares, unbiased."""
         return jnp.vdot(*self.rows[..., -1]) / 2
@@ -144,7 +125,7 @@ class SampledProblem(eqx.Module):
         """At a point, by the random numbers of a step."""
         references, (flat, unravel) = self.residual.references, ravel_pytree(at)
         key = jax.random.fold_in(jax.random.key(self.residual.key), step)
-        weight, number, rows = 1 / np.sqrt(references.count()), 0, []
+        weight, number, rows = 1 / math.sqrt(references.count()), 0, []
         for cameras, images in references.groups:
             numbers = jnp.arange(number, number + len(images), dtype=jnp.uint32)
             number += len(images)
@@ -155,7 +136,7 @@ class SampledProblem(eqx.Module):
 
                 def residual(flat: Array) -> Array:
                     halves = self.halves(self.free.forward(unravel(flat)), camera, of_step)
-                    return ((halves - image) * weight).reshape(-1, 3)
+                    return ((halves - image[None]) * weight).reshape(-1, 3)
 
                 return jacobian(residual, flat)
 

@@ -194,8 +194,8 @@ class Triangles(NamedTuple):
             over its entries i): SᵀS is the sum of their outer products.
     """
 
-    residual: Float[Array, "numbers numbers"]
-    scores: Float[Array, "free free"]
+    residual: Float[Array | np.ndarray, "numbers numbers"]
+    scores: Float[Array | np.ndarray, "rows free"]
 
 
 class Problem(eqx.Module):

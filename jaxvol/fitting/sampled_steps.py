@@ -1,37 +1,45 @@
 """Gauss–Newton steps from noisy samples of residual and Jacobian, averaged over steps.
 
-Near the minimum y*, the gradient at yₖ is gₖ = H (yₖ - y*) + noise. So y* = E[ȳ - H⁻¹ ḡ] for means over any
-steps: each step goes there, with the means over the last steps, so that noise falls with their number. The
-first steps, from far away, must be forgotten: steps fall into epochs, each twice as long as the one before,
-and means are over this epoch and the last, which is half to three quarters of all steps. Without noise, the
-first steps are Gauss–Newton's.
+A sample at yₖ is [Jₖ rₖ] by one half of the paths, and the same by the other. Products of different halves,
+of the same or of different steps, have no bias: means over all such pairs estimate the curvature H = JᵀJ, the
+gradient g = Jᵀr and the loss around the mean point ȳ, and so the minimum, ȳ - H⁻¹ g. Each step goes there. As
+residuals are multiplied by Jacobians of many steps, whose noise is averaged, little more is left than the
+noise of the mean residual.
+
+The first steps, from far away, must be forgotten: steps fall into epochs, each twice as long as the one
+before, and means are over this epoch and the last, which is half to three quarters of all steps. Without
+noise, the first steps are Gauss–Newton's.
 
 Unlike stochastic gradient descent, whose steps must become small at a rate that fits the curvature (Robbins
 and Monro 1951; Polyak and Juditsky 1992), nothing needs to be chosen.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from .constraints import FreeVariables
 from .outcomes import Limits, Outcome
 from .path_traced import Sample, SampledProblem
 from .residuals import Triangles
+from .uncertainty import spreads
 
 
 LONGEST = 1.0
 """A step moves no free variable, which are of order 1, by more than this."""
 
 FLOOR = 0.1
-"""Smallest curvature, relative to that with noise, which is larger: while few samples are averaged, the
-unbiased one may be 0 or negative."""
+"""Smallest curvature in any direction by a single sample, relative to that with noise, which is larger: the
+unbiased one may be 0 or negative. With the number of samples, it falls as their noise."""
 
+FORGET = 2.0
+"""How many times as long as the one before an epoch is."""
 
 LEAST = 12
 """Steps that a fit takes at least: standard errors are known from 7 to 9 samples then."""
@@ -41,59 +49,72 @@ ENOUGH = 0.5
 references leave: together, these are at most 12 % larger than the latter."""
 
 
+class Estimate(NamedTuple):
+    """Of the minimum, from averages.
+
+    Attributes:
+        point: where the gradient is 0.
+        covariance: of this point, due to the noise of the paths.
+        loss: there.
+        loss_error: standard error of the loss, likewise.
+    """
+
+    point: Float[Array, " free"]
+    covariance: Float[Array, "free free"]
+    loss: Float[Array, ""]
+    loss_error: Float[Array, ""]
+
+
 class Averages(eqx.Module):
     """Means over samples at several points."""
 
     steps: Float[Array, ""]
-    both: Float[Array, " both"]
-    """Point and gradient, one behind the other."""
-    moments: Float[Array, "both both"]
-    """Sums of products of their deviations from the mean."""
-    curvature: Float[Array, "free free"]
-    squares: Float[Array, " free"]
-    loss: Float[Array, ""]
-    rows: Float[Array, "pixels channels numbers"]
+    point: Float[Array, " free"]
+    rows: Float[Array, "pixels channels columns"]
     """[J r]."""
+    products: Float[Array, "columns columns"]
+    """[J r]ᵀ [J r] of each half of the paths."""
+    scatter: Float[Array, "free free"]
+    """Of the scores of a step's mean residual: sum over pixels of their variance due to its paths."""
+    fourth: Float[Array, ""]
+    """Sum over pixels of the squared variance of a step's mean residual, at most."""
 
     @classmethod
-    def of(cls, point: Float[Array, " free"], sample: Sample) -> "Averages":
-        """Of one sample."""
-        both = jnp.concatenate([point, sample.gradient])
-        moments = jnp.zeros((both.size, both.size), both.dtype)
-        rest = sample.curvature, sample.squares, sample.loss, jnp.mean(sample.rows, axis=0)
-        return cls(jnp.ones((), both.dtype), both, moments, *rest)
+    def of(cls, point: Float[Array, " free"], sample: Sample, jacobian: Array, others: Array) -> "Averages":
+        """Of one sample. `jacobian`: the mean one over `others` steps before."""
+        columns = sample.rows.shape[-1]
+        rows, apart = jnp.mean(sample.rows, axis=0), (sample.rows[0] - sample.rows[1])[..., -1:] / 2
+        halves = sample.rows.reshape(2, -1, columns)
+        products = jnp.mean(jnp.swapaxes(halves, 1, 2) @ halves, axis=0)
+        jacobian = jacobian + (rows[..., :-1] - jacobian) / (others + 1)
+        scores = jnp.sum(jacobian * apart, axis=1)
+        fourth = jnp.sum(jnp.sum(apart**2, axis=(1, 2)) ** 2)
+        return cls(jnp.ones((), rows.dtype), point, rows, products, scores.T @ scores, fourth)
 
     def joined(self, other: "Averages") -> "Averages":
-        """Over the samples of both (Chan, Golub and LeVeque 1983)."""
+        """Over the samples of both."""
         steps = self.steps + other.steps
         share = other.steps / steps
-        means = jax.tree.map(lambda a, b: a + (b - a) * share, self, other)
-        apart = other.both - self.both
-        moments = self.moments + other.moments + jnp.outer(apart, apart) * (self.steps * share)
-        return eqx.tree_at(lambda each: (each.steps, each.moments), means, (steps, moments))
+        both = jax.tree.map(lambda a, b: a + (b - a) * share, self, other)
+        return eqx.tree_at(lambda each: each.steps, both, steps)
 
     @property
-    def solution(self) -> tuple[Float[Array, " free"], Float[Array, "free free"]]:
-        """Where the mean gradient is 0, and its covariance due to the noise of paths."""
-        scale = jnp.sqrt(jnp.where(self.squares > 0, self.squares, 1))
-        values, axes = jnp.linalg.eigh(self.curvature / scale / scale[:, None])
-        half = axes / jnp.sqrt(jnp.maximum(values, FLOOR)) / scale[:, None]
-        inverse = half @ half.T
-        n = len(inverse)
-        point = self.both[:n] - inverse @ self.both[n:]
-        each = jnp.concatenate([jnp.eye(n, dtype=inverse.dtype), -inverse], axis=1)
-        freedom = self.steps * (self.steps - 1)
-        covariance = each @ self.moments @ each.T / jnp.maximum(freedom, 1)
-        return point, jnp.where(freedom > 0, covariance, jnp.inf)
-
-    @property
-    def triangles(self) -> Triangles:
-        """Of the mean residual and Jacobian."""
-        scores = jnp.sum(self.rows[..., :-1] * self.rows[..., -1:], axis=1)
-        both = self.rows.reshape(-1, self.rows.shape[-1]), scores
-        squares = (jnp.zeros((each.shape[1],) * 2, each.dtype) for each in both)  # there may be few pixels
-        pairs = zip(squares, both, strict=True)
-        return Triangles(*(jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs))
+    def estimate(self) -> Estimate:
+        """Of the minimum, by a loss that is quadratic around it."""
+        flat, halves = self.rows.reshape(-1, self.rows.shape[-1]), 2 * self.steps
+        squares = flat.T @ flat
+        # over all pairs of different halves of all steps
+        pairs = (halves * squares - self.products) / (halves - 1)
+        curvature, gradient = pairs[:-1, :-1], pairs[:-1, -1]
+        size = jnp.diagonal(squares)[:-1]
+        scale = jnp.sqrt(jnp.where(size > 0, size, 1))
+        values, axes = jnp.linalg.eigh(curvature / jnp.outer(scale, scale))
+        axes = axes / jnp.outer(scale, jnp.sqrt(jnp.maximum(values, FLOOR / jnp.sqrt(self.steps))))
+        inverse = axes @ axes.T
+        covariance = inverse @ self.scatter @ inverse / self.steps
+        loss = (pairs[-1, -1] - gradient @ inverse @ gradient) / 2
+        error = jnp.sqrt(self.fourth / 2) / self.steps
+        return Estimate(self.point - inverse @ gradient, covariance, loss, error)
 
 
 class SampledState(eqx.Module):
@@ -105,19 +126,19 @@ class SampledState(eqx.Module):
         step: number of samples so far.
         last: averages over the last epoch; of no steps at first.
         current: over this one.
+        window: over both.
         loss: by the last sample.
-        mean_loss: over both epochs; with the triangles and the covariance there.
+        estimate: from both epochs.
     """
 
     y: FreeVariables
     evaluated: FreeVariables
-    step: Any
+    step: Int[Array, ""]
     last: Averages
     current: Averages
+    window: Averages
     loss: Float[Array, ""]
-    mean_loss: Float[Array, ""]
-    triangles: Triangles
-    covariance: Float[Array, "free free"]
+    estimate: Estimate
 
 
 @eqx.filter_jit
@@ -125,12 +146,11 @@ def first_state(problem: SampledProblem, y: FreeVariables) -> SampledState:
     """Before any step."""
     flat, _ = ravel_pytree(y)
     sample = eqx.filter_eval_shape(problem.sample, y, jnp.zeros((), jnp.int32))
-    averages = eqx.filter_eval_shape(Averages.of, flat, sample)
+    averages = eqx.filter_eval_shape(lambda s: Averages.of(flat, s, s.rows[0, ..., :-1], flat[0]), sample)
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), averages)
     zero, n = jnp.zeros((), flat.dtype), flat.size
-    triangles = Triangles(*(jnp.zeros((size, size), flat.dtype) for size in (n + 1, n)))
-    covariance = jnp.full((n, n), jnp.inf, flat.dtype)
-    return SampledState(y, y, jnp.zeros((), jnp.int32), none, none, zero, zero, triangles, covariance)
+    estimate = Estimate(flat, jnp.zeros((n, n), flat.dtype), zero, zero)
+    return SampledState(y, y, jnp.zeros((), jnp.int32), none, none, none, zero, estimate)
 
 
 @eqx.filter_jit
@@ -138,15 +158,16 @@ def next_state(problem: SampledProblem, state: SampledState) -> SampledState:
     """After another sample."""
     sample = problem.sample(state.y, state.step)
     flat, unravel = ravel_pytree(state.y)
-    current = state.current.joined(Averages.of(flat, sample))
+    known = state.window
+    added = Averages.of(flat, sample, known.rows[..., :-1], known.steps)
+    current = state.current.joined(added)
     window = state.last.joined(current)
-    to, covariance = window.solution
-    y = unravel(flat + jnp.clip(to - flat, -LONGEST, LONGEST))
-    ended, none = current.steps >= 2 * state.last.steps, jax.tree.map(jnp.zeros_like, current)
+    estimate = window.estimate
+    y = unravel(flat + jnp.clip(estimate.point - flat, -LONGEST, LONGEST))
+    ended, none = current.steps >= FORGET * state.last.steps, jax.tree.map(jnp.zeros_like, current)
     last = jax.tree.map(lambda new, old: jnp.where(ended, new, old), current, state.last)
     current = jax.tree.map(lambda new, old: jnp.where(ended, new, old), none, current)
-    found = sample.loss, window.loss, window.triangles, covariance
-    return SampledState(y, state.y, state.step + 1, last, current, *found)
+    return SampledState(y, state.y, state.step + 1, last, current, window, sample.loss, estimate)
 
 
 class SampledRun(eqx.Module):
@@ -172,18 +193,25 @@ class SampledRun(eqx.Module):
 
     @property
     def loss(self) -> float:
-        """Of the samples that it is the result of."""
-        return float(self.state.mean_loss)
+        """At the result, by the samples that it follows from."""
+        return float(self.state.estimate.loss)
+
+    @property
+    def loss_error(self) -> float:
+        """Standard error of the loss, due to the noise of the paths."""
+        return float(self.state.estimate.loss_error)
 
     @property
     def triangles(self) -> Triangles:
-        """Of the same samples."""
-        return self.state.triangles
+        """Of the mean residual and Jacobian of the same samples."""
+        rows = np.asarray(self.state.window.rows)
+        scores = np.sum(rows[..., :-1] * rows[..., -1:], axis=1)
+        return Triangles(*(np.linalg.qr(each, "r") for each in (rows.reshape(-1, rows.shape[-1]), scores)))
 
     @property
     def own(self) -> Float[Array, "free free"]:
         """Covariance of the result that is due to the noise of the paths."""
-        return self.state.covariance
+        return self.state.estimate.covariance
 
     def step(self, solver: Any, problem: SampledProblem) -> "SampledRun":
         """After another sample. There is only one solver."""

@@ -34,7 +34,8 @@ MISFIT = "The model does not fit"
 
 
 class Uncertainty(NamedTuple):
-    """Uncertainty of fitted parameters that is due to noise of the references.
+    """Uncertainty of fitted parameters that is due to noise of the references, and of the paths of a
+    `PathTracedResidual` (which counts twice, so that errors are at most 1.4 times too large).
 
     If the model cannot make the references, the parameters are biased, and neither covariance knows by how
     much. A misfit whose norm is k times the standard deviation of (equal) noise may shift a parameter by up
@@ -130,9 +131,10 @@ def uncertainty(
     return Uncertainty(covariance(each), names, moved, covariance(equal), chi_squared)
 
 
-def warn_of_misfit(noise: Noise | None, chi_squared: float | None, message: str | None) -> None:
-    """Warn if noise does not explain the residual. `message`: how the fit ended, if it did not converge."""
-    if noise is None or chi_squared is None or chi_squared <= noise.largest_by_chance:
+def warn_of_misfit(noise: Noise, chi_squared: float, slack: float, message: str | None) -> None:
+    """Warn if noise does not explain the residual, of which χ² is known only up to a `slack`. `message`: how
+    the fit ended, if it did not converge."""
+    if not chi_squared - slack > noise.largest_by_chance:
         return
     because = "" if message is None else f", or the fit is not at its minimum ({message})"
     warnings.warn(

@@ -56,6 +56,22 @@ FAULTS: list[Fault] = [
         ),
     ),
     Fault(
+        "fit by the path tracer: squares of the same paths",
+        "fitting.sampled_steps:Averages.estimate",
+        lambda estimate: property(lambda self: estimate.fget(replace(self, products=0 * self.products))),
+        (
+            "fitting/test_path_traced_fit.py::test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said",
+        ),
+    ),
+    Fault(
+        "fit by the path tracer: the first steps are never forgotten",
+        "fitting.sampled_steps:FORGET",
+        lambda forget: 1e9,
+        (
+            "fitting/test_path_traced_fit.py::test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said",
+        ),
+    ),
+    Fault(
         "fit: checkpoints of other fits are used",
         "fitting.checkpoints:load",
         lambda load: lambda path, like, about: load(path, like, {}),

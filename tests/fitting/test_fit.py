@@ -370,7 +370,10 @@ BAD = [
     (coarse_to_fine(curve), "residual must be an ImageResidual, to be blurred; got"),
     (coarse_to_fine(blurs=()), "blurs must hold at least one"),
     (lambda: jv.fit_in_stages([], GREY), "residuals must be a list of at least one; got a list of length 0"),
-    (lambda: jv.fit_in_stages(images(), GREY), "residuals must be a list of at least one; got an ImageRes"),
+    (
+        lambda: jv.fit_in_stages(images(), GREY),
+        "residuals must be a list of at least one; got a ImageResidual",
+    ),
 ]
 
 
