@@ -34,7 +34,7 @@ from .uncertainty import spreads
 LONGEST = 1.0
 """A step moves no free variable, which are of order 1, by more than this."""
 
-FLOOR = 0.1
+FLOOR = 0.3
 """Smallest curvature in any direction by a single sample, relative to that with noise, which is larger: the
 unbiased one may be 0 or negative. With the number of samples, it falls as their noise."""
 
