@@ -142,8 +142,8 @@ class SampledState(eqx.Module):
 
 
 @eqx.filter_jit
-def first_state(problem: SampledProblem, y: FreeVariables) -> SampledState:
-    """Before any step."""
+def first_state(problem: SampledProblem | Any, y: FreeVariables) -> SampledState:
+    """Before any step. `problem`: whatever has such a method `sample`."""
     flat, _ = ravel_pytree(y)
     sample = eqx.filter_eval_shape(problem.sample, y, jnp.zeros((), jnp.int32))
     averages = eqx.filter_eval_shape(lambda s: Averages.of(flat, s, s.rows[0, ..., :-1], flat[0]), sample)
@@ -154,7 +154,7 @@ def first_state(problem: SampledProblem, y: FreeVariables) -> SampledState:
 
 
 @eqx.filter_jit
-def next_state(problem: SampledProblem, state: SampledState) -> SampledState:
+def next_state(problem: SampledProblem | Any, state: SampledState) -> SampledState:
     """After another sample."""
     sample = problem.sample(state.y, state.step)
     flat, unravel = ravel_pytree(state.y)
