@@ -320,23 +320,28 @@ def _traced(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
 def _(primals: tuple[Inputs, Constants, How], tangents: tuple[Any, Any, Any]) -> tuple[PathTraced, Any]:
     inputs, constants, how = primals
     traced, moving = _traced(*primals), tangents[0]
+    constant = jax.tree.map(lambda _: None, traced)
     if not jax.tree.leaves(moving):
-        return traced, jax.tree.map(lambda _: None, traced)
+        return traced, constant
     if jax.tree.leaves(moving.volume):
         check_voxels(inputs.transfer, inputs.materials)
     how = replace(how, sampling=OF_DERIVATIVES)
-    radiance, opacity, groups = _derivative(inputs, moving, constants, how)
-    return traced, PathTraced(radiance, opacity, None, None, traced.paths, None, groups)
+    found = _derivative(inputs, moving, constants, how)
+    return traced, eqx.tree_at(_estimates, constant, found, is_leaf=lambda leaf: leaf is None)
+
+
+def _estimates(traced: PathTraced) -> tuple[Any, ...]:
+    """What has a derivative."""
+    return traced.radiance, traced.opacity, traced.groups
 
 
 def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, how: How) -> tuple[Any, ...]:
-    """Derivative of radiance, opacity and groups along tangents, None where these are 0."""
+    """Derivatives of the `_estimates` along tangents, which are None where they are 0."""
     perturbed = jax.tree.map(lambda _, tangent: tangent is not None, inputs, tangents)
     moving, fixed = eqx.partition(inputs, perturbed)
 
     def image(moving: Inputs) -> tuple[Any, ...]:
-        traced = _traced_by(eqx.combine(moving, fixed), constants, how)
-        return traced.radiance, traced.opacity, traced.groups
+        return _estimates(_traced_by(eqx.combine(moving, fixed), constants, how))
 
     return jax.jvp(image, (moving,), (tangents,))[1]
 
