@@ -194,10 +194,9 @@ def path_trace(
     probability 6e-8, are never drawn.
 
     **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
-    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit, and
-    voxels without materials. They are unbiased: decisions stay as drawn, and the probability of each enters as
-    a weight, whose mean has the derivative. The image is the same as without. All derivatives that
-    `jax.jacfwd` asks for at once are by the same paths:
+    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit,
+    and, without materials, voxels. They are unbiased: decisions stay as drawn, and their probabilities enter
+    as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns:
 
         def images(extinction):
             transfer = jv.TransferFunction(values, colors, extinction)
@@ -232,9 +231,9 @@ def path_trace(
             scattered at most that many times, and `exhausted` marks the pixels that lack some.
         antialias: let rays pass through random points of their pixels.
         lanes: paths that are traced side by side. Memory grows with it; the result does not change.
-        groups: that paths are split into, a divisor of `paths`. Several keep an image each, of 16 bytes
-            a pixel, and as much for each derivative, so that whatever is computed of them has a standard error:
-            see `PathTraced.images` and `mean_and_standard_error`.
+        groups: that paths are split into, a divisor of `paths`. Of several, each keeps an image,
+            16 bytes a pixel, and as much for each derivative; so whatever is computed of images has a
+            standard error: see `PathTraced.images` and `mean_and_standard_error`.
 
     Returns:
         A `PathTraced`, with the standard error of each pixel.

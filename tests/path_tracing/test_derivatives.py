@@ -1,8 +1,8 @@
 """Are the derivatives of path tracing right, and their standard errors?
 
-With respect to all kinds of parameters at once, so that tests share one program; compared with float64 central
-differences of quadrature (light scattered once), with Chandrasekhar's half-space, and with central differences
-of images of the same random numbers.
+With respect to all kinds of parameters at once, so that tests share one program; compared with differences of
+quadrature in float64 (light scattered once), with Chandrasekhar's half-space, and with differences of images
+of the same random numbers.
 """
 
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ from .test_path_trace import (
 
 
 GROUPS = 16
-KINDS = "empty dense color opacity path anisotropy sun lamp sky".split()
+KINDS = ["empty", "dense", "color", "opacity", "path", "anisotropy", "sun", "lamp", "sky"]
 """What the components of a vector of parameters change: see `Scene.changed`."""
 
 
@@ -98,8 +98,8 @@ SCENE = Scene(VOLUME, around(VOLUME), EXTINCTION, lit(SUN, LAMP, SKY), (NOWHERE,
 
 
 def derivatives(scene: Scene, **how: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Images by groups, with their opacity; their derivatives, (groups, height, width, 4, parameters); and the
-    derivatives of the image of all paths."""
+    """Images by groups, with their opacity; their derivatives, (groups, height, width, 4, parameters); and
+    the derivatives of the image of all paths."""
 
     def images(by: Any) -> tuple[jax.Array, ...]:
         traced = scene.changed(by).traced(**how)
