@@ -196,13 +196,8 @@ def path_trace(
     **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
     colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit,
     and, without materials, voxels. They are unbiased: decisions stay as drawn, and their probabilities enter
-    as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns:
-
-        def images(extinction):
-            transfer = jv.TransferFunction(values, colors, extinction)
-            return jv.path_trace(volume, transfer, camera, lights, paths=256, groups=16).images()
-
-        derivative, error = mean_and_standard_error(jax.jacfwd(images)(extinction))
+    as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns; with
+    `groups`, a derivative has a standard error (`mean_and_standard_error`).
 
     Their noise is greater than that of the image, and grows with the number of collisions of a path: in very
     thick media of high albedo, take many paths. At a colour of 0 or 1, where the albedo is clipped, and an
