@@ -56,7 +56,8 @@ class PathTraced(eqx.Module):
             contributed.
         paths: per pixel.
         seed: of the last paths' random numbers.
-        groups: of each group of paths, the mean radiance and, last, opacity; None for one group.
+        groups: of each group of paths, the mean radiance and, last, opacity; None for one group, and where
+            groups of different sizes were joined.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -130,7 +131,17 @@ class PathTraced(eqx.Module):
         radiance = self.radiance + (other.radiance - self.radiance) * share
         opacity = self.opacity + (other.opacity - self.opacity) * share
         deviations = self.deviations + other.deviations + between
-        return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths, other.seed)
+        exhausted = self.exhausted | other.exhausted
+        return PathTraced(
+            radiance, opacity, deviations, exhausted, paths, other.seed, self._all_groups(other)
+        )
+
+    def _all_groups(self, other: "PathTraced") -> Array | None:
+        """The groups of both, if they are of the same size."""
+        if self.groups is None or other.groups is None:
+            return None
+        same = self.paths * len(other.groups) == other.paths * len(self.groups)
+        return jnp.concatenate([self.groups, other.groups]) if same else None
 
 
 def _background(background: Any, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
@@ -214,8 +225,8 @@ def path_trace(
         lights: those with a position or a direction are sampled at every scattering, one of them at random; a
             `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
             unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once. More paths of another key are added
-            by `PathTraced.joined`.
+        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once, and 16 for each derivative. More
+            paths of another key are added by `PathTraced.joined`.
         key: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
             and on the path's number.
         materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
