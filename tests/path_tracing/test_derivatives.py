@@ -291,6 +291,9 @@ def test_images_by_groups_are_over_a_background():
     of_paths = np.asarray(traced.standard_error)
     assert 0.9 < np.mean(mean_and_standard_error(traced.groups[..., :3])[1]) / of_paths.mean() < 1.1
     assert error.shape == mean.shape
+    other = SCENE._replace(lights=lit(SUN, LAMP)).traced(max_scatterings=1, key=1)
+    both = traced.joined(other)
+    np.testing.assert_allclose(both.images(background).mean(axis=0), both.image(background), atol=1e-6)
     with pytest.raises(ValueError, match="groups must divide paths; got groups = 3"):
         trace(VOLUME, SCENE.transfer, SCENE.camera, SCENE.lights, groups=3)
     with pytest.raises(ValueError, match="images are by groups of paths"):
