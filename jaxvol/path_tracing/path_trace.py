@@ -24,7 +24,7 @@ from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_only
 from ..xla.platform import is_traced
-from .fixed_paths import check_voxels, with_constant_paths
+from .fixed_paths import check_voxels, has_step, with_constant_paths
 from .lanes import walk_all
 from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
 from .medium import Medium
@@ -104,7 +104,7 @@ class PathTraced(eqx.Module):
         if self.groups is None:
             raise ValueError("images are by groups of paths; call path_trace(..., groups=) with 2 or more.")
         background = _background(background, self.radiance)
-        return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background
+        return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background[None]
 
     def joined(self, other: "PathTraced") -> "PathTraced":
         """The image by the paths of both, of the same scene and different keys.
@@ -251,7 +251,7 @@ def path_trace(
         RuntimeError: if it is differentiated with respect to what moves paths or jumps of the medium: the
             camera, the volume's place, directions and positions of lights, the control points' values of the
             transfer function, the values of materials, and voxels where there are materials or a transfer
-            function has a step (unless it is traced).
+            function has a step (if it is traced, the derivative is NaN).
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
@@ -348,7 +348,10 @@ def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, how: 
     def image(moving: Inputs) -> tuple[Any, ...]:
         return _estimates(_traced_by(eqx.combine(moving, fixed), constants, how))
 
-    return jax.jvp(image, (moving,), (tangents,))[1]
+    _, found = jax.jvp(image, (moving,), (tangents,))
+    if jax.tree.leaves(moving.volume):  # a transfer function that is traced was not checked
+        found = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), found)
+    return found
 
 
 def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
