@@ -5,7 +5,8 @@ from typing import Any, TypeVar
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
-import numpy as np
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
 
 from ..lighting.materials import Material
 from ..scene.camera import Camera
@@ -54,8 +55,14 @@ def check_voxels(transfer: Transfer, materials: tuple[Material, ...]) -> None:
     if materials:
         reason = "which end at values of the volume, or where the transfer function shows nothing"
         raise RuntimeError(f"{what} where there are materials, {reason}. {REMEDY}")
-    if any(not is_traced(line) and np.any(np.diff(line) == 0) for line in _lines_of(transfer)):
+    if not is_traced(transfer) and has_step(transfer):
         raise RuntimeError(f"{what} under a transfer function with a step (two equal values). {REMEDY}")
+
+
+def has_step(transfer: Transfer) -> Bool[Array, ""]:
+    """Whether two neighbouring control points have the same value."""
+    equal = [jnp.any(line[..., 1:] == line[..., :-1]) for line in _lines_of(transfer)]
+    return jnp.any(jnp.stack(equal)) if equal else jnp.zeros((), bool)
 
 
 def _lines_of(transfer: Transfer) -> list[Any]:

@@ -40,7 +40,7 @@ OF_IMAGES = Sampling(1, 0, None)
 
 # With the margin m, the derivative of the logarithm of a path's probability has a variance proportional to
 # m / (m - 1), and takes m times as many candidates: least work for m = 2.
-OF_DERIVATIVES = Sampling(2, 0.25, 0.25)
+OF_DERIVATIVES = Sampling(2, 0.5, 0.25)
 
 
 @jax.custom_jvp

@@ -31,13 +31,14 @@ class Majorants(eqx.Module):
             distance, in blocks, to the nearest block that may.
         last: grid coordinate of the last node along each axis.
         empty: majorant of empty blocks (1/length).
-        least: least rate of collisions (1/length); where it exceeds the extinction, these have weights.
+        least: least rate at which collisions are drawn (1/length), with weights where it exceeds the
+            extinction; None: all are drawn as they are.
     """
 
     table: Float[Array, "bx by bz"]
     last: Vec3
     empty: Scalar | float = 0.0
-    least: Scalar | float = 0.0
+    least: Scalar | None = None
 
     @classmethod
     def of(

@@ -24,7 +24,7 @@ from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_only
 from ..xla.platform import is_traced
-from .fixed_paths import check_voxels, with_constant_paths
+from .fixed_paths import check_voxels, has_step, with_constant_paths
 from .lanes import walk_all
 from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
 from .medium import Medium
@@ -56,7 +56,8 @@ class PathTraced(eqx.Module):
             contributed.
         paths: per pixel.
         seed: of the last paths' random numbers.
-        groups: of each group of paths, the mean radiance and, last, opacity; None for one group.
+        groups: of each group of paths, the mean radiance and, last, opacity; None for one group, and where
+            groups of different sizes were joined.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -103,7 +104,7 @@ class PathTraced(eqx.Module):
         if self.groups is None:
             raise ValueError("images are by groups of paths; call path_trace(..., groups=) with 2 or more.")
         background = _background(background, self.radiance)
-        return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background
+        return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background[None]
 
     def joined(self, other: "PathTraced") -> "PathTraced":
         """The image by the paths of both, of the same scene and different keys.
@@ -130,7 +131,17 @@ class PathTraced(eqx.Module):
         radiance = self.radiance + (other.radiance - self.radiance) * share
         opacity = self.opacity + (other.opacity - self.opacity) * share
         deviations = self.deviations + other.deviations + between
-        return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths, other.seed)
+        exhausted = self.exhausted | other.exhausted
+        return PathTraced(
+            radiance, opacity, deviations, exhausted, paths, other.seed, self._all_groups(other)
+        )
+
+    def _all_groups(self, other: "PathTraced") -> Array | None:
+        """The groups of both, if they are of the same size."""
+        if self.groups is None or other.groups is None:
+            return None
+        same = self.paths * len(other.groups) == other.paths * len(self.groups)
+        return jnp.concatenate([self.groups, other.groups]) if same else None
 
 
 def _background(background: Any, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
@@ -194,16 +205,10 @@ def path_trace(
     probability 6e-8, are never drawn.
 
     **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
-    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit, and
-    voxels without materials. They are unbiased: decisions stay as drawn, and the probability of each enters as
-    a weight, whose mean has the derivative. The image is the same as without. All derivatives that
-    `jax.jacfwd` asks for at once are by the same paths:
-
-        def images(extinction):
-            transfer = jv.TransferFunction(values, colors, extinction)
-            return jv.path_trace(volume, transfer, camera, lights, paths=256, groups=16).images()
-
-        derivative, error = mean_and_standard_error(jax.jacfwd(images)(extinction))
+    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit,
+    and, without materials, voxels. They are unbiased: decisions stay as drawn, and their probabilities enter
+    as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns; with
+    `groups`, a derivative has a standard error (`mean_and_standard_error`).
 
     Their noise is greater than that of the image, and grows with the number of collisions of a path: in very
     thick media of high albedo, take many paths. At a colour of 0 or 1, where the albedo is clipped, and an
@@ -220,8 +225,8 @@ def path_trace(
         lights: those with a position or a direction are sampled at every scattering, one of them at random; a
             `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
             unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once. More paths of another key are added
-            by `PathTraced.joined`.
+        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once, and 16 for each derivative. More
+            paths of another key are added by `PathTraced.joined`.
         key: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
             and on the path's number.
         materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
@@ -232,9 +237,9 @@ def path_trace(
             scattered at most that many times, and `exhausted` marks the pixels that lack some.
         antialias: let rays pass through random points of their pixels.
         lanes: paths that are traced side by side. Memory grows with it; the result does not change.
-        groups: that paths are split into, a divisor of `paths`. Several keep an image each, of 16 bytes
-            a pixel, and as much for each derivative, so that whatever is computed of them has a standard error:
-            see `PathTraced.images` and `mean_and_standard_error`.
+        groups: that paths are split into, a divisor of `paths`. Of several, each keeps an image,
+            16 bytes a pixel, and as much for each derivative; so whatever is computed of images has a
+            standard error: see `PathTraced.images` and `mean_and_standard_error`.
 
     Returns:
         A `PathTraced`, with the standard error of each pixel.
@@ -246,7 +251,7 @@ def path_trace(
         RuntimeError: if it is differentiated with respect to what moves paths or jumps of the medium: the
             camera, the volume's place, directions and positions of lights, the control points' values of the
             transfer function, the values of materials, and voxels where there are materials or a transfer
-            function has a step (unless it is traced).
+            function has a step (if it is traced, the derivative is NaN).
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
@@ -320,25 +325,33 @@ def _traced(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
 def _(primals: tuple[Inputs, Constants, How], tangents: tuple[Any, Any, Any]) -> tuple[PathTraced, Any]:
     inputs, constants, how = primals
     traced, moving = _traced(*primals), tangents[0]
+    constant = jax.tree.map(lambda _: None, traced)
     if not jax.tree.leaves(moving):
-        return traced, jax.tree.map(lambda _: None, traced)
+        return traced, constant
     if jax.tree.leaves(moving.volume):
         check_voxels(inputs.transfer, inputs.materials)
     how = replace(how, sampling=OF_DERIVATIVES)
-    radiance, opacity, groups = _derivative(inputs, moving, constants, how)
-    return traced, PathTraced(radiance, opacity, None, None, traced.paths, None, groups)
+    found = _derivative(inputs, moving, constants, how)
+    return traced, eqx.tree_at(_estimates, constant, found, is_leaf=lambda leaf: leaf is None)
+
+
+def _estimates(traced: PathTraced) -> tuple[Any, ...]:
+    """What has a derivative."""
+    return traced.radiance, traced.opacity, traced.groups
 
 
 def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, how: How) -> tuple[Any, ...]:
-    """Derivative of radiance, opacity and groups along tangents, None where these are 0."""
+    """Derivatives of the `_estimates` along tangents, which are None where they are 0."""
     perturbed = jax.tree.map(lambda _, tangent: tangent is not None, inputs, tangents)
     moving, fixed = eqx.partition(inputs, perturbed)
 
     def image(moving: Inputs) -> tuple[Any, ...]:
-        traced = _traced_by(eqx.combine(moving, fixed), constants, how)
-        return traced.radiance, traced.opacity, traced.groups
+        return _estimates(_traced_by(eqx.combine(moving, fixed), constants, how))
 
-    return jax.jvp(image, (moving,), (tangents,))[1]
+    _, found = jax.jvp(image, (moving,), (tangents,))
+    if jax.tree.leaves(moving.volume):  # a transfer function that is traced was not checked
+        found = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), found)
+    return found
 
 
 def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:

@@ -90,7 +90,7 @@ class Decision(NamedTuple):
     @classmethod
     def at(cls, majorants: Majorants, candidate: Candidate, extinction: Scalar) -> "Decision":
         share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
-        if isinstance(majorants.least, float):  # 0
+        if majorants.least is None:
             return cls(jax.lax.stop_gradient(share), likelihood(share), likelihood(1 - share), share)
         chance = jax.lax.stop_gradient(jnp.maximum(share, majorants.least / candidate.majorant))
         return cls(chance, share / chance, (1 - share) / (1 - chance), share)

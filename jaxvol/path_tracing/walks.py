@@ -185,10 +185,10 @@ def _scatter(
     `turn`: the direction around the z axis."""
     kept = scaled(albedo, collided)
     before_roulette = times(walk.throughput, kept)
-    if walk.importance is None:
+    least = scene.sampling.importance
+    if walk.importance is None or least is None:
         importance = greatest(before_roulette)
     else:
-        least = scene.sampling.importance
         importance = walk.importance * jnp.maximum(jax.lax.stop_gradient(greatest(kept)), least)
     weight, importance = _roulette(importance, survive)
     weight = weight * likelihood(phase(turn[2], scene.anisotropy))

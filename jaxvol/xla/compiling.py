@@ -36,8 +36,8 @@ def compiled(
     rule, so the rule is used only where `jax.vmap` is the innermost transformation of the arguments. Where
     they are also differentiated, or a `jax.jit` lies between, operations are batched.
 
-    `in_turn`: False if operations are always to be batched, as for a batch of tangents, on which no branch and
-    no loop depends.
+    `in_turn`: False if operations are always to be batched, as for a batch of tangents, on which no branch
+    and no loop depends.
     """
     options: Any = {"compiler_options": OPTIONS}
     nested, outermost = eqx.filter_jit(function), eqx.filter_jit(function, **options)
