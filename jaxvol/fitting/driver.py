@@ -367,7 +367,8 @@ def _allow_promotion() -> Iterator[None]:
         yield
 
 
-def _report(run: "_Run | SampledRun", problem: Problem | SampledProblem, limits: Limits, result: Any) -> Fit:
+def _report(run: Any, problem: Any, limits: Limits, result: Any) -> Fit:
+    """The result of a run, a `_Run` or `SampledRun`, and its problem."""
     estimate, chi_squared, slack = None, None, None
     if problem.noise is not None:
         # of Σ r², as the loss is half the mean square; and what is uncertain of it, as three standard errors

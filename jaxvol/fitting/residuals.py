@@ -194,8 +194,8 @@ class Triangles(NamedTuple):
             over its entries i): SᵀS is the sum of their outer products.
     """
 
-    residual: Float[Array | np.ndarray, "numbers numbers"]
-    scores: Float[Array | np.ndarray, "rows free"]
+    residual: Float[Array, "numbers numbers"]
+    scores: Float[Array, "rows free"]
 
 
 class Problem(eqx.Module):
@@ -235,8 +235,9 @@ class Problem(eqx.Module):
     @property
     def noise(self) -> Noise | None:
         """Of the references, if it is known. Noise of blurred pixels is not independent."""
-        known = isinstance(self.residual, ImageResidual) and self.residual.blur is None
-        return self.residual.references.noise if known else None
+        if isinstance(self.residual, ImageResidual) and self.residual.blur is None:
+            return self.residual.references.noise
+        return None
 
     @property
     def scale(self) -> float:

@@ -206,7 +206,9 @@ class SampledRun(eqx.Module):
         """Of the mean residual and Jacobian of the same samples."""
         rows = np.asarray(self.state.window.rows)
         scores = np.sum(rows[..., :-1] * rows[..., -1:], axis=1)
-        return Triangles(*(np.linalg.qr(each, "r") for each in (rows.reshape(-1, rows.shape[-1]), scores)))
+        both = rows.reshape(-1, rows.shape[-1]), scores
+        factors: Any = (np.linalg.qr(each, "r") for each in both)
+        return Triangles(*(jnp.asarray(factor) for factor in factors))
 
     @property
     def own(self) -> Float[Array, "free free"]:

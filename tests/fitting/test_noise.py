@@ -1,6 +1,7 @@
 """Is noise of references told from a model that does not fit, and do standard errors cover the truth?"""
 
 import warnings
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +63,8 @@ def traced(paths: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, jv.PathTr
     mean = radiance.mean(axis=2)
     deviations = np.sum((radiance - mean[:, :, None]) ** 2, axis=2)
     arrays = (jnp.asarray(each, jnp.float32) for each in (mean, met.mean(axis=2), deviations))
-    return radiance, met, jv.PathTraced(*arrays, jnp.zeros((4, 6), bool), paths, jnp.uint32(0))
+    image: Any = (*arrays, jnp.zeros((4, 6), bool), paths, jnp.uint32(0))
+    return radiance, met, jv.PathTraced(*image)
 
 
 def test_the_noise_of_a_path_traced_image_is_that_of_its_paths_over_the_background():
@@ -71,6 +73,7 @@ def test_the_noise_of_a_path_traced_image_is_that_of_its_paths_over_the_backgrou
         of_paths = radiance + (1 - met[..., None]) * np.asarray(background)
         found, variance = path_traced_view(image, jnp.asarray(background, jnp.float32))
         np.testing.assert_allclose(found, of_paths.mean(axis=2), rtol=1e-5)
+        assert variance is not None
         np.testing.assert_allclose(variance, of_paths.var(axis=2, ddof=1) / 32, rtol=1e-4)
 
 
