@@ -129,7 +129,7 @@ def number(
     )
 
 
-def not_negative(name: str, value: Arrayable, shape: tuple[int, ...] = ()) -> Array:
+def not_negative(name: str, value: Arrayable, shape: tuple[int | None, ...] = ()) -> Array:
     """`value` as an array of finite numbers of at least 0; by default a scalar."""
     array = finite_array(name, value, shape)
     return require(array, lambda v: v >= 0, f"{name} must not be negative; got {{got}}.")

@@ -17,6 +17,13 @@ from .candidates import (
     refined as refined,
 )
 from .choice import Choice as Choice, Evidence as Evidence, choose as choose
-from .driver import Fit as Fit, Outcome as Outcome, fit as fit, fit_coarse_to_fine as fit_coarse_to_fine
+from .driver import (
+    Fit as Fit,
+    Outcome as Outcome,
+    fit as fit,
+    fit_coarse_to_fine as fit_coarse_to_fine,
+    fit_in_stages as fit_in_stages,
+)
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
+from .path_traced import PathTracedResidual as PathTracedResidual
 from .residuals import ImageResidual as ImageResidual

@@ -12,7 +12,6 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -23,10 +22,12 @@ from jaxtyping import Array
 
 from .._util.checks import described, integer, not_negative
 from ..xla.trees import PyTree
+from . import checkpoints
 from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, fit
 from .residuals import ImageResidual, check_residual
+from .uncertainty import MISFIT
 
 
 RESOLUTION = 1e-4
@@ -136,7 +137,8 @@ def choose(
 
     Returns:
         A `Choice`, with the evidence for each candidate. If the largest is chosen, a larger one may be better
-        still. Undetermined directions are counted there, in place of the warnings of `fit`.
+        still. Undetermined directions are counted there, in place of the warnings of `fit`; whether a model
+        fits is in `fit.uncertainty.reduced_chi_squared`.
 
     Raises:
         ValueError: for no candidates, candidates that do not grow or have no start, no held-out views, a view
@@ -155,10 +157,10 @@ def choose(
         start = candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters)
         how = {**options, "constraints": candidate.constraints, "where": candidate.where}
         if checkpoint is not None:
-            file = Path(checkpoint)
-            how["checkpoint"] = file.with_name(f"{file.stem}-{at + 1}{file.suffix}")
+            how["checkpoint"] = checkpoints.numbered(checkpoint, at)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=UNDETERMINED)
+            warnings.filterwarnings("ignore", message=MISFIT)
             fits.append(fit(_of_model(training, candidate), start, **how))
         parameters = fits[-1].parameters
         entries = (_entries(_of_model(view, candidate), parameters) for view in validation)
@@ -168,7 +170,11 @@ def choose(
     if not any(map(math.isfinite, losses)):
         raise ValueError("held_out must have finite residuals for one candidate at least; got none.")
     best = int(np.nanargmin(losses))
-    norm = training.scale() if isinstance(training, ImageResidual) else math.sqrt(2 * fits[0].losses[0])
+    norm = (
+        training.references.scale()
+        if isinstance(training, ImageResidual)
+        else math.sqrt(2 * fits[0].losses[0])
+    )
     rows, chosen = [], best
     for at, (candidate, own, loss) in enumerate(zip(candidates, fits, losses, strict=True)):
         error = standard_error(found[at], found[best], block)
@@ -218,9 +224,9 @@ def _entries(residual: Any, parameters: PyTree) -> Array:
     """Of one view; (height, width, channels) of an image."""
     if not isinstance(residual, ImageResidual):
         return ravel_pytree(residual(parameters))[0]
-    ((function, items),) = residual.tiles(residual.count())
+    ((function, items),) = residual.tiles(residual.references.count())
     entries = jax.lax.map(lambda item: function(parameters, item, "replay"), items)
-    return entries.reshape(residual.groups[0][1].shape[1:])
+    return entries.reshape(residual.references.groups[0][1].shape[1:])
 
 
 def _list(name: str, given: Any) -> list[Any]:
@@ -252,10 +258,10 @@ def _residuals(residual: Any, views: Any, held_out: list[Any]) -> tuple[Any, lis
     if isinstance(residual, ImageResidual):
         if views is not None:
             raise ValueError("views must not be given with an ImageResidual, which has views of its own.")
-        how = {"background": residual.background, "compositing": residual.compositing}
+        how = {"background": residual.references.background, "compositing": residual.compositing}
         training, validation = residual, [ImageResidual(residual.scene, [view], **how) for view in held_out]
         # another picture by the same camera tells nothing of other views
-        fitted, others = residual.cameras(), [view[0] for view in held_out]
+        fitted, others = residual.references.cameras(), [view[0] for view in held_out]
     else:
         check_residual(residual)
         fitted, others = _list("views", views), held_out

@@ -7,13 +7,14 @@ large to hold, but a Gauss–Newton or Levenberg–Marquardt step needs only the
 
 which is (n + 1, n + 1) and is computed tile by tile, by QR of the triangle so far and the tile's rows (TSQR,
 Demmel et al. 2012). A residual of n + 1 numbers with the Jacobian [R; 0] thus replaces that of all pixels
-exactly, for any solver; unlike JᵀJ, it does not square the condition number.
+exactly, for any solver; unlike JᵀJ, it does not square the condition number. The scores Jᵢ rᵢ, whose outer
+products tell how much the estimate varies, are reduced in the same pass.
 """
 
 import inspect
 import math
-from collections.abc import Callable, Iterable
-from typing import Any, cast
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, described, finite_array, not_negative
+from .._util.checks import Arrayable, described, not_negative
 from ..compositing.blending import Compositing
 from ..compositing.modes import Mode, compositing_of
 from ..ray import check_arguments
@@ -31,14 +32,17 @@ from ..scene.camera import Camera
 from ..scene.transfer import Transfer
 from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
+from .noise import Noise
+from .references import References
 
 
 TANGENTS = 64
 """Columns of the Jacobian computed at once: a march keeps its state for each of them."""
 
 
-Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, " entries"]], PyTree]
-"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items."""
+Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, "pixels channels"]], PyTree]
+"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items. Noise
+may be correlated between the entries of a pixel."""
 
 
 def check_residual(residual: Any) -> None:
@@ -48,6 +52,14 @@ def check_residual(residual: Any) -> None:
             "residual must be an ImageResidual, or a function from parameters to arrays; "
             f"got {described(residual)}. The order is fit(residual, parameters)."
         )
+
+
+def check_scene(scene: Any) -> None:
+    """Reject what cannot be called with parameters and a camera."""
+    try:
+        inspect.signature(scene).bind(None, None)
+    except TypeError as fault:
+        raise ValueError(f"scene must be a function of (parameters, camera); got {scene!r}.") from fault
 
 
 SceneFunction = Callable[[Any, Camera], tuple[Any, ...]]
@@ -66,9 +78,15 @@ class ImageResidual(eqx.Module):
             `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit. The solver
             chooses the adjoint.
         views: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
-            `background`, or (height, width, 4), as `Rendering.rgba`.
+            `background`, or (height, width, 4), as `Rendering.rgba`; or a `PathTraced`, which is put before
+            `background`.
         background: linear RGB behind the volume, for three-channel images.
         compositing: as in `render`.
+        noise: standard deviation of the noise of the references: a number; or a list with a number, an array
+            like the image or one that broadcasts to it, or None, for each view. Where it is not given, it is
+            the standard error of a view that is a `PathTraced` of more than one path, and else unknown. If it
+            is known for all views, `fit` compares it with the residual, and warns of a model that does not
+            fit. It doesn't weight the residual.
         blur: compare blurred images: standard deviation of a Gaussian, as a fraction of the image's height,
             for `fit_coarse_to_fine`. Whole images are then differentiated at once. Pixels beyond the border
             do not count. Standard errors are too small, since the noise of blurred pixels is not independent:
@@ -76,14 +94,13 @@ class ImageResidual(eqx.Module):
 
     Raises:
         ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or
-            infinite pixels, a negative `blur`, and a scene that returns something else; and when it is
-            fitted, for blurred images that `max_jacobian` leaves no room for.
+            infinite pixels, a negative `blur`, `noise` that is negative, infinite or of another shape, and a
+            scene that returns something else; and when it is fitted, for blurred images that `max_jacobian`
+            leaves no room for.
     """
 
     scene: SceneFunction
-    groups: list[tuple[Camera, Float[Array, "views height width channels"]]]
-    """Stacked views of the same size and kind."""
-    background: Float[Array, "3"]
+    references: References
     compositing: Compositing[Any]
     blur: Float[Array, ""] | None
 
@@ -94,47 +111,23 @@ class ImageResidual(eqx.Module):
         background: Arrayable = (1.0, 1.0, 1.0),
         *,
         compositing: Mode | Compositing[Any] | Any = "over",
+        noise: Arrayable | Sequence[Arrayable | None] | None = None,
         blur: Arrayable | None = None,
     ):
-        try:
-            inspect.signature(scene).bind(None, None)
-        except TypeError as fault:
-            raise ValueError(f"scene must be a function of (parameters, camera); got {scene!r}.") from fault
+        check_scene(scene)
         self.scene = cast(Any, scene)
-        self.background = finite_array("background", background, (3,))
         self.compositing = compositing_of(compositing)
         self.blur = None if blur is None else not_negative("blur", blur)
-        views = list(views) if isinstance(views, Iterable) else []
-        if not views:
-            raise ValueError("views must hold at least one pair (camera, image); got none.")
-        by_kind: dict[Any, list[tuple[Camera, Array]]] = {}
-        for number, view in enumerate(views):
-            camera, image = _view(number, view)
-            by_kind.setdefault((jax.tree.structure(camera), image.shape), []).append((camera, image))
-        self.groups = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *views) for views in by_kind.values()]
+        self.references = References.of(views, background, noise)
 
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
         sigma = None if blur is None else not_negative("blur", blur)
         return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
 
-    def cameras(self) -> list[Camera]:
-        """Cameras of all views."""
-        each = ((cameras, view) for cameras, images in self.groups for view in range(len(images)))
-        return [jax.tree.map(lambda leaf, view=view: leaf[view], cameras) for cameras, view in each]
-
-    def count(self) -> int:
-        """Total number of entries."""
-        return sum(images.size for _, images in self.groups)
-
-    def scale(self) -> float:
-        """Norm of the compared data: changes within its rounding carry no information."""
-        squares = sum(float(jnp.sum(images**2)) for _, images in self.groups)
-        return math.sqrt(squares / self.count())
-
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most `most` entries."""
-        return [self._tiles(*group, most) for group in self.groups]
+        return [self._tiles(*group, most) for group in self.references.groups]
 
     def _tiles(self, cameras: Camera, images: Array, most: int) -> Tiles:
         views, height, width, channels = images.shape
@@ -146,7 +139,7 @@ class ImageResidual(eqx.Module):
             )
         pieces = math.ceil(height / min(height, most // (width * channels)))
         rows = math.ceil(height / pieces)
-        weight = 1 / math.sqrt(self.count())
+        weight = 1 / math.sqrt(self.references.count())
 
         def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
@@ -168,7 +161,7 @@ class ImageResidual(eqx.Module):
                 camera = camera.part(0, first, (camera.size[0], rows))
             how: Any = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
-            rendered = rendering.rgba if channels == 4 else rendering.image(self.background)
+            rendered = rendering.rgba if channels == 4 else rendering.image(self.references.background)
             row = first + jnp.arange(rows)
             reference = images[view, jnp.minimum(row, height - 1)]
             # the last piece may reach past the image
@@ -178,7 +171,7 @@ class ImageResidual(eqx.Module):
                 for axis, n in enumerate((height, width)):
                     kernel = _blurring(n, self.blur * height)
                     difference = jnp.moveaxis(jnp.tensordot(kernel, difference, axes=(1, axis)), 0, axis)
-            return difference.reshape(-1)
+            return difference.reshape(-1, channels)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return residual, (jnp.asarray(view), jnp.asarray(piece * rows))
@@ -192,19 +185,17 @@ def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
     return jax.nn.softmax(-(away**2) / 2, axis=1)
 
 
-def _view(number: int, view: Any) -> tuple[Camera, Array]:
-    if not isinstance(view, tuple | list) or len(view) != 2 or not isinstance(view[0], Camera):
-        raise ValueError(f"views[{number}] must be a pair (camera, image); got {described(view)}.")
-    camera, name = view[0], f"views[{number}]: the image"
-    if (kind := np.asarray(view[1]).dtype).kind not in "fV":  # V: JAX's own 8- and 16-bit floats
-        raise ValueError(
-            f"{name} must be linear RGB, floats in [0, 1]; got {kind}. Convert a picture file with "
-            "jv.read_views, or its pixels with jv.from_srgb(image / 255)."
-        )
-    image = finite_array(name, view[1], (*camera.size[::-1], None)).astype(jnp.float32)
-    if image.shape[2] not in (3, 4):
-        raise ValueError(f"{name} must have 3 or 4 channels; got {image.shape[2]}.")
-    return camera, image
+class Triangles(NamedTuple):
+    """What a least-squares fit keeps of a residual of m entries and its Jacobian.
+
+    Attributes:
+        residual: the triangle R of [J r], whose last column replaces the residual.
+        scores: the triangle S of the scores, the gradients of each pixel's part of the loss (that is, Σ Jᵢ rᵢ
+            over its entries i): SᵀS is the sum of their outer products.
+    """
+
+    residual: Float[Array, "numbers numbers"]
+    scores: Float[Array, "rows free"]
 
 
 class Problem(eqx.Module):
@@ -222,7 +213,9 @@ class Problem(eqx.Module):
     def of(cls, residual: Any, free: Free, y: FreeVariables, most: int, least_squares: bool) -> "Problem":
         """With as large tiles as fit into `most` bytes; without Jacobian, all of the residual."""
         images = isinstance(residual, ImageResidual)
-        count = residual.count() if images else size(eqx.filter_eval_shape(residual, free.forward(y)))
+        count = (
+            residual.references.count() if images else size(eqx.filter_eval_shape(residual, free.forward(y)))
+        )
         row = (size(y) + 1) * 4
         if count == 0:
             raise ValueError("residual must return at least one number; got none.")
@@ -239,13 +232,26 @@ class Problem(eqx.Module):
             )
         return cls(residual, free, count, tile, least_squares)
 
+    @property
+    def noise(self) -> Noise | None:
+        """Of the references, if it is known. Noise of blurred pixels is not independent."""
+        if isinstance(self.residual, ImageResidual) and self.residual.blur is None:
+            return self.residual.references.noise
+        return None
+
+    @property
+    def scale(self) -> float:
+        """Norm of the references; 0 for a function."""
+        return self.residual.references.scale() if isinstance(self.residual, ImageResidual) else 0.0
+
     def __call__(self, y: FreeVariables, _: Any = None) -> tuple[Array, tuple[Array, FreeVariables, Any]]:
-        """What a solver minimises; and the loss, its point, and the triangle there."""
+        """What a solver minimises; and the loss, its point, and the triangles there."""
         if not self.least_squares:
             loss = self.loss(y)
             return loss, (loss, y, None)
-        triangle = self.condensed(y)
-        return triangle[:, -1], (jnp.sum(triangle[:, -1] ** 2) / 2, y, triangle)
+        triangles = self.condensed(y)
+        column = triangles.residual[:, -1]
+        return column, (jnp.sum(column**2) / 2, y, triangles)
 
     def loss(self, free: FreeVariables) -> Float[Array, ""]:
         """Half the sum of squares. Its gradient is summed tile by tile, in reverse mode."""
@@ -270,29 +276,35 @@ class Problem(eqx.Module):
 
         return loss(free)
 
-    def condensed(self, free: FreeVariables) -> Float[Array, "numbers numbers"]:
+    def condensed(self, free: FreeVariables) -> Triangles:
         """The triangle [R c; 0 ρ], whose last column of n + 1 numbers replaces the residual, in value and
-        derivative. Forward mode."""
+        derivative, and that of the scores, without derivative. Forward mode."""
 
         @jax.custom_jvp
-        def condensed(free: FreeVariables) -> Array:
+        def condensed(free: FreeVariables) -> Triangles:
             flat, unravel = ravel_pytree(free)
 
-            def add(function: Any, triangle: Array, item: Any) -> Array:
+            def add(function: Any, triangles: Triangles, item: Any) -> Triangles:
                 def residual(flat: Array) -> Array:
                     return function(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
 
-                return jnp.linalg.qr(jnp.concatenate([triangle, _jacobian(residual, flat)]), mode="r")
+                rows = jacobian(residual, flat)
+                scores = jnp.sum(rows[..., :-1] * rows[..., -1:], axis=1)
+                both = zip(triangles, (rows.reshape(-1, flat.size + 1), scores), strict=True)
+                return Triangles(*(jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in both))
 
-            triangle = self._accumulate(add, jnp.zeros((flat.size + 1, flat.size + 1), flat.dtype))
+            zeros = (jnp.zeros((n, n), flat.dtype) for n in (flat.size + 1, flat.size))
+            triangle, scores = self._accumulate(add, Triangles(*zeros))
             # QR's row signs are arbitrary; fixed here, so that they do not jump from step to step
-            return triangle * jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
+            signs = jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
+            return Triangles(triangle * signs, scores)
 
         @condensed.defjvp
-        def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Array, Array]:
-            triangle = condensed(*primal)
+        def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Triangles, Triangles]:
+            triangle, scores = condensed(*primal)
             change = triangle[:, :-1] @ ravel_pytree(*tangent)[0]
-            return triangle, jnp.zeros_like(triangle).at[:, -1].set(change)
+            changes = jnp.zeros_like(triangle).at[:, -1].set(change), jnp.zeros_like(scores)
+            return Triangles(triangle, scores), Triangles(*changes)
 
         return condensed(free)
 
@@ -302,13 +314,15 @@ class Problem(eqx.Module):
             tiles = self.residual.tiles(self.tile)
         else:
             own: Any = self.residual
-            tiles = [(lambda parameters, *_: ravel_pytree(own(parameters))[0], jnp.zeros(1))]
+            tiles = [(lambda parameters, *_: ravel_pytree(own(parameters))[0][:, None], jnp.zeros(1))]
         for function, items in tiles:
             total, _ = jax.lax.scan(lambda sum, item, f=function: (add(f, sum, item), None), total, items)
         return total
 
 
-def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Array, "entries numbers"]:
+def jacobian(
+    f: Callable[[Array], Float[Array, "pixels channels"]], at: Float[Array, " n"]
+) -> Float[Array, "pixels channels numbers"]:
     """[J r] by forward mode, at most `TANGENTS` columns at a time."""
     n = at.size
     chunk = min(n, TANGENTS)
@@ -316,5 +330,5 @@ def _jacobian(f: Callable[[Array], Array], at: Float[Array, " n"]) -> Float[Arra
     directions = jnp.eye(chunks * chunk, n, dtype=at.dtype).reshape(chunks, chunk, n)
     push = jax.vmap(lambda direction: jax.jvp(f, (at,), (direction,)), out_axes=(None, 0))
     value, columns = jax.lax.map(push, directions)
-    columns = columns.reshape(chunks * chunk, -1)[:n]
-    return jnp.concatenate([columns, value[:1]]).T
+    columns = columns.reshape(chunks * chunk, *value.shape[1:])[:n]
+    return jnp.moveaxis(jnp.concatenate([columns, value[:1]]), 0, -1)

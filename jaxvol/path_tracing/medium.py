@@ -16,6 +16,7 @@ from ..scene.space import Affine
 from ..scene.transfer import Measured, Transfer, classification_of
 from ..scene.volume import Volume
 from ..xla.memory import gather
+from .likelihood import OF_IMAGES, Sampling, clipped, jumping
 
 
 Block: TypeAlias = tuple[Int[Array, "..."], Int[Array, "..."], Int[Array, "..."]]
@@ -29,14 +30,24 @@ class Majorants(eqx.Module):
         table: for each block, its majorant (1/length) if it may have extinction; else minus the chessboard
             distance, in blocks, to the nearest block that may.
         last: grid coordinate of the last node along each axis.
+        empty: majorant of empty blocks (1/length).
+        least: least rate at which collisions are drawn (1/length), with weights where it exceeds the
+            extinction; None: all are drawn as they are.
     """
 
     table: Float[Array, "bx by bz"]
     last: Vec3
+    empty: Scalar | float = 0.0
+    least: Scalar | None = None
 
     @classmethod
     def of(
-        cls, volume: Volume, blocks: Blocks, transfer: Transfer, materials: tuple[Material, ...]
+        cls,
+        volume: Volume,
+        blocks: Blocks,
+        transfer: Transfer,
+        materials: tuple[Material, ...],
+        sampling: Sampling,
     ) -> "Majorants":
         """Those of the medium that `Medium.of` makes of a volume. **Raises** `ValueError` for a transfer
         function without a majorant."""
@@ -61,11 +72,21 @@ class Majorants(eqx.Module):
         bound = jnp.where(own > 0, bound, 0)
         distance = Affine(volume).occupancy(bound > 0).distance().astype(bound.dtype)
         x, y, z = (jnp.asarray(n - 1, bound.dtype) for n in volume.shape)
-        return cls(jnp.where(bound > 0, bound, -distance.reshape(bound.shape)), (x, y, z))
+        last, distance = (x, y, z), distance.reshape(bound.shape)
+        if not sampling.collisions:
+            return cls(jnp.where(bound > 0, sampling.margin * bound, -distance), last)
+        sides = [n * step for n, step in zip(last, volume.spacing, strict=True)]
+        least = sampling.collisions / jnp.sqrt(sum(side * side for side in sides))
+        table = jnp.where(bound > 0, sampling.margin * jnp.maximum(bound, least), -distance)
+        return cls(table, last, sampling.margin * least, least)
 
     def at(self, block: Block) -> Scalar:
         (x, y, z), (_, ny, nz) = block, self.table.shape
         return gather(self.table.reshape(-1), (x * ny + y) * nz + z)
+
+    def majorant(self, entry: Scalar) -> Scalar:
+        """The majorant of an entry of the table."""
+        return jnp.maximum(entry, self.empty)
 
     def holding(self, coordinate: Vec3) -> Block:
         """The block that holds a grid coordinate, or the nearest one."""
@@ -99,7 +120,12 @@ class Medium(NamedTuple):
 
     @classmethod
     def of(
-        cls, volume: Volume, blocks: Blocks, transfer: Transfer, materials: tuple[Material, ...] = ()
+        cls,
+        volume: Volume,
+        blocks: Blocks,
+        transfer: Transfer,
+        materials: tuple[Material, ...] = (),
+        sampling: Sampling = OF_IMAGES,
     ) -> "Medium":
         """The medium that `path_trace` describes."""
         classification = classification_of(transfer, volume)
@@ -117,9 +143,10 @@ class Medium(NamedTuple):
             visible = extinction > 0
             for share, material in zip(fractions, materials, strict=True):
                 here = visible & (share > 0)
+                extinction = jumping(extinction, ~visible & (share > 0))
                 extinction = jnp.where(here, 1 / material.mean_free_path, extinction)
                 kept = jnp.where(here, 1 - material.opacity, kept)
-            r, g, b = (jnp.clip(c, 0, 1) * kept for c in color)
+            r, g, b = (clipped(c) * kept for c in color)
             return extinction, (r, g, b)
 
-        return cls(measure, classify, Majorants.of(volume, blocks, transfer, materials))
+        return cls(measure, classify, Majorants.of(volume, blocks, transfer, materials, sampling))

@@ -1,10 +1,10 @@
 """Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,8 +22,11 @@ from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import compiled
+from ..xla.differentiation import forward_only
 from ..xla.platform import is_traced
+from .fixed_paths import check_voxels, has_step, with_constant_paths
 from .lanes import walk_all
+from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
 from .medium import Medium
 from .walks import Walk, WalkResult, WalkScene, Words, step
 
@@ -34,11 +37,11 @@ LANES = 2**13
 WALKS_PER_LANE = 128
 """Walks that each lane of a batch runs, one after the other."""
 
-NOT_DIFFERENTIABLE = (
-    "path_trace has no derivative, but an input carries a tangent here (jax.grad, jax.jvp). Differentiate "
-    "lighting.ScattererTemplates instead, or apply jax.lax.stop_gradient to the inputs."
+FORWARD_ONLY = (
+    "path_trace has derivatives in forward mode only; take jax.jacfwd or jax.jvp in place of jax.grad, "
+    "jax.vjp or jax.jacrev."
 )
-"""Error message: how often and where a path collides jumps with the extinction."""
+"""Error message: a reverse pass would have to keep or repeat all that happens along each path."""
 
 
 class PathTraced(eqx.Module):
@@ -53,6 +56,8 @@ class PathTraced(eqx.Module):
             contributed.
         paths: per pixel.
         seed: of the last paths' random numbers.
+        groups: of each group of paths, the mean radiance and, last, opacity; None for one group, and where
+            groups of different sizes were joined.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -61,6 +66,7 @@ class PathTraced(eqx.Module):
     exhausted: Bool[Array, "height width"]
     paths: int = eqx.field(static=True)
     seed: UInt32[Array, ""]
+    groups: Float[Array, "groups height width 4"] | None = None
 
     @property
     def standard_error(self) -> Float[Array, "height width 3"]:
@@ -81,12 +87,24 @@ class PathTraced(eqx.Module):
         Raises:
             ValueError: for another shape.
         """
-        background = jnp.asarray(background, self.radiance.dtype)
-        if background.shape not in ((3,), self.radiance.shape):
-            shapes = f"(3,) or {self.radiance.shape}"
-            raise ValueError(f"background must have shape {shapes}; got {background.shape}.")
-        background = jnp.broadcast_to(background, self.radiance.shape)
-        return self.radiance + (1 - self.opacity[..., None]) * background
+        return self.radiance + (1 - self.opacity[..., None]) * _background(background, self.radiance)
+
+    def images(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "groups height width 3"]:
+        """Linear RGB over a background, by each group of paths: independent images, whose mean is `image`.
+
+        Args:
+            background: as for `image`.
+
+        Returns:
+            The images.
+
+        Raises:
+            ValueError: for another shape, and for paths in one group.
+        """
+        if self.groups is None:
+            raise ValueError("images are by groups of paths; call path_trace(..., groups=) with 2 or more.")
+        background = _background(background, self.radiance)
+        return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background[None]
 
     def joined(self, other: "PathTraced") -> "PathTraced":
         """The image by the paths of both, of the same scene and different keys.
@@ -113,7 +131,48 @@ class PathTraced(eqx.Module):
         radiance = self.radiance + (other.radiance - self.radiance) * share
         opacity = self.opacity + (other.opacity - self.opacity) * share
         deviations = self.deviations + other.deviations + between
-        return PathTraced(radiance, opacity, deviations, self.exhausted | other.exhausted, paths, other.seed)
+        exhausted = self.exhausted | other.exhausted
+        return PathTraced(
+            radiance, opacity, deviations, exhausted, paths, other.seed, self._all_groups(other)
+        )
+
+    def _all_groups(self, other: "PathTraced") -> Array | None:
+        """The groups of both, if they are of the same size."""
+        if self.groups is None or other.groups is None:
+            return None
+        same = self.paths * len(other.groups) == other.paths * len(self.groups)
+        return jnp.concatenate([self.groups, other.groups]) if same else None
+
+
+def _background(background: Any, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+    background = jnp.asarray(background, image.dtype)
+    if background.shape not in ((3,), image.shape):
+        raise ValueError(f"background must have shape (3,) or {image.shape}; got {background.shape}.")
+    return jnp.broadcast_to(background, image.shape)
+
+
+def mean_and_standard_error(groups: Any) -> tuple[Any, Any]:
+    """Estimate and its standard error, from independent estimates by groups of paths.
+
+    Args:
+        groups: a tree of arrays whose first axis is that of groups: `PathTraced.images`, what is computed of
+            each, or their derivatives.
+
+    Returns:
+        Mean, and standard error of the mean, of each array. The latter itself has a relative error of
+        1 / sqrt(2 (groups - 1)).
+
+    Raises:
+        ValueError: for fewer than two groups.
+    """
+    few = {len(leaf) for leaf in jax.tree.leaves(groups) if len(leaf) < 2}
+    if few:
+        raise ValueError(f"groups must be 2 or more along the first axis; got {few.pop()}.")
+
+    def error(leaf: Array) -> Array:
+        return jnp.std(leaf, axis=0, ddof=1) / np.sqrt(leaf.shape[0])
+
+    return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), groups), jax.tree.map(error, groups)
 
 
 def path_trace(
@@ -129,6 +188,7 @@ def path_trace(
     max_scatterings: int | Any = 2**20,
     antialias: bool | Any = False,
     lanes: int | Any = None,
+    groups: int | Any = 1,
 ) -> PathTraced:
     """Image of a volume that scatters light any number of times.
 
@@ -144,7 +204,19 @@ def path_trace(
     Random numbers have 24 bits, so free paths longer than 16.6 mean free paths within a block of voxels, of
     probability 6e-8, are never drawn.
 
-    Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`.
+    **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
+    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit,
+    and, without materials, voxels. They are unbiased: decisions stay as drawn, and their probabilities enter
+    as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns; with
+    `groups`, a derivative has a standard error (`mean_and_standard_error`).
+
+    Their noise is greater than that of the image, and grows with the number of collisions of a path: in very
+    thick media of high albedo, take many paths. At a colour of 0 or 1, where the albedo is clipped, and an
+    extinction of 0, derivatives are one-sided. They are NaN with respect to an extinction of 0 inside a
+    material, which would appear all at once. `deviations` and the `standard_error` count as constants.
+
+    Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`. Of derivatives: Vicini, Speierer
+    and Jakob 2021; Nimier-David et al. 2022; see `likelihood`.
 
     Args:
         volume: on its own grid; curved grids (`ToroidalMap`) are not supported.
@@ -153,8 +225,8 @@ def path_trace(
         lights: those with a position or a direction are sampled at every scattering, one of them at random; a
             `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
             unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once. More paths of another key are added
-            by `PathTraced.joined`.
+        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once, and 16 for each derivative. More
+            paths of another key are added by `PathTraced.joined`.
         key: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
             and on the path's number.
         materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
@@ -165,6 +237,9 @@ def path_trace(
             scattered at most that many times, and `exhausted` marks the pixels that lack some.
         antialias: let rays pass through random points of their pixels.
         lanes: paths that are traced side by side. Memory grows with it; the result does not change.
+        groups: that paths are split into, a divisor of `paths`. Of several, each keeps an image,
+            16 bytes a pixel, and as much for each derivative; so whatever is computed of images has a
+            standard error: see `PathTraced.images` and `mean_and_standard_error`.
 
     Returns:
         A `PathTraced`, with the standard error of each pixel.
@@ -172,14 +247,14 @@ def path_trace(
     Raises:
         ValueError: for arguments out of these ranges, no lights, a transfer function without a majorant, and
             labels where the volume has none.
-        RuntimeError: if it is differentiated with respect to any of its inputs. It may be called in a
-            function that is differentiated with respect to something else.
+            Also if it is differentiated in reverse mode (`jax.grad`).
+        RuntimeError: if it is differentiated with respect to what moves paths or jumps of the medium: the
+            camera, the volume's place, directions and positions of lights, the control points' values of the
+            transfer function, the values of materials, and voxels where there are materials or a transfer
+            function has a step (if it is traced, the derivative is NaN).
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
-    volume, transfer, camera, lights, materials, anisotropy = eqxi.nondifferentiable(
-        (volume, transfer, camera, lights, materials, anisotropy), msg=NOT_DIFFERENTIABLE
-    )
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):
@@ -189,12 +264,17 @@ def path_trace(
     limit = min(integer("max_scatterings", max_scatterings, 1), 2**31 - 1)
     if lanes is None:
         lanes = LANES if jax.default_backend() == "cpu" else 32 * LANES
+    groups = integer("groups", groups, 1)
+    if paths % groups:
+        raise ValueError(f"groups must divide paths; got groups = {groups} and paths = {paths}.")
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
-    blocks = Blocks.of(volume, slopes=transfer.reads_gradient)
-    inputs = volume, blocks, transfer, materials, lights, anisotropy, camera
+    volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials)
+    blocks = Blocks.of(jax.lax.stop_gradient(volume), slopes=transfer.reads_gradient)
+    inputs = Inputs(volume, transfer, materials, lights, anisotropy)
+    how = How(paths, groups, lanes, pixels, antialias)
     limit = jnp.asarray(limit, jnp.int32)
-    return _trace(inputs, words_of(volume), limit, seed, paths, lanes, pixels, antialias)
+    return forward_only(_traced(inputs, (camera, blocks, words_of(volume), limit, seed), how), FORWARD_ONLY)
 
 
 def _seed(key: Any) -> UInt32[Array, ""]:
@@ -208,30 +288,89 @@ def _seed(key: Any) -> UInt32[Array, ""]:
     return jax.random.bits(key, (), jnp.uint32)
 
 
-@compiled
-def _trace(
-    inputs: tuple[Any, ...],
-    words: UInt32[Array, " voxels"] | None,
-    max_scatterings: Int[Array, ""],
-    seed: UInt32[Array, ""],
-    paths: int,
-    lanes: int,
-    pixels: int,
-    antialias: bool,
-) -> PathTraced:
-    """Trace the image in batches of `pixels`. `words`: the volume's packed voxels."""
+class Inputs(NamedTuple):
+    """What an image may be differentiated with respect to, at least in part."""
+
+    volume: Volume
+    transfer: Transfer
+    materials: tuple[Material, ...]
+    lights: tuple[Light, ...]
+    anisotropy: Float[Array, ""]
+
+
+@dataclass(frozen=True)
+class How:
+    """Static arguments. `pixels`: of a batch."""
+
+    paths: int
+    groups: int
+    lanes: int
+    pixels: int
+    antialias: bool
+    sampling: Sampling = OF_IMAGES
+
+
+Constants: TypeAlias = tuple[
+    Camera, Blocks, UInt32[Array, " voxels"] | None, Int[Array, ""], UInt32[Array, ""]
+]
+"""Camera, ranges of blocks, the volume's packed voxels, `max_scatterings`, and the seed."""
+
+
+@eqx.filter_custom_jvp
+def _traced(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
+    return _trace(inputs, constants, how)
+
+
+@_traced.def_jvp
+def _(primals: tuple[Inputs, Constants, How], tangents: tuple[Any, Any, Any]) -> tuple[PathTraced, Any]:
+    inputs, constants, how = primals
+    traced, moving = _traced(*primals), tangents[0]
+    constant = jax.tree.map(lambda _: None, traced)
+    if not jax.tree.leaves(moving):
+        return traced, constant
+    if jax.tree.leaves(moving.volume):
+        check_voxels(inputs.transfer, inputs.materials)
+    how = replace(how, sampling=OF_DERIVATIVES)
+    found = _derivative(inputs, moving, constants, how)
+    return traced, eqx.tree_at(_estimates, constant, found, is_leaf=lambda leaf: leaf is None)
+
+
+def _estimates(traced: PathTraced) -> tuple[Any, ...]:
+    """What has a derivative."""
+    return traced.radiance, traced.opacity, traced.groups
+
+
+def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, how: How) -> tuple[Any, ...]:
+    """Derivatives of the `_estimates` along tangents, which are None where they are 0."""
+    perturbed = jax.tree.map(lambda _, tangent: tangent is not None, inputs, tangents)
+    moving, fixed = eqx.partition(inputs, perturbed)
+
+    def image(moving: Inputs) -> tuple[Any, ...]:
+        return _estimates(_traced_by(eqx.combine(moving, fixed), constants, how))
+
+    _, found = jax.jvp(image, (moving,), (tangents,))
+    if jax.tree.leaves(moving.volume):  # a transfer function that is traced was not checked
+        found = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), found)
+    return found
+
+
+def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
+    """Trace the image in batches of pixels."""
     # float64 becomes float32, whose rounding is far below the noise
-    volume, blocks, transfer, materials, lights, anisotropy, camera = jax.tree.map(
-        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, inputs
+    (volume, transfer, materials, lights, anisotropy), (camera, blocks, words, max_scatterings, seed) = (
+        jax.tree.map(
+            lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, (inputs, constants)
+        )
     )
     packed, (width, height) = with_words(volume, words), camera.size
-    medium = Medium.of(packed, blocks, transfer, materials)
-    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings)
+    medium = Medium.of(packed, blocks, transfer, materials, how.sampling)
+    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings, how.sampling)
     # Checked here, since comparisons in the walks would hide a NaN. The values of a volume with its own field
     # are unknown and its ranges infinite, which is not an error.
     ranges = blocks if volume.field is None else None
     valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
     valid &= all_finite((materials, lights, anisotropy, camera))
+    paths, pixels = how.paths, how.pixels
     batches, count = -(-width * height // pixels), pixels * paths
 
     def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
@@ -239,22 +378,32 @@ def _trace(
             pixel, path = number * pixels + index // paths, index % paths
             alive = valid & (index < count) & (pixel < width * height)
             words = pixel.astype(jnp.uint32), path.astype(jnp.uint32), jnp.broadcast_to(seed, index.shape)
-            return jax.vmap(partial(_begin, scene, camera, antialias))(words, alive)
+            return jax.vmap(partial(_begin, scene, camera, how.antialias))(words, alive)
 
-        results = walk_all(begin, partial(step, scene), count, lanes)
+        results = walk_all(begin, partial(step, scene), count, how.lanes)
         results = jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results)
         radiance = jnp.stack(results.radiance, axis=-1)
         mean = radiance.mean(axis=1)
-        opacity = results.met.astype(mean.dtype).mean(axis=1)
+        opacity = results.opacity.mean(axis=1)
         deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
-        return mean, opacity, deviations, results.exhausted.any(axis=1)
+        numbers = mean, opacity, deviations, results.exhausted.any(axis=1)
+        if how.groups == 1:
+            return numbers
+        each = jnp.concatenate([radiance, results.opacity[..., None]], axis=-1)
+        return *numbers, each.reshape(pixels, how.groups, -1, 4).mean(axis=2)
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
-    *numbers, exhausted = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
-    radiance, opacity, deviations = (jnp.where(valid, each, jnp.nan) for each in numbers)
-    return PathTraced(radiance, opacity, deviations, exhausted, paths, seed)
+    found = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
+    radiance, opacity, deviations, exhausted, *groups = found
+    numbers = radiance, opacity, deviations, *(jnp.moveaxis(each, 2, 0) for each in groups)
+    # also of a derivative all numbers
+    radiance, opacity, deviations, *groups = (jnp.where(valid, each, jnp.nan * each) for each in numbers)
+    return PathTraced(radiance, opacity, deviations, exhausted, paths, seed, *groups)
+
+
+_trace, _derivative = compiled(_traced_by), compiled(_derivative_of, in_turn=False)
 
 
 def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
@@ -273,4 +422,5 @@ def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, aliv
     zero, result = jnp.zeros_like(flight.depth), WalkResult.zeros(())
     black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
     steps, to_light, alive = jnp.zeros((), jnp.int32), jnp.zeros((), bool), alive & (ray.length > 0)
-    return Walk(words, steps, flight, to_light, direction, white, black, zero, result, alive)
+    importance = None if scene.sampling.importance is None else zero + 1
+    return Walk(words, steps, flight, to_light, direction, white, importance, black, zero, result, alive)

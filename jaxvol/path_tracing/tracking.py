@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool
 
 from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import BLOCK
+from .likelihood import likelihood
 from .medium import Block, Majorants
 
 
@@ -71,6 +72,30 @@ class Candidate(NamedTuple):
     majorant: Scalar
 
 
+class Decision(NamedTuple):
+    """Whether light collides at a candidate.
+
+    Attributes:
+        chance: probability with which a collision is drawn, a constant for derivatives.
+        collided: weight of a collision.
+        passed: weight of none.
+        share: the true probability.
+    """
+
+    chance: Scalar
+    collided: Scalar
+    passed: Scalar
+    share: Scalar
+
+    @classmethod
+    def at(cls, majorants: Majorants, candidate: Candidate, extinction: Scalar) -> "Decision":
+        share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
+        if majorants.least is None:
+            return cls(jax.lax.stop_gradient(share), likelihood(share), likelihood(1 - share), share)
+        chance = jax.lax.stop_gradient(jnp.maximum(share, majorants.least / candidate.majorant))
+        return cls(chance, share / chance, (1 - share) / (1 - chance), share)
+
+
 def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, Candidate]:
     """Advance a flight to its next candidate, to its end, or across CROSSINGS block borders."""
 
@@ -85,13 +110,13 @@ def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, 
     start = flight, -jnp.log1p(-uniform), no, no
     flight, _, found, over = jax.lax.fori_loop(0, CROSSINGS, cross, start)
     coordinate = majorants.within(along(flight.start, flight.rate, flight.depth), flight.block)
-    return flight, Candidate(found, over, coordinate, flight.entry)
+    return flight, Candidate(found, over, coordinate, majorants.majorant(flight.entry))
 
 
 def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Flight, Scalar, Array, Array]:
     """Advance a flight by an optical depth, or to the border of the box in which its majorant holds. Also
     returns the remaining optical depth, whether it is used up (a candidate), and whether the flight ends."""
-    majorant, reach = jnp.maximum(flight.entry, 0), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
+    majorant, reach = majorants.majorant(flight.entry), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
     axes = list(zip(flight.start, flight.rate, flight.block, majorants.table.shape, strict=True))
     walls = [_wall(start, rate, index, reach, count) for start, rate, index, count in axes]
     border = jnp.minimum(jnp.minimum(walls[0], walls[1]), walls[2])

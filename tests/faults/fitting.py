@@ -13,6 +13,10 @@ def last_is_best(step):
     return faulty
 
 
+def as_if_equal(found):
+    return found._replace(covariance=found.covariance_of_equal_noise)
+
+
 FAULTS: list[Fault] = [
     Fault(
         "fit: the last point is given back, not the best",
@@ -25,6 +29,47 @@ FAULTS: list[Fault] = [
         "fitting.constraints:Free.moved",
         lambda moved: lambda self, free: list(free),
         ("fitting/test_fit.py::test_parameters_and_covariance_are_those_of_scipy",),
+    ),
+    Fault(
+        "fit: standard errors are those of equal noise",
+        "fitting.driver:uncertainty",
+        lambda uncertainty: lambda *given: as_if_equal(uncertainty(*given)),
+        (
+            "fitting/test_fit.py::test_standard_errors_are_those_of_unequal_noise",
+            "fitting/test_noise.py::test_standard_errors_cover_the_truth_where_noise_differs_tenfold_and_no_misfit_"
+            "is_told",
+        ),
+    ),
+    Fault(
+        "fit: pixels without noise count in the reduced chi-squared",
+        "fitting.noise:Noise.reduced_chi_squared",
+        lambda reduced: lambda self, *given: reduced(replace(self, noisy=self.noisy * 10), *given),
+        ("fitting/test_noise.py::test_pixels_without_noise_do_not_count_in_the_reduced_chi_squared",),
+    ),
+    Fault(
+        "fit: any residual may be due to chance",
+        "fitting.noise:Noise.largest_by_chance",
+        lambda limit: property(lambda self: 1000 * limit.fget(self)),
+        (
+            "fitting/test_noise.py::test_published_templates_do_not_fit_path_traced_images_and_the_fit_says_so",
+            "fitting/test_noise.py::test_noise_exceeds_the_limit_once_in_741_even_if_it_is_correlated_within_blocks",
+        ),
+    ),
+    Fault(
+        "fit by the path tracer: squares of the same paths",
+        "fitting.sampled_steps:Averages.estimate",
+        lambda estimate: property(lambda self: estimate.fget(replace(self, products=0 * self.products))),
+        (
+            "fitting/test_path_traced_fit.py::test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said",
+        ),
+    ),
+    Fault(
+        "fit by the path tracer: the first steps are never forgotten",
+        "fitting.sampled_steps:FORGET",
+        lambda forget: 1e9,
+        (
+            "fitting/test_path_traced_fit.py::test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said",
+        ),
     ),
     Fault(
         "fit: checkpoints of other fits are used",

@@ -9,6 +9,7 @@ from . import Fault
 
 PHOTONS, SHADING = "lighting/test_photons.py::", "lighting/test_shading.py::"
 PHONG, PATHS = "lighting/test_phong.py::", "path_tracing/test_path_trace.py::"
+SLOPES = "path_tracing/test_derivatives.py::"
 
 
 def between_ends(values, extinction, low, high):
@@ -81,13 +82,20 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "path tracing: what survives Russian roulette is not raised",
-        "path_tracing.walks:_after_roulette",
-        lambda f: (
-            lambda throughput, uniform: tuple(
-                jnp.where(jnp.maximum(jnp.maximum(*throughput[:2]), throughput[2]) > 0.25 * uniform, c, 0)
-                for c in throughput
-            )
-        ),
+        "path_tracing.walks:_roulette",
+        lambda f: lambda importance, uniform: (jnp.where(importance > 0.25 * uniform, 1.0, 0.0), importance),
         (f"{PATHS}test_light_scattered_many_times_is_reflected_as_by_chandrasekhar",),
+    ),
+    Fault(
+        "path tracing: derivatives are by the paths of images, which nothing that is transparent scatters",
+        "path_tracing.likelihood:OF_DERIVATIVES",
+        lambda f: f._replace(margin=1, collisions=0),
+        (f"{SLOPES}test_derivatives_of_light_scattered_once_are_those_of_quadrature_and_errors_are_as_told",),
+    ),
+    Fault(
+        "path tracing: the probability of a direction counts as a constant",
+        "path_tracing.likelihood:likelihood",
+        lambda f: jnp.ones_like,
+        (f"{SLOPES}test_derivatives_of_light_scattered_often_are_those_of_images_of_the_same_key",),
     ),
 ]

@@ -136,9 +136,24 @@ def test_parameters_and_covariance_are_those_of_scipy():
     assert float(result.parameters["rate"][0]) == pytest.approx(rate, rel=1e-3)
     assert result.uncertainty is not None
     assert result.uncertainty.names == ["['rate'][0]", "['top']"]
-    np.testing.assert_allclose(result.uncertainty.covariance, covariance[::-1, ::-1], rtol=1e-2)
-    assert result.uncertainty.standard_errors["['top']"] == pytest.approx(covariance[0, 0] ** 0.5, rel=1e-2)
+    equal = result.uncertainty.covariance_of_equal_noise
+    np.testing.assert_allclose(equal, covariance[::-1, ::-1], rtol=1e-2)
     assert result.uncertainty.undetermined == []
+    assert result.uncertainty.reduced_chi_squared is None
+
+
+def test_standard_errors_are_those_of_unequal_noise():
+    """HC1 of White (1980), MacKinnon and White (1985), in float64, at SciPy's parameters."""
+    (top, rate), _ = independent()
+    decay = np.exp(-rate * X.astype(float))
+    jac = np.stack([top * X * decay, 1 - decay], axis=1)
+    scores = jac * (top * (1 - decay) - DATA)[:, None]
+    inverse = np.linalg.inv(jac.T @ jac)
+    expected = inverse @ scores.T @ scores @ inverse * len(X) / (len(X) - 2)
+    found = fitted().uncertainty
+    assert found is not None
+    np.testing.assert_allclose(found.covariance, expected, rtol=1e-2)
+    assert found.standard_errors["['top']"] == pytest.approx(expected[1, 1] ** 0.5, rel=1e-2)
 
 
 @pytest.mark.parametrize("solver", ["gauss_newton", "bfgs", "adam", "dogleg"])
@@ -161,7 +176,7 @@ def test_images_are_blurred_as_by_scipy():
 
     @eqx.filter_jit
     def entries(residual):
-        ((function, items),) = residual.tiles(residual.count())
+        ((function, items),) = residual.tiles(residual.references.count())
         return function(TRUTH, jax.tree.map(lambda leaf: leaf[0], items), "forward")
 
     difference = (views()[0][1] - target).astype(np.float64)
@@ -176,15 +191,18 @@ def test_coarse_to_fine_is_one_fit_after_the_other(monkeypatch):
     calls = []
 
     def fit(residual, parameters, **options):
-        calls.append((residual.blur, parameters, options))
+        calls.append((residual.blur, parameters, options["patience"], options["checkpoint"]))
         found = object.__new__(jv.Fit)
         object.__setattr__(found, "parameters", parameters + 1)
         return found
 
     monkeypatch.setattr("jaxvol.fitting.driver.fit", fit)
     residual = jv.ImageResidual(seen, [(camera(DIRECTIONS[0]), BLANK)], blur=0.3)
-    fits = jv.fit_coarse_to_fine(residual, 5, blurs=(0.25, 0.125, None), patience=4)
-    assert calls == [(0.25, 5, {"patience": 4}), (0.125, 6, {"patience": 4}), (None, 7, {"patience": 4})]
+    how: Any = {"patience": 4, "checkpoint": "folder/a.ckpt"}
+    fits = jv.fit_coarse_to_fine(residual, 5, blurs=(0.25, 0.125, None), **how)
+    stages = (0.25, 5), (0.125, 6), (None, 7)
+    files = [Path(f"folder/a-{number}.ckpt") for number in (1, 2, 3)]
+    assert calls == [(*stage, 4, file) for stage, file in zip(stages, files, strict=True)]
     assert [each.parameters for each in fits] == [6, 7, 8]
 
 
@@ -193,15 +211,20 @@ def test_tiles_make_no_difference_and_the_gradient_is_that_of_the_triangle():
     """Of views of two sizes, one of them with transparency."""
     small = camera((0.2, 0.9, 0.5), (10, 8))
     residual = jv.ImageResidual(seen, [*views(), (small, jv.render(*seen(TRUTH, small)).rgba)])
-    assert residual.count() == 2 * WIDTH * HEIGHT * 3 + 10 * 8 * 4
+    assert residual.references.count() == 2 * WIDTH * HEIGHT * 3 + 10 * 8 * 4
     free, y = Free.of(GREY, None, None)
-    triangle = eqx.filter_jit(lambda problem, y: problem.condensed(y))
-    whole, tiled = (
-        np.asarray(triangle(Problem(residual, free, residual.count(), tile, True), y), np.float64)
-        for tile in (residual.count(), 3 * WIDTH * 3)
+    triangles = eqx.filter_jit(lambda problem, y: problem.condensed(y))
+    (whole, scores), (tiled, of_tiles) = (
+        [np.asarray(each, np.float64) for each in triangles(of_tile, y)]
+        for of_tile in (
+            Problem(residual, free, residual.references.count(), t, True)
+            for t in (residual.references.count(), 3 * WIDTH * 3)
+        )
     )
     np.testing.assert_allclose(tiled, whole, rtol=0, atol=2e-6 * abs(whole).max())
-    problem = Problem(residual, free, residual.count(), residual.count(), False)
+    scores, of_tiles = scores.T @ scores, of_tiles.T @ of_tiles  # the rows' signs are arbitrary
+    np.testing.assert_allclose(of_tiles, scores, rtol=0, atol=1e-5 * abs(scores).max())
+    problem = Problem(residual, free, residual.references.count(), residual.references.count(), False)
     gradient = eqx.filter_jit(lambda p, y: jax.grad(p.loss)(y))(problem, y)
     flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient)])
     np.testing.assert_allclose(whole[:, :-1].T @ whole[:, -1], flat, rtol=0, atol=1e-5 * abs(flat).max())
@@ -303,6 +326,17 @@ BAD = [
     (lambda: images(scene=3), "scene must be a function"),
     (lambda: images(scene=lambda transfer: transfer), r"scene must be a function of \(parameters, camera\)"),
     (lambda: images(blur=-0.1), "blur must not be negative"),
+    (lambda: images(noise=-0.1), "noise must not be negative; got -0.1"),
+    (
+        lambda: images(noise=BLANK),
+        r"noise must be a number, or a list with an entry for each of 1 views; got",
+    ),
+    (lambda: images(noise=[0.1, 0.1]), "noise must be .* each of 1 views; got a list of length 2"),
+    (
+        lambda: images(noise=[BLANK[:4]]),
+        r"noise\[0\] .* like its image, \(16, 20, 3\); got shape \(4, 20, 3\)",
+    ),
+    (lambda: images(noise=[np.inf]), r"noise\[0\] must be finite; got inf"),
     (lambda: jv.ImageResidual(seen, []), "views must hold at least one pair"),
     (lambda: jv.ImageResidual(seen, [BLANK]), r"views\[0\] must be a pair"),
     (
@@ -335,7 +369,11 @@ BAD = [
     (of_curve(max_jacobian=100), "max_jacobian leaves room for 8 of the"),
     (coarse_to_fine(curve), "residual must be an ImageResidual, to be blurred; got"),
     (coarse_to_fine(blurs=()), "blurs must hold at least one"),
-    (coarse_to_fine(checkpoint="fit.npz"), "checkpoint is of one fit"),
+    (lambda: jv.fit_in_stages([], GREY), "residuals must be a list of at least one; got a list of length 0"),
+    (
+        lambda: jv.fit_in_stages(images(), GREY),
+        "residuals must be a list of at least one; got a ImageResidual",
+    ),
 ]
 
 

@@ -291,23 +291,6 @@ def image_of(scene, **how):
     return trace(*given, anisotropy=scene["anisotropy"], **how).radiance
 
 
-@pytest.mark.parametrize("name", SCENE)
-def test_it_refuses_to_be_differentiated(name):
-    def loss(part):
-        return image_of(SCENE | {name: part}).sum()
-
-    part = SCENE[name]
-    still = jax.tree.map(np.zeros_like, part)
-    for derivative in (
-        lambda: jax.grad(loss)(part),
-        lambda: jax.grad(jax.jit(loss))(part),
-        lambda: jax.jvp(loss, (part,), (still,)),
-        lambda: jax.grad(lambda path: image_of(SCENE, materials=Material(0.5, path)).sum())(0.5),
-    ):
-        with pytest.raises(RuntimeError, match=r"path_trace has no derivative.*ScattererTemplates"):
-            derivative()
-
-
 def test_it_may_stand_in_what_is_differentiated_with_respect_to_something_else():
     expected = np.mean(image_of(SCENE))
 

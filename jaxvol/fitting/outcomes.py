@@ -1,0 +1,23 @@
+"""How does a fit end?"""
+
+from typing import NamedTuple
+
+import optimistix as optx
+
+
+class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+    """How a fit ended: Optimistix's results, and `stalled`."""
+
+    stalled = (
+        "No step lowered the loss by more than rtol any more: either a minimum, to the precision of the "
+        "float type, or a point where the derivative does not predict how the loss changes."
+    )
+
+
+class Limits(NamedTuple):
+    """When a fit ends: see `fit`."""
+
+    max_steps: int
+    patience: int
+    rtol: float
+    atol: float

@@ -1,0 +1,81 @@
+"""Which inputs have no derivative, since they move paths, or the places where the medium jumps?"""
+
+from typing import Any, TypeVar
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ..lighting.materials import Material
+from ..scene.camera import Camera
+from ..scene.transfer import Transfer, TransferFunction
+from ..scene.transfer2d import TransferFunction2D
+from ..scene.volume import Volume, with_voxels, without_voxels
+from ..xla.platform import is_traced
+
+
+T = TypeVar("T")
+
+REMEDY = (
+    "Keep constant what is not to be differentiated by jax.lax.stop_gradient; for a derivative, take "
+    "differences of images of the same key, or differentiate render with lighting.ScattererTemplates."
+)
+
+
+def constant(name: str, tree: T, reason: str = "it moves the paths") -> T:
+    """The tree. Raises `RuntimeError` where it is differentiated."""
+    message = f"path_trace has no derivative with respect to {name}, since {reason}. {REMEDY}"
+    return eqxi.nondifferentiable(tree, msg=message)
+
+
+def with_constant_paths(
+    volume: Volume, transfer: Transfer, camera: Camera, materials: tuple[Material, ...]
+) -> tuple[Volume, Transfer, Camera, tuple[Material, ...]]:
+    """The same. Raises `RuntimeError` where what moves paths or jumps of the medium is differentiated."""
+    place = "the volume's spacing, origin and direction"
+    data, field = volume.data, volume.field
+    volume = constant(place, eqx.tree_at(_field_of, without_voxels(volume), None, is_leaf=_is_none))
+    volume = eqx.tree_at(_field_of, with_voxels(volume, data), field, is_leaf=_is_none)
+
+    lines = constant("the control points' values of transfer", _lines_of(transfer), "they are constants")
+    transfer = eqx.tree_at(_lines_of, transfer, lines) if lines else transfer
+    edges = constant("the values of materials", [m.values for m in materials], "the medium jumps there")
+    materials = tuple(
+        eqx.tree_at(lambda m: m.values, material, edge, is_leaf=_is_none)
+        for material, edge in zip(materials, edges, strict=True)
+    )
+    return volume, transfer, constant("camera", camera), materials
+
+
+def check_voxels(transfer: Transfer, materials: tuple[Material, ...]) -> None:
+    """Raises `RuntimeError` if jumps of the medium move with the voxels."""
+    what = "path_trace has no derivative with respect to voxels"
+    if materials:
+        reason = "which end at values of the volume, or where the transfer function shows nothing"
+        raise RuntimeError(f"{what} where there are materials, {reason}. {REMEDY}")
+    if not is_traced(transfer) and has_step(transfer):
+        raise RuntimeError(f"{what} under a transfer function with a step (two equal values). {REMEDY}")
+
+
+def has_step(transfer: Transfer) -> Bool[Array, ""]:
+    """Whether two neighbouring control points have the same value."""
+    equal = [jnp.any(line[..., 1:] == line[..., :-1]) for line in _lines_of(transfer)]
+    return jnp.any(jnp.stack(equal)) if equal else jnp.zeros((), bool)
+
+
+def _lines_of(transfer: Transfer) -> list[Any]:
+    """Control points' values, and magnitudes, of all tables in a transfer function."""
+    tables = TransferFunction | TransferFunction2D
+    parts = jax.tree.leaves(transfer, is_leaf=lambda part: isinstance(part, tables))
+    found: list[Any] = [part.values for part in parts if isinstance(part, tables)]
+    return found + [part.magnitudes for part in parts if isinstance(part, TransferFunction2D)]
+
+
+def _field_of(volume: Volume) -> Any:
+    return volume.field
+
+
+def _is_none(leaf: Any) -> bool:
+    return leaf is None
