@@ -1,11 +1,11 @@
 """How near do templates by transport come to path-traced light, beside the published form, and in what time?
 
 A ball of one material, the head phantom of flesh and bone, and CT of an engine of two metals, each thin and
-thick in mean free paths. The camera's rays meet the extinction of the materials, 1/λ, so that `path_trace` and
-`render` show the same medium; lights, camera and colours are the same. The published form has no scale of its
-own (the paper gives none), so that its image is also compared after the factor that brings it nearest; images
-by transport are compared as they are. Times are those of a frame whose light is kept from the frame before,
-as multiples of the unlit frame, and of computing the light once.
+thick in mean free paths. Rays of the camera meet the extinction of the materials, 1/λ, so that `path_trace`
+and `render` show the same medium; lights, camera and colours are the same. The published form has no scale of
+its own (the paper gives none), so that its image is also compared after the factor that brings it nearest;
+images by transport are compared as they are. Times are those of a frame whose light was computed for the
+frame before, as multiples of the unlit frame.
 """
 
 from argparse import Namespace
@@ -19,7 +19,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from . import charts, harness, timing
+from . import charts, timing
 from .harness import experiment
 from .mean_free_path import COLOR, RADIUS, balls
 from .scenes import SCENES
@@ -39,7 +39,9 @@ FORMS: dict[str, dict[str, Any]] = {
 """Options of the templates."""
 
 
-def medium(layers: list[tuple[float, float, Any, float, float]]) -> tuple[jv.TransferFunction, tuple[jv.Material, ...]]:
+def medium(
+    layers: list[tuple[float, float, Any, float, float]],
+) -> tuple[jv.TransferFunction, tuple[jv.Material, ...]]:
     """A transfer function of steps, and the materials that it shows: low and high value, colour, mean free
     path and opacity of each."""
     points, materials = [], []
@@ -82,7 +84,9 @@ def measure(scene: tuple[Any, ...], chosen: Namespace) -> tuple[dict[str, Any], 
     lights = DirectionalLight(direction, SUN), ConstantLight(SKY)
     transforms = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-3)
     march = jv.March(float(volume.spacing.min()) / 2, transforms, "midpoint")
-    traced = jv.path_trace(volume, transfer, camera, lights, paths=chosen.paths, key=chosen.seed, materials=materials)
+    traced = jv.path_trace(
+        volume, transfer, camera, lights, paths=chosen.paths, key=chosen.seed, materials=materials
+    )
     reference = np.asarray(traced.radiance)
     noise, level = rms(traced.standard_error), float(reference.mean())
     rows: dict[str, Any] = {TRACED: {"mean radiance": level, "noise / mean": noise / level}}
@@ -119,10 +123,11 @@ def pictures(found: dict[str, dict[str, np.ndarray]], rows: dict[str, Any], path
             row = rows[scene][name]
             scale = row["best scale"] if name.startswith("published") else 1.0
             axis.imshow(jv.to_srgb(np.clip(scale * images[name] / white, 0, 1)))
+            error = "rmse / mean" + " at best scale" * name.startswith("published")
             caption = (
                 f"noise {row['noise / mean']:.2f}"
                 if name == TRACED
-                else f"error {row['rmse / mean at best scale' if scale != 1 else 'rmse / mean']:.2f}, × {scale:.2f}"
+                else f"error {row[error]:.2f}, × {scale:.2f}"
             )
             axis.set(title=f"{scene}: {name}", xlabel=caption, xticks=[], yticks=[])
             axis.title.set_fontsize(8)

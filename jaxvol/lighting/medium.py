@@ -15,8 +15,8 @@ class Scattering(NamedTuple):
     Attributes:
         extinction: 1/length; 0 where nothing is visible.
         albedo: of single scattering, (r, g, b).
-        rate: the extinction, without its fall to 0 at the volume's faces; along a flight from here, collisions
-            are proposed at this rate.
+        rate: the extinction, without its fall to 0 at the volume's faces; along a flight from here,
+            collisions are proposed at this rate.
     """
 
     extinction: Scalar
@@ -25,16 +25,19 @@ class Scattering(NamedTuple):
 
 
 def scattering_at(around: Surroundings, materials: tuple[Material, ...], point: Vec3) -> Scattering:
-    """How light is scattered at a world point: in a material of mean free path λ and opacity α, the extinction
-    is 1/λ and the albedo the colour times 1 - α; elsewhere, they are the transfer function's extinction and
-    colour. Where the transfer function shows nothing, there is nothing."""
+    """How light is scattered at a world point: in a material of mean free path λ and opacity α, the
+    extinction is 1/λ and the albedo the colour times 1 - α; elsewhere, they are the transfer function's
+    extinction and colour. Where the transfer function shows nothing, there is nothing."""
     measured = around.measured(point)
     there = around.classified(point, measured)
     color, own = around.classification.classify(measured)
     fractions = shares(materials, around.volume, there.coordinate, there.value, edge=EDGE)
-    rest = 1 - sum(fractions)
-    rate = rest * own + sum(f / m.mean_free_path for f, m in zip(fractions, materials, strict=True))
-    kept = 1 - sum(f * m.opacity for f, m in zip(fractions, materials, strict=True))
+    rate, rest, kept = jnp.zeros_like(own), jnp.ones_like(own), jnp.ones_like(own)
+    for fraction, material in zip(fractions, materials, strict=True):
+        rate = rate + fraction / material.mean_free_path
+        rest = rest - fraction
+        kept = kept - fraction * material.opacity
+    rate = rate + rest * own
     visible = there.extinction > 0
     r, g, b = scaled(color, kept)
     albedo = jnp.clip(r, 0, 1), jnp.clip(g, 0, 1), jnp.clip(b, 0, 1)

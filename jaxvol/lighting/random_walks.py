@@ -4,8 +4,8 @@ The light scattered at a point x of a homogeneous medium towards the camera is, 
 
     ω p E(x) + ω Σ_k ω^k p E(y_k)          ω: albedo; p: phase function; E: irradiance that arrives there
 
-where y_1, y_2, … are the vertices of a random walk from x with exponential flights of mean λ, whose directions
-follow the phase function, and which ends where it leaves the medium.
+where y_1, y_2, … are the vertices of a random walk from x with exponential flights of mean λ, whose
+directions follow the phase function, and which ends where it leaves the medium.
 """
 
 import jax
@@ -22,7 +22,8 @@ def unit_walks(
     """Directions and lengths, in mean free paths, of the flights of random walks, in sets of `walks`.
 
     The first directions of a set are spread evenly over the sphere. Lengths and turns of each level are
-    stratified over all walks: as few are kept, drawn one by one their mean length would be off by 1/√number."""
+    stratified over all walks: as few are kept, drawn one by one their mean length would be off by
+    1/√number."""
     number = count * walks
     rotate, shuffle, within = jax.random.split(key, 3)
     q, r = jnp.linalg.qr(jax.random.normal(rotate, (count, 3, 3)))

@@ -141,8 +141,8 @@ def scatterer_template(
         form: `"published"`, or `"transport"`, which is ours: the photons are the vertices of `packets` random
             walks, the first of them the point itself, and keep their `parent`. Flights are as long as above;
             directions follow the phase function, and nothing is merged. Of the light, α (1 - α)^k is at the
-            k-th vertices, so that the sum over photons inside a homogeneous object, all of whose ancestors are
-            inside, estimates multiple scattering without bias.
+            k-th vertices, so that the sum over photons inside a homogeneous object, all of whose ancestors
+            are inside, estimates multiple scattering without bias.
         anisotropy: g of the phase function (Henyey and Greenstein), in (-1, 1), for `"transport"`.
 
     Returns:
@@ -153,10 +153,9 @@ def scatterer_template(
         ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
             a traced opacity, intensities are then NaN. For whole levels of more than 4096 photons.
     """
-    of_template, levels = _simulation(
-        (material,), packets, threshold, threshold_on, merge, levels, form, anisotropy
-    )
-    return of_template(material.optics, _key(key), max(levels), None)
+    how = packets, threshold, threshold_on, merge, levels, form, anisotropy
+    of_template, (own_levels,) = _simulation((material,), *how)
+    return of_template(material.optics, _key(key), own_levels, None)
 
 
 def scatterer_templates(
@@ -194,19 +193,18 @@ def scatterer_templates(
         ValueError: as `scatterer_template` does.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
-    of_template, levels = _simulation(
-        materials, packets, threshold, threshold_on, merge, levels, form, anisotropy
-    )
+    how = packets, threshold, threshold_on, merge, levels, form, anisotropy
+    of_template, own = _simulation(materials, *how)
 
     def one(
         optics: Optics, own_levels: Int[Array, ""], material: Int[Array, ""], template: Int[Array, ""]
     ) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
-        return of_template(optics, draws, max(levels), own_levels)
+        return of_template(optics, draws, max(own), own_levels)
 
     several = jax.vmap(jax.vmap(one, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
     numbers = jnp.arange(len(materials))
-    return several(optics_of(materials), jnp.asarray(levels), numbers, jnp.arange(count))
+    return several(optics_of(materials), jnp.asarray(own), numbers, jnp.arange(count))
 
 
 def _simulation(
@@ -255,9 +253,10 @@ def check_form(form: Any) -> None:
         raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
 
 
-def scatterings(materials: Sequence[Material], threshold: float, levels: int | None) -> int:
+def scatterings(materials: Sequence[Material], threshold: float, levels: Any) -> int:
     """Number of scatterings of a random walk: as given, or after which less than `threshold` of the light is
-    left in any of the materials. **Raises** `ValueError` where that depends on a traced opacity, or is never."""
+    left in any of the materials. **Raises** `ValueError` where that depends on a traced opacity, or is
+    never."""
     if levels is not None:
         return integer("levels", levels, 1)
     if is_traced([material.opacity for material in materials]):

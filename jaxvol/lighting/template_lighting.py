@@ -21,7 +21,7 @@ from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import computed_now
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
-from .baked import BakedLighting, bake
+from .baked import bake
 from .deferred import Deferred
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
@@ -81,22 +81,22 @@ class ScattererTemplates(Lighting):
     darkens the sum once. Where it fails: `experiments/stability.py`, "long mean free paths", "short mean
     free paths".
 
-    **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths found from
-    path-traced images are the true ones. The medium is that of `path_trace` with these materials: the
-    extinction is 1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the transfer
-    function's, and samples in no material are lit, too. (Only the rays of the camera meet the transfer
-    function's extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices
-    of random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
-    counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
-    half-space's reflectance. Where the medium changes along a flight, weights make up for it. Light that was
-    scattered before is computed on a grid of `baked` nodes, of which each turns a template at random; direct
-    light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`, `occlusion`, `reach`, `cutoff`
-    and `given` are of the published form alone.
-    Its bias: the light of the last `levels`, at most `threshold` of all; the grid, whose nodes should be no
-    further apart than the mean free path; optical depths along flights, by Simpson's rule, which miss gaps
-    narrower than a flight; with anisotropy, the directions of scattered light up to spherical harmonics of
-    order 2. What it is against path tracing: `docs/methods.md`. Points at which the extinction becomes 0 do
-    not move under the derivative; edges of materials do.
+    **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths found
+    from path-traced images are the true ones. The medium is that of `path_trace` with these materials: the
+    extinction is 1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the
+    transfer function's, and samples in no material are lit, too. (Only the rays of the camera meet the
+    transfer function's extinction everywhere: let it be 1/λ for the same image.) The paper's photons become
+    the vertices of random walks: the sample itself counts; directions follow the phase function, not
+    refraction; a photon counts only if all those that it descends from are inside; and the scale is that of
+    scattering, not of a half-space's reflectance. Where the medium changes along a flight, weights make up
+    for it. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a
+    template at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`,
+    `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the
+    last `levels`, at most `threshold` of all; the grid, whose nodes should be no further apart than the mean
+    free path; optical depths along flights, by Simpson's rule, which miss gaps narrower than a flight; with
+    anisotropy, the directions of scattered light up to spherical harmonics of order 2. What it is against
+    path tracing: `docs/methods.md`. Points at which the extinction becomes 0 do not move under the
+    derivative; edges of materials do.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would

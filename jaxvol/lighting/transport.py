@@ -6,7 +6,9 @@ sample gets from a light directly changes fast at surfaces, and is computed for 
 """
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -82,31 +84,34 @@ class ScatteredLight(Shading):
         return 1 if self.depths.shape[-1] else 0
 
     def begin(self, around: Surroundings, sample: Sample) -> tuple[Vec3, Scalar]:
-        """Radiance from the grid, scattered towards the camera; and the share of light that is not absorbed."""
+        """Radiance from the grid, scattered towards the camera; and the share that is not absorbed."""
         coordinate = around.space.coordinate(sample.point)
         row = interpolated(self.radiance, _on_grid(around, self.shape, sample.point))
         light = _scattered(row, sample.direction, self.anisotropy)
         fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=EDGE)
-        absorbed = sum(f * m.opacity for f, m in zip(fractions, self.materials, strict=True))
-        return light, 1 - absorbed
+        kept = jnp.ones_like(fractions[0])
+        for fraction, material in zip(fractions, self.materials, strict=True):
+            kept = kept - fraction * material.opacity
+        return light, kept
 
     def term(
         self, around: Surroundings, sample: Sample, shared: Any, number: Int[Array, ""]
     ) -> tuple[Scalar, ...]:
-        """The transmittance towards each light: step by step near the sample, from the grid beyond."""
+        """The transmittance towards each light: step by step near the sample, from the grid beyond. (Between
+        a node outside of matter and one inside, depths do not grow linearly.)"""
         near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
-        towards = [light.at(sample.point, sample.direction) for light in located(self.lights)]
+        ways = [_way(light, sample.point, sample.direction) for light in located(self.lights)]
+        reaches = [jnp.minimum(near, distance) for _, distance in ways]
         places = [
-            along(sample.point, arriving.toward, middle * jnp.minimum(near, arriving.distance))
-            for arriving in towards
+            along(sample.point, direction, middle * reach)
+            for (direction, _), reach in zip(ways, reaches, strict=True)
             for _, middle in _growing(LOCAL_STEPS)
         ]
-        steps = iter(around.stored(lambda: [self._extinction(around, place) for place in places]))
+        read = iter(around.stored(lambda: [self._extinction(around, place) for place in places]))
         found = []
-        for light, arriving in enumerate(towards):
-            reach = jnp.minimum(near, arriving.distance)
-            depth = reach * sum(width * next(steps) for width, _ in _growing(LOCAL_STEPS))
-            beyond = along(sample.point, arriving.toward, reach)
+        for light, ((direction, _), reach) in enumerate(zip(ways, reaches, strict=True)):
+            depth = reach * sum(width * next(read) for width, _ in _growing(LOCAL_STEPS))
+            beyond = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, beyond))
             found.append(jnp.exp(-depth - row[light]))
         return tuple(found)
@@ -127,6 +132,13 @@ class ScatteredLight(Shading):
 def located(lights: tuple[Light, ...]) -> list[Light]:
     """The lights that reach a point from a single direction."""
     return [light for light in lights if not isinstance(light, ConstantLight)]
+
+
+def _way(light: Light, point: Vec3, direction: Vec3) -> tuple[Vec3, Scalar]:
+    """Direction and distance of a light."""
+    arriving = light.at(point, direction)
+    assert arriving.toward is not None
+    return arriving.toward, arriving.distance
 
 
 def arrived(
@@ -156,21 +168,47 @@ def _on_grid(around: Surroundings, shape: tuple[int, ...], point: Vec3) -> tuple
 def _growing(steps: int) -> list[tuple[float, float]]:
     """Widths and middles of steps that divide 1 and grow in proportion to their number."""
     ends = [(i / steps) ** 2 for i in range(steps + 1)]
-    return [(b - a, (a + b) / 2) for a, b in zip(ends, ends[1:], strict=False)]
+    return [(b - a, (a + b) / 2) for a, b in itertools.pairwise(ends)]
 
 
 class Transport(NamedTuple):
-    """What light is computed from. `directions`, `lengths`: the flights of `count` sets of `walks`, with so
-    many `levels` each."""
+    """What light is computed from: templates of so many `sets` of `walks`, of `levels` scatterings each."""
 
     around: Surroundings
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
     anisotropy: Float[Array, ""] | None
     seed: int
-    count: int
+    sets: int
     walks: int
     levels: int
+
+    def solved(self, nodes: int) -> ScatteredLight:
+        """The light on a grid of so many nodes along the volume's longest side. NaN in any input makes all of
+        it NaN."""
+        volume = self.around.volume
+        nx, ny, nz = (max(2, round(nodes * n / max(volume.shape))) for n in volume.shape)
+        # the transfer function's tables are computed once, before all loops
+        around = dataclasses.replace(self.around, tables=self.around.classification)
+        grid = _Grid(self._replace(around=around), (nx, ny, nz))
+        matter, near = grid.matter()
+        depths = grid.depths(near)
+        radiance = grid.radiance(near, matter, depths)
+        # checked here, since comparisons would hide a NaN
+        data = volume.data if jnp.issubdtype(volume.data.dtype, jnp.inexact) else None
+        inputs = without_voxels(volume), data, self.around.transfer, self.materials, self.lights
+        valid = all_finite((inputs, self.anisotropy))
+        radiance, depths = (jnp.where(valid, each, jnp.nan) for each in (radiance, depths))
+        return ScatteredLight(radiance, depths, self.materials, self.lights, self.anisotropy, grid.shape)
+
+    @property
+    def dtype(self) -> Any:
+        return self.around.volume.spacing.dtype
+
+    @property
+    def order(self) -> int:
+        """Of the `harmonics` that tell directions."""
+        return 0 if self.anisotropy is None else 2
 
     @property
     def sky(self) -> Vec3:
@@ -179,37 +217,36 @@ class Transport(NamedTuple):
         return apart(sum(constant, jnp.zeros(3, self.dtype)))
 
     @property
-    def dtype(self) -> Any:
-        return self.around.volume.spacing.dtype
+    def rates(self) -> list[Scalar]:
+        """Rates of collision at which the lengths of flights are proposed, besides that where they begin."""
+        thin = THIN / jax.lax.stop_gradient(self.around.space.diagonal)
+        return [thin, *(1 / material.mean_free_path for material in self.materials)]
+
+    def flights(self) -> Float[Array, "flights 4"]:
+        """Direction and length, in mean free paths, of each flight: by level, walk and set."""
+        key = jax.random.key(self.seed)
+        g = jnp.zeros((), self.dtype) if self.anisotropy is None else self.anisotropy
+        directions, lengths = unit_walks(key, self.sets, self.walks, self.levels, g)
+        return jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(-1, 4)
 
     def at(self, point: Vec3) -> Scattering:
         return scattering_at(self.around, self.materials, point)
 
-    def solved(self, nodes: int) -> ScatteredLight:
-        """The light on a grid of so many nodes along the volume's longest side. NaN in any input makes all of
-        it NaN."""
-        whole = self.around.volume.shape
-        x, y, z = (max(2, round(nodes * n / max(whole))) for n in whole)
-        # the transfer function's tables are computed before all loops
-        around = dataclasses.replace(self.around, tables=self.around.classification)
-        grid = _Grid(self._replace(around=around), (x, y, z))
-        extinction, rates, near = grid.rates()
-        depths = grid.depths(near)
-        radiance = grid.radiance(near, extinction, rates, depths)
-        inputs = (
-            without_voxels(self.around.volume),
-            self.around.transfer,
-            self.materials,
-            self.lights,
-            self.anisotropy,
-        )
-        data = self.around.volume.data
-        valid = all_finite((inputs, data if jnp.issubdtype(data.dtype, jnp.inexact) else None))
-        radiance, depths = (jnp.where(valid, each, jnp.nan) for each in (radiance, depths))
-        return ScatteredLight(radiance, depths, self.materials, self.lights, self.anisotropy, grid.shape)
+
+class _State(NamedTuple):
+    """Of a walk: where it is, extinction and rate of collisions there, the fraction of the light there that
+    arrives where the walk began, and the radiance gathered so far."""
+
+    point: Vec3
+    extinction: Scalar
+    rate: Scalar
+    throughput: Vec3
+    light: Vec3
 
 
 class _Grid(NamedTuple):
+    """The nodes at which light is computed."""
+
     transport: Transport
     shape: tuple[int, int, int]
 
@@ -217,42 +254,48 @@ class _Grid(NamedTuple):
     def size(self) -> int:
         return math.prod(self.shape)
 
-    def point(self, number: Int[Array, ""], beside: Vec3 = (0.0, 0.0, 0.0)) -> Vec3:
+    def point(self, number: Int[Array, ""], beside: tuple[Any, Any, Any] = (0.0, 0.0, 0.0)) -> Vec3:
         """World point of a node, or `beside` it, in units of the grid."""
         around, dtype = self.transport.around, self.transport.dtype
-        ends = zip(
-            jnp.unravel_index(number, self.shape), beside, self.shape, around.volume.shape, strict=True
-        )
+        nodes = jnp.unravel_index(number, self.shape)
+        ends = zip(nodes, beside, self.shape, around.volume.shape, strict=True)
         x, y, z = ((i.astype(dtype) + offset) * ((whole - 1) / (n - 1)) for i, offset, n, whole in ends)
         return around.space.point((x, y, z))
 
-    def mapped(self, f: Any, nodes: Int[Array, " nodes"], together: int) -> Array:
-        """`f` of nodes, some `together`; 0 for all other nodes. `nodes` ends with as many `size` as are
-        missing."""
+    def mapped(self, f: Callable[[Array], Array], nodes: Int[Array, " nodes"], together: int) -> Array:
+        """`f` of nodes, some `together`; 0 for all others. `nodes` may end with numbers past the last."""
         together = min(together, self.size)
-        chunks = jnp.pad(nodes, (0, -nodes.size % together), constant_values=self.size).reshape(-1, together)
-        # nothing of a chunk is kept for the backward pass, which would not fit into memory
-        of_chunk = jax.checkpoint(lambda chunk: jax.vmap(f)(jnp.minimum(chunk, self.size - 1)))
+        padded = jnp.pad(nodes, (0, -nodes.size % together), constant_values=self.size)
+        chunks = padded.reshape(-1, together)
+
+        @jax.checkpoint  # all that a backward pass needs of all nodes would not fit into memory
+        def of_chunk(chunk: Int[Array, " together"]) -> Array:
+            return jax.vmap(f)(jnp.minimum(chunk, self.size - 1))
+
         kind = jax.eval_shape(of_chunk, chunks[0])
 
-        def one(chunk: Int[Array, " together"]) -> Array:
-            return jax.lax.cond(
-                chunk[0] < self.size, of_chunk, lambda _: jnp.zeros(kind.shape, kind.dtype), chunk
-            )
+        def if_any(chunk: Int[Array, " together"]) -> Array:
+            def none(_: Any) -> Array:
+                return jnp.zeros(kind.shape, kind.dtype)
 
-        found = jax.lax.map(one, chunks)
+            return jax.lax.cond(chunk[0] < self.size, of_chunk, none, chunk)
+
+        found = jax.lax.map(if_any, chunks)
         found = found.reshape(-1, *found.shape[2:])
         whole = jnp.zeros((self.size, *found.shape[1:]), found.dtype)
         return whole.at[chunks.reshape(-1)].set(found, mode="drop")
 
-    def rates(self) -> tuple[Array, Array, Int[Array, " nodes"]]:
-        """The extinction at all nodes; the rate at which flights from them collide; and the nodes around
-        which anything may be visible, in front."""
-        offsets = jnp.asarray([(0, 0, 0), *np.ndindex(2, 2, 2)], self.transport.dtype)
-        offsets = jnp.where(jnp.arange(9)[:, None] > 0, (offsets - 0.5) / 2, 0)
+    def matter(self) -> tuple[tuple[Array, Array], Int[Array, " nodes"]]:
+        """The extinction at all nodes and the rate of collisions around them; and the nodes around which
+        anything may be visible, in front."""
+        offsets = np.array([(0, 0, 0), *np.ndindex(2, 2, 2)]) / 2 - 0.25
+        offsets[0] = 0
 
         def one(number: Int[Array, ""]) -> Array:
-            around = jax.vmap(lambda offset: self.transport.at(self.point(number, apart(offset))))(offsets)
+            def there(offset: Float[Array, "3"]) -> Scattering:
+                return self.transport.at(self.point(number, apart(offset)))
+
+            around = jax.vmap(there)(jnp.asarray(offsets, self.transport.dtype))
             seen = (around.extinction > 0).astype(around.rate.dtype)
             rate = jnp.sum(seen * around.rate) / jnp.maximum(jnp.sum(seen), 1)
             return jnp.stack([around.extinction[0], rate, jnp.max(seen)])
@@ -264,107 +307,88 @@ class _Grid(NamedTuple):
             rate = jnp.where(known > 0, rate, total / jnp.maximum(number, 1))
             known = (number > 0).astype(rate.dtype)
         near = jnp.nonzero(known.reshape(-1) > 0, size=self.size, fill_value=self.size)[0]
-        return found[:, 0], rate.reshape(-1), near
+        return (found[:, 0], rate.reshape(-1)), near
 
     def depths(self, near: Int[Array, " nodes"]) -> Float[Array, "nodes lights"]:
         """Optical depths from nodes towards the lights."""
         transport, sources = self.transport, located(self.transport.lights)
         if not sources:
             return jnp.zeros((self.size, 0), transport.dtype)
-        widths, middles = (
-            jnp.asarray(each, transport.dtype)
-            for each in zip(*_growing(STEPS * max(self.shape)), strict=True)
-        )
+        steps = jnp.asarray(_growing(STEPS * max(self.shape)), transport.dtype)
+
+        def toward(point: Vec3, light: Light) -> Scalar:
+            (direction, distance), pixel = _way(light, point, point), jnp.zeros((), jnp.int32)
+            ray = enter(transport.around.space, point, direction, (pixel, pixel))
+            length = jnp.minimum(ray.length, distance)
+
+            def add(depth: Scalar, step: Float[Array, "2"]) -> tuple[Scalar, None]:
+                width, middle = step
+                place = along(ray.entry, direction, middle * length)
+                return depth + width * transport.at(place).extinction, None
+
+            return length * jax.lax.scan(add, jnp.zeros_like(length), steps)[0]
 
         def one(number: Int[Array, ""]) -> Array:
-            point, found = self.point(number), []
-            for light in sources:
-                arriving = light.at(point, point)
-                column = row = jnp.zeros((), jnp.int32)
-                ray = enter(transport.around.space, point, arriving.toward, (column, row))
-                length = jnp.minimum(ray.length, arriving.distance)
-
-                def add(depth: Scalar, step: Any) -> tuple[Scalar, None]:
-                    width, middle = step
-                    place = along(ray.entry, arriving.toward, middle * length)
-                    return depth + width * transport.at(place).extinction, None
-
-                found.append(length * jax.lax.scan(add, jnp.zeros_like(length), (widths, middles))[0])
-            return jnp.stack(found)
+            return jnp.stack([toward(self.point(number), light) for light in sources])
 
         return self.mapped(one, near, NODES[1])
 
-    def radiance(self, near: Int[Array, " nodes"], extinctions: Array, rates: Array, depths: Array) -> Array:
-        """Radiance at nodes of light that was scattered at least once, or came from a constant light."""
-        transport, order = self.transport, 0 if self.transport.anisotropy is None else 2
-        around, levels = transport.around, transport.levels
-        number_of_walks = transport.count * transport.walks
-        g = jnp.zeros((), transport.dtype) if transport.anisotropy is None else transport.anisotropy
-        directions, lengths = unit_walks(
-            jax.random.key(transport.seed), transport.count, transport.walks, levels, g
-        )
-        flights = jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(
-            number_of_walks, levels, 4
-        )
-        thin = THIN / jax.lax.stop_gradient(around.space.diagonal)
-        each_rate = [thin, *(1 / material.mean_free_path for material in transport.materials)]
-        sky, seed, sources = transport.sky, jnp.uint32(transport.seed), located(transport.lights)
+    def radiance(
+        self, near: Int[Array, " nodes"], matter: tuple[Array, Array], depths: Float[Array, "nodes lights"]
+    ) -> Float[Array, "nodes channels"]:
+        """Radiance at nodes of light that was scattered before, or that comes from a constant light."""
+        transport, flights = self.transport, self.transport.flights()
+        levels, walks, dtype = transport.levels, transport.walks, transport.dtype
+        seed, zero = jnp.uint32(transport.seed), jnp.zeros((), transport.dtype)
 
         def one(number: Int[Array, ""]) -> Array:
-            word = number.astype(jnp.uint32)
-            *turn, which = (
-                u.astype(transport.dtype) for u in hashed_uniforms_4(word, word, jnp.uint32(2**31), seed)
-            )
-            axes = _rotation(*turn)
-            template = (which * transport.count).astype(jnp.int32)
-            start = self.point(number)
-            here = extinctions[number], rates[number]
+            word, extinction, rate = number.astype(jnp.uint32), matter[0][number], matter[1][number]
+            *turn, which = (u.astype(dtype) for u in hashed_uniforms_4(word, word, jnp.uint32(2**31), seed))
+            axes, chosen = _rotation(*turn), (which * transport.sets).astype(jnp.int32)
 
             def walk(index: Int[Array, ""]) -> Array:
-                of_walk = template * transport.walks + index
+                def flight(level: Int[Array, ""]) -> tuple[Vec3, Scalar]:
+                    """Direction and length of a flight of the template, turned."""
+                    x, y, z, length = gather(flights, ((chosen * walks + index) * levels) + level)
+                    a, b, c = (dot(axis, (x, y, z)) for axis in axes)
+                    return (a, b, c), length
 
-                def flight(state: Any, level: Int[Array, ""]) -> tuple[Any, None]:
-                    point, (extinction, own), throughput, light = state
-                    row = gather(flights.reshape(-1, 4), of_walk * levels + level)
-                    along_template = row[0], row[1], row[2]
-                    x, y, z = (dot(axis, along_template) for axis in axes)
-                    direction = x, y, z
-                    u = hashed_uniforms_4(word, index.astype(jnp.uint32), level.astype(jnp.uint32), seed)[0]
-                    rate = _proposed(own, each_rate, u.astype(own.dtype))
-                    distance = row[3] / jnp.maximum(rate, LEAST)
-                    density = _density(own, each_rate, distance)
-                    both = jax.vmap(lambda s: transport.at(along(point, direction, s)))(
-                        jnp.stack([distance / 2, distance])
-                    )
-                    middle, there = (
-                        jax.tree.map(lambda leaf: leaf[0], both),
-                        jax.tree.map(lambda leaf: leaf[1], both),
-                    )
-                    depth = distance * (extinction + 4 * middle.extinction + there.extinction) / 6
-                    weight = there.extinction * jnp.exp(-depth) / jnp.maximum(density, LEAST**2)
-                    light = plus(light, scaled(times(throughput, sky), 1 - weight))
-                    throughput = times(scaled(throughput, weight), there.albedo)
-                    end = along(point, direction, distance)
-                    if sources:
-                        depths_there = interpolated(depths, _on_grid(around, self.shape, end))
-                        for i, source in enumerate(sources):
-                            added = arrived(
-                                source, end, direction, transport.anisotropy, jnp.exp(-depths_there[i])
-                            )
-                            light = plus(light, times(throughput, added))
-                    return (end, (there.extinction, there.rate), throughput, light), None
+                def advance(state: _State, level: Int[Array, ""]) -> tuple[_State, None]:
+                    words = word, index.astype(jnp.uint32), level.astype(jnp.uint32), seed
+                    choice = hashed_uniforms_4(*words)[0].astype(dtype)
+                    return self.advanced(state, *flight(level), choice, depths), None
 
-                zero = jnp.zeros((), transport.dtype)
-                state = start, here, (zero + 1,) * 3, (zero,) * 3
-                (_, _, _, light), _ = jax.lax.scan(flight, state, jnp.arange(levels))
-                first = gather(flights.reshape(-1, 4), of_walk * levels)
-                x, y, z = (dot(axis, (first[0], first[1], first[2])) for axis in axes)
-                basis = harmonics((x, y, z), order)
-                return packed([scaled(light, 4 * math.pi * b) for b in basis])
+                none, all_ = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
+                start = _State(self.point(number), extinction, rate, all_, none)
+                end, _ = jax.lax.scan(advance, start, jnp.arange(levels))
+                basis = harmonics(flight(jnp.zeros((), jnp.int32))[0], transport.order)
+                return packed([scaled(end.light, 4 * math.pi * each) for each in basis])
 
-            return jnp.mean(jax.vmap(walk)(jnp.arange(transport.walks)), axis=0)
+            return jnp.mean(jax.vmap(walk)(jnp.arange(walks)), axis=0)
 
         return self.mapped(one, near, NODES[0])
+
+    def advanced(
+        self, state: _State, direction: Vec3, length: Scalar, choice: Scalar, depths: Array
+    ) -> _State:
+        """A walk after its next flight, of this length in mean free paths, and the light that it gathers."""
+        transport, (point, extinction, own, throughput, light) = self.transport, state
+        distance = length / jnp.maximum(_proposed(own, transport.rates, choice), LEAST)
+        density = jnp.maximum(_density(own, transport.rates, distance), LEAST**2)
+        ends = jnp.stack([distance / 2, distance])
+        reads = jax.vmap(lambda s: transport.at(along(point, direction, s)))(ends)
+        middle, there = (jax.tree.map(lambda leaf, i=i: leaf[i], reads) for i in (0, 1))
+        depth = distance * (extinction + 4 * middle.extinction + there.extinction) / 6  # Simpson's rule
+        weight = there.extinction * jnp.exp(-depth) / density
+        # the mean of 1 - weight is the fraction of flights that leave
+        light = plus(light, scaled(times(throughput, transport.sky), 1 - weight))
+        throughput = times(scaled(throughput, weight), there.albedo)
+        end = along(point, direction, distance)
+        row = interpolated(depths, _on_grid(transport.around, self.shape, end))
+        for i, source in enumerate(located(transport.lights)):
+            added = arrived(source, end, direction, transport.anisotropy, jnp.exp(-row[i]))
+            light = plus(light, times(throughput, added))
+        return _State(end, there.extinction, there.rate, throughput, light)
 
 
 def _scattered(row: Float[Array, "channels"], direction: Vec3, anisotropy: Scalar | None) -> Vec3:

@@ -33,7 +33,7 @@ MARCH = jv.March(0.1, (jv.AlphaCorrection(),), "midpoint")
 NIGHT = DirectionalLight((0, 0, 1), (0, 0, 0)), PointLight((9, 9, 9), (0, 0, 0)), ConstantLight((0, 0, 0))
 SUN, LAMP = DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)), PointLight((2.0, -2.0, 2.0), (3.0, 4.0, 2.0))
 SKY = ConstantLight((0.5, 1.0, 0.7))
-VALUES = [0.0, 10.0, 20.0, 60.0, 100.0]
+VALUES = [10.0, 10.0, 60.0, 60.0, 100.0]
 LEVELS = 24
 
 
@@ -52,7 +52,7 @@ def nested(inner: float = 80.0, outer: float = 40.0) -> jv.Volume:
 
 
 def transfer(thin: float, color: Any = (0.8, 0.5, 0.9), least: float = 0.0) -> jv.TransferFunction:
-    extinction = [least, least, thin, thin, 2 * thin]
+    extinction = [least, thin, thin, 2 * thin, 2 * thin]
     return jv.TransferFunction(VALUES, [color] * 5, extinction)
 
 
@@ -75,13 +75,14 @@ def image(volume: Any, function: Any, lighting: Any, adjoint: Any = "replay") ->
 
 def test_a_walk_has_the_light_of_its_scatterings_and_keeps_parents():
     template = scatterer_template(Material(0.3, 2.0), 0, packets=5, levels=6, form="transport")
-    assert template.parent is not None and template.intensity.shape == (31,)
+    assert template.intensity.shape == (31,)
     level = np.repeat(np.arange(7), [1, 5, 5, 5, 5, 5, 5])
     expected = 0.3 * 0.7**level / np.where(level == 0, 1, 5)
     np.testing.assert_allclose(template.intensity, expected, rtol=1e-6)
     np.testing.assert_array_equal(template.offset[0], 0)
     parent = np.asarray(template.parent)
-    assert parent[0] == -1 and np.all(level[parent[1:]] == level[1:] - 1)
+    assert parent[0] == -1
+    np.testing.assert_array_equal(level[parent[1:]], level[1:] - 1)
     np.testing.assert_array_equal(parent[6:] % 5, np.arange(6, 31) % 5)  # each walk stays its own
     twice = scatterer_template(Material(0.3, 4.0), 0, packets=5, levels=6, form="transport")
     np.testing.assert_allclose(twice.offset, 2 * template.offset, rtol=1e-6)
@@ -119,14 +120,16 @@ def test_in_a_white_furnace_matter_is_as_bright_as_the_sky():
 @pytest.mark.parametrize("anisotropy", [0.0, 0.5])
 def test_light_is_that_of_path_tracing(lights, anisotropy):
     volume, function, of_materials = nested(), transfer(2.0), materials(0.5, 0.25)
-    found = np.asarray(image(volume, function, light_of(of_materials, lit(*lights), anisotropy=jnp.float32(anisotropy))))
+    found = np.asarray(
+        image(volume, function, light_of(of_materials, lit(*lights), anisotropy=jnp.float32(anisotropy)))
+    )
     how: dict[str, Any] = {"materials": of_materials, "anisotropy": anisotropy, "paths": 1024}
     traced = jv.path_trace(volume, function, CAMERA, lit(*lights), **how)
     expected, error = (np.asarray(each) for each in (traced.radiance, traced.standard_error))
     total = np.sqrt((error**2).sum(axis=(0, 1))) / expected.sum(axis=(0, 1))
     ratio = found.sum(axis=(0, 1)) / expected.sum(axis=(0, 1))
     print(lights, anisotropy, ratio, total)
-    assert np.all(total < 0.012)
+    assert np.all(total < 0.02)
     np.testing.assert_allclose(ratio, 1, atol=0.05)
 
 
@@ -157,7 +160,9 @@ def test_gradients_are_those_of_differences_in_all_adjoints():
     }
     gradient = eqx.filter_grad(total)(scene)
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
-    pushed = jax.jit(lambda tangent: jax.jvp(lambda m: total(eqx.combine(m, fixed), "forward"), (moving,), (tangent,))[1])
+    pushed = jax.jit(
+        lambda tangent: jax.jvp(lambda m: total(eqx.combine(m, fixed), "forward"), (moving,), (tangent,))[1]
+    )
     value = eqx.filter_jit(total)
     for name, (where, step) in leaves.items():
         leaf = where(scene)
