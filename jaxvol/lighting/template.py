@@ -243,8 +243,8 @@ def check_isotropic(anisotropy: Any) -> None:
 
 
 def isotropic(anisotropy: Any) -> bool:
-    """Whether an anisotropy is known to be 0 when a program is traced."""
-    return isinstance(anisotropy, int | float | np.number) and anisotropy == 0
+    """Whether an anisotropy is known to be 0 when a program is traced; None stands for 0."""
+    return anisotropy is None or (isinstance(anisotropy, int | float | np.number) and anisotropy == 0)
 
 
 def check_form(form: Any) -> None:

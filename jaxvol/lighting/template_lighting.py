@@ -94,7 +94,7 @@ class ScattererTemplates(Lighting):
     `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the
     last `levels`, at most `threshold` of all; the grid, whose nodes should be no further apart than the mean
     free path; optical depths along flights, by Simpson's rule, which miss gaps narrower than a flight; with
-    anisotropy, the directions of scattered light up to spherical harmonics of order 2. What it is against
+    anisotropy, the directions of scattered light up to spherical harmonics of order 2 (at g = 0.5, 5 to 10 %). What it is against
     path tracing: `docs/methods.md`. Points at which the extinction becomes 0 do not move under the
     derivative; edges of materials do.
 
@@ -181,7 +181,7 @@ class ScattererTemplates(Lighting):
         levels: int | Sequence[int] | None = None,
         given: ScattererTemplate | Any | None = None,
         form: Form | Any = "published",
-        anisotropy: Arrayable = 0.0,
+        anisotropy: Arrayable | None = 0.0,
     ):
         check_form(form)
         if form == "transport":
@@ -191,9 +191,9 @@ class ScattererTemplates(Lighting):
             check_isotropic(anisotropy)
         packets = (8 if form == "transport" else 4) if packets is None else packets
         self.form = form
-        self.anisotropy = (
-            None if isotropic(anisotropy) else number("anisotropy", anisotropy, above=-1, below=1)
-        )
+        self.anisotropy = None
+        if anisotropy is not None and not isotropic(anisotropy):
+            self.anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         if occlusion not in get_args(Occlusion):
