@@ -94,9 +94,9 @@ class ScattererTemplates(Lighting):
     `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the
     last `levels`, at most `threshold` of all; the grid, whose nodes should be no further apart than the mean
     free path; optical depths along flights, by Simpson's rule, which miss gaps narrower than a flight; with
-    anisotropy, the directions of scattered light up to spherical harmonics of order 2 (at g = 0.5, 5 to 10 %). What it is against
-    path tracing: `docs/methods.md`. Points at which the extinction becomes 0 do not move under the
-    derivative; edges of materials do.
+    anisotropy, the directions of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5).
+    Points at which the extinction becomes 0 do not move under the derivative; edges of materials do. How near
+    it comes to path tracing: `experiments/transport.py`.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
