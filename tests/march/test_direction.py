@@ -174,7 +174,7 @@ def test_the_world_gradient_is_that_of_the_world():
 def test_light_arrives_at_the_world_point():
     """A lamp's irradiance by the distance from where NumPy puts the node."""
     lamp = PointLight((1.5, -2.0, 2.0), (1.0, 4.0, 2.0))
-    scene = WalkScene(TURNED, None, (lamp,), jnp.float32(0), jnp.int32(1))  # pyright: ignore
+    scene = WalkScene(TURNED, None, (lamp,), jnp.float32(0), jnp.int32(1), None)  # pyright: ignore
     node = np.array([5.0, 17.0, 2.0])
     point = np.asarray(TURNED.origin) + R @ (node * np.asarray(TURNED.spacing))
 

@@ -102,6 +102,14 @@ def derivatives(scene: Scene, **how: Any) -> tuple[np.ndarray, np.ndarray, np.nd
     """Images by groups, with their opacity; their derivatives, (groups, height, width, 4, parameters); and
     the derivatives of the image of all paths."""
 
+    how = {name: jnp.asarray(value) if name == "key" else value for name, value in how.items()}
+    groups, *tangents = _derivatives(scene, how)
+    found, of_all = (np.asarray(each, float) for each in tangents)
+    return np.asarray(groups), found, of_all
+
+
+@eqx.filter_jit  # by themselves, the operations are a hundred programs
+def _derivatives(scene: Scene, how: dict[str, Any]) -> tuple[jax.Array, ...]:
     def images(by: Any) -> tuple[jax.Array, ...]:
         traced = scene.changed(by).traced(**how)
         assert traced.groups is not None
@@ -111,8 +119,7 @@ def derivatives(scene: Scene, **how: Any) -> tuple[np.ndarray, np.ndarray, np.nd
         return jax.jvp(images, (jnp.zeros(len(KINDS)),), (tangent,))
 
     (groups, _), tangents = jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(KINDS)))
-    found, of_all = (np.asarray(each, float) for each in tangents)
-    return np.asarray(groups), found, of_all
+    return groups, *tangents
 
 
 def unit(kind: str) -> np.ndarray:
