@@ -9,6 +9,7 @@ frame before, as multiples of the unlit frame.
 """
 
 from argparse import Namespace
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ FORMS: dict[str, dict[str, Any]] = {
 
 
 def medium(
-    layers: list[tuple[float, float, Any, float, float]],
+    layers: Sequence[tuple[float, float, Any, float, float]],
 ) -> tuple[jv.TransferFunction, tuple[jv.Material, ...]]:
     """A transfer function of steps, and the materials that it shows: low and high value, colour, mean free
     path and opacity of each."""
