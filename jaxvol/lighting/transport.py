@@ -46,7 +46,7 @@ LOCAL_STEPS = 4
 LOCAL = 1.5
 """Length of these, in the grid's spacing."""
 
-OWN = 0.6
+OWN = 0.85
 """Share of flights whose length is drawn from the extinction where they begin. The others' is drawn from the
 mean free path of any material, or from that of thin matter, so that no weight is large where a flight goes on
 in thinner matter, or beyond a cavity."""

@@ -24,8 +24,6 @@ from jaxvol.lighting import (
     scatterer_templates,
 )
 
-from ..scenes import slow
-
 
 SIDE, NODES = 10, 16
 CAMERA = jv.Camera((3.0, -4.0, 2.0), (0, 0, 0), (0, 0, 1), 30, size=(8, 8))
@@ -138,7 +136,7 @@ def test_light_is_that_of_path_tracing(lights):
     np.testing.assert_allclose(ratio, 1, atol=0.05 if SKY in lights else 0.03)
 
 
-@slow
+@pytest.mark.slow
 @pytest.mark.parametrize("lights", [(SUN,), (LAMP,), (SKY,)], ids=["sun", "lamp", "sky"])
 def test_light_that_is_scattered_ahead_is_nearly_that_of_path_tracing(lights):
     ratio, error = compared(lights, jnp.float32(0.5))
@@ -149,7 +147,7 @@ def test_light_that_is_scattered_ahead_is_nearly_that_of_path_tracing(lights):
 # ---------------------------------------------------------------- derivatives
 
 
-@slow
+@pytest.mark.slow
 @pytest.mark.parametrize("anisotropy", [None, 0.3], ids=["isotropic", "ahead"])
 def test_gradients_are_those_of_differences_in_all_adjoints(anisotropy):
     # visible everywhere, since points where the extinction jumps do not move under the derivative
@@ -212,7 +210,7 @@ def test_light_is_computed_once_for_all_images_of_a_scene(monkeypatch):
     assert len(calls) == 2
 
 
-@slow
+@pytest.mark.slow
 def test_a_ray_that_sees_one_surface_is_lit_alike_where_it_is_shaded_once():
     volume, function = nested(), transfer(60.0)
     lighting = light_of(materials(1 / 60, 1 / 60), lit(SUN))
