@@ -81,8 +81,8 @@ class ScattererTemplates(Lighting):
     darkens the sum once. Where it fails: `experiments/stability.py`, "long mean free paths", "short mean
     free paths".
 
-    **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths found
-    from path-traced images are the true ones. The medium is that of `path_trace` with these materials: the
+    **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths can be
+    found from path-traced images. The medium is that of `path_trace` with these materials: the
     extinction is 1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the
     transfer function's, and samples in no material are lit, too. (Only the rays of the camera meet the
     transfer function's extinction everywhere: let it be 1/λ for the same image.) The paper's photons become
