@@ -10,6 +10,7 @@ from . import Fault
 PHOTONS, SHADING = "lighting/test_photons.py::", "lighting/test_shading.py::"
 PHONG, PATHS = "lighting/test_phong.py::", "path_tracing/test_path_trace.py::"
 SLOPES = "path_tracing/test_derivatives.py::"
+TRANSPORT = "lighting/test_transport.py::test_light_is_that_of_path_tracing"
 
 
 def between_ends(values, extinction, low, high):
@@ -55,6 +56,18 @@ FAULTS: list[Fault] = [
             "lighting/test_template.py::"
             "test_whole_levels_are_those_of_each_material_and_depend_on_nothing_traced",
         ),
+    ),
+    Fault(
+        "light: nothing shadows a sample but what is near",
+        "lighting.transport:interpolated",
+        lambda f: lambda rows, at: f(rows, at) * (rows.shape[-1] == 3),
+        (f"{TRANSPORT}[sun]",),
+    ),
+    Fault(
+        "light: flights are longer than the mean free path",
+        "lighting.transport:unit_walks",
+        lambda f: lambda *given: (lambda turns, lengths: (turns, 1.5 * lengths))(*f(*given)),
+        (f"{TRANSPORT}[sky]",),
     ),
     Fault(
         "light: photons at voxels are not moved by refraction",
