@@ -1,27 +1,36 @@
 """Are mean free paths recovered from images, rendered with templates and path-traced?
 
-Three balls of three materials, lit from the side, are rendered with scatterer templates. Starting three times
-too long or too short, Levenberg–Marquardt fits the three mean free paths.
+From renders of templates: three balls of three materials, lit from the side. Starting three times too long or
+too short, Levenberg–Marquardt fits the three mean free paths.
 
-Then one ball at a time, with an optical thickness from far below 1 to far above, is rendered with templates
-and by path tracing. Templates are on the scale of path tracing only approximately, and less so where objects
-are thin and colours dark. So the brightness of the lights is fitted along with the mean free path, and the
-error that remains is the bias of the model. This is done twice: with the extinction that the camera's rays
-meet known, and with it following from the mean free path, as in the path tracer. Objects too small for their
-mean free path leave it undetermined.
+From path-traced views, whose noise is known: one ball, from half a mean free path thick to 32; and the head
+phantom, of two and three materials. All fits start three times too short, and see two views. Five ways:
+
+- published templates, with the extinction that the camera's rays meet known, or following from the mean free
+  path, 1/λ. The paper gives no scale, so the brightness of the lights is fitted along;
+- templates by transport, likewise, with the brightness as it is;
+- the path tracer itself, with other paths in each step; and from where templates by transport end.
+
+Each is repeated with other references, and other templates. A warning says where a model does not fit: then,
+standard errors do not tell of its bias.
 """
 
+import time
+import warnings
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
+from jaxvol.fitting.uncertainty import MISFIT
 from jaxvol.lighting import ConstantLight, DirectionalLight, ScattererTemplates
 
-from . import charts
+from . import charts, harness
 from .harness import experiment
 from .scenes import grid, on_cube
 
@@ -31,8 +40,28 @@ STEPS = 40
 OFF = (3.0, 1 / 3, 3.0)
 COLOR = (0.8, 0.6, 0.5)
 RADIUS = 0.7
-THICKNESSES = (0.02, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-TEMPLATES, KNOWN, TIED = "templates", "extinction known", "extinction 1/λ"
+THICKNESSES = ("0.5", "1", "2", "4", "8", "16", "32")
+PUBLISHED, TRANSPORT = "published templates", "templates by transport"
+KNOWN, TIED = ", extinction known", ", extinction 1/λ"
+PATHS, STAGES = "path tracer", "templates by transport, then path tracer"
+MATERIALS = {
+    "ball": (60.0, 256.0, COLOR, 2 * RADIUS, 0.2),
+    "flesh": (50.0, 170.0, (0.75, 0.35, 0.27), 0.3, 0.3),
+    "bone": (170.0, 256.0, (0.9, 0.88, 0.8), 0.2, 0.1),
+    "skin": (50.0, 105.0, (0.85, 0.6, 0.5), 0.5, 0.2),
+    "muscle": (105.0, 170.0, (0.75, 0.35, 0.27), 0.3, 0.3),
+}
+"""Low and high value, colour, mean free path and opacity; the ball is one mean free path thick."""
+HEADS = {"head, two materials": ("flesh", "bone"), "head, three materials": ("skin", "muscle", "bone")}
+MARKS = {
+    PUBLISHED + KNOWN: "C3s",
+    PUBLISHED + TIED: "C1s",
+    TRANSPORT + KNOWN: "C0^",
+    TRANSPORT + TIED: "C9^",
+    PATHS: "C2o",
+    STAGES: "ko",
+}
+PUBLISHED_HOW: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
 
 
 def balls(resolution: int, parts: Sequence[tuple[float, tuple[float, float, float], float]]) -> jv.Volume:
@@ -55,13 +84,8 @@ def lights(brightness: Any = 1.0) -> tuple[Any, ...]:
     return DirectionalLight((0.8, 0.5, -0.6), sun), ConstantLight(sky)
 
 
-def templates(materials: Any, brightness: Any = 1.0) -> ScattererTemplates:
-    how: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
-    return ScattererTemplates(materials, lights(brightness), **how)
-
-
-def rendered(scene: tuple) -> jv.Rendering:
-    return jv.render(*scene[:4], lighting=scene[4])
+def templates(materials: Any, brightness: Any = 1.0, seed: int = 0) -> ScattererTemplates:
+    return ScattererTemplates(materials, lights(brightness), seed=seed, **PUBLISHED_HOW)
 
 
 def marching(volume: jv.Volume) -> jv.March:
@@ -83,7 +107,11 @@ def three_materials(size: int, resolution: int) -> dict[str, Any]:
     def scene(materials: Any, camera: jv.Camera) -> tuple:
         return volume, transfer, camera, march, templates(materials)
 
-    views = [(camera, rendered(scene(materials_of(truth), camera)).rgba) for camera in cameras(size)]
+    def rendered(camera: jv.Camera) -> Any:
+        *plain, lighting = scene(materials_of(truth), camera)
+        return jv.render(*plain, lighting=lighting).rgba
+
+    views = [(camera, rendered(camera)) for camera in cameras(size)]
     start = materials_of([path * off for path, off in zip(truth, OFF, strict=True)])
     found = jv.fit(jv.ImageResidual(scene, views), start, max_steps=STEPS)
     ratios = [float(m.mean_free_path) / path for m, path in zip(found.parameters, truth, strict=True)]
@@ -91,90 +119,185 @@ def three_materials(size: int, resolution: int) -> dict[str, Any]:
     return {"truth": truth, "start": OFF, "found": ratios, **about}
 
 
-def one_ball(thickness: float, volume: jv.Volume, chosen: Namespace) -> dict[str, Any]:
-    """Fit one mean free path to renders with templates and path-traced ones."""
-    march, values = marching(volume), np.array([60.0, 140.0, 255.0])
-    path = 2 * RADIUS / thickness
-    # with templates, the extinction that the camera sees is free to choose: here the true one, but enough to
-    # be visible at all
-    visible = max(1 / path, 2.0)
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A volume of materials in steps of the transfer function, as templates and path tracing show it.
 
-    def material(path: Any) -> jv.Material:
-        return jv.Material(0.2, path, 1.0, values=(60, 256))
+    Attributes:
+        volume: what is shown.
+        march: of templates.
+        bounds: low and high value of each material.
+        colors: of each material.
+        nodes: of the grid of templates by transport.
+        levels: of templates by transport, after which a hundredth of the light is left.
+        seed: of the templates.
+    """
 
-    def transfer(extinction: Any) -> jv.TransferFunction:
-        there = jnp.array([0.0, 1.0, 1.0]) * extinction
-        return jv.TransferFunction(values, np.broadcast_to(COLOR, (3, 3)), there)
+    volume: jv.Volume
+    march: jv.March
+    bounds: Any
+    colors: Any
+    nodes: int
+    levels: int
+    seed: int
 
-    def scene(given: dict[str, Any], camera: jv.Camera) -> tuple:
-        path = given["material"].mean_free_path
-        extinction = given["tied"] / path + (1 - given["tied"]) * given["extinction"]
-        return volume, transfer(extinction), camera, march, templates(given["material"], given["brightness"])
+    def medium(self, given: dict[str, Any]) -> jv.TransferFunction:
+        """What the camera's rays meet: the given extinction, or what follows from mean free paths."""
+        own = 1 / jnp.stack([each.mean_free_path for each in given["materials"]])
+        extinction = own * given["tied"] + given["extinction"] * (1 - given["tied"])
+        # a step up to the first material, and steps from each to the next
+        twice = (jnp.repeat(jnp.asarray(each), 2, axis=0) for each in (self.colors, extinction))
+        values = jnp.ravel(self.bounds)
+        pairs = ((values[:1], values), *((jnp.zeros_like(each[:1]), each) for each in twice))
+        return jv.TransferFunction(*(jnp.concatenate(pair) for pair in pairs))
 
-    def start(off: float, tied: float) -> dict[str, Any]:
-        known = {"tied": jnp.float32(tied), "extinction": jnp.float32(visible)}
-        return {"material": material(path * off), "brightness": jnp.float32(1.0), **known}
+    def published(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
+        lit = templates(given["materials"], given["brightness"], self.seed)
+        return self.volume, self.medium(given), camera, self.march, lit
 
-    own, traced = [], []
-    for camera in cameras(chosen.size):
-        own.append((camera, rendered(scene(start(1.0, 0.0), camera)).image((0, 0, 0))))
-        how = {"paths": chosen.paths, "key": chosen.seed, "materials": material(path)}
-        traced.append((camera, jv.path_trace(volume, transfer(1 / path), camera, lights(), **how).radiance))
-    constraints = {
-        "material": None,
-        "brightness": jv.Positive(),
-        "tied": jv.Fixed(),
-        "extinction": jv.Fixed(),
+    def transport(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
+        how: dict[str, Any] = {"form": "transport", "baked": self.nodes, "levels": self.levels}
+        lit = ScattererTemplates(given["materials"], lights(given["brightness"]), seed=self.seed, **how)
+        return self.volume, self.medium(given), camera, self.march, lit
+
+    def traced(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
+        return self.volume, self.medium(given), camera, lights(given["brightness"]), given["materials"]
+
+
+def scene_of(volume: jv.Volume, names: Sequence[str], chosen: Namespace, seed: int) -> tuple[Scene, Any]:
+    """The scene of a volume of these materials, and its true parameters."""
+    low, high, colors, paths, opacities = map(
+        np.array, zip(*(MATERIALS[name] for name in names), strict=True)
+    )
+    albedo = np.max(np.max(colors, axis=1) * (1 - opacities))
+    levels = int(np.ceil(np.log(0.01) / np.log(albedo)))
+    scene = Scene(volume, marching(volume), np.stack([low, high], axis=1), colors, chosen.nodes, levels, seed)
+    each = zip(opacities, paths, low, high, strict=True)
+    materials = tuple(jv.Material(a, path, values=(lo, hi)) for a, path, lo, hi in each)
+    extinction = jnp.asarray(1 / paths, jnp.float32)
+    given = {"tied": jnp.float32(1.0), "brightness": jnp.float32(1.0)}
+    return scene, {"materials": materials, "extinction": extinction, **given}
+
+
+def times(factor: float, given: dict[str, Any]) -> dict[str, Any]:
+    """Parameters with mean free paths so many times as long."""
+    return given | {
+        "materials": tuple(
+            eqx.tree_at(lambda m: m.mean_free_path, each, each.mean_free_path * factor)
+            for each in given["materials"]
+        )
     }
-    row: dict[str, Any] = {"thickness": thickness}
-    for name, views, tied in ((TEMPLATES, own, 0.0), (KNOWN, traced, 0.0), (TIED, traced, 1.0)):
-        residual = jv.ImageResidual(scene, views, background=(0, 0, 0))
-        found = jv.fit(residual, start(1 / 3, tied), constraints=constraints, max_steps=STEPS)
-        assert found.uncertainty is not None
-        errors = found.uncertainty.standard_errors
-        row[name] = {
-            "ratio": float(found.parameters["material"].mean_free_path) / path,
-            "standard error": next(e for n, e in errors.items() if "mean_free_path" in n) / path,
-            "brightness": float(found.parameters["brightness"]),
-            "undetermined": found.uncertainty.undetermined,
-            "loss": float(found.losses.min()),
-            "message": found.message,
-        }
-    return row
+
+
+FIXED = {"materials": None, "extinction": jv.Fixed(), "tied": jv.Fixed(), "brightness": jv.Fixed()}
+
+
+def told(found: jv.Fit, truth: dict[str, Any]) -> dict[str, Any]:
+    """A row: what was found, over what is true."""
+    assert found.uncertainty is not None
+    true = [float(each.mean_free_path) for each in truth["materials"]]
+    errors = [e for name, e in found.uncertainty.standard_errors.items() if "mean_free_path" in name]
+    paths = [float(each.mean_free_path) for each in found.parameters["materials"]]
+    return {
+        "ratio": [path / t for path, t in zip(paths, true, strict=True)],
+        "standard error": [float(error) / t for error, t in zip(errors, true, strict=True)],
+        "brightness": float(found.parameters["brightness"]),
+        "reduced chi-squared": float(found.uncertainty.reduced_chi_squared or 0),
+        "steps": len(found.losses),
+        "message": found.message,
+    }
+
+
+def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[str, dict[str, Any]]:
+    """Fit mean free paths to path-traced views, in all ways."""
+    views = []
+    for at, camera in enumerate(cameras(chosen.size)):
+        how = {"paths": chosen.paths, "key": 1000 + 10 * scene.seed + at, "materials": truth["materials"]}
+        views.append((camera, jv.path_trace(scene.volume, scene.medium(truth), camera, lights(), **how)))
+    published, transport = (
+        jv.ImageResidual(way, views, (0, 0, 0)) for way in (scene.published, scene.transport)
+    )
+    paths = jv.PathTracedResidual(scene.traced, views, (0, 0, 0), paths=16, key=scene.seed)
+    bright = FIXED | {"brightness": jv.Positive()}
+    ways: list[tuple[Sequence[str], Sequence[Any], float, Any]] = [
+        ([PUBLISHED + KNOWN], [published], 0.0, bright),
+        ([PUBLISHED + TIED], [published], 1.0, bright),
+        ([TRANSPORT + KNOWN], [transport], 0.0, FIXED),
+        ([TRANSPORT + TIED, STAGES], [transport, paths], 1.0, FIXED),
+        ([PATHS], [paths], 1.0, FIXED),
+    ]
+    rows: dict[str, dict[str, Any]] = {}
+    for names, residuals, tied, constraints in ways:
+        start, begun = times(1 / 3, truth) | {"tied": jnp.float32(tied)}, time.perf_counter()
+        how = {"constraints": constraints, "max_steps": chosen.steps, "patience": 3, "rtol": 1e-3}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            fits = jv.fit_in_stages(residuals, start, **how)
+        misfit = any(str(each.message).startswith(MISFIT) for each in caught)
+        seconds = round(time.perf_counter() - begun, 1)
+        for name, found in zip(names, fits, strict=True):
+            # of several fits, only the last one warns, and the time is that of all
+            last = {"warned of a misfit": misfit, "seconds": seconds} if found is fits[-1] else {}
+            rows[name] = {**told(found, truth), **last}
+            print(name, rows[name], flush=True)
+    return rows
+
+
+def scenes(chosen: Namespace, seed: int) -> dict[str, tuple[Scene, dict[str, Any]]]:
+    volume = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
+    scene, truth = scene_of(volume, ["ball"], chosen, seed)
+    found = {}
+    for thickness in chosen.thicknesses:
+        true = times(1 / float(thickness), truth)
+        found[thickness] = scene, true | {"extinction": truth["extinction"] * float(thickness)}
+    for name, names in HEADS.items():
+        if name in chosen.heads:
+            found[name] = scene_of(jv.phantom("head", chosen.resolution), names, chosen, seed)
+    return found
 
 
 def draw(result: dict[str, Any]) -> Any:
-    figure, ((left, right),) = charts.panels(1, 2, 9, 3.8)
-    losses = result["three materials"]["losses"]
-    left.semilogy(range(1, len(losses) + 1), losses, "o-")
-    left.set(xlabel="step of the fit", ylabel="mean squared difference of the images")
-    left.set_title("λ of three materials, from starts 3 times off")
-    rows = result["one ball"]
-    for name, mark in ((TEMPLATES, "ko-"), (KNOWN, "C0s-"), (TIED, "C3^-")):
-        known = [row for row in rows if not row[name]["undetermined"] and np.isfinite(row[name]["ratio"])]
-        label = "from images by templates" if name == TEMPLATES else f"from path-traced images, {name}"
-        right.loglog([r["thickness"] for r in known], [r[name]["ratio"] for r in known], mark, label=label)
-    lost = [row["thickness"] for row in rows if row[TEMPLATES]["undetermined"]]
-    label = "from images by templates: said to be undetermined"
-    right.plot(lost, np.ones(len(lost)), "kx", markersize=9, label=label)
-    right.axhline(1, color="k", linewidth=0.8)
-    right.set(xlabel="optical thickness, diameter / λ", ylabel="λ found / λ true")
-    right.set_title("λ of one ball, from two views")
-    charts.legend_below(figure, right, 2)
+    figure, ((left, right),) = charts.panels(1, 2, 10, 4.4)
+    rows = result["path-traced views"]
+    balls_ = [(float(name), each) for name, each in rows.items() if name not in HEADS]
+    parts = [(scene, at) for scene in HEADS if scene in rows for at in range(len(HEADS[scene]))]
+    for n, (name, mark) in enumerate(MARKS.items()):
+        how: dict[str, Any] = {"linestyle": "none", "alpha": 0.7}
+        points = [(x * 1.04 ** (n - 2), s[name]["ratio"][0]) for x, each in balls_ for s in each.values()]
+        left.loglog(*zip(*points, strict=True), mark, label=name, **how)
+        for x, (scene, at) in enumerate(parts):
+            found = [seed[name]["ratio"][at] for seed in rows[scene].values()]
+            right.semilogy(np.full(len(found), x + 0.1 * (n - 2)), found, mark, **how)
+    left.set(xlabel="optical thickness, diameter / λ", title="One ball")
+    told = (f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts)
+    right.set_xticks(range(len(parts)), list(told))
+    right.set_title("Head phantom")
+    for panel in (left, right):
+        panel.axhspan(0.9, 1.1, color="0.9", zorder=0)
+        panel.axhline(1, color="k", linewidth=0.8)
+        panel.set_ylabel("λ found / λ true")
+        charts.plain_numbers(panel)
+    charts.legend_below(figure, left, 3)
     return figure
 
 
 @experiment(
-    size=32,
+    size=24,
     resolution=32,
     paths=256,
-    thicknesses=THICKNESSES,
-    quick={"size": 10, "resolution": 12, "paths": 2, "thicknesses": (2.0,)},
+    nodes={"type": int, "default": 32, "help": "of the light of templates by transport, along an axis"},
+    steps={"type": int, "default": 48, "help": "most steps of a fit"},
+    seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
+    thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
+    heads=harness.some_of(HEADS, "SCENE"),
+    quick={"size": 8, "resolution": 8, "paths": 4, "nodes": 6, "steps": 2, "seeds": 1, "thicknesses": ["2"]}
+    | {"heads": []},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    ball = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
-    return {
-        "goal": GOAL,
-        "three materials": three_materials(chosen.size, chosen.resolution),
-        "one ball": [one_ball(thickness, ball, chosen) for thickness in chosen.thicknesses],
-    }
+    rows: dict[str, dict[str, Any]] = {}
+    for seed in range(chosen.seed, chosen.seed + chosen.seeds):
+        for name, (scene, truth) in scenes(chosen, seed).items():
+            print(f"{name}, seed {seed}", flush=True)
+            rows.setdefault(name, {})[str(seed)] = from_paths(scene, truth, chosen)
+    own = three_materials(chosen.size, chosen.resolution)
+    return {"goal": GOAL, "three materials": own, "path-traced views": rows}
