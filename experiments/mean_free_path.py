@@ -88,8 +88,9 @@ def templates(materials: Any, brightness: Any = 1.0, seed: int = 0) -> Scatterer
     return ScattererTemplates(materials, lights(brightness), seed=seed, **PUBLISHED_HOW)
 
 
-def marching(volume: jv.Volume) -> jv.March:
-    return jv.March(float(volume.spacing.min()), (jv.AlphaCorrection(),), "midpoint")
+def marching(volume: jv.Volume, steps: int = 1) -> jv.March:
+    """So many steps a voxel."""
+    return jv.March(float(volume.spacing.min()) / steps, (jv.AlphaCorrection(),), "midpoint")
 
 
 def three_materials(size: int, resolution: int) -> dict[str, Any]:
@@ -125,7 +126,8 @@ class Scene:
 
     Attributes:
         volume: what is shown.
-        march: of templates.
+        march: of published templates.
+        fine: of templates by transport, by shorter steps: paths have none.
         bounds: low and high value of each material.
         colors: of each material.
         nodes: of the grid of templates by transport.
@@ -135,6 +137,7 @@ class Scene:
 
     volume: jv.Volume
     march: jv.March
+    fine: jv.March
     bounds: Any
     colors: Any
     nodes: int
@@ -158,7 +161,7 @@ class Scene:
     def transport(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
         how: dict[str, Any] = {"form": "transport", "baked": self.nodes, "levels": self.levels}
         lit = ScattererTemplates(given["materials"], lights(given["brightness"]), seed=self.seed, **how)
-        return self.volume, self.medium(given), camera, self.march, lit
+        return self.volume, self.medium(given), camera, self.fine, lit
 
     def traced(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
         return self.volume, self.medium(given), camera, lights(given["brightness"]), given["materials"]
@@ -171,7 +174,8 @@ def scene_of(volume: jv.Volume, names: Sequence[str], chosen: Namespace, seed: i
     )
     albedo = np.max(np.max(colors, axis=1) * (1 - opacities))
     levels = int(np.ceil(np.log(0.01) / np.log(albedo)))
-    scene = Scene(volume, marching(volume), np.stack([low, high], axis=1), colors, chosen.nodes, levels, seed)
+    bounds, marches = np.stack([low, high], axis=1), (marching(volume), marching(volume, 4))
+    scene = Scene(volume, *marches, bounds, colors, chosen.nodes, levels, seed)
     each = zip(opacities, paths, low, high, strict=True)
     materials = tuple(jv.Material(a, path, values=(lo, hi)) for a, path, lo, hi in each)
     extinction = jnp.asarray(1 / paths, jnp.float32)
@@ -284,8 +288,8 @@ def draw(result: dict[str, Any]) -> Any:
 @experiment(
     size=24,
     resolution=32,
-    paths=256,
-    nodes={"type": int, "default": 32, "help": "of the light of templates by transport, along an axis"},
+    paths=512,
+    nodes={"type": int, "default": 40, "help": "of the light of templates by transport, along an axis"},
     steps={"type": int, "default": 48, "help": "most steps of a fit"},
     seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
     thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
