@@ -61,6 +61,8 @@ MARKS = {
     PATHS: "C2o",
     STAGES: "ko",
 }
+PER_PATH = 2
+"""Nodes of templates by transport per mean free path, as long as there are few."""
 PUBLISHED_HOW: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
 
 
@@ -167,15 +169,20 @@ class Scene:
         return self.volume, self.medium(given), camera, lights(given["brightness"]), given["materials"]
 
 
-def scene_of(volume: jv.Volume, names: Sequence[str], chosen: Namespace, seed: int) -> tuple[Scene, Any]:
-    """The scene of a volume of these materials, and its true parameters."""
-    low, high, colors, paths, opacities = map(
-        np.array, zip(*(MATERIALS[name] for name in names), strict=True)
-    )
+def scene_of(
+    volume: jv.Volume, names: Sequence[str], chosen: Namespace, seed: int, thickness: float = 1.0
+) -> tuple[Scene, dict[str, Any]]:
+    """The scene of a volume of these materials, with mean free paths so many times shorter, and its true
+    parameters."""
+    columns = zip(*(MATERIALS[name] for name in names), strict=True)
+    low, high, colors, paths, opacities = map(np.array, columns)
+    paths = paths / thickness
     albedo = np.max(np.max(colors, axis=1) * (1 - opacities))
     levels = int(np.ceil(np.log(0.01) / np.log(albedo)))
     bounds, marches = np.stack([low, high], axis=1), (marching(volume), marching(volume, 4))
-    scene = Scene(volume, *marches, bounds, colors, chosen.nodes, levels, seed)
+    across = float(max(volume.spacing * (np.array(volume.shape) - 1)))
+    nodes = int(np.clip(np.ceil(1 + across * PER_PATH / min(paths)), chosen.nodes / 1.5, chosen.nodes))
+    scene = Scene(volume, *marches, bounds, colors, nodes, levels, seed)
     each = zip(opacities, paths, low, high, strict=True)
     materials = tuple(jv.Material(a, path, values=(lo, hi)) for a, path, lo, hi in each)
     extinction = jnp.asarray(1 / paths, jnp.float32)
@@ -249,11 +256,11 @@ def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[s
 
 def scenes(chosen: Namespace, seed: int) -> dict[str, tuple[Scene, dict[str, Any]]]:
     volume = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
-    scene, truth = scene_of(volume, ["ball"], chosen, seed)
-    found = {}
+    found: dict[str, tuple[Scene, dict[str, Any]]] = {}
+    same: dict[int, Scene] = {}
     for thickness in chosen.thicknesses:
-        true = times(1 / float(thickness), truth)
-        found[thickness] = scene, true | {"extinction": truth["extinction"] * float(thickness)}
+        scene, truth = scene_of(volume, ["ball"], chosen, seed, float(thickness))
+        found[thickness] = same.setdefault(scene.nodes, scene), truth  # programs are of a scene
     for name, names in HEADS.items():
         if name in chosen.heads:
             found[name] = scene_of(jv.phantom("head", chosen.resolution), names, chosen, seed)
@@ -267,10 +274,12 @@ def draw(result: dict[str, Any]) -> Any:
     parts = [(scene, at) for scene in HEADS if scene in rows for at in range(len(HEADS[scene]))]
     for n, (name, mark) in enumerate(MARKS.items()):
         how: dict[str, Any] = {"linestyle": "none", "alpha": 0.7}
-        points = [(x * 1.04 ** (n - 2), s[name]["ratio"][0]) for x, each in balls_ for s in each.values()]
+        points = [
+            (x * 1.04 ** (n - 2), s[name]["ratio"][0]) for x, each in balls_ for s in each["fits"].values()
+        ]
         left.loglog(*zip(*points, strict=True), mark, label=name, **how)
         for x, (scene, at) in enumerate(parts):
-            found = [seed[name]["ratio"][at] for seed in rows[scene].values()]
+            found = [seed[name]["ratio"][at] for seed in rows[scene]["fits"].values()]
             right.semilogy(np.full(len(found), x + 0.1 * (n - 2)), found, mark, **how)
     left.set(xlabel="optical thickness, diameter / λ", title="One ball")
     told = (f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts)
@@ -289,7 +298,7 @@ def draw(result: dict[str, Any]) -> Any:
     size=24,
     resolution=32,
     paths=512,
-    nodes={"type": int, "default": 40, "help": "of the light of templates by transport, along an axis"},
+    nodes={"type": int, "default": 48, "help": "most nodes of templates by transport, along an axis"},
     steps={"type": int, "default": 48, "help": "most steps of a fit"},
     seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
     thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
@@ -302,6 +311,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
     for seed in range(chosen.seed, chosen.seed + chosen.seeds):
         for name, (scene, truth) in scenes(chosen, seed).items():
             print(f"{name}, seed {seed}", flush=True)
-            rows.setdefault(name, {})[str(seed)] = from_paths(scene, truth, chosen)
+            fits = from_paths(scene, truth, chosen)
+            rows.setdefault(name, {"nodes": scene.nodes, "fits": {}})["fits"][str(seed)] = fits
     own = three_materials(chosen.size, chosen.resolution)
     return {"goal": GOAL, "three materials": own, "path-traced views": rows}

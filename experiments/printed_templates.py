@@ -22,9 +22,9 @@ import jax.numpy as jnp
 import jaxvol as jv
 from jaxvol._util.vec3 import Scalar
 from jaxvol.lighting import ScattererTemplates
+from jaxvol.lighting.packet_tree import PacketTree
 from jaxvol.lighting.photons import PhotonShading
 from jaxvol.lighting.shading import Shading, Surroundings
-from jaxvol.lighting.template import PacketTree
 
 
 @dataclass

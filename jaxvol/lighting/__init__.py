@@ -11,9 +11,9 @@ from .lights import (
 from .materials import Material as Material
 from .phong import Phong as Phong
 from .shading import Lighting as Lighting, Shading as Shading
-from .template import (
-    ScattererTemplate as ScattererTemplate,
+from .simulation import (
     scatterer_template as scatterer_template,
     scatterer_templates as scatterer_templates,
 )
+from .template import ScattererTemplate as ScattererTemplate
 from .template_lighting import ScattererTemplates as ScattererTemplates

@@ -8,12 +8,21 @@ where y_1, y_2, … are the vertices of a random walk from x with exponential fl
 directions follow the phase function, and which ends where it leaves the medium.
 """
 
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from .._util.checks import integer
 from .._util.vec3 import Scalar, golden_spiral, turned
+from ..xla.platform import is_traced
+from .materials import Material, Optics
 from .phase import sample_phase
+from .template import ScattererTemplate
 
 
 def unit_walks(
@@ -49,3 +58,35 @@ def unit_walks(
         jnp.moveaxis(directions.reshape(*shape, 3), 0, 2),
         jnp.moveaxis(lengths.reshape(shape), 0, 2),
     )
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def walk_template(
+    optics: Optics, key: PRNGKeyArray, levels: int, packets: int, anisotropy: Scalar
+) -> ScattererTemplate:
+    """The template of `form="transport"`."""
+    directions, lengths = unit_walks(key, 1, packets, levels, anisotropy)
+    vertices = jnp.cumsum(directions[0] * lengths[0, ..., None], axis=1) * optics.mean_free_path
+    by_level = jnp.moveaxis(vertices, 0, 1).reshape(-1, 3)
+    k = jnp.repeat(jnp.arange(1, levels + 1), packets)
+    light = optics.opacity * (1 - optics.opacity) ** k.astype(by_level.dtype) / packets
+    parents = jnp.maximum(jnp.arange(1, k.size + 1) - packets, 0)
+    return ScattererTemplate(
+        jnp.concatenate([jnp.zeros((1, 3), by_level.dtype), by_level]),
+        jnp.concatenate([optics.opacity[None], light]),
+        jnp.concatenate([jnp.full(1, -1), parents]),
+    )
+
+
+def scatterings(materials: Sequence[Material], threshold: float, levels: Any) -> int:
+    """Number of scatterings of a random walk: as given, or after which less than `threshold` of the light is
+    left in any of the materials. **Raises** `ValueError` where that depends on a traced opacity, or is
+    never."""
+    if levels is not None:
+        return integer("levels", levels, 1)
+    if is_traced([material.opacity for material in materials]):
+        raise ValueError("levels must be given where opacity is traced: the length of walks depends on it.")
+    least = min(float(material.opacity) for material in materials)
+    if least == 0:
+        raise ValueError("levels must be given for a material of opacity 0, in which no light is absorbed.")
+    return 1 if least == 1 else max(1, math.ceil(math.log(threshold) / math.log(1 - least)))

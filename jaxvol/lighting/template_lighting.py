@@ -25,19 +25,12 @@ from .baked import bake
 from .deferred import Deferred
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
+from .packet_tree import PacketTree, ThresholdOn
 from .photons import Interpolation, Occlusion, PhotonShading
+from .random_walks import scatterings
 from .shading import Lighting, Shading, Surroundings
-from .template import (
-    Form,
-    PacketTree,
-    ScattererTemplate,
-    ThresholdOn,
-    check_form,
-    check_isotropic,
-    isotropic,
-    scatterer_templates,
-    scatterings,
-)
+from .simulation import Form, check_form, check_isotropic, isotropic, scatterer_templates
+from .template import ScattererTemplate
 from .transport import Transport
 from .voxel_photons import VoxelPhotons
 

@@ -72,7 +72,7 @@ class ScatteredLight(Shading):
         shape: of the grid of depths.
     """
 
-    radiance: Float[Array, "nodes channels"]
+    radiance: Float[Array, "finer channels"]
     depths: Float[Array, "nodes lights"]
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]

@@ -44,13 +44,13 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "light: photons below the threshold are kept",
-        "lighting.template:PacketTree.faded",
+        "lighting.packet_tree:PacketTree.faded",
         lambda f: lambda self, opacity, light: light,
         ("lighting/test_template.py::test_a_conserving_template_holds_what_the_threshold_leaves",),
     ),
     Fault(
         "light: materials have as many levels as the one that has most",
-        "lighting.template:PacketTree.template",
+        "lighting.packet_tree:PacketTree.template",
         lambda f: lambda self, optics, key, levels, merge, own=None: f(self, optics, key, levels, merge),
         (
             "lighting/test_template.py::"

@@ -23,7 +23,7 @@ from jaxvol.lighting import (
 )
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import materials_of
-from jaxvol.lighting.template import PacketTree
+from jaxvol.lighting.packet_tree import PacketTree
 from jaxvol.lighting.template_lighting import with_baked_light
 
 from .samples import shaded

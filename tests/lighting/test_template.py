@@ -17,7 +17,7 @@ from jaxvol.lighting import (
     scatterer_template,
     scatterer_templates,
 )
-from jaxvol.lighting.template import FADES, PacketTree
+from jaxvol.lighting.packet_tree import FADES, PacketTree
 
 from ..scenes import in_float64
 

@@ -22,12 +22,14 @@ from jaxvol.lighting import (
     ScattererTemplates,
     scatterer_template,
     scatterer_templates,
+    transport,
 )
 
 
 SIDE, NODES = 10, 16
 CAMERA = jv.Camera((3.0, -4.0, 2.0), (0, 0, 0), (0, 0, 1), 30, size=(8, 8))
-MARCH = jv.March(0.1, (jv.AlphaCorrection(),), "midpoint")
+MARCH = jv.March(0.025, (jv.AlphaCorrection(),), "midpoint")
+"""By steps of 0.1, images are brighter by 1 to 3 %."""
 NIGHT = DirectionalLight((0, 0, 1), (0, 0, 0)), PointLight((9, 9, 9), (0, 0, 0)), ConstantLight((0, 0, 0))
 SUN, LAMP = DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)), PointLight((2.0, -2.0, 2.0), (3.0, 4.0, 2.0))
 SKY = ConstantLight((0.5, 1.0, 0.7))
@@ -103,6 +105,22 @@ def test_flights_have_the_mean_free_path_and_turns_the_mean_cosine(anisotropy):
     np.testing.assert_allclose(unit[:, 0].mean(axis=(0, 1)), 0, atol=0.02)
 
 
+def test_lengths_of_flights_are_distributed_as_weights_take_them_to_be():
+    """In thin and dense matter beside that where flights begin: the mean of f(length) / density is ∫ f."""
+    rates, number = (1.0, 0.04, 25.0), 2**16
+    choice, u = np.random.default_rng(0).uniform(size=(2, number)).astype(np.float32)
+
+    @jax.jit
+    def lengths(choice: Any, free_paths: Any) -> Any:
+        own, *others = (jnp.float32(rate) for rate in rates)
+        length = free_paths / transport._proposed(own, others, choice)
+        return length, transport._density(own, others, length)
+
+    length, density = (np.asarray(each, float) for each in lengths(choice, -np.log1p(-u)))
+    for rate in rates:
+        np.testing.assert_allclose(np.mean(rate * np.exp(-rate * length) / density), 1, atol=0.05)
+
+
 # ---------------------------------------------------------------- light
 
 
@@ -130,10 +148,9 @@ def compared(lights: Any, anisotropy: Any) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("lights", [(SUN,), (LAMP,), (SKY,)], ids=["sun", "lamp", "sky"])
 def test_light_is_that_of_path_tracing(lights):
-    # under a sky, light falls steeply behind a face, which 16 nodes do not follow; with 40 it is within 2 %
     ratio, error = compared(lights, 0.0)
     assert np.all(error < 0.012)
-    np.testing.assert_allclose(ratio, 1, atol=0.05 if SKY in lights else 0.03)
+    np.testing.assert_allclose(ratio, 1, atol=0.03)
 
 
 @pytest.mark.slow
@@ -148,11 +165,11 @@ def test_light_that_is_scattered_ahead_is_nearly_that_of_path_tracing(lights):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("anisotropy", [None, 0.3], ids=["isotropic", "ahead"])
-def test_gradients_are_those_of_differences_in_all_adjoints(anisotropy):
-    # visible everywhere, since points where the extinction jumps do not move under the derivative
-    g = None if anisotropy is None else jnp.float32(anisotropy)
-    scene = nested(), transfer(2.0, least=0.5), materials(0.5, 0.25), lit(SUN, LAMP, SKY), g
+def test_gradients_are_those_of_differences_in_all_adjoints():
+    # visible everywhere, since points where the extinction jumps do not move under the derivative; and no
+    # voxel has the value of a control point, where the extinction has two derivatives
+    volume = eqx.tree_at(lambda volume: volume.data, nested(), nested().data + 5)
+    scene = volume, transfer(2.0, least=0.5), materials(0.5, 0.25), lit(SUN, LAMP, SKY), jnp.float32(0.3)
     weights = np.random.default_rng(0).uniform(0, 2, size=(8, 8, 3)).astype(np.float32)
 
     def total(scene: Any, adjoint: Any = "replay") -> Any:
@@ -180,15 +197,12 @@ def test_gradients_are_those_of_differences_in_all_adjoints(anisotropy):
     value = eqx.filter_jit(total)
     for name, (where, step) in leaves.items():
         leaf = where(scene)
-        if leaf is None:
-            continue
-        along = np.random.default_rng(1).normal(size=leaf.shape).astype(np.float32)
+        along = np.random.default_rng(1).normal(1, 1, size=leaf.shape).astype(np.float32)
         ends = [float(value(eqx.tree_at(where, scene, leaf + sign * step * along))) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / (2 * step)
         reverse = float(np.sum(np.asarray(where(gradient)) * along))
         tangent = eqx.tree_at(where, jax.tree.map(jnp.zeros_like, moving), jnp.asarray(along))
         forward = float(pushed(tangent))
-        print(name, expected, reverse, forward)
         np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-5, err_msg=name)
         np.testing.assert_allclose(reverse, expected, rtol=0.03, atol=1e-3, err_msg=name)
 

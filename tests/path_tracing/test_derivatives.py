@@ -56,7 +56,7 @@ class Scene(NamedTuple):
     camera: jv.Camera
     extinction: Any
     lights: tuple[Any, ...]
-    materials: tuple[Material, ...]
+    materials: Any
     colors: Any = COLORS
     anisotropy: Any = 0.4
 
@@ -175,14 +175,14 @@ def test_derivatives_of_light_scattered_once_are_those_of_quadrature_and_errors_
 @pytest.mark.slow
 def test_the_standard_error_of_a_derivative_is_its_standard_deviation_over_keys():
     scene, means, errors = SCENE._replace(lights=lit(SUN, LAMP)), [], []
-    for key in range(48):
+    for key in range(32):
         found = derivatives(scene, max_scatterings=1, key=key)[1].mean(axis=(1, 2))[:, :3]
         mean, error = mean_and_standard_error(found[..., np.array([0, 1, 2, 5, 6, 7])])
         means.append(mean)
         errors.append(error)
     ratio = np.std(means, axis=0, ddof=1) / np.sqrt(np.mean(np.square(errors), axis=0))
-    # each has a standard deviation of 0.1
-    assert np.all((ratio > 0.7) & (ratio < 1.3))
+    # each has a standard deviation of 0.13
+    assert np.all((ratio > 0.6) & (ratio < 1.4))
 
 
 def test_the_derivative_of_a_half_space_by_its_opacity_is_chandrasekhars():
@@ -208,36 +208,37 @@ IN_MATERIALS = SCENE._replace(
 )
 
 
-def compared(scene: Scene, direction: np.ndarray, step: float, keys: int, *, one_sided: bool) -> None:
-    """Derivatives of the mean image are differences of images of the same keys."""
+def compared(scene: Scene, directions: np.ndarray, steps: dict[int, float], keys: int) -> None:
+    """Derivatives of the mean image, along rows of `directions`, are differences of images of the same keys:
+    central ones, or one-sided where a step is negative."""
 
     def mean(by: np.ndarray, key: int) -> np.ndarray:
         groups = scene.changed(by).traced(key=key).groups
         return np.asarray(groups, float).mean(axis=(0, 1, 2))
 
-    found = np.concatenate(
-        [derivatives(scene, key=key)[1].mean(axis=(1, 2)) @ direction for key in range(keys // 2)]
-    )
-    derivative, error = mean_and_standard_error(found)
-    by_keys = [
-        difference(lambda by, key=key: mean(by, key), direction, step, one_sided=one_sided)
-        for key in range(100, 100 + keys)
-    ]
-    expected, its_error = mean_and_standard_error(np.stack(by_keys))
-    assert np.all(np.hypot(error, its_error)[:3] < 0.2 * abs(expected[:3]).max())
-    assert np.all(abs(derivative - expected) < 3 * np.hypot(error, its_error) + 1e-7)
+    found = np.concatenate([derivatives(scene, key=key)[1].mean(axis=(1, 2)) for key in range(keys // 2)])
+    for row, step in steps.items():
+        direction = directions[row]
+        derivative, error = mean_and_standard_error(found @ direction)
+        by_keys = [
+            difference(lambda by, key=key: mean(by, key), direction, abs(step), one_sided=step < 0)
+            for key in range(100, 100 + keys)
+        ]
+        expected, its_error = mean_and_standard_error(np.stack(by_keys))
+        assert np.all(np.hypot(error, its_error)[:3] < 0.2 * abs(expected[:3]).max()), direction
+        assert np.all(abs(derivative - expected) < 3 * np.hypot(error, its_error) + 1e-7), direction
 
 
 def test_derivatives_of_light_scattered_often_are_those_of_images_of_the_same_key():
     every = sum(unit(kind) for kind in KINDS if kind not in ("empty", "anisotropy")) - unit("anisotropy") / 2
-    compared(IN_MATERIALS, every, 0.05, 6, one_sided=False)
+    compared(IN_MATERIALS, every[None], {0: 0.05}, 6)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_derivative_by_each_kind_of_parameter_is_that_of_images_of_the_same_key(kind):
-    step = 0.02 if kind == "anisotropy" else 0.05
-    compared(IN_MATERIALS, unit(kind), step, 12, one_sided=kind == "empty")
+def test_the_derivative_by_each_kind_of_parameter_is_that_of_images_of_the_same_key():
+    steps = {"empty": -0.05, "anisotropy": 0.02}
+    each = {at: steps.get(kind, 0.05) for at, kind in enumerate(KINDS)}
+    compared(IN_MATERIALS, np.eye(len(KINDS)), each, 12)
 
 
 def test_an_extinction_of_0_in_a_material_has_no_derivative():
@@ -253,7 +254,7 @@ def test_the_derivative_by_voxels_is_that_of_images_of_the_same_key():
 
     def mean(by: Any, key: int) -> jax.Array:
         volume = eqx.tree_at(lambda volume: volume.data, NOISE, NOISE.data + by * change)
-        traced = Scene(volume, around(NOISE), 0.3 + EXTINCTION, lit(SUN, SKY), ()).traced(key=key)
+        traced = Scene(volume, around(NOISE), 0.3 + EXTINCTION, lit(SUN, SKY), None).traced(key=key)
         assert traced.groups is not None
         return traced.groups.mean(axis=(1, 2))
 

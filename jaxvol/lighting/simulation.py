@@ -1,0 +1,180 @@
+"""Simulates scatterer templates: of one material or of several, as published or by random walks."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from .._util.checks import Arrayable, integer, number
+from .materials import Material, Optics, materials_of, optics_of
+from .packet_tree import MERGE, PacketTree, ThresholdOn
+from .random_walks import scatterings, walk_template
+from .template import ScattererTemplate
+
+
+Form = Literal["published", "transport"]
+
+
+def scatterer_template(
+    material: Material,
+    key: PRNGKeyArray | int,
+    *,
+    packets: int = 4,
+    threshold: float = 0.01,
+    threshold_on: ThresholdOn | Any = "photon",
+    merge: float = MERGE,
+    levels: int | None = None,
+    form: Form | Any = "published",
+    anisotropy: Arrayable = 0.0,
+) -> ScattererTemplate:
+    """Simulate how light spreads around a point inside a material.
+
+    A packet of energy I travels Δx = -λ ln u in its direction, u uniform. Where it arrives, in a material of
+    opacity α, αI is absorbed and becomes a photon; of the rest I' = (1 - α) I, `I' cos θ'` is refracted by an
+    angle θ', into a direction uniformly distributed over the cone within the critical angle of total
+    reflection between the material and air; and `I' (1 - cos θ')` is reflected into any direction of the
+    half-space it came from. Packets, or whole levels of the tree, end at the threshold.
+
+    So all parts add up to I, and a template's energy falls short of 1 only by what the threshold cuts off.
+    The paper's tables were made in this way; its equations (1) to (3) as printed hand on αI
+    (`experiments/printed_templates.py`). Its count of 56 to 63 photons, at an opacity of 50 % and a threshold
+    of 0.01, is that of `threshold_on="level"`: 63 of one packet (six levels), 60 of four (four levels each,
+    whose photons are a quarter as bright), less those that were merged.
+
+    Where it fails: `experiments/stability.py`, "lopsided templates", "energy of templates as printed".
+
+    Args:
+        material: its opacity, mean free path λ and refractive index.
+        key: a JAX key, or an integer seed. All draws depend on it alone, so offsets are λ times fixed ones.
+        packets: how many packets share the light, of energy 1, at the origin. Their directions are spread
+            evenly and rotated at random. One packet makes a lopsided template.
+        threshold: in (0, 1), of a photon's intensity. The first photons are the brightest, of α / `packets`
+            each: with a threshold above 1.25 times that (by levels, above that), a template is empty.
+        threshold_on: what is compared with the threshold. `"photon"`: each photon, which fades out between
+            this and 0.8 times this, instead of vanishing at once. `"level"`: the brightest possible photon
+            of a level k, α (1 - α)^k / `packets`; levels from there on are left out and others kept whole,
+            as in the paper. Nothing fades: how many levels there are is fixed when the template is made, and
+            depends on nothing that is traced.
+        merge: photons closer than this fraction of λ are merged, as in the paper's tables.
+        levels: of the tree; required if the opacity is traced. By default as many as may hold photons above
+            the threshold.
+        form: `"published"`, or `"transport"`, which is ours: the photons are the vertices of `packets` random
+            walks, the first of them the point itself, and keep their `parent`. Flights are as long as above;
+            directions follow the phase function, and nothing is merged. Of the light, α (1 - α)^k is at the
+            k-th vertices, so that the sum over photons inside a homogeneous object, all of whose ancestors
+            are inside, estimates multiple scattering without bias.
+        anisotropy: g of the phase function (Henyey and Greenstein), in (-1, 1), for `"transport"`.
+
+    Returns:
+        A `ScattererTemplate`, differentiable in the material's mean free path, opacity and refractive index
+        (at an index of 1, where the critical angle has no derivative, the derivative used is 0).
+
+    Raises:
+        ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
+            a traced opacity, intensities are then NaN. For whole levels of more than 4096 photons.
+    """
+    how = packets, threshold, threshold_on, merge, levels, form, anisotropy
+    of_template, (own_levels,) = _simulation((material,), *how)
+    return of_template(material.optics, _key(key), own_levels, None)
+
+
+def scatterer_templates(
+    materials: Material | Sequence[Material],
+    key: PRNGKeyArray | int,
+    *,
+    count: int = 8,
+    packets: int = 4,
+    threshold: float = 0.01,
+    threshold_on: ThresholdOn | Any = "photon",
+    merge: float = MERGE,
+    levels: int | Sequence[int] | None = None,
+    form: Form | Any = "published",
+    anisotropy: Arrayable = 0.0,
+) -> ScattererTemplate:
+    """Several templates for each of several materials, simulated at once.
+
+    Args:
+        materials: one or several.
+        key: as for `scatterer_template`. The draws are also keyed by the indices of material and template.
+        count: templates per material.
+        packets: as for `scatterer_template`.
+        threshold: as for `scatterer_template`.
+        threshold_on: as for `scatterer_template`.
+        merge: as for `scatterer_template`.
+        levels: as for `scatterer_template`; one number for all materials, or, of the published form, one for
+            each.
+        form: as for `scatterer_template`.
+        anisotropy: as for `scatterer_template`.
+
+    Returns:
+        A `ScattererTemplate` with leading axes (materials, count).
+
+    Raises:
+        ValueError: as `scatterer_template` does.
+    """
+    materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
+    how = packets, threshold, threshold_on, merge, levels, form, anisotropy
+    of_template, own = _simulation(materials, *how)
+
+    def one(
+        optics: Optics, own_levels: Int[Array, ""], material: Int[Array, ""], template: Int[Array, ""]
+    ) -> ScattererTemplate:
+        draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
+        return of_template(optics, draws, max(own), own_levels)
+
+    several = jax.vmap(jax.vmap(one, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
+    numbers = jnp.arange(len(materials))
+    return several(optics_of(materials), jnp.asarray(own), numbers, jnp.arange(count))
+
+
+def _simulation(
+    materials: Sequence[Material],
+    packets: int,
+    threshold: float,
+    threshold_on: Any,
+    merge: float,
+    levels: Any,
+    form: Any,
+    anisotropy: Arrayable,
+) -> tuple[Callable[..., ScattererTemplate], tuple[int, ...]]:
+    """What simulates one template, from its optics, key, the most levels of any and its own number; and the
+    number of levels of each material."""
+    check_form(form)
+    tree = PacketTree(packets, threshold, threshold_on)
+    if form == "transport":
+        g = number("anisotropy", anisotropy, above=-1, below=1)
+
+        def walks(optics: Optics, draws: PRNGKeyArray, most: int, _: Any) -> ScattererTemplate:
+            return walk_template(optics, draws, most, tree.packets, g)
+
+        return walks, (scatterings(materials, tree.threshold, levels),) * len(materials)
+    check_isotropic(anisotropy)
+
+    def photons(optics: Optics, draws: PRNGKeyArray, most: int, own: Any) -> ScattererTemplate:
+        return tree.template(optics, draws, most, merge, own if tree.whole_levels else None)
+
+    return photons, tree.levels_of(materials, levels)
+
+
+def check_isotropic(anisotropy: Any) -> None:
+    """Raise `ValueError` for an anisotropy with the published form, whose directions follow refraction."""
+    if not isotropic(anisotropy):
+        raise ValueError(f'anisotropy is of form="transport"; got {anisotropy!r} for form="published".')
+
+
+def isotropic(anisotropy: Any) -> bool:
+    """Whether an anisotropy is known to be 0 when a program is traced; None stands for 0."""
+    return anisotropy is None or (isinstance(anisotropy, int | float | np.number) and anisotropy == 0)
+
+
+def check_form(form: Any) -> None:
+    """Raise `ValueError` for what is no `Form`."""
+    if form not in get_args(Form):
+        raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
+
+
+def _key(key: PRNGKeyArray | int) -> PRNGKeyArray:
+    return jax.random.key(key) if isinstance(key, int | np.integer) else key
