@@ -84,7 +84,7 @@ def measure(scene: tuple[Any, ...], chosen: Namespace) -> tuple[dict[str, Any], 
     volume, transfer, materials, camera, direction = scene
     lights = DirectionalLight(direction, SUN), ConstantLight(SKY)
     transforms = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-3)
-    march = jv.March(float(volume.spacing.min()) / 2, transforms, "midpoint")
+    march = jv.March(float(volume.spacing.min()) / 4, transforms, "midpoint")
     traced = jv.path_trace(
         volume, transfer, camera, lights, paths=chosen.paths, key=chosen.seed, materials=materials
     )

@@ -113,7 +113,7 @@ def fit(
             parameters.
             `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays. Or a solver
             of Optimistix, with its own tolerances; or a transformation of Optax. A `PathTracedResidual` has
-            one of its own: Gauss–Newton steps from means over the last half of all steps.
+            one of its own: Gauss–Newton steps from means over the last half to three quarters of all steps.
         constraints: a tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
             `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`, `ProbeGeometry(probe)`, or None
             for the default: of a transfer function, positive extinction, colours in [0, 1] and fixed values;
@@ -128,7 +128,7 @@ def fit(
         atol: see `rtol`.
         max_steps: maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
         patience: number of steps after which a fit has stalled if the loss has not fallen by more than
-            `rtol`, relatively; by default 10, or 100 for Optax.
+            `rtol`, relatively; by default 10, or 100 for Optax. A `PathTracedResidual` has none.
         max_jacobian: bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
             (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image.
         callback: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.

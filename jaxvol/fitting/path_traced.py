@@ -42,8 +42,8 @@ class PathTracedResidual(eqx.Module):
         views: pairs (camera, image), at least one: see `ImageResidual`. An image has three channels. Where it
             is path-traced, it must be by another key.
         background: linear RGB behind the volume.
-        paths: for each pixel and step, even. A few suffice, since steps are averaged: few paths and many
-            steps find the same as many paths and few steps in the same time, but from far away need less.
+        paths: for each pixel and step, even. How near a fit comes depends on paths times steps. From far
+            away, few paths and many steps take less time.
         key: seed of all random numbers, an integer.
         noise: standard deviation of the noise of the references: see `ImageResidual`.
 

@@ -57,7 +57,7 @@ class References(eqx.Module):
         return sum(images.size for _, images in self.groups)
 
     def scale(self) -> float:
-        """Norm of the compared data: changes within its rounding carry no information."""
+        """Root mean square of the images: changes within its rounding carry no information."""
         squares = sum(float(jnp.sum(images**2)) for _, images in self.groups)
         return math.sqrt(squares / self.count())
 

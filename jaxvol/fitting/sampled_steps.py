@@ -42,7 +42,7 @@ FORGET = 2.0
 """How many times as long as the one before an epoch is."""
 
 LEAST = 12
-"""Steps that a fit takes at least: standard errors are known from 7 to 9 samples then."""
+"""Steps that a fit takes at least: standard errors are known from 9 samples then."""
 
 ENOUGH = 0.5
 """A fit has converged when the noise of its own paths is at most this fraction of the standard error that the
@@ -74,22 +74,26 @@ class Averages(eqx.Module):
     """[J r]."""
     products: Float[Array, "columns columns"]
     """[J r]ᵀ [J r] of each half of the paths."""
-    scatter: Float[Array, "free free"]
-    """Of the scores of a step's mean residual: sum over pixels of their variance due to its paths."""
+    scatter: Float[Array, "columns columns"]
+    """Of the scores of a step's mean residual, and of what it adds to the loss: sum over pixels of their
+    variance due to its paths."""
+    squares: Float[Array, ""]
+    """Of the mean residual up to a step, noise included: their sum over pixels."""
     fourth: Float[Array, ""]
     """Sum over pixels of the squared variance of a step's mean residual, at most."""
 
     @classmethod
-    def of(cls, point: Float[Array, " free"], sample: Sample, jacobian: Array, others: Array) -> "Averages":
-        """Of one sample. `jacobian`: the mean one over `others` steps before."""
+    def of(cls, point: Float[Array, " free"], sample: Sample, known: Array, others: Array) -> "Averages":
+        """Of one sample. `known`: the mean rows over `others` steps before."""
         columns = sample.rows.shape[-1]
         rows, apart = jnp.mean(sample.rows, axis=0), (sample.rows[0] - sample.rows[1])[..., -1:] / 2
         halves = sample.rows.reshape(2, -1, columns)
         products = jnp.mean(jnp.swapaxes(halves, 1, 2) @ halves, axis=0)
-        jacobian = jacobian + (rows[..., :-1] - jacobian) / (others + 1)
-        scores = jnp.sum(jacobian * apart, axis=1)
+        mean = known + (rows - known) / (others + 1)
+        scores = jnp.sum(mean * apart, axis=1)
         fourth = jnp.sum(jnp.sum(apart**2, axis=(1, 2)) ** 2)
-        return cls(jnp.ones((), rows.dtype), point, rows, products, scores.T @ scores, fourth)
+        squares = jnp.sum(mean[..., -1] ** 2)
+        return cls(jnp.ones((), rows.dtype), point, rows, products, scores.T @ scores, squares, fourth)
 
     def joined(self, other: "Averages") -> "Averages":
         """Over the samples of both."""
@@ -111,9 +115,11 @@ class Averages(eqx.Module):
         values, axes = jnp.linalg.eigh(curvature / jnp.outer(scale, scale))
         axes = axes / jnp.outer(scale, jnp.sqrt(jnp.maximum(values, FLOOR / jnp.sqrt(self.steps))))
         inverse = axes @ axes.T
-        covariance = inverse @ self.scatter @ inverse / self.steps
+        covariance = inverse @ self.scatter[:-1, :-1] @ inverse / self.steps
         loss = (pairs[-1, -1] - gradient @ inverse @ gradient) / 2
-        error = jnp.sqrt(self.fourth / 2) / self.steps
+        # of a loss that is not noise, as much is uncertain as noise is correlated with it
+        share = jnp.clip(2 * loss / jnp.maximum(self.squares, jnp.finfo(loss.dtype).tiny), 0, 1)
+        error = jnp.sqrt(self.fourth / 2 / self.steps**2 + share * self.scatter[-1, -1] / self.steps)
         return Estimate(self.point - inverse @ gradient, covariance, loss, error)
 
 
@@ -146,7 +152,7 @@ def first_state(problem: SampledProblem | Any, y: FreeVariables) -> SampledState
     """Before any step. `problem`: whatever has such a method `sample`."""
     flat, _ = ravel_pytree(y)
     sample = eqx.filter_eval_shape(problem.sample, y, jnp.zeros((), jnp.int32))
-    averages = eqx.filter_eval_shape(lambda s: Averages.of(flat, s, s.rows[0, ..., :-1], flat[0]), sample)
+    averages = eqx.filter_eval_shape(lambda s: Averages.of(flat, s, s.rows[0], flat[0]), sample)
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), averages)
     zero, n = jnp.zeros((), flat.dtype), flat.size
     estimate = Estimate(flat, jnp.zeros((n, n), flat.dtype), zero, zero)
@@ -159,7 +165,7 @@ def next_state(problem: SampledProblem | Any, state: SampledState) -> SampledSta
     sample = problem.sample(state.y, state.step)
     flat, unravel = ravel_pytree(state.y)
     known = state.window
-    added = Averages.of(flat, sample, known.rows[..., :-1], known.steps)
+    added = Averages.of(flat, sample, known.rows, known.steps)
     current = state.current.joined(added)
     window = state.last.joined(current)
     estimate = window.estimate
@@ -219,6 +225,10 @@ class SampledRun(eqx.Module):
         """After another sample. There is only one solver."""
         state = next_state(problem, self.state)
         loss = float(state.loss)
+        if not np.all(
+            np.isfinite(ravel_pytree(state.y)[0])
+        ):  # a loss may be finite where its derivative isn't
+            loss = math.nan
         # the last result that was finite
         return SampledRun(state if math.isfinite(loss) else self.state, [*self.losses, loss])
 

@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 
-from .._util.vec3 import Scalar, Vec3, scaled
+from .._util.vec3 import Scalar, Vec3
 from .materials import EDGE, Material, shares
 from .shading import Surroundings
 
@@ -39,6 +40,17 @@ def scattering_at(around: Surroundings, materials: tuple[Material, ...], point: 
         kept = kept - fraction * material.opacity
     rate = rate + rest * own
     visible = there.extinction > 0
-    r, g, b = scaled(color, kept)
-    albedo = jnp.clip(r, 0, 1), jnp.clip(g, 0, 1), jnp.clip(b, 0, 1)
-    return Scattering(jnp.where(visible, rate * there.inside, 0), albedo, jnp.where(visible, rate, 0))
+    r, g, b = (clipped(c) * kept for c in color)
+    return Scattering(jnp.where(visible, rate * there.inside, 0), (r, g, b), jnp.where(visible, rate, 0))
+
+
+@jax.custom_jvp
+def clipped(albedo: Scalar) -> Scalar:
+    """Clipped to [0, 1]; the derivative at 0 and 1 is that of the inside."""
+    return jnp.clip(albedo, 0, 1)
+
+
+@clipped.defjvp
+def _(primals: tuple[Scalar], tangents: tuple[Scalar]) -> tuple[Scalar, Scalar]:
+    ((albedo,), (tangent,)) = primals, tangents
+    return clipped(albedo), jnp.where((albedo >= 0) & (albedo <= 1), tangent, 0)

@@ -5,7 +5,8 @@ The light scattered at a point x of a homogeneous medium towards the camera is, 
     ω p E(x) + ω Σ_k ω^k p E(y_k)          ω: albedo; p: phase function; E: irradiance that arrives there
 
 where y_1, y_2, … are the vertices of a random walk from x with exponential flights of mean λ, whose
-directions follow the phase function, and which ends where it leaves the medium.
+directions follow the phase function, and which ends where it leaves the medium. With opacity α, ω = 1 - α for
+white; a template holds α (1 - α)^k at the k-th vertices, as the light that is absorbed there.
 """
 
 import math
@@ -42,6 +43,7 @@ def unit_walks(
     ranks = jnp.broadcast_to(jnp.arange(number, dtype=q.dtype), (levels, 3, number))
     ranks = jax.random.permutation(shuffle, ranks, axis=-1, independent=True)
     u = (ranks + jax.random.uniform(within, (levels, 3, number), q.dtype)) / number
+    u = jnp.minimum(u, 1 - jnp.finfo(u.dtype).epsneg)  # rounding makes it 1, and the flight infinite
 
     def flight(
         direction: Float[Array, "number 3"], u: Float[Array, "3 number"]

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._util.checks import all_finite
+from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4
 from .._util.vec3 import Scalar, Vec3, along, apart, dot, plus, scaled, times
 from ..scene.space import enter
@@ -28,14 +29,15 @@ from .baked import sum_neighbors
 from .harmonics import harmonics, packed, powers, unpacked
 from .lights import ConstantLight, Light
 from .materials import EDGE, Material, shares
-from .medium import Scattering, scattering_at
+from .medium import Scattering, clipped, scattering_at
 from .phase import phase
 from .random_walks import unit_walks
 from .shading import Sample, Shading, Surroundings
 
 
-NEAR = 2
-"""Nodes up to which light is computed around visible ones, since samples lie between nodes."""
+NEAR, FAR = 2, 3
+"""Nodes around visible ones up to which radiance is computed, since samples lie between nodes; and optical
+depths, which are read farther towards lights (`LOCAL`)."""
 
 STEPS = 2
 """Steps from a node towards a light, per node of the grid's longest side. They grow with the distance."""
@@ -47,26 +49,29 @@ LOCAL = 2.25
 """Length of these, in the grid's spacing."""
 
 OWN = 0.85
-"""Share of flights whose length is drawn from the extinction where they begin. The others' is drawn from the
-mean free path of any material, or from that of thin matter, so that no weight is large where a flight goes on
-in thinner matter, or beyond a cavity."""
+"""Share of flights whose length is drawn at the rate of collisions where they begin. The others' is drawn at
+that of any material, or of thin matter, so that no weight is large where a flight goes on in thinner matter,
+or beyond a cavity."""
 
 THIN = 4
 """Mean free paths of thin matter along the diagonal of the volume."""
+
+COPIES = 3
+"""Of the radiance on the finer grid, that are held at once."""
 
 NODES = 2**9, 2**12
 """Nodes at a time for walks, and for what is simpler."""
 
 LEAST = 1e-6
-"""Least rate of collisions, and least density, by which anything is divided."""
+"""Least rate of collisions by which anything is divided, relative to that of thin matter, and its density."""
 
 
 class ScatteredLight(Shading):
     """Light in a scene, on grids that span the volume's.
 
     Attributes:
-        radiance: at each node of a finer grid, of light that was scattered before, by the direction from
-            which it comes (`harmonics`), three channels each.
+        radiance: at each node of a finer grid, of light that was scattered before, and of constant lights, by
+            the direction from which it comes (`harmonics`), three channels each.
         depths: at each node, the optical depth up to each light that has a direction.
         anisotropy: g; None for 0.
         shape: of the grid of depths.
@@ -102,18 +107,22 @@ class ScatteredLight(Shading):
         near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
         ways = [_way(light, sample.point, sample.direction) for light in located(self.lights)]
         reaches = [jnp.minimum(near, distance) for _, distance in ways]
-        places = [
-            along(sample.point, direction, middle * reach)
-            for (direction, _), reach in zip(ways, reaches, strict=True)
-            for _, middle in _growing(LOCAL_STEPS)
-        ]
-        read = iter(around.stored(lambda: [self._extinction(around, place) for place in places]))
+        steps = jnp.asarray(_growing(LOCAL_STEPS), near.dtype)
+        starts = [(direction, reach) for (direction, _), reach in zip(ways, reaches, strict=True)]
+
+        def read(middle: Scalar) -> list[Scalar]:
+            return [
+                self._extinction(around, along(sample.point, direction, middle * reach))
+                for direction, reach in starts
+            ]
+
+        read_ = around.stored(lambda: jax.vmap(read)(steps[:, 1]))
         found = []
-        for light, ((direction, _), reach) in enumerate(zip(ways, reaches, strict=True)):
-            depth = reach * sum(width * next(read) for width, _ in _growing(LOCAL_STEPS))
+        for light, ((direction, distance), reach) in enumerate(zip(ways, reaches, strict=True)):
+            depth = reach * jnp.sum(steps[:, 0] * read_[light])
             beyond = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, beyond))
-            found.append(jnp.exp(-depth - row[light]))
+            found.append(jnp.exp(-depth - jnp.where(reach < distance, row[light], 0)))
         return tuple(found)
 
     def color(self, sample: Sample, shared: tuple[Vec3, Scalar], sums: Any) -> Vec3:
@@ -122,7 +131,7 @@ class ScatteredLight(Shading):
             light = plus(
                 light, arrived(source, sample.point, sample.direction, self.anisotropy, transmittance)
             )
-        r, g, b = (jnp.clip(c, 0, 1) * kept for c in sample.color)
+        r, g, b = (clipped(c) * kept for c in sample.color)
         return times((r, g, b), light)
 
     def _extinction(self, around: Surroundings, point: Vec3) -> Scalar:
@@ -170,7 +179,8 @@ def refined(values: Float[Array, "nx ny nz channels"]) -> Float[Array, "fx fy fz
     falls steeply behind a surface is far from linear.)"""
     for axis in range(3):
         n = values.shape[axis]
-        padded = jnp.pad(values, [(1, 1) if i == axis else (0, 0) for i in range(4)], mode="edge")
+        ends = [(1, 1) if i == axis else (0, 0) for i in range(4)]
+        padded = jnp.pad(values, ends, mode="reflect", reflect_type="odd")  # exact for what is linear
         a, b, c, d = (jax.lax.slice_in_dim(padded, i, i + n - 1, axis=axis) for i in range(4))
         middle = (9 * (b + c) - (a + d)) / 16
         last = jax.lax.slice_in_dim(values, n - 1, n, axis=axis)
@@ -204,15 +214,20 @@ class Transport(NamedTuple):
     levels: int
 
     def solved(self, nodes: int) -> ScatteredLight:
-        """The light on a grid of so many nodes along the volume's longest side. NaN in any input makes all of
-        it NaN."""
+        """The light on a grid of so many nodes along the axis of most voxels. NaN in any input makes all of
+        it NaN. **Raises** `ValueError` for grids that do not fit into memory."""
         volume = self.around.volume
         nx, ny, nz = (max(2, round(nodes * n / max(volume.shape))) for n in volume.shape)
         # the transfer function's tables are computed once, before all loops
         around = dataclasses.replace(self.around, tables=self.around.classification)
         grid = _Grid(self._replace(around=around), (nx, ny, nz))
-        matter, near = grid.matter()
-        depths = grid.depths(near)
+        harmonics_ = 9 if self.order else 1
+        require_room(
+            4 * math.prod(_finer(grid.shape)) * COPIES * 3 * harmonics_,
+            f"light at {nx} x {ny} x {nz} nodes for baked={nodes}; use fewer",
+        )
+        matter, near, far = grid.matter()
+        depths = grid.depths(far)
         radiance = refined(grid.radiance(near, matter, depths).reshape(*grid.shape, -1))
         if self.order == 0:
             radiance = jnp.maximum(radiance, 0)
@@ -308,9 +323,9 @@ class _Grid(NamedTuple):
         whole = jnp.zeros((self.size, *found.shape[1:]), found.dtype)
         return whole.at[chunks.reshape(-1)].set(found, mode="drop")
 
-    def matter(self) -> tuple[tuple[Array, Array], Int[Array, " nodes"]]:
-        """The extinction at all nodes and the rate of collisions around them; and the nodes around which
-        anything may be visible, in front."""
+    def matter(self) -> tuple[tuple[Array, Array], Int[Array, " nodes"], Int[Array, " nodes"]]:
+        """The extinction at all nodes and the rate of collisions around them; and the numbers of the nodes
+        near visible ones, and of those farther off, too, followed by numbers past the last."""
         offsets = np.array([(0, 0, 0), *np.ndindex(2, 2, 2)]) / 2 - 0.25
         offsets[0] = 0
 
@@ -325,14 +340,15 @@ class _Grid(NamedTuple):
 
         found = self.mapped(one, jnp.arange(self.size), NODES[1])
         rate, known = (found[:, i].reshape(*self.shape, 1) for i in (1, 2))
-        for _ in range(NEAR):
+        reached = []
+        for _ in range(FAR):
             total, number = sum_neighbors(rate * known), sum_neighbors(known)
             rate = jnp.where(known > 0, rate, total / jnp.maximum(number, 1))
             known = (number > 0).astype(rate.dtype)
-        near = jnp.nonzero(known.reshape(-1) > 0, size=self.size, fill_value=self.size)[0]
-        return (found[:, 0], rate.reshape(-1)), near
+            reached.append(jnp.nonzero(known.reshape(-1) > 0, size=self.size, fill_value=self.size)[0])
+        return (found[:, 0], rate.reshape(-1)), reached[NEAR - 1], reached[-1]
 
-    def depths(self, near: Int[Array, " nodes"]) -> Float[Array, "nodes lights"]:
+    def depths(self, nodes: Int[Array, " nodes"]) -> Float[Array, "nodes lights"]:
         """Optical depths from nodes towards the lights."""
         transport, sources = self.transport, located(self.transport.lights)
         if not sources:
@@ -354,7 +370,7 @@ class _Grid(NamedTuple):
         def one(number: Int[Array, ""]) -> Array:
             return jnp.stack([toward(self.point(number), light) for light in sources])
 
-        return self.mapped(one, near, NODES[1])
+        return self.mapped(one, nodes, NODES[1])
 
     def radiance(
         self, near: Int[Array, " nodes"], matter: tuple[Array, Array], depths: Float[Array, "nodes lights"]
@@ -396,8 +412,11 @@ class _Grid(NamedTuple):
     ) -> _State:
         """A walk after its next flight, of this length in mean free paths, and the light that it gathers."""
         transport, (point, extinction, own, throughput, light) = self.transport, state
-        distance = length / jnp.maximum(_proposed(own, transport.rates, choice), LEAST)
-        density = jnp.maximum(_density(own, transport.rates, distance), LEAST**2)
+        rates = transport.rates
+        least = LEAST * rates[0]
+        own = jnp.maximum(own, least)
+        distance = length / jnp.maximum(_proposed(own, rates, choice), least)
+        density = jnp.maximum(_density(own, rates, distance), LEAST * least)
         ends = jnp.stack([distance / 2, distance])
         reads = jax.vmap(lambda s: transport.at(along(point, direction, s)))(ends)
         middle, there = (jax.tree.map(lambda leaf, i=i: leaf[i], reads) for i in (0, 1))

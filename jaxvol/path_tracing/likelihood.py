@@ -59,20 +59,8 @@ def _(primals: tuple[Scalar], tangents: tuple[Scalar]) -> tuple[Scalar, Scalar]:
 
 
 @jax.custom_jvp
-def clipped(albedo: Scalar) -> Scalar:
-    """Clipped to [0, 1]; the derivative at 0 and 1 is that of the inside."""
-    return jnp.clip(albedo, 0, 1)
-
-
-@clipped.defjvp
-def _(primals: tuple[Scalar], tangents: tuple[Scalar]) -> tuple[Scalar, Scalar]:
-    ((albedo,), (tangent,)) = primals, tangents
-    return clipped(albedo), jnp.where((albedo >= 0) & (albedo <= 1), tangent, 0)
-
-
-@jax.custom_jvp
 def jumping(number: Scalar, where: Bool[Array, "..."]) -> Scalar:
-    """The number; its derivative is NaN, unless it is 0, `where` the number is at a jump."""
+    """The number itself; `where` it is at a jump, any change of it has the derivative NaN."""
     return number
 
 

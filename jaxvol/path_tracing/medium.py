@@ -11,12 +11,13 @@ from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.materials import Material, shares
+from ..lighting.medium import clipped
 from ..scene.occupancy import BLOCK, Blocks
 from ..scene.space import Affine
 from ..scene.transfer import Measured, Transfer, classification_of
 from ..scene.volume import Volume
 from ..xla.memory import gather
-from .likelihood import OF_IMAGES, Sampling, clipped, jumping
+from .likelihood import OF_IMAGES, Sampling, jumping
 
 
 Block: TypeAlias = tuple[Int[Array, "..."], Int[Array, "..."], Int[Array, "..."]]

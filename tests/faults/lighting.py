@@ -70,6 +70,12 @@ FAULTS: list[Fault] = [
         (f"{TRANSPORT}[sky]",),
     ),
     Fault(
+        "light: flights at other rates than their own are not counted",
+        "lighting.transport:_density",
+        lambda f: lambda own, rates, length: own * jnp.exp(-own * length),
+        ("lighting/test_transport.py::test_lengths_of_flights_are_distributed_as_weights_take_them_to_be",),
+    ),
+    Fault(
         "light: photons at voxels are not moved by refraction",
         "lighting.voxel_photons:VoxelPhotons._ratios",
         lambda f: lambda self, *of: (f(self, *of)[0] ** 0, f(self, *of)[1]),

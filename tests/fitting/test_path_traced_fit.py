@@ -29,6 +29,8 @@ class Decay(eqx.Module):
     the parameters, and the derivative has the same."""
 
     seed: jax.Array
+    off: jax.Array
+    """By how much every other datum is above, the rest below what any parameters show."""
 
     def sample(self, at, step):
         (at,) = at
@@ -36,32 +38,38 @@ class Decay(eqx.Module):
         noise = jax.random.normal(key, (2, X.size, 1)) * 0.5
         mean = jnp.exp(-at[1] * X)[:, None]
         derivative = jnp.concatenate([mean, -X[:, None] * at[0] * mean], axis=1)
-        data = TRUTH[0] * np.exp(-TRUTH[1] * X)[:, None]
+        data = TRUTH[0] * np.exp(-TRUTH[1] * X)[:, None] + self.off * (-1.0) ** np.arange(X.size)[:, None]
         error = at[0] * mean[None] * (1 + noise) - data[None]
         rows = jnp.concatenate([derivative[None] * (1 + noise), error], axis=-1)
         return Sample(rows[:, :, None, :] / np.sqrt(X.size).astype(np.float32))
 
 
-@cache
-def found() -> tuple[np.ndarray, ...]:
-    """After each step, of fits by other noise each: results, the standard errors that they report, losses."""
+@jax.jit
+def fits(seeds: Any, off: Any) -> tuple[jax.Array, ...]:
+    """After each step, of fits by other noise each: results, the standard errors that they report, losses and
+    theirs."""
 
     def fit(seed):
-        problem: Any = Decay(seed)
+        problem: Any = Decay(seed, off)
 
         def step(state, _):
             state = next_state(problem, state)
             error = jnp.sqrt(jnp.diagonal(state.estimate.covariance))
-            return state, (state.y[0], error, state.estimate.loss)
+            return state, (state.y[0], error, state.estimate.loss, state.estimate.loss_error)
 
         return jax.lax.scan(step, first_state(problem, (jnp.asarray([2.0, 0.5]),)), length=240)[1]
 
-    return tuple(map(np.asarray, jax.jit(jax.vmap(fit))(jnp.arange(40, dtype=jnp.int32))))
+    return jax.vmap(fit)(seeds)
+
+
+@cache
+def found(off: float = 0.0) -> tuple[np.ndarray, ...]:
+    return tuple(map(np.asarray, fits(jnp.arange(40, dtype=jnp.int32), jnp.float32(off))))
 
 
 def test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said():
     """And the loss there, which is 0, has no bias by the noise."""
-    y, error, loss = found()
+    y, error, loss, _ = found()
     for steps in (60, 240):
         off = y[:, steps - 1] - TRUTH
         assert np.all(np.mean(np.abs(off) < 2 * error[:, steps - 1], axis=0) >= 0.85)
@@ -69,6 +77,15 @@ def test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said():
         assert np.all(off.std(axis=0) < 0.4 / steps**0.5)
         left = loss[:, steps - 1]
         assert np.abs(left.mean()) < 4 * left.std() / 40**0.5
+
+
+@pytest.mark.parametrize("off", [0.0, 0.2])
+def test_the_error_of_the_loss_is_its_standard_deviation_over_seeds(off):
+    """Also where the model does not fit. (Fourth powers of noise make it too large by up to √3.)"""
+    _, _, loss, told = found(off)
+    spread = loss[:, -1].std(ddof=1)
+    assert 0.75 < told[:, -1].mean() / spread < 2.2
+    assert abs(loss[:, -1].mean() - off**2 / 2) < 4 * spread / 40**0.5 + 0.1 * off**2 / 2
 
 
 def test_noise_falls_with_the_square_root_of_the_steps():

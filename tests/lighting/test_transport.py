@@ -177,17 +177,18 @@ def test_gradients_are_those_of_differences_in_all_adjoints():
         lighting = light_of(of_materials, lights, anisotropy=g)
         return jnp.sum(weights * image(volume, function, lighting, adjoint))
 
+    # where flights move, by steps that are short, since their ends pass soft edges
     leaves = {
-        "mean free path": (lambda s: s[2][1].mean_free_path, 0.002),
+        "mean free path": (lambda s: s[2][1].mean_free_path, 0.0003),
         "opacity": (lambda s: s[2][0].opacity, 0.02),
-        "anisotropy": (lambda s: s[4], 0.02),
-        "extinction": (lambda s: s[1].extinction, 0.02),
+        "anisotropy": (lambda s: s[4], 0.002),
+        "extinction": (lambda s: s[1].extinction, 0.002),
         "colours": (lambda s: s[1].colors, 0.02),
         "irradiance": (lambda s: s[3][0].irradiance, 0.1),
         "direction": (lambda s: s[3][0].direction, 0.02),
         "intensity": (lambda s: s[3][1].intensity, 0.1),
         "radiance": (lambda s: s[3][2].radiance, 0.1),
-        "voxels": (lambda s: s[0].data, 0.2),
+        "voxels": (lambda s: s[0].data, 0.03),
     }
     gradient = eqx.filter_grad(total)(scene)
     moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
