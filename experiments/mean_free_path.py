@@ -4,7 +4,7 @@ From renders of templates: three balls of three materials, lit from the side. St
 too short, Levenberg–Marquardt fits the three mean free paths.
 
 From path-traced views, whose noise is known: one ball, from half a mean free path thick to 32; and the head
-phantom, of two and three materials. All fits start three times too short, and see two views. Five ways:
+phantom, of two and three materials. All fits start three times too short, and see two views. Six ways:
 
 - published templates, with the extinction that the camera's rays meet known, or following from the mean free
   path, 1/λ. The paper gives no scale, so the brightness of the lights is fitted along;
@@ -302,7 +302,7 @@ def draw(result: dict[str, Any]) -> Any:
     steps={"type": int, "default": 48, "help": "most steps of a fit"},
     seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
     thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
-    heads=harness.some_of(HEADS, "SCENE"),
+    heads=harness.some_of(HEADS, "SCENE") | {"nargs": "*"},
     quick={"size": 8, "resolution": 8, "paths": 4, "nodes": 6, "steps": 2, "seeds": 1, "thicknesses": ["2"]}
     | {"heads": []},
 )

@@ -145,6 +145,9 @@ def _simulation(
     check_form(form)
     tree = PacketTree(packets, threshold, threshold_on)
     if form == "transport":
+        for name, given, default in (("threshold_on", threshold_on, "photon"), ("merge", merge, MERGE)):
+            if given != default:
+                raise ValueError(f'{name} is of form="published"; got {given!r} for form="transport".')
         g = number("anisotropy", anisotropy, above=-1, below=1)
 
         def walks(optics: Optics, draws: PRNGKeyArray, most: int, _: Any) -> ScattererTemplate:

@@ -85,13 +85,13 @@ class ScattererTemplates(Lighting):
     for it. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a
     template at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`,
     `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the
-    last `levels`, at most `threshold` of all; the grid, whose nodes should be no further apart than half the
-    mean free path (a ball under the sun is within 1 %, at three quarters of it 3 % too dark); optical depths
-    along flights, by Simpson's rule, which miss gaps narrower than a flight; with anisotropy, the directions
-    of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of the march should
-    be short against the mean free path, too: of a third of it, they make images up to 3 % too bright. Points
-    at which the extinction becomes 0 do not move under the derivative; edges of materials do. How near it
-    comes to path tracing: `experiments/transport.py`.
+    last `levels`, in materials at most `threshold` of all; the grid, whose nodes should be no further apart
+    than half the mean free path (a ball under the sun is within 1 %, at three quarters of it 3 % too dark);
+    optical depths along flights, by Simpson's rule, which miss gaps narrower than a flight; with anisotropy,
+    the directions of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of
+    the march should be short against the mean free path, too: of a third of it, they make images up to 3 %
+    too bright. Points at which the extinction becomes 0 do not move under the derivative; edges of materials
+    do. How near it comes to path tracing: `experiments/transport.py`.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
@@ -126,7 +126,7 @@ class ScattererTemplates(Lighting):
         packets: of the templates, see `scatterer_template`; by default 4, and 8 for `"transport"`.
         threshold: of the templates.
         threshold_on: of the templates; the paper's is `"level"`.
-        levels: of the templates; one number, or one for each material.
+        levels: of the templates; one number, or one for each material (of the published form).
         given: templates to use as they are instead of simulated ones, with leading axes (materials,
             templates). Then nothing depends on the materials' mean free paths.
         form: `"published"`, or `"transport"`: see above.
@@ -180,7 +180,13 @@ class ScattererTemplates(Lighting):
     ):
         check_form(form)
         if form == "transport":
-            published = {"blend": blend, "photons": photons, "occlusion": occlusion, "reach": tuple(reach)}
+            published = {
+                "threshold_on": threshold_on,
+                "blend": blend,
+                "photons": photons,
+                "occlusion": occlusion,
+                "reach": tuple(reach),
+            }
             _check_unused({**published, "cutoff": cutoff, "interpolation": interpolation, "given": given})
         else:
             check_isotropic(anisotropy)
@@ -275,6 +281,7 @@ class ScattererTemplates(Lighting):
 
 
 _DEFAULTS = {
+    "threshold_on": "photon",
     "blend": False,
     "photons": None,
     "occlusion": "soft",

@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
 from .._util.memory import require_room
@@ -88,8 +88,10 @@ class ScatteredLight(Shading):
     def terms(self) -> int:
         return 1 if self.depths.shape[-1] else 0
 
-    def begin(self, around: Surroundings, sample: Sample) -> tuple[Vec3, Scalar]:
-        """Radiance from the grid, scattered towards the camera; and the share that is not absorbed."""
+    def begin(self, around: Surroundings, sample: Sample) -> tuple[Vec3, Scalar, tuple[Scalar, ...]]:
+        """Radiance from the grid, scattered towards the camera; the share that is not absorbed; and the
+        optical depth towards each light, beyond the steps near the sample. (Between a node outside of matter
+        and one inside, depths do not grow linearly, so that they are not interpolated at the sample.)"""
         coordinate = around.space.coordinate(sample.point)
         row = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
         light = _scattered(row, sample.direction, self.anisotropy)
@@ -97,45 +99,40 @@ class ScatteredLight(Shading):
         kept = jnp.ones_like(fractions[0])
         for fraction, material in zip(fractions, self.materials, strict=True):
             kept = kept - fraction * material.opacity
-        return light, kept
+        beyond = []
+        for light_, (direction, reach, lit) in enumerate(self._ways(around, sample)):
+            point = along(sample.point, direction, reach)
+            row = interpolated(self.depths, _on_grid(around, self.shape, point))
+            beyond.append(jnp.where(lit, 0, row[light_]))
+        return light, kept, tuple(beyond)
 
     def term(
         self, around: Surroundings, sample: Sample, shared: Any, number: Int[Array, ""]
     ) -> tuple[Scalar, ...]:
-        """The transmittance towards each light: step by step near the sample, from the grid beyond. (Between
-        a node outside of matter and one inside, depths do not grow linearly.)"""
-        near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
-        ways = [_way(light, sample.point, sample.direction) for light in located(self.lights)]
-        reaches = [jnp.minimum(near, distance) for _, distance in ways]
-        steps = jnp.asarray(_growing(LOCAL_STEPS), near.dtype)
-        starts = [(direction, reach) for (direction, _), reach in zip(ways, reaches, strict=True)]
+        """The optical depth towards each light, near the sample: all of it, since places that are read
+        together take less time."""
+        ways, steps = self._ways(around, sample), _growing(LOCAL_STEPS)
+        places = [along(sample.point, to, middle * reach) for to, reach, _ in ways for _, middle in steps]
+        read = around.stored(lambda: [self._extinction(around, place) for place in places])
+        each = iter(read)
+        return tuple(reach * sum(width * next(each) for width, _ in steps) for _, reach, _ in ways)
 
-        def read(middle: Scalar) -> list[Scalar]:
-            return [
-                self._extinction(around, along(sample.point, direction, middle * reach))
-                for direction, reach in starts
-            ]
-
-        read_ = around.stored(lambda: jax.vmap(read)(steps[:, 1]))
-        found = []
-        for light, ((direction, distance), reach) in enumerate(zip(ways, reaches, strict=True)):
-            depth = reach * jnp.sum(steps[:, 0] * read_[light])
-            beyond = along(sample.point, direction, reach)
-            row = interpolated(self.depths, _on_grid(around, self.shape, beyond))
-            found.append(jnp.exp(-depth - jnp.where(reach < distance, row[light], 0)))
-        return tuple(found)
-
-    def color(self, sample: Sample, shared: tuple[Vec3, Scalar], sums: Any) -> Vec3:
-        light, kept = shared
-        for source, transmittance in zip(located(self.lights), sums or (), strict=True):
-            light = plus(
-                light, arrived(source, sample.point, sample.direction, self.anisotropy, transmittance)
-            )
+    def color(self, sample: Sample, shared: tuple[Vec3, Scalar, tuple[Scalar, ...]], sums: Any) -> Vec3:
+        light, kept, beyond = shared
+        for source, near, far in zip(located(self.lights), sums or (), beyond, strict=True):
+            how = self.anisotropy, jnp.exp(-near - far)
+            light = plus(light, arrived(source, sample.point, sample.direction, *how))
         r, g, b = (clipped(c) * kept for c in sample.color)
         return times((r, g, b), light)
 
     def _extinction(self, around: Surroundings, point: Vec3) -> Scalar:
         return scattering_at(around, self.materials, point).extinction
+
+    def _ways(self, around: Surroundings, sample: Sample) -> list[tuple[Vec3, Scalar, Bool[Array, ""]]]:
+        """Of each light, the direction, how far steps go, and whether they reach it."""
+        near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
+        ways = (_way(light, sample.point, sample.direction) for light in located(self.lights))
+        return [(direction, jnp.minimum(near, distance), distance <= near) for direction, distance in ways]
 
 
 def located(lights: tuple[Light, ...]) -> list[Light]:

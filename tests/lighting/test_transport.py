@@ -26,12 +26,15 @@ from jaxvol.lighting import (
 )
 
 
-SIDE, NODES = 10, 16
+SHAPE, NODES = (10, 12, 9), 16
 CAMERA = jv.Camera((3.0, -4.0, 2.0), (0, 0, 0), (0, 0, 1), 30, size=(8, 8))
 MARCH = jv.March(0.025, (jv.AlphaCorrection(),), "midpoint")
 """By steps of 0.1, images are brighter by 1 to 3 %."""
 NIGHT = DirectionalLight((0, 0, 1), (0, 0, 0)), PointLight((9, 9, 9), (0, 0, 0)), ConstantLight((0, 0, 0))
-SUN, LAMP = DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)), PointLight((2.0, -2.0, 2.0), (3.0, 4.0, 2.0))
+SUN, LAMP = (
+    DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)),
+    PointLight((0.65, -0.65, 0.65), (0.3, 0.4, 0.2)),
+)
 SKY = ConstantLight((0.5, 1.0, 0.7))
 STEPS, RAMPS = (10.0, 10.0, 60.0, 60.0, 100.0), (0.0, 20.0, 50.0, 70.0, 100.0)
 """Values at which the transfer functions have points."""
@@ -44,12 +47,11 @@ def lit(*lights: Any) -> tuple[Any, ...]:
 
 
 def nested(inner: float = 80.0, outer: float = 40.0) -> jv.Volume:
-    """A ball in a ball, around the origin; air around them."""
-    x = np.linspace(-1, 1, SIDE)
-    far = np.sqrt(sum(axis**2 for axis in np.meshgrid(x, x, x, indexing="ij")))
+    """A ball in a ball, around the origin; air around them. No two axes are alike."""
+    axes = np.meshgrid(*(np.linspace(-1, 1, n) for n in SHAPE), indexing="ij")
+    far = np.sqrt(sum(axis**2 for axis in axes))
     data = outer * np.clip((0.85 - far) * 6, 0, 1) + (inner - outer) * np.clip((0.5 - far) * 6, 0, 1)
-    step = 2 / (SIDE - 1)
-    return jv.Volume(data.astype(np.float32), (step,) * 3, (-1.0, -1.0, -1.0))
+    return jv.Volume(data.astype(np.float32), [2 / (n - 1) for n in SHAPE], (-1.0, -1.0, -1.0))
 
 
 def transfer(thin: float, color: Any = (0.8, 0.5, 0.9), *, least: float = 0.0) -> jv.TransferFunction:
@@ -159,6 +161,19 @@ def test_light_that_is_scattered_ahead_is_nearly_that_of_path_tracing(lights):
     ratio, error = compared(lights, jnp.float32(0.5))
     assert np.all(error < 0.02)
     np.testing.assert_allclose(ratio, 1, atol=0.12)
+
+
+def test_light_between_nodes_is_that_of_a_cubic_and_at_faces_of_a_line():
+    def values(x: Any, y: Any, z: Any) -> Any:
+        return np.stack([x**3 - 2 * x * y + 3 * z, x + 2 * y - z], axis=-1)
+
+    coarse, fine = (
+        np.meshgrid(*(np.linspace(0, 5, n) for n in ends), indexing="ij") for ends in ((6,) * 3, (11,) * 3)
+    )
+    found = np.asarray(jax.jit(transport.refined)(values(*coarse).astype(np.float32)))
+    expected = values(*fine)
+    np.testing.assert_allclose(found[2:-2, 2:-2, 2:-2], expected[2:-2, 2:-2, 2:-2], atol=1e-4)
+    np.testing.assert_allclose(found[..., 1], expected[..., 1], atol=1e-5)
 
 
 # ---------------------------------------------------------------- derivatives
