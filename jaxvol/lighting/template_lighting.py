@@ -100,8 +100,9 @@ class ScattererTemplates(Lighting):
     Args:
         materials: one or several. Where two overlap, the first counts.
         lights: one or several, of any kind but `HeadLight`.
-        templates: number per material, of which each pixel uses one, chosen at random (the paper does not say
-            which). A single one has no noise, takes less time, and is lopsided in the same way everywhere.
+        templates: number per material, by default 8, of which each pixel uses one, chosen at random (the paper
+            does not say which). A single one has no noise, takes less time, and is lopsided in the same way
+            everywhere. With `"transport"`, each node of the grid uses one of 256: more take no more time.
         blend: use all templates for every sample, instead. This has less noise, and takes as much longer as
             there are templates.
         photons: keep this many of each template's brightest photons, scaled to the energy of all. By default
@@ -161,7 +162,7 @@ class ScattererTemplates(Lighting):
         materials: Material | Sequence[Any],
         lights: Light | tuple[Light, ...] | Any,
         *,
-        templates: int = 8,
+        templates: int | None = None,
         blend: bool | Any = False,
         photons: int | None = None,
         occlusion: Occlusion | Any = "soft",
@@ -191,6 +192,7 @@ class ScattererTemplates(Lighting):
         else:
             check_isotropic(anisotropy)
         packets = (8 if form == "transport" else 4) if packets is None else packets
+        templates = (256 if form == "transport" else 8) if templates is None else templates
         self.form = form
         self.anisotropy = None
         if anisotropy is not None and not isotropic(anisotropy):

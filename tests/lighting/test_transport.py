@@ -26,14 +26,14 @@ from jaxvol.lighting import (
 )
 
 
-SHAPE, NODES = (10, 12, 9), 16
+SHAPE, NODES = (10, 12, 9), 20
 CAMERA = jv.Camera((3.0, -4.0, 2.0), (0, 0, 0), (0, 0, 1), 30, size=(8, 8))
 MARCH = jv.March(0.025, (jv.AlphaCorrection(),), "midpoint")
 """By steps of 0.1, images are brighter by 1 to 3 %."""
 NIGHT = DirectionalLight((0, 0, 1), (0, 0, 0)), PointLight((9, 9, 9), (0, 0, 0)), ConstantLight((0, 0, 0))
 SUN, LAMP = (
     DirectionalLight((0.5, 1.0, -0.7), (2.0, 1.0, 3.0)),
-    PointLight((0.65, -0.65, 0.65), (0.3, 0.4, 0.2)),
+    PointLight((0.95, -0.95, 0.95), (0.6, 0.8, 0.4)),
 )
 SKY = ConstantLight((0.5, 1.0, 0.7))
 STEPS, RAMPS = (10.0, 10.0, 60.0, 60.0, 100.0), (0.0, 20.0, 50.0, 70.0, 100.0)
@@ -141,7 +141,7 @@ def compared(lights: Any, anisotropy: Any) -> tuple[np.ndarray, np.ndarray]:
     volume, function, of_materials = nested(), transfer(2.0), materials(0.5, 0.25)
     lighting = light_of(of_materials, lit(*lights), anisotropy=anisotropy)
     found = np.asarray(image(volume, function, lighting))
-    how: dict[str, Any] = {"materials": of_materials, "anisotropy": anisotropy, "paths": 1024}
+    how: dict[str, Any] = {"materials": of_materials, "anisotropy": anisotropy, "paths": 3072}
     traced = jv.path_trace(volume, function, CAMERA, lit(*lights), **how)
     expected, error = (np.asarray(each) for each in (traced.radiance, traced.standard_error))
     total = expected.sum(axis=(0, 1))
