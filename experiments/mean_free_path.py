@@ -268,29 +268,34 @@ def scenes(chosen: Namespace, seed: int) -> dict[str, tuple[Scene, dict[str, Any
 
 
 def draw(result: dict[str, Any]) -> Any:
-    figure, ((left, right),) = charts.panels(1, 2, 10, 4.4)
     rows = result["path-traced views"]
     balls_ = [(float(name), each) for name, each in rows.items() if name not in HEADS]
     parts = [(scene, at) for scene in HEADS if scene in rows for at in range(len(HEADS[scene]))]
+    count = 3 if parts else 2
+    figure, (panels,) = charts.panels(1, count, 4.7 * count, 4.4)
     for n, (name, mark) in enumerate(MARKS.items()):
         how: dict[str, Any] = {"linestyle": "none", "alpha": 0.7}
-        points = [
-            (x * 1.04 ** (n - 2), s[name]["ratio"][0]) for x, each in balls_ for s in each["fits"].values()
-        ]
-        left.loglog(*zip(*points, strict=True), mark, label=name, **how)
+        fits = ((x * 1.04 ** (n - 2), fit[name]) for x, each in balls_ for fit in each["fits"].values())
+        points = [(x, fit["ratio"][0]) for x, fit in fits]
+        for panel in panels[: 1 if name.startswith(PUBLISHED) else 2]:
+            panel.plot(*zip(*points, strict=True), mark, label=name, **how)
         for x, (scene, at) in enumerate(parts):
             found = [seed[name]["ratio"][at] for seed in rows[scene]["fits"].values()]
-            right.semilogy(np.full(len(found), x + 0.1 * (n - 2)), found, mark, **how)
-    left.set(xlabel="optical thickness, diameter / λ", title="One ball")
-    told = (f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts)
-    right.set_xticks(range(len(parts)), list(told))
-    right.set_title("Head phantom")
-    for panel in (left, right):
+            panels[2].plot(np.full(len(found), x + 0.1 * (n - 2)), found, mark, **how)
+    for panel, title in zip(panels, ("One ball", "One ball, nearer", "Head phantom"), strict=False):
         panel.axhspan(0.9, 1.1, color="0.9", zorder=0)
         panel.axhline(1, color="k", linewidth=0.8)
-        panel.set_ylabel("λ found / λ true")
+        panel.set(ylabel="λ found / λ true", title=title)
+    for panel in panels[:2]:
+        charts.numbered(panel, [x for x, _ in balls_], [f"{x:g}" for x, _ in balls_])
+        panel.set_xlabel("optical thickness, diameter / λ")
+    for panel in (panels[0], *panels[2:]):
+        panel.set_yscale("log")
         charts.plain_numbers(panel)
-    charts.legend_below(figure, left, 3)
+    if parts:
+        told = (f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts)
+        panels[2].set_xticks(range(len(parts)), list(told))
+    charts.legend_below(figure, panels[0], 3)
     return figure
 
 
