@@ -264,7 +264,7 @@ def test_the_derivative_by_voxels_is_that_of_images_of_the_same_key():
         (mean(0.05, key).mean(axis=0) - mean(-0.05, key).mean(axis=0)) / 0.1 for key in range(100, 116)
     ]
     expected, its_error = mean_and_standard_error(np.stack(by_keys).astype(float))
-    assert np.all(abs(expected) > 5 * np.hypot(error, its_error))
+    assert np.sum(abs(expected) > 5 * np.hypot(error, its_error)) == 3  # less and more light cancel in green
     assert np.all(abs(derivative - expected) < 3 * np.hypot(error, its_error))
 
 
