@@ -225,9 +225,8 @@ class SampledRun(eqx.Module):
         """After another sample. There is only one solver."""
         state = next_state(problem, self.state)
         loss = float(state.loss)
-        if not np.all(
-            np.isfinite(ravel_pytree(state.y)[0])
-        ):  # a loss may be finite where its derivative isn't
+        # a loss may be finite where its derivative isn't
+        if not np.all(np.isfinite(ravel_pytree(state.y)[0])):
             loss = math.nan
         # the last result that was finite
         return SampledRun(state if math.isfinite(loss) else self.state, [*self.losses, loss])
