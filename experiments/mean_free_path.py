@@ -61,7 +61,7 @@ MARKS = {
     PATHS: "C2o",
     STAGES: "ko",
 }
-PER_PATH = 2
+PER_PATH = 3
 """Nodes of templates by transport per mean free path, as long as there are few."""
 PUBLISHED_HOW: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
 
@@ -179,9 +179,9 @@ def scene_of(
     paths = paths / thickness
     albedo = np.max(np.max(colors, axis=1) * (1 - opacities))
     levels = int(np.ceil(np.log(0.01) / np.log(albedo)))
-    bounds, marches = np.stack([low, high], axis=1), (marching(volume), marching(volume, 4))
+    bounds, marches = np.stack([low, high], axis=1), (marching(volume), marching(volume, 8))
     across = float(max(volume.spacing * (np.array(volume.shape) - 1)))
-    nodes = int(np.clip(np.ceil(1 + across * PER_PATH / min(paths)), chosen.nodes / 1.5, chosen.nodes))
+    nodes = int(np.clip(np.ceil(1 + across * PER_PATH / min(paths)), chosen.nodes / 2, chosen.nodes))
     scene = Scene(volume, *marches, bounds, colors, nodes, levels, seed)
     each = zip(opacities, paths, low, high, strict=True)
     materials = tuple(jv.Material(a, path, values=(lo, hi)) for a, path, lo, hi in each)
@@ -303,7 +303,7 @@ def draw(result: dict[str, Any]) -> Any:
     size=24,
     resolution=32,
     paths=512,
-    nodes={"type": int, "default": 48, "help": "most nodes of templates by transport, along an axis"},
+    nodes={"type": int, "default": 64, "help": "most nodes of templates by transport, along an axis"},
     steps={"type": int, "default": 48, "help": "most steps of a fit"},
     seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
     thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
