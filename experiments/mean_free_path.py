@@ -61,8 +61,6 @@ MARKS = {
     PATHS: "C2o",
     STAGES: "ko",
 }
-PER_PATH = 3
-"""Nodes of templates by transport per mean free path, as long as there are few."""
 PUBLISHED_HOW: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
 
 
@@ -180,9 +178,7 @@ def scene_of(
     albedo = np.max(np.max(colors, axis=1) * (1 - opacities))
     levels = int(np.ceil(np.log(0.01) / np.log(albedo)))
     bounds, marches = np.stack([low, high], axis=1), (marching(volume), marching(volume, 8))
-    across = float(max(volume.spacing * (np.array(volume.shape) - 1)))
-    nodes = int(np.clip(np.ceil(1 + across * PER_PATH / min(paths)), chosen.nodes / 2, chosen.nodes))
-    scene = Scene(volume, *marches, bounds, colors, nodes, levels, seed)
+    scene = Scene(volume, *marches, bounds, colors, chosen.nodes, levels, seed)
     each = zip(opacities, paths, low, high, strict=True)
     materials = tuple(jv.Material(a, path, values=(lo, hi)) for a, path, lo, hi in each)
     extinction = jnp.asarray(1 / paths, jnp.float32)
@@ -256,11 +252,9 @@ def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[s
 
 def scenes(chosen: Namespace, seed: int) -> dict[str, tuple[Scene, dict[str, Any]]]:
     volume = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
-    found: dict[str, tuple[Scene, dict[str, Any]]] = {}
-    same: dict[int, Scene] = {}
-    for thickness in chosen.thicknesses:
-        scene, truth = scene_of(volume, ["ball"], chosen, seed, float(thickness))
-        found[thickness] = same.setdefault(scene.nodes, scene), truth  # programs are of a scene
+    balls_ = {name: scene_of(volume, ["ball"], chosen, seed, float(name)) for name in chosen.thicknesses}
+    # programs are of a scene
+    found = {name: (next(iter(balls_.values()))[0], truth) for name, (_, truth) in balls_.items()}
     for name, names in HEADS.items():
         if name in chosen.heads:
             found[name] = scene_of(jv.phantom("head", chosen.resolution), names, chosen, seed)
@@ -275,12 +269,12 @@ def draw(result: dict[str, Any]) -> Any:
     figure, (panels,) = charts.panels(1, count, 4.7 * count, 4.4)
     for n, (name, mark) in enumerate(MARKS.items()):
         how: dict[str, Any] = {"linestyle": "none", "alpha": 0.7}
-        fits = ((x * 1.04 ** (n - 2), fit[name]) for x, each in balls_ for fit in each["fits"].values())
+        fits = ((x * 1.04 ** (n - 2), fit[name]) for x, each in balls_ for fit in each.values())
         points = [(x, fit["ratio"][0]) for x, fit in fits]
         for panel in panels[: 1 if name.startswith(PUBLISHED) else 2]:
             panel.plot(*zip(*points, strict=True), mark, label=name, **how)
         for x, (scene, at) in enumerate(parts):
-            found = [seed[name]["ratio"][at] for seed in rows[scene]["fits"].values()]
+            found = [seed[name]["ratio"][at] for seed in rows[scene].values()]
             panels[2].plot(np.full(len(found), x + 0.1 * (n - 2)), found, mark, **how)
     for panel, title in zip(panels, ("One ball", "One ball, nearer", "Head phantom"), strict=False):
         panel.axhspan(0.9, 1.1, color="0.9", zorder=0)
@@ -303,7 +297,7 @@ def draw(result: dict[str, Any]) -> Any:
     size=24,
     resolution=32,
     paths=512,
-    nodes={"type": int, "default": 64, "help": "most nodes of templates by transport, along an axis"},
+    nodes={"type": int, "default": 64, "help": "nodes of templates by transport, along an axis"},
     steps={"type": int, "default": 48, "help": "most steps of a fit"},
     seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
     thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
@@ -317,6 +311,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
         for name, (scene, truth) in scenes(chosen, seed).items():
             print(f"{name}, seed {seed}", flush=True)
             fits = from_paths(scene, truth, chosen)
-            rows.setdefault(name, {"nodes": scene.nodes, "fits": {}})["fits"][str(seed)] = fits
+            rows.setdefault(name, {})[str(seed)] = fits
     own = three_materials(chosen.size, chosen.resolution)
     return {"goal": GOAL, "three materials": own, "path-traced views": rows}

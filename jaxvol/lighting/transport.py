@@ -335,7 +335,7 @@ class _Grid(NamedTuple):
             rate = jnp.sum(seen * around.rate) / jnp.maximum(jnp.sum(seen), 1)
             return jnp.stack([around.extinction[0], rate, jnp.max(seen)])
 
-        found = self.mapped(one, jnp.arange(self.size), NODES[1])
+        found = self.mapped(one, jnp.arange(self.size, dtype=jnp.int32), NODES[1])
         rate, known = (found[:, i].reshape(*self.shape, 1) for i in (1, 2))
         reached = []
         for _ in range(FAR):
@@ -396,11 +396,11 @@ class _Grid(NamedTuple):
 
                 none, all_ = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
                 start = _State(self.point(number), extinction, rate, all_, none)
-                end, _ = jax.lax.scan(advance, start, jnp.arange(levels))
+                end, _ = jax.lax.scan(advance, start, jnp.arange(levels, dtype=jnp.int32))
                 basis = harmonics(flight(jnp.zeros((), jnp.int32))[0], transport.order)
                 return packed([scaled(end.light, 4 * math.pi * each) for each in basis])
 
-            return jnp.mean(jax.vmap(walk)(jnp.arange(walks)), axis=0)
+            return jnp.mean(jax.vmap(walk)(jnp.arange(walks, dtype=jnp.int32)), axis=0)
 
         return self.mapped(one, near, NODES[0])
 

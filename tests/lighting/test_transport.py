@@ -25,6 +25,8 @@ from jaxvol.lighting import (
     transport,
 )
 
+from ..scenes import in_float64
+
 
 SHAPE, NODES = (10, 12, 9), 20
 CAMERA = jv.Camera((3.0, -4.0, 2.0), (0, 0, 0), (0, 0, 1), 30, size=(8, 8))
@@ -181,46 +183,54 @@ def test_light_between_nodes_is_that_of_a_cubic_and_at_faces_of_a_line():
 
 @pytest.mark.slow
 def test_gradients_are_those_of_differences_in_all_adjoints():
-    # visible everywhere, since points where the extinction jumps do not move under the derivative; and no
-    # voxel has the value of a control point, where the extinction has two derivatives
+    # in float64, by steps so short that no end of a flight passes an edge of a material; visible everywhere,
+    # since points where the extinction jumps do not move under the derivative; and no voxel has the value of
+    # a control point, where the extinction has two derivatives
     volume = eqx.tree_at(lambda volume: volume.data, nested(), nested().data + 5)
     scene = volume, transfer(2.0, least=0.5), materials(0.5, 0.25), lit(SUN, LAMP, SKY), jnp.float32(0.3)
-    weights = np.random.default_rng(0).uniform(0, 2, size=(8, 8, 3)).astype(np.float32)
+    weights = np.random.default_rng(0).uniform(0, 2, size=(8, 8, 3))
 
     def total(scene: Any, adjoint: Any = "replay") -> Any:
         volume, function, of_materials, lights, g = scene
         lighting = light_of(of_materials, lights, anisotropy=g)
-        return jnp.sum(weights * image(volume, function, lighting, adjoint))
+        how: dict[str, Any] = {"lighting": lighting, "adjoint": adjoint}
+        return jnp.sum(weights * jv.render(volume, function, *seen, **how).image((0.0, 0.0, 0.0)))
 
-    # where flights move, by steps that are short, since their ends pass soft edges
     leaves = {
-        "mean free path": (lambda s: s[2][1].mean_free_path, 0.0003),
-        "opacity": (lambda s: s[2][0].opacity, 0.02),
-        "anisotropy": (lambda s: s[4], 0.002),
-        "extinction": (lambda s: s[1].extinction, 0.002),
-        "colours": (lambda s: s[1].colors, 0.02),
-        "irradiance": (lambda s: s[3][0].irradiance, 0.1),
-        "direction": (lambda s: s[3][0].direction, 0.02),
-        "intensity": (lambda s: s[3][1].intensity, 0.1),
-        "radiance": (lambda s: s[3][2].radiance, 0.1),
-        "voxels": (lambda s: s[0].data, 0.03),
+        "mean free path": lambda s: s[2][1].mean_free_path,
+        "opacity": lambda s: s[2][0].opacity,
+        "anisotropy": lambda s: s[4],
+        "extinction": lambda s: s[1].extinction,
+        "colours": lambda s: s[1].colors,
+        "irradiance": lambda s: s[3][0].irradiance,
+        "direction": lambda s: s[3][0].direction,
+        "intensity": lambda s: s[3][1].intensity,
+        "radiance": lambda s: s[3][2].radiance,
+        "voxels": lambda s: s[0].data,
     }
-    gradient = eqx.filter_grad(total)(scene)
-    moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
-    pushed = jax.jit(
-        lambda tangent: jax.jvp(lambda m: total(eqx.combine(m, fixed), "forward"), (moving,), (tangent,))[1]
-    )
-    value = eqx.filter_jit(total)
-    for name, (where, step) in leaves.items():
-        leaf = where(scene)
-        along = np.random.default_rng(1).normal(1, 1, size=leaf.shape).astype(np.float32)
-        ends = [float(value(eqx.tree_at(where, scene, leaf + sign * step * along))) for sign in (1, -1)]
-        expected = (ends[0] - ends[1]) / (2 * step)
-        reverse = float(np.sum(np.asarray(where(gradient)) * along))
-        tangent = eqx.tree_at(where, jax.tree.map(jnp.zeros_like, moving), jnp.asarray(along))
-        forward = float(pushed(tangent))
-        np.testing.assert_allclose(reverse, forward, rtol=1e-3, atol=1e-5, err_msg=name)
-        np.testing.assert_allclose(reverse, expected, rtol=0.03, atol=1e-3, err_msg=name)
+    with in_float64():
+        scene, seen = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float64) if eqx.is_inexact_array(leaf) else leaf,
+            (scene, (CAMERA, MARCH)),
+        )
+        gradient = eqx.filter_grad(total)(scene)
+        moving, fixed = eqx.partition(scene, eqx.is_inexact_array)
+        pushed = jax.jit(
+            lambda tangent: jax.jvp(lambda m: total(eqx.combine(m, fixed), "forward"), (moving,), (tangent,))[
+                1
+            ]
+        )
+        value = eqx.filter_jit(total)
+        for name, where in leaves.items():
+            leaf, step = where(scene), 1e-6
+            along = np.random.default_rng(1).normal(1, 1, size=leaf.shape)
+            ends = [float(value(eqx.tree_at(where, scene, leaf + sign * step * along))) for sign in (1, -1)]
+            expected = (ends[0] - ends[1]) / (2 * step)
+            reverse = float(np.sum(np.asarray(where(gradient)) * along))
+            tangent = eqx.tree_at(where, jax.tree.map(jnp.zeros_like, moving), jnp.asarray(along))
+            forward = float(pushed(tangent))
+            np.testing.assert_allclose(reverse, forward, rtol=1e-6, err_msg=name)
+            np.testing.assert_allclose(reverse, expected, rtol=1e-3, err_msg=name)
 
 
 # ---------------------------------------------------------------- use
