@@ -87,9 +87,7 @@ def measure(scene: tuple[Any, ...], chosen: Namespace) -> tuple[dict[str, Any], 
     lights = DirectionalLight(direction, SUN), ConstantLight(SKY)
     transforms = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-3)
     march = jv.March(float(volume.spacing.min()) / 4, transforms, "midpoint")
-    traced = partial(
-        jv.path_trace, volume, transfer, camera, lights, paths=chosen.paths, materials=materials
-    )
+    traced = partial(jv.path_trace, volume, transfer, camera, lights, paths=chosen.paths, materials=materials)
     one, other = (np.asarray(traced(key=2 * chosen.seed + i).radiance) for i in range(2))
     reference = (one + other) / 2
     noise, level = rms(one - other) / 2, float(reference.mean())

@@ -33,6 +33,12 @@ def clip_below(value: Scalar, least: Scalar) -> Scalar:
     return jnp.where(value < least, least, value)
 
 
+def not_negative(extinction: Array) -> Array:
+    """The extinction, or 0 below 0, where an optimiser's step may end; it has no derivative there. NaN stays
+    NaN."""
+    return jnp.where(extinction < 0, 0, extinction)
+
+
 def points_below(
     values: Float[Array, " n"], value: Float[Array, "*batch"], *, strictly: bool = False
 ) -> Int[Array, "*batch"]:

@@ -98,7 +98,7 @@ class LabelTransferFunction(Transfer):
     def _seen(self) -> TransferFunction:
         """All functions, with the extinctions that are seen."""
         factor = jnp.where(self.shown, self.opacity, 0)
-        extinction = self.stacked.extinction * factor[:, None]
+        extinction = linear.not_negative(self.stacked.extinction * factor[:, None])
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:

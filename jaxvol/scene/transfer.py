@@ -154,6 +154,7 @@ class TransferFunction(Transfer):
             second's. These have no gradient.
         colors: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
         extinction: (n,) at the points, in 1/length, ≥ 0; a width w has opacity `1 - exp(-extinction w)`.
+            Where an optimiser's step leaves it negative, it counts as 0, and has no gradient.
 
     VTK interpolates opacity instead; the two differ between points where opacities are high. Put a step
     between values of the data: interpolation may round a value to either side.
@@ -203,19 +204,24 @@ class TransferFunction(Transfer):
 
     def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
         """Opacity at the control points of a layer of thickness `unit_distance`."""
-        return -jnp.expm1(-self.extinction * number("unit_distance", unit_distance, above=0))
+        return -jnp.expm1(-self._seen * number("unit_distance", unit_distance, above=0))
+
+    @property
+    def _seen(self) -> Float[Array, " n"]:
+        """The extinction at the control points, as it is seen."""
+        return linear.not_negative(self.extinction)
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
+        values, extinction = jax.lax.stop_gradient((self.values, self._seen))
         bound = linear.upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
 
     def variation(self, windows: Windows) -> Variation:
-        points = jax.lax.stop_gradient((self.values, self.colors, self.extinction))
+        points = jax.lax.stop_gradient((self.values, self.colors, self._seen))
         return Variation(*linear.variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        values, extinction = jax.lax.stop_gradient((self.values, self.extinction))
+        values, extinction = jax.lax.stop_gradient((self.values, self._seen))
         return linear.positive_between(values, extinction, blocks.low, blocks.high)
 
     def search(self) -> Callable[[Measured], Measured] | None:
@@ -260,7 +266,7 @@ class TransferFunction(Transfer):
 
     def span_rows(self) -> Float[Array, "spans 26"]:
         """The table of `piecewise_means.span_rows`."""
-        at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        at_points = jnp.concatenate([self.colors, self._seen[:, None]], axis=1)
         return span_rows(jax.lax.stop_gradient(self.values), at_points)
 
     def vjp(
@@ -290,7 +296,8 @@ class TransferFunction(Transfer):
         shared = jnp.concatenate([each * (1 - part)[..., None], each * part[..., None]], axis=-1)
         sums = row_sums(len(rows), interval, shared)
         at_points = sums[:, :4] + jnp.pad(sums[:-1, 4:], ((1, 0), (0, 0)))
-        leaves = jnp.zeros_like(self.values), at_points[:, :3], at_points[:, 3]
+        of_extinction = jnp.where(self.extinction < 0, 0, at_points[:, 3])
+        leaves = jnp.zeros_like(self.values), at_points[:, :3], of_extinction
         none = jax.tree.map(jnp.zeros_like, eqx.filter(self, eqx.is_inexact_array))
         transfer = eqx.tree_at(lambda t: (t.values, t.colors, t.extinction), none, leaves)
         of_value = color[0] * r + color[1] * g + color[2] * b + extinction * slope
@@ -303,7 +310,7 @@ class TransferFunction(Transfer):
         values = jax.lax.stop_gradient(self.values)
         gap = (values[1:] - values[:-1])[:, None]
         inverse = jnp.where(gap > 0, 1 / jnp.where(gap > 0, gap, 1), 0)
-        at_points = jnp.concatenate([self.colors, self.extinction[:, None]], axis=1)
+        at_points = jnp.concatenate([self.colors, self._seen[:, None]], axis=1)
         slopes = jnp.concatenate([(at_points[1:] - at_points[:-1]) * inverse, inverse], axis=1)
         return jnp.concatenate([values[:, None], at_points, jnp.pad(slopes, ((0, 1), (0, 0)))], axis=1)
 

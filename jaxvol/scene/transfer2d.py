@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._util import bilinear
 from .._util.checks import Arrayable, finite_array, increasing, require
-from .._util.piecewise_linear import ROUNDING, Range, points_around, table_row
+from .._util.piecewise_linear import ROUNDING, Range, not_negative, points_around, table_row
 from .._util.vec3 import Scalar, Vec3, length
 from ..xla.memory import row_sums
 from ..xla.platform import is_traced
@@ -28,7 +28,7 @@ class TransferFunction2D(Transfer):
         magnitudes: (m,) increasing, in value units per world length; m ≥ 2. Two neighbours may be equal, and
             make a step. Values and magnitudes have no gradient.
         colors: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
-        extinction: (n, m), in 1/length, ≥ 0.
+        extinction: (n, m), in 1/length, ≥ 0; below, it counts as 0, and has no gradient.
 
     The magnitude is that of `volume.gradient`, also under a `ToroidalMap`, which bends the grid: choose a
     spacing for which that has a meaning. Where the gradient is 0, the derivative of its magnitude is taken as
@@ -152,10 +152,11 @@ class TransferFunction2D(Transfer):
 
     def rows(self) -> Float[Array, "cells 16"]:
         """A table with one row for each cell between lines: colour and extinction of its four corners."""
-        return bilinear.corner_rows(jnp.concatenate([self.colors, self.extinction[..., None]], axis=-1))
+        extinction = not_negative(self.extinction)
+        return bilinear.corner_rows(jnp.concatenate([self.colors, extinction[..., None]], axis=-1))
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        extinction = jax.lax.stop_gradient(self.extinction)
+        extinction = jax.lax.stop_gradient(not_negative(self.extinction))
         values, magnitudes = self._lines(blocks)
         bound = bilinear.greatest_between(extinction, values, magnitudes) * (1 + ROUNDING)
         return jnp.where(self.visible(blocks), bound, 0)

@@ -81,6 +81,24 @@ def test_tables_are_linear_between_points_and_constant_beyond_the_ends(case):
     np.testing.assert_allclose(np.sum(found.extinction), 4 * len(where), rtol=1e-5)
 
 
+@pytest.mark.parametrize("n", [FEW, MANY])
+def test_negative_extinction_counts_as_zero_and_has_no_gradient(n):
+    """As after an optimiser's step."""
+    values = np.linspace(-50, 300, 541, dtype=np.float32)
+    values = np.concatenate([values, TABLES["few" if n == FEW else "many"].values, np.zeros(n, np.float32)])
+    transfer = table(n)
+    stepped = eqx.tree_at(lambda t: t.extinction, transfer, transfer.extinction - 0.3)
+    clipped = eqx.tree_at(lambda t: t.extinction, transfer, jnp.maximum(stepped.extinction, 0))
+    found, expected = looked_up(stepped, values), looked_up(clipped, values)
+    jax.tree.map(np.testing.assert_array_equal, found[0], expected[0])
+    negative = np.asarray(stepped.extinction) < 0
+    for gradient in (found[1][0], found[2][0]):  # by JAX, and by `vjp`
+        np.testing.assert_array_equal(np.asarray(gradient.extinction)[negative], 0)
+        kept = np.where(negative, 0, expected[2][0].extinction)
+        np.testing.assert_allclose(gradient.extinction, kept, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(gradient.colors, expected[2][0].colors, rtol=1e-5, atol=1e-4)
+
+
 def test_zero_extinction_is_exactly_transparent():
     extinction = np.where(np.arange(FEW) == 3, 1.0, 0)
     transfer = jv.TransferFunction(np.arange(FEW), np.ones((FEW, 3)), extinction)
