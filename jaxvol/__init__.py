@@ -63,7 +63,7 @@ from .scene.camera import Camera as Camera
 from .scene.labels import LabelTransferFunction as LabelTransferFunction
 from .scene.presets import PRESETS as PRESETS, colormap as colormap, preset as preset
 from .scene.rendering import Rendering as Rendering
-from .scene.transfer import TransferFunction as TransferFunction
+from .scene.transfer import Transfer as Transfer, TransferFunction as TransferFunction
 from .scene.transfer2d import TransferFunction2D as TransferFunction2D
 from .scene.volume import Field as Field, Volume as Volume
 from .xla.persistent_cache import keep_programs as keep_programs

@@ -19,7 +19,6 @@ Where rays leap over empty space, the first march records each ray's first and l
 second one leaps over all others, which saves two fifths of the samples in the head.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -33,7 +32,7 @@ from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..scene.transfer import classification_of
+from ..scene.transfer import Transfer, classification_of
 from ..scene.volume import with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..xla.trees import PyTree, added, floats, zeros_of
@@ -175,44 +174,61 @@ class Replay(SampleVisitor):
                 of_value, *rest = of_read
                 of_read = (of_value + shaded[i].of_value, *rest)
             of_measured.append(of_read)
-        if not total.geometric and total.voxels is None:
+        if not (total.geometric or self.reads_transfer) and total.voxels is None:
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_place = [None] * len(depths) if shaded is None else [part.of_place for part in shaded]
-        (of_march, of_volume, of_rays), bases, of_cubes = self._geometric_vjp(
+        (of_march, of_volume, of_rays, of_transfer), bases, of_cubes = self._geometric_vjp(
             ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         )
         total = total._replace(march=added(total.march, of_march), volume=added(total.volume, of_volume))
+        if self.reads_transfer:
+            total = total._replace(transfer=added(total.transfer, of_transfer))
         if total.voxels is not None:
             voxels = scatter_add(total.voxels, self.scene.volume.shape, bases, of_cubes)
             total = total._replace(voxels=voxels)
         return carry, of_rays, total
 
+    @property
+    def reads_transfer(self) -> bool:
+        """Whether what is measured at a sample may depend on the transfer function, and has a gradient."""
+        overridden = type(self.scene.transfer).attributes is not Transfer.attributes
+        return self.total.transfer is not None and overridden
+
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
-    ) -> tuple[tuple[PyTree, PyTree, PyTree], list[Array], list[Cube]]:
+    ) -> tuple[tuple[PyTree, PyTree, PyTree, PyTree], list[Array], list[Cube]]:
         """From the cotangents of each piece's measured values and width, of its depth where the loss depends
-        on that, and of its point where it is shaded: those of march, volume and rays; the index at which each
-        fetched cube of voxels begins; and the cubes' cotangents. The number of samples counts as constant."""
-        parts = self.prepared.march, without_voxels(self.scene.volume), ray
-        (march, volume, ray), fixed = eqx.partition(parts, eqx.is_inexact_array)
-        _, _, ray_fixed = fixed
-        voxels = self.total.voxels is not None
+        on that, and of its point where it is shaded: those of march, volume, rays, and of the transfer
+        function where samples are measured by it; the index at which each fetched cube of voxels begins; and
+        the cubes' cotangents. The number of samples counts as constant."""
+        parts = self.prepared.march, without_voxels(self.scene.volume), ray, self.scene.transfer
+        geometric, voxels = self.total.geometric, self.total.voxels is not None
+        asked = geometric, geometric, geometric, self.reads_transfer
+        moving = tuple(floats(part) if a else None for part, a in zip(parts, asked, strict=True))
+        fixed = tuple(
+            eqx.filter(part, eqx.is_inexact_array, inverse=True) if a else part
+            for part, a in zip(parts, asked, strict=True)
+        )
+        *shared, ray_fixed, transfer_fixed = fixed
 
         def one(
             march: PyTree,
             volume: PyTree,
             ray: PyTree,
+            transfer: PyTree,
             perturbations: Any,
             ray_fixed: PyTree,
             at: Progress,
             number: Int[Array, ""],
         ) -> tuple[list[Any], list[Array]]:
-            march, volume, ray = eqx.combine((march, volume, ray), (*fixed[:2], ray_fixed))
+            march, volume, ray, transfer = eqx.combine(
+                (march, volume, ray, transfer), (*shared, ray_fixed, transfer_fixed)
+            )
             whole, record = with_voxels(volume, self.scene.volume.data), Recording(perturbations or [], [])
             here = with_fetch(whole, record if voxels else self.prepared.volume.fetch)
-            classification = classification_of(self.scene.transfer, here, integrated=march.integrates)
+            classification = classification_of(transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # what it finds has no gradient
             scene = self.prepared._replace(march=march, volume=here, classification=classification)
             found = []
@@ -224,14 +240,14 @@ class Replay(SampleVisitor):
                 found.append((floats(measured), piece.width, at_depth, place))
             return found, record.bases
 
-        rays = jax.vmap(one, in_axes=(None, None, 0, 0, 0, 0, None))
-        cells = jax.vmap(rays, in_axes=(None, None, None, 0, None, None, 0))
+        rays = jax.vmap(one, in_axes=(None, None, 0, None, 0, 0, 0, None))
+        cells = jax.vmap(rays, in_axes=(None, None, None, None, 0, None, None, 0))
 
-        def all_(moving: tuple[PyTree, PyTree, PyTree], perturbations: list[Cube]) -> PyTree:
+        def all_(moving: tuple[PyTree, ...], perturbations: list[Cube]) -> PyTree:
             each = jnp.arange(number, dtype=at.index.dtype)
             return cells(*moving, perturbations, ray_fixed, at, each)
 
-        moving, perturbations = (march, volume, ray), []
+        perturbations = []
         if voxels:
             _, bases = jax.eval_shape(all_, moving, [])
             if not bases and self.scene.volume.field is not None:
@@ -242,12 +258,9 @@ class Replay(SampleVisitor):
                     " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
             perturbations = cubes_of_zeros(bases, ray.length.dtype)
-        if self.total.geometric:
-            _, pull, bases = jax.vjp(all_, moving, perturbations, has_aux=True)
-            of_moving, of_cubes = pull(cotangents)
-            return of_moving, bases, of_cubes
-        _, pull, bases = jax.vjp(partial(all_, moving), perturbations, has_aux=True)
-        return (None, None, None), bases, *pull(cotangents)
+        _, pull, bases = jax.vjp(all_, moving, perturbations, has_aux=True)
+        of_moving, of_cubes = pull(cotangents)
+        return of_moving, bases, of_cubes
 
     def _slopes(
         self, alphas: list[Scalar], weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar

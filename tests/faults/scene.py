@@ -43,6 +43,21 @@ FAULTS: list[Fault] = [
         ("compositing/test_compositing.py::test_slopes_are_those_of_jax",),
     ),
     Fault(
+        "replay: what a transfer function reads beside the value has no gradient to it",
+        "engine.replay:Replay.reads_transfer",
+        lambda _: False,
+        ("scene/test_own_transfer.py::test_what_is_read_beside_the_value_has_its_gradient",),
+    ),
+    Fault(
+        "transfer function: extinction below 0 has a gradient",
+        "_util.piecewise_linear:not_negative",
+        lambda _: lambda extinction: extinction,
+        (
+            "scene/test_transfer.py::test_negative_extinction_counts_as_zero_and_has_no_gradient[8]",
+            "scene/test_transfer.py::test_negative_extinction_counts_as_zero_and_has_no_gradient[40]",
+        ),
+    ),
+    Fault(
         "maximum: leaps over what may win, since it is invisible",
         "compositing.projections:Maximum.occupied",
         lambda _: lambda self, transfer, blocks: transfer.visible(blocks),
