@@ -3,8 +3,8 @@
 From renders of templates: three balls of three materials, lit from the side. Starting three times too long or
 too short, Levenberg–Marquardt fits the three mean free paths.
 
-From path-traced views, whose noise is known: one ball, from half a mean free path thick to 32; and the head
-phantom, of two and three materials. All fits start three times too short, and see two views. Six ways:
+From path-traced views, whose noise is known: one ball, from half a mean free path thick to 32. All fits start
+three times too short, and see two views. Six ways:
 
 - published templates, with the extinction that the camera's rays meet known, or following from the mean free
   path, 1/λ. The paper gives no scale, so the brightness of the lights is fitted along;
@@ -52,7 +52,6 @@ MATERIALS = {
     "muscle": (105.0, 170.0, (0.75, 0.35, 0.27), 0.3, 0.3),
 }
 """Low and high value, colour, mean free path and opacity; the ball is one mean free path thick."""
-HEADS = {"head, two materials": ("flesh", "bone"), "head, three materials": ("skin", "muscle", "bone")}
 MARKS = {
     PUBLISHED + KNOWN: "C3s",
     PUBLISHED + TIED: "C1s",
@@ -61,6 +60,8 @@ MARKS = {
     PATHS: "C2o",
     STAGES: "ko",
 }
+PER_PATH = 3
+"""Nodes of templates by transport per mean free path of the ball, as long as there are few."""
 PUBLISHED_HOW: dict[str, Any] = {"templates": 4, "photons": 12, "levels": 4, "reach": (2.0, 4.0)}
 
 
@@ -168,7 +169,7 @@ class Scene:
 
 
 def scene_of(
-    volume: jv.Volume, names: Sequence[str], chosen: Namespace, seed: int, thickness: float = 1.0
+    volume: jv.Volume, names: Sequence[str], nodes: int, seed: int, thickness: float = 1.0
 ) -> tuple[Scene, dict[str, Any]]:
     """The scene of a volume of these materials, with mean free paths so many times shorter, and its true
     parameters."""
@@ -178,7 +179,7 @@ def scene_of(
     albedo = np.max(np.max(colors, axis=1) * (1 - opacities))
     levels = int(np.ceil(np.log(0.01) / np.log(albedo)))
     bounds, marches = np.stack([low, high], axis=1), (marching(volume), marching(volume, 8))
-    scene = Scene(volume, *marches, bounds, colors, chosen.nodes, levels, seed)
+    scene = Scene(volume, *marches, bounds, colors, nodes, levels, seed)
     each = zip(opacities, paths, low, high, strict=True)
     materials = tuple(jv.Material(a, path, values=(lo, hi)) for a, path, lo, hi in each)
     extinction = jnp.asarray(1 / paths, jnp.float32)
@@ -215,8 +216,11 @@ def told(found: jv.Fit, truth: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[str, dict[str, Any]]:
-    """Fit mean free paths to path-traced views, in all ways."""
+def from_paths(
+    scene: Scene, truth: dict[str, Any], chosen: Namespace, *, known: bool = True
+) -> dict[str, dict[str, Any]]:
+    """Fit mean free paths to path-traced views, in all ways; or in those of an extinction that is not
+    `known`."""
     views = []
     for at, camera in enumerate(cameras(chosen.size)):
         how = {"paths": chosen.paths, "key": 1000 + 10 * scene.seed + at, "materials": truth["materials"]}
@@ -235,6 +239,8 @@ def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[s
     ]
     rows: dict[str, dict[str, Any]] = {}
     for names, residuals, tied, constraints in ways:
+        if tied == 0 and not known:
+            continue
         start, begun = times(1 / 3, truth) | {"tied": jnp.float32(tied)}, time.perf_counter()
         how = {"constraints": constraints, "max_steps": chosen.steps, "patience": 3, "rtol": 1e-3}
         with warnings.catch_warnings(record=True) as caught:
@@ -251,59 +257,49 @@ def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[s
 
 
 def scenes(chosen: Namespace, seed: int) -> dict[str, tuple[Scene, dict[str, Any]]]:
-    volume = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)])
-    balls_ = {name: scene_of(volume, ["ball"], chosen, seed, float(name)) for name in chosen.thicknesses}
-    # programs are of a scene
-    found = {name: (next(iter(balls_.values()))[0], truth) for name, (_, truth) in balls_.items()}
-    for name, names in HEADS.items():
-        if name in chosen.heads:
-            found[name] = scene_of(jv.phantom("head", chosen.resolution), names, chosen, seed)
+    volume, found = balls(chosen.resolution, [(200, (0, 0, 0), RADIUS)]), {}
+    same: dict[int, Scene] = {}  # programs are of a scene
+    for name in chosen.thicknesses:
+        wanted = 1 + float(name) * PER_PATH / RADIUS
+        nodes = int(np.clip(np.ceil(wanted), chosen.nodes / 2, chosen.nodes))
+        scene, truth = scene_of(volume, ["ball"], nodes, seed, float(name))
+        found[name] = same.setdefault(nodes, scene), truth
     return found
 
 
 def draw(result: dict[str, Any]) -> Any:
     rows = result["path-traced views"]
-    balls_ = [(float(name), each) for name, each in rows.items() if name not in HEADS]
-    parts = [(scene, at) for scene in HEADS if scene in rows for at in range(len(HEADS[scene]))]
-    count = 3 if parts else 2
-    figure, (panels,) = charts.panels(1, count, 4.7 * count, 4.4)
+    figure, (panels,) = charts.panels(1, 2, 9.4, 4.4)
     for n, (name, mark) in enumerate(MARKS.items()):
-        how: dict[str, Any] = {"linestyle": "none", "alpha": 0.7}
-        fits = ((x * 1.04 ** (n - 2), fit[name]) for x, each in balls_ for fit in each.values())
-        points = [(x, fit["ratio"][0]) for x, fit in fits]
+        fits = ((float(x), each[name]) for x, row in rows.items() for each in row["fits"].values())
+        points = [(x * 1.04 ** (n - 2), fit["ratio"][0]) for x, fit in fits]
         for panel in panels[: 1 if name.startswith(PUBLISHED) else 2]:
-            panel.plot(*zip(*points, strict=True), mark, label=name, **how)
-        for x, (scene, at) in enumerate(parts):
-            found = [seed[name]["ratio"][at] for seed in rows[scene].values()]
-            panels[2].plot(np.full(len(found), x + 0.1 * (n - 2)), found, mark, **how)
-    for panel, title in zip(panels, ("One ball", "One ball, nearer", "Head phantom"), strict=False):
+            panel.plot(*zip(*points, strict=True), mark, label=name, linestyle="none", alpha=0.7)
+    for panel, title in zip(panels, ("One ball", "One ball, nearer"), strict=True):
         panel.axhspan(0.9, 1.1, color="0.9", zorder=0)
         panel.axhline(1, color="k", linewidth=0.8)
         panel.set(ylabel="λ found / λ true", title=title)
-    for panel in panels[:2]:
-        charts.numbered(panel, [x for x, _ in balls_], [f"{x:g}" for x, _ in balls_])
+        charts.numbered(panel, [float(x) for x in rows], list(rows))
         panel.set_xlabel("optical thickness, diameter / λ")
-    for panel in (panels[0], *panels[2:]):
-        panel.set_yscale("log")
-        charts.plain_numbers(panel)
-    if parts:
-        told = (f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts)
-        panels[2].set_xticks(range(len(parts)), list(told))
+    panels[0].set_yscale("log")
+    charts.plain_numbers(panels[0])
     charts.legend_below(figure, panels[0], 3)
     return figure
 
 
+OPTIONS: dict[str, Any] = {
+    "size": 24,
+    "resolution": 32,
+    "paths": 512,
+    "nodes": {"type": int, "default": 64, "help": "most nodes of templates by transport, along an axis"},
+    "steps": {"type": int, "default": 48, "help": "most steps of a fit"},
+    "seeds": {"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
+}
+QUICK = {"size": 8, "resolution": 8, "paths": 4, "nodes": 6, "steps": 2, "seeds": 1}
+
+
 @experiment(
-    size=24,
-    resolution=32,
-    paths=512,
-    nodes={"type": int, "default": 64, "help": "nodes of templates by transport, along an axis"},
-    steps={"type": int, "default": 48, "help": "most steps of a fit"},
-    seeds={"type": int, "default": 3, "help": "number of references of each scene, and of templates"},
-    thicknesses=harness.some_of(THICKNESSES, "THICKNESS"),
-    heads=harness.some_of(HEADS, "SCENE") | {"nargs": "*"},
-    quick={"size": 8, "resolution": 8, "paths": 4, "nodes": 6, "steps": 2, "seeds": 1, "thicknesses": ["2"]}
-    | {"heads": []},
+    **OPTIONS, thicknesses=harness.some_of(THICKNESSES, "THICKNESS"), quick=QUICK | {"thicknesses": ["2"]}
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     rows: dict[str, dict[str, Any]] = {}
@@ -311,6 +307,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
         for name, (scene, truth) in scenes(chosen, seed).items():
             print(f"{name}, seed {seed}", flush=True)
             fits = from_paths(scene, truth, chosen)
-            rows.setdefault(name, {})[str(seed)] = fits
+            rows.setdefault(name, {"nodes": scene.nodes, "fits": {}})["fits"][str(seed)] = fits
     own = three_materials(chosen.size, chosen.resolution)
     return {"goal": GOAL, "three materials": own, "path-traced views": rows}
