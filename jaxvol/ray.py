@@ -124,6 +124,9 @@ EXPECTED: dict[str, tuple[type, str, str]] = {
 }
 """For each argument name: its type, a description, and how to make one."""
 
+MATCH = 1e-3
+"""How near a sample lies to a selected depth to be that one, in steps."""
+
 FINAL: dict[type, str] = {
     Volume: "jaxvol.Field instead, and pass it as Volume(..., field=...)",
     TransferFunction: "jaxvol.scene.transfer.Transfer instead",
@@ -371,8 +374,11 @@ def _selected(
     # a selected depth is a fixed number of steps: its derivative by the step is depth / step
     scale = march.step / jax.lax.stop_gradient(march.step)
     gradient = partial(world_gradient, scene.volume, scene.space)
-    sampler = RaySampler(ray, scene.classification, scale, gradient)
-    found = compositing.pixel(sampler, jax.lax.stop_gradient(state))
+    state = jax.lax.stop_gradient(state)
+    chosen = compositing.depth(state)
+    moving = chosen + _movement(march, ray, scene.volume, chosen, scale)
+    sampler = RaySampler(ray, scene.classification, scale, gradient, (chosen, moving))
+    found = compositing.pixel(sampler, state)
     check_answer(compositing, "pixel", found, (rgba, rgba[3]))
     pixel, depth = found
     normal = compositing.normal(sampler, depth)
@@ -381,5 +387,26 @@ def _selected(
     valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
     # a product with infinity would have the derivative NaN
     seen = ~jnp.isinf(depth)
-    depth = jnp.where(seen, ray.t_in + jnp.where(seen, depth, 0) * scale, jnp.inf)
+    depth = sampler.differentiable_depth(jnp.where(seen, depth, 0))
+    depth = jnp.where(seen, ray.t_in + depth, jnp.inf)
     return Pixel(pixel * valid, depth, None if normal is None else normal * valid)
+
+
+def _movement(march: March, ray: Ray, volume: Volume, depth: Scalar, scale: Scalar) -> Scalar:
+    """0, with the derivatives of a sample that the march found at this depth: those of the sample in the cell
+    that begins a fixed number of steps past the entry, and is cut; or, where the march has longer cells, of
+    the number of steps."""
+    start = march.start(ray)
+    starts = [start, start + march.shift(ray)] if march.may_shift else [start]
+    step = jax.lax.stop_gradient(march.step)
+    moving, gap = depth * scale, jnp.full_like(depth, MATCH) * step
+    for start in map(jax.lax.stop_gradient, starts):
+        number = jnp.floor(depth / step - start + MATCH)
+        begin = (start + number) * march.step
+        cell = Cell(begin, march.step + jnp.zeros_like(begin), jnp.zeros(begin.shape, bool))
+        for piece in march.cut(cell, ray, volume):
+            sample = march.sample(piece)
+            apart_ = jnp.abs(jax.lax.stop_gradient(sample) - depth)
+            moving = jnp.where(apart_ < gap, sample, moving)
+            gap = jnp.minimum(gap, apart_)
+    return moving - jax.lax.stop_gradient(moving)

@@ -23,12 +23,15 @@ class RaySampler(NamedTuple):
         classification: how samples are measured, classified and shaded.
         depth_scale: 1, with the derivative that depths of a fixed number of steps have by the step.
         gradient: of the volume's value at a world point, by that point; None during the march.
+        chosen: the depth that the march chose, twice: as a number, and as its sample moves; None during the
+            march.
     """
 
     ray: Ray
     classification: Classification
     depth_scale: Scalar | int = 1
     gradient: Callable[[Vec3], Vec3] | None = None
+    chosen: tuple[Scalar, Scalar] | None = None
 
     def value(self, depth: Scalar) -> Scalar:
         """The volume's value at this depth."""
@@ -43,8 +46,12 @@ class RaySampler(NamedTuple):
         return along(self.ray.entry, self.ray.direction, self.differentiable_depth(depth))
 
     def differentiable_depth(self, depth: Scalar) -> Scalar:
-        """The same depth, which moves with the step as its sample does: to compute with, as in a fog."""
-        return depth * self.depth_scale
+        """The same depth, which moves with the step, and if it is that of the chosen sample, with the faces
+        that cut its cell: to compute with, as in a fog."""
+        if self.chosen is None:
+            return depth * self.depth_scale
+        number, moving = self.chosen
+        return jnp.where(depth == number, moving, depth * self.depth_scale)
 
     def color(
         self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
@@ -69,10 +76,11 @@ class Selection(Compositing[State]):
     """A mode that picks one depth on a ray by comparing samples. `pixel` then computes the pixel from what is
     there, once for each ray, after the march.
 
-    Gradients are those of `pixel`, also of parameters: the chosen depth stays the same number of steps past
-    the entry, while the ray, the step and what the ray meets change. They miss the jumps of a pixel where the
-    choice changes, and that a cell which is cut at a face moves with that face. The gradient of voxels takes
-    an array of their size for each fetch of `pixel`, for each chunk of 2048 pixels: slow for large volumes.
+    Gradients are those of `pixel`, also of parameters: the chosen sample stays that of the same cell, while
+    the ray, the step, the faces that cut the cell, and what the ray meets change. They miss the jumps of a
+    pixel where the choice changes, and under `AdaptiveSampling` that a cut cell moves with a face. The
+    gradient of voxels takes an array of their size for each fetch of `pixel`, for each chunk of 2048 pixels:
+    slow for large volumes.
     """
 
     @abstractmethod

@@ -161,6 +161,38 @@ def test_gradients_are_central_differences(name, adjoint):
         check_gradients(scene, parameters, adjoint, **options)
 
 
+def test_a_selected_sample_moves_with_the_face_that_cuts_its_cell():
+    """Values grow towards the exit, and are cut by a plane inside, as those of tissue are."""
+    x, y, z = np.indices((8, 8, 8)) / 7
+    with in_float64():
+        volume = jv.Volume(10 * (x + 0.5 * y + 0.2 * z))
+        transfer = jv.TransferFunction([0, 20], [(0, 0, 0), (1, 1, 1)], [0.1, 0.1])
+        camera = jv.Camera((-30, -20, 9), volume.center, (0, 0, 1), size=(8, 8))
+        plane = (5.0, 3.5, 3.5), (-0.8, -0.3, 0.5)
+        weights = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.5, (8, 8)))
+
+        def shown(given):
+            step, shift, origin = given
+            seen = eqx.tree_at(lambda c: c.position, camera, camera.position + shift)
+            cut = eqx.tree_at(lambda c: c.origins, jv.Clip(planes=[plane]), origin[None])
+            march = jv.March(step, (jv.Jitter(1), cut, jv.AlphaCorrection()), "midpoint")
+            seen = jv.render(volume, transfer, seen, march, compositing="maximum")
+            depth = jnp.where(seen.rgba[..., 3] > 0, seen.depth, 0)
+            return jnp.sum(weights * (seen.rgba[..., 0] + depth / 10))
+
+        given = [jnp.asarray(0.6), jnp.zeros(3), jnp.asarray(plane[0])]
+        gradient, value = jax.jit(jax.grad(shown))(given), jax.jit(shown)
+        for at, along in enumerate((1.0, (0.5, 0.3, -0.8), (1.0, 0.0, 0.0))):
+            ends = []
+            for step in (1e-6, -1e-6):
+                moved = list(given)
+                moved[at] = given[at] + step * np.asarray(along)
+                ends.append(float(value(moved)))
+            expected = (ends[0] - ends[1]) / 2e-6
+            assert abs(expected) > 0.01
+            np.testing.assert_allclose(np.sum(gradient[at] * np.asarray(along)), expected, rtol=1e-5)
+
+
 # ---- with light, labels, tiles ----
 
 
