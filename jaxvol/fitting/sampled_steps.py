@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .constraints import FreeVariables
 from .outcomes import Limits, Outcome
@@ -31,8 +31,8 @@ from .residuals import Triangles
 from .uncertainty import spreads
 
 
-LONGEST = 1.0
-"""A step moves no free variable, which are of order 1, by more than this."""
+LONGEST = 1.0, 0.5
+"""A step moves no free variable by more than the first, or by more than this part of itself."""
 
 FLOOR = 0.3
 """Smallest curvature in any direction by a single sample, relative to that with noise, which is larger: the
@@ -46,7 +46,8 @@ LEAST = 12
 
 ENOUGH = 0.5
 """A fit has converged when the noise of its own paths is at most this fraction of the standard error that the
-references leave: together, these are at most 12 % larger than the latter."""
+references leave: together, these are at most 12 % larger than the latter; and no step of those that are
+averaged was shortened, since the minimum lay too far away."""
 
 
 class Estimate(NamedTuple):
@@ -69,6 +70,8 @@ class Averages(eqx.Module):
     """Means over samples at several points."""
 
     steps: Float[Array, ""]
+    cut: Float[Array, ""]
+    """1 for a sample that a shortened step led to, else 0."""
     point: Float[Array, " free"]
     rows: Float[Array, "pixels channels columns"]
     """[J r]."""
@@ -83,7 +86,9 @@ class Averages(eqx.Module):
     """Sum over pixels of the squared variance of a step's mean residual, at most."""
 
     @classmethod
-    def of(cls, point: Float[Array, " free"], sample: Sample, known: Array, others: Array) -> "Averages":
+    def of(
+        cls, point: Float[Array, " free"], cut: Array, sample: Sample, known: Array, others: Array
+    ) -> "Averages":
         """Of one sample. `known`: the mean rows over `others` steps before."""
         columns = sample.rows.shape[-1]
         rows, apart = jnp.mean(sample.rows, axis=0), (sample.rows[0] - sample.rows[1])[..., -1:] / 2
@@ -93,7 +98,8 @@ class Averages(eqx.Module):
         scores = jnp.sum(mean * apart, axis=1)
         fourth = jnp.sum(jnp.sum(apart**2, axis=(1, 2)) ** 2)
         squares = jnp.sum(mean[..., -1] ** 2)
-        return cls(jnp.ones((), rows.dtype), point, rows, products, scores.T @ scores, squares, fourth)
+        one = jnp.ones((), rows.dtype)
+        return cls(one, cut.astype(one.dtype), point, rows, products, scores.T @ scores, squares, fourth)
 
     def joined(self, other: "Averages") -> "Averages":
         """Over the samples of both."""
@@ -129,6 +135,7 @@ class SampledState(eqx.Module):
     Attributes:
         y: where the next sample is taken.
         evaluated: where the last one was.
+        cut: whether the step to `y` was shortened.
         step: number of samples so far.
         last: averages over the last epoch; of no steps at first.
         current: over this one.
@@ -139,6 +146,7 @@ class SampledState(eqx.Module):
 
     y: FreeVariables
     evaluated: FreeVariables
+    cut: Bool[Array, ""]
     step: Int[Array, ""]
     last: Averages
     current: Averages
@@ -150,13 +158,13 @@ class SampledState(eqx.Module):
 @eqx.filter_jit
 def first_state(problem: SampledProblem | Any, y: FreeVariables) -> SampledState:
     """Before any step. `problem`: whatever has such a method `sample`."""
-    flat, _ = ravel_pytree(y)
+    (flat, _), no = ravel_pytree(y), jnp.zeros((), bool)
     sample = eqx.filter_eval_shape(problem.sample, y, jnp.zeros((), jnp.int32))
-    averages = eqx.filter_eval_shape(lambda s: Averages.of(flat, s, s.rows[0], flat[0]), sample)
+    averages = eqx.filter_eval_shape(lambda s: Averages.of(flat, no, s, s.rows[0], flat[0]), sample)
     none = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), averages)
     zero, n = jnp.zeros((), flat.dtype), flat.size
     estimate = Estimate(flat, jnp.zeros((n, n), flat.dtype), zero, zero)
-    return SampledState(y, y, jnp.zeros((), jnp.int32), none, none, none, zero, estimate)
+    return SampledState(y, y, no, jnp.zeros((), jnp.int32), none, none, none, zero, estimate)
 
 
 @eqx.filter_jit
@@ -165,15 +173,16 @@ def next_state(problem: SampledProblem | Any, state: SampledState) -> SampledSta
     sample = problem.sample(state.y, state.step)
     flat, unravel = ravel_pytree(state.y)
     known = state.window
-    added = Averages.of(flat, sample, known.rows, known.steps)
+    added = Averages.of(flat, state.cut, sample, known.rows, known.steps)
     current = state.current.joined(added)
     window = state.last.joined(current)
     estimate = window.estimate
-    y = unravel(flat + jnp.clip(estimate.point - flat, -LONGEST, LONGEST))
+    step, most = estimate.point - flat, jnp.maximum(LONGEST[0], LONGEST[1] * jnp.abs(flat))
+    y, cut = unravel(flat + jnp.clip(step, -most, most)), jnp.any(jnp.abs(step) > most)
     ended, none = current.steps >= FORGET * state.last.steps, jax.tree.map(jnp.zeros_like, current)
     last = jax.tree.map(lambda new, old: jnp.where(ended, new, old), current, state.last)
     current = jax.tree.map(lambda new, old: jnp.where(ended, new, old), none, current)
-    return SampledState(y, state.y, state.step + 1, last, current, window, sample.loss, estimate)
+    return SampledState(y, state.y, cut, state.step + 1, last, current, window, sample.loss, estimate)
 
 
 class SampledRun(eqx.Module):
@@ -241,11 +250,16 @@ class SampledRun(eqx.Module):
         loose = own > limits.atol + limits.rtol * np.abs(flat)
         return float(np.max((own / left)[loose], initial=0))
 
+    @property
+    def settled(self) -> bool:
+        """Whether no step to a sample that is averaged, nor the last one, was shortened."""
+        return not (bool(self.state.cut) or self.state.window.cut > 0)
+
     def ended(self, problem: SampledProblem, limits: Limits) -> Any:
         """The result if the fit has ended, else None."""
         if not math.isfinite(self.losses[-1]):
             return Outcome.nonfinite
-        if len(self.losses) >= LEAST and self.ratio(problem, limits) <= ENOUGH:
+        if self.settled and len(self.losses) >= LEAST and self.ratio(problem, limits) <= ENOUGH:
             return Outcome.successful
         return Outcome.nonlinear_max_steps_reached if len(self.losses) >= limits.max_steps else None
 

@@ -1,7 +1,7 @@
 """Materials: how they scatter light, and where in a volume they are."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from ..scene.volume import Volume
 
 
 EDGE = 0.1
-"""A material with soft edges fades in and out over this fraction of its value range."""
+"""Materials with soft edges fade in and out over this fraction of the narrowest value range."""
 
 
 class Optics(NamedTuple):
@@ -101,14 +101,22 @@ def optics_of(materials: Sequence[Material]) -> Optics:
 
 
 def shares(
-    materials: tuple[Material, ...], volume: Volume, coordinate: Vec3, value: Scalar, *, edge: float = 0.0
+    materials: tuple[Material, ...],
+    volume: Volume,
+    coordinate: Vec3,
+    value: Scalar,
+    *,
+    edge: float = 0.0,
+    labels: Literal["nearest", "linear"] = "nearest",
 ) -> tuple[Scalar, ...]:
     """Share of each material at a grid coordinate with this value: 1 for the first that is present, 0 for all
-    others. `edge`: the fraction of its value range over which a material fades; above 0, shares are
-    continuous and sum to at most 1, and labels are looked up trilinearly."""
+    others. `edge`: over which fraction of the narrowest value range materials fade; above 0, or with
+    `"linear"` labels, shares are continuous and sum to at most 1."""
     remaining, each = jnp.ones_like(value), []
+    ranges = [one.values[1] - one.values[0] for one in materials if one.values is not None]
+    width = edge * jax.lax.stop_gradient(jnp.min(jnp.stack(ranges))) if ranges else jnp.zeros_like(value)
     for one in materials:
-        if one.label is not None and edge == 0:
+        if one.label is not None and labels == "nearest":
             share = (volume.label(coordinate) == one.label).astype(value.dtype)
         elif one.label is not None:
             share = volume.label_share(coordinate, one.label)
@@ -119,10 +127,10 @@ def shares(
             if edge == 0:
                 share = step(value - low) * step(high - value)
             else:
-                width = edge * (high - low)
                 share = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
-        each.append(remaining * share)
-        remaining = remaining * (1 - share)
+        # so that of two that follow each other, each has half where they meet
+        each.append(jnp.where(share > remaining, remaining, share))  # NaN stays NaN
+        remaining = remaining - each[-1]
     return tuple(each)
 
 

@@ -209,7 +209,8 @@ class PhotonShading(Shading):
         return Medium(_sum(each), ratio, optics.mean_free_path, optics.refractive_index)
 
     def shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        return shares_of(self.materials, around.volume, coordinate, value, edge=EDGE if self._soft else 0.0)
+        how: Any = {"edge": EDGE, "labels": "linear"} if self._soft else {}
+        return shares_of(self.materials, around.volume, coordinate, value, **how)
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
         """Visibility of a photon from the sample, from the extinctions at its place and at `reach`."""

@@ -260,7 +260,7 @@ class Transport(NamedTuple):
     def flights(self) -> Float[Array, "flights 4"]:
         """Direction and length, in mean free paths, of each flight: by level, walk and set."""
         key = jax.random.key(self.seed)
-        g = jnp.zeros((), self.dtype) if self.anisotropy is None else self.anisotropy
+        g = jnp.zeros((), self.dtype) if self.anisotropy is None else jax.lax.stop_gradient(self.anisotropy)
         directions, lengths = unit_walks(key, self.sets, self.walks, self.levels, g)
         return jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(-1, 4)
 
@@ -392,7 +392,13 @@ class _Grid(NamedTuple):
                 def advance(state: _State, level: Int[Array, ""]) -> tuple[_State, None]:
                     words = word, index.astype(jnp.uint32), level.astype(jnp.uint32), seed
                     choice = hashed_uniforms_4(*words)[0].astype(dtype)
-                    return self.advanced(state, *flight(level), choice, depths), None
+                    direction, length = flight(level)
+                    if (g := transport.anisotropy) is not None:  # 1, with the derivative of turns
+                        before, _ = flight(jnp.maximum(level - 1, 0))
+                        density = jnp.where(level > 0, phase(dot(before, direction), g), 1)
+                        turned = scaled(state.throughput, density / jax.lax.stop_gradient(density))
+                        state = state._replace(throughput=turned)
+                    return self.advanced(state, direction, length, choice, depths), None
 
                 none, all_ = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
                 start = _State(self.point(number), extinction, rate, all_, none)
@@ -409,7 +415,9 @@ class _Grid(NamedTuple):
     ) -> _State:
         """A walk after its next flight, of this length in mean free paths, and the light that it gathers."""
         transport, (point, extinction, own, throughput, light) = self.transport, state
-        rates = transport.rates
+        # Walks stay where they are under the derivative, which is that of their weights: as they moved, it
+        # would lack what they gain or lose where the extinction jumps, at every surface.
+        own, rates = jax.lax.stop_gradient((own, transport.rates))
         least = LEAST * rates[0]
         own = jnp.maximum(own, least)
         distance = length / jnp.maximum(_proposed(own, rates, choice), least)

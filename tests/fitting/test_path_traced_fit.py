@@ -14,7 +14,7 @@ import jaxvol as jv
 from experiments.coverage import mean_free_path
 from experiments.mean_free_path import balls, cameras, lights
 from jaxvol.fitting.path_traced import Sample
-from jaxvol.fitting.sampled_steps import first_state, next_state
+from jaxvol.fitting.sampled_steps import SampledRun, first_state, next_state
 
 
 # -- a model whose noise is known -------------------------------------------------------------------------
@@ -31,13 +31,15 @@ class Decay(eqx.Module):
     seed: jax.Array
     off: jax.Array
     """By how much every other datum is above, the rest below what any parameters show."""
+    unit: jax.Array
+    """Of p and q."""
 
     def sample(self, at, step):
-        (at,) = at
+        at = at[0] / self.unit
         key = jax.random.fold_in(jax.random.key(self.seed), step)
         noise = jax.random.normal(key, (2, X.size, 1)) * 0.5
         mean = jnp.exp(-at[1] * X)[:, None]
-        derivative = jnp.concatenate([mean, -X[:, None] * at[0] * mean], axis=1)
+        derivative = jnp.concatenate([mean, -X[:, None] * at[0] * mean], axis=1) / self.unit
         data = TRUTH[0] * np.exp(-TRUTH[1] * X)[:, None] + self.off * (-1.0) ** np.arange(X.size)[:, None]
         error = at[0] * mean[None] * (1 + noise) - data[None]
         rows = jnp.concatenate([derivative[None] * (1 + noise), error], axis=-1)
@@ -45,31 +47,34 @@ class Decay(eqx.Module):
 
 
 @jax.jit
-def fits(seeds: Any, off: Any) -> tuple[jax.Array, ...]:
+def fits(seeds: Any, off: Any, unit: Any) -> tuple[jax.Array, ...]:
     """After each step, of fits by other noise each: results, the standard errors that they report, losses and
-    theirs."""
+    theirs, and the share of shortened steps."""
 
     def fit(seed):
-        problem: Any = Decay(seed, off)
+        problem: Any = Decay(seed, off, unit)
 
         def step(state, _):
             state = next_state(problem, state)
             error = jnp.sqrt(jnp.diagonal(state.estimate.covariance))
-            return state, (state.y[0], error, state.estimate.loss, state.estimate.loss_error)
+            told = state.estimate.loss, state.estimate.loss_error, state.window.cut
+            return state, (state.y[0] / unit, error / unit, *told)
 
-        return jax.lax.scan(step, first_state(problem, (jnp.asarray([2.0, 0.5]),)), length=240)[1]
+        start = (jnp.asarray([2.0, 0.5]) * unit,)
+        return jax.lax.scan(step, first_state(problem, start), length=240)[1]
 
     return jax.vmap(fit)(seeds)
 
 
 @cache
-def found(off: float = 0.0) -> tuple[np.ndarray, ...]:
-    return tuple(map(np.asarray, fits(jnp.arange(40, dtype=jnp.int32), jnp.float32(off))))
+def found(off: float = 0.0, unit: float = 1.0) -> tuple[np.ndarray, ...]:
+    given = jnp.float32(off), jnp.float32(unit)
+    return tuple(map(np.asarray, fits(jnp.arange(40, dtype=jnp.int32), *given)))
 
 
 def test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said():
     """And the loss there, which is 0, has no bias by the noise."""
-    y, error, loss, _ = found()
+    y, error, loss, *_ = found()
     for steps in (60, 240):
         off = y[:, steps - 1] - TRUTH
         assert np.all(np.mean(np.abs(off) < 2 * error[:, steps - 1], axis=0) >= 0.85)
@@ -82,7 +87,7 @@ def test_samples_of_independent_halves_lead_to_the_truth_as_near_as_is_said():
 @pytest.mark.parametrize("off", [0.0, 0.2])
 def test_the_error_of_the_loss_is_its_standard_deviation_over_seeds(off):
     """Also where the model does not fit. (Fourth powers of noise make it too large by up to √3.)"""
-    _, _, loss, told = found(off)
+    _, _, loss, told, _ = found(off)
     spread = loss[:, -1].std(ddof=1)
     assert 0.75 < told[:, -1].mean() / spread < 2.2
     assert abs(loss[:, -1].mean() - off**2 / 2) < 4 * spread / 40**0.5 + 0.1 * off**2 / 2
@@ -91,6 +96,24 @@ def test_the_error_of_the_loss_is_its_standard_deviation_over_seeds(off):
 def test_noise_falls_with_the_square_root_of_the_steps():
     few, many = (np.abs(found()[0][:, steps - 1] - TRUTH).mean() for steps in (15, 240))
     assert 2.5 < few / many < 8
+
+
+@pytest.mark.parametrize("unit", [0.01, 100.0])
+def test_any_unit_will_do(unit):
+    """As mean free paths of millimetres. Far steps are shortened, and are known to be."""
+    y, error, *_, cut = found(unit=unit)
+    off = y[:, -1] - TRUTH
+    assert np.all(np.mean(np.abs(off) < 2 * error[:, -1], axis=0) >= 0.85)
+    assert (unit < 1) == np.all(cut[:, 3] == 0)
+    np.testing.assert_array_equal(cut[:, -1], 0)
+
+
+def test_a_fit_whose_steps_are_shortened_has_not_settled():
+    problem: Any = Decay(jnp.int32(0), jnp.float32(0), jnp.float32(1))
+    state = first_state(problem, (jnp.asarray([2.0, 0.5]),))
+    assert SampledRun(state, []).settled
+    for where in (lambda s: s.cut, lambda s: s.window.cut):
+        assert not SampledRun(eqx.tree_at(where, state, jnp.float32(0.1)), []).settled
 
 
 # -- path-traced images -----------------------------------------------------------------------------------

@@ -24,6 +24,9 @@ from jaxvol.lighting import (
     scatterer_templates,
     transport,
 )
+from jaxvol.lighting.materials import EDGE, shares
+from jaxvol.lighting.medium import scattering_at
+from jaxvol.lighting.shading import Surroundings
 
 from ..scenes import in_float64
 
@@ -74,6 +77,30 @@ def light_of(of_materials: Any, lights: Any, **how: Any) -> ScattererTemplates:
 def image(volume: Any, function: Any, lighting: Any, adjoint: Any = "replay") -> Any:
     rendered = jv.render(volume, function, CAMERA, MARCH, lighting=lighting, adjoint=adjoint)
     return rendered.image((0.0, 0.0, 0.0))
+
+
+# ---------------------------------------------------------------- the medium
+
+
+def test_where_two_materials_meet_nothing_is_in_neither():
+    volume = nested()
+    values = np.linspace(5, 190, 400, dtype=np.float32)
+    each = jax.jit(jax.vmap(lambda v: shares(materials(1, 1), volume, (v, v, v), v, edge=EDGE)))(values)
+    np.testing.assert_allclose(sum(each)[values > 13], 1, rtol=1e-6)
+    assert each[0][np.searchsorted(values, 60)] == pytest.approx(0.5, abs=0.1)
+
+
+def test_two_labels_of_one_material_are_one():
+    labels = np.where(np.indices(SHAPE)[0] < 5, 1, 2).astype(np.uint8)
+    volume = jv.Volume(np.ones(SHAPE, np.uint8), nested().spacing, nested().origin, labels)
+    one = jv.TransferFunction([0, 1], [(0.8, 0.5, 0.9)] * 2, [2.0, 2.0])
+    around = Surroundings(volume, jv.LabelTransferFunction({1: one, 2: one}), MARCH.locate(volume))
+    of_labels = tuple(Material(0.3, 0.5, label=label) for label in (1, 2))
+    places = np.random.default_rng(0).uniform(-0.95, 0.95, (3, 300)).astype(np.float32)
+    found = jax.jit(jax.vmap(lambda x, y, z: scattering_at(around, of_labels, (x, y, z))))(*places)
+    for albedo, color in zip(found.albedo, (0.8, 0.5, 0.9), strict=True):
+        np.testing.assert_allclose(albedo, 0.7 * color, rtol=1e-6)
+    np.testing.assert_allclose(found.extinction, 2, rtol=1e-6)
 
 
 # ---------------------------------------------------------------- templates
@@ -179,6 +206,26 @@ def test_light_between_nodes_is_that_of_a_cubic_and_at_faces_of_a_line():
 
 
 # ---------------------------------------------------------------- derivatives
+
+
+def test_light_changes_with_the_mean_free_path_as_its_derivative_says():
+    """Where the extinction jumps at surfaces, and flights end behind them."""
+    volume = nested()
+    around = Surroundings(volume, transfer(2.5), MARCH.locate(volume))
+
+    @jax.jit
+    def light(path: Any) -> Any:
+        how: tuple[Any, ...] = (lit(SUN, SKY), None, 0, 64, 16, LEVELS)
+
+        def total(path: Any) -> Any:
+            return jnp.mean(transport.Transport(around, (Material(0.2, path),), *how).solved(12).radiance)
+
+        return jax.jvp(total, (path,), (jnp.ones_like(path),))
+
+    at, step = 0.4, 0.06
+    _, found = light(jnp.float32(at))
+    expected = (light(jnp.float32(at + step))[0] - light(jnp.float32(at - step))[0]) / (2 * step)
+    np.testing.assert_allclose(found, expected, rtol=0.08)
 
 
 @pytest.mark.slow
