@@ -50,8 +50,7 @@ class Fit(eqx.Module):
         solution: optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
         losses: half the sum of squared residuals at the solver's point after each step; of a
             `PathTracedResidual`, samples of it, which may be negative.
-        uncertainty: `covariance`, `names`, `standard_errors`, `undetermined` directions and
-            `reduced_chi_squared`, for a least-squares solver; else None.
+        uncertainty: an `Uncertainty`, for a least-squares solver; else None.
     """
 
     parameters: PyTree
@@ -203,7 +202,7 @@ def fit_in_stages(
 ) -> list[Fit]:
     """Fit parameters to residuals in turn, each time from where the last fit ended.
 
-    For example to a fast model first, and then to the one that the references are by:
+    For example to a model without noise first, and then to the one that the references are by:
 
         templates = jv.ImageResidual(lit_scene, views, (0, 0, 0))
         paths = jv.PathTracedResidual(traced_scene, views, (0, 0, 0))

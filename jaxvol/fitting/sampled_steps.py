@@ -273,5 +273,5 @@ class SampledRun(eqx.Module):
         ratio = self.ratio(problem, limits)
         return (
             f"The fit {ended}: noise of its own paths adds {ratio:.2g} times the standard error that the "
-            "references leave."
+            f"references leave ({ENOUGH} is enough)."
         )

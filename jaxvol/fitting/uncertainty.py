@@ -63,7 +63,7 @@ class Uncertainty(NamedTuple):
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Square roots of the variances in `covariance`, by name."""
+        """Square roots of the variances in `covariance`, by name; of a single number, the name is empty."""
         return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 

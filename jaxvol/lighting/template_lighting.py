@@ -90,8 +90,12 @@ class ScattererTemplates(Lighting):
     optical depths along flights, by Simpson's rule, which miss gaps narrower than a flight; with anisotropy,
     the directions of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of
     the march should be short against the mean free path, too: of a third of it, they make images up to 3 %
-    too bright. Points at which the extinction becomes 0 do not move under the derivative; edges of materials
-    do. How near it comes to path tracing: `experiments/transport.py`.
+    too bright. How near it comes to path tracing: `experiments/transport.py`.
+
+    Its derivatives are those of the mean over all walks: under them walks stay where they are, and count
+    more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ or g change, so
+    that its differences show the derivative only over some 10 % of λ. If voxels change, edges of materials
+    move under the derivative, but not the surface at which the extinction becomes 0.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
     gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would

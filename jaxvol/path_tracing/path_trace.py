@@ -199,7 +199,8 @@ def path_trace(
     The image is radiance, in the unit of `lights`, as that of `ScattererTemplates`: in a white furnace
     (albedo 1 under a `ConstantLight` of radiance L) it is L times the opacity.
 
-    NaN or infinity in any input makes the whole image NaN, since any path may reach it.
+    NaN or infinity in any input makes the whole image NaN, since any path may reach it (what has a range,
+    such as a mean free path, is an error then). Images are float32, also of float64 scenes.
 
     Random numbers have 24 bits, so free paths longer than 16.6 mean free paths within a block of voxels, of
     probability 6e-8, are never drawn.
