@@ -243,7 +243,7 @@ class Replay(SampleVisitor):
         rays = jax.vmap(one, in_axes=(None, None, 0, None, 0, 0, 0, None))
         cells = jax.vmap(rays, in_axes=(None, None, None, None, 0, None, None, 0))
 
-        def all_(moving: tuple[PyTree, ...], perturbations: list[Cube]) -> PyTree:
+        def all_(moving: tuple[PyTree, PyTree, PyTree, PyTree], perturbations: list[Cube]) -> PyTree:
             each = jnp.arange(number, dtype=at.index.dtype)
             return cells(*moving, perturbations, ray_fixed, at, each)
 

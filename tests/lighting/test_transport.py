@@ -86,7 +86,7 @@ def test_where_two_materials_meet_nothing_is_in_neither():
     volume = nested()
     values = np.linspace(5, 190, 400, dtype=np.float32)
     each = jax.jit(jax.vmap(lambda v: shares(materials(1, 1), volume, (v, v, v), v, edge=EDGE)))(values)
-    np.testing.assert_allclose(sum(each)[values > 13], 1, rtol=1e-6)
+    np.testing.assert_allclose(np.sum(each, axis=0)[values > 13], 1, rtol=1e-6)
     assert each[0][np.searchsorted(values, 60)] == pytest.approx(0.5, abs=0.1)
 
 

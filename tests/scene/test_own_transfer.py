@@ -34,7 +34,8 @@ def test_what_is_read_beside_the_value_has_its_gradient():
     @eqx.filter_jit
     def gradient(scene: Any, adjoint: Any) -> Any:
         def loss(scene: Any) -> Any:
-            return jnp.sum(jv.render(*scene, camera, march, adjoint=adjoint).rgba ** 2)
+            volume, transfer = scene
+            return jnp.sum(jv.render(volume, transfer, camera, march, adjoint=adjoint).rgba ** 2)
 
         return eqx.filter_grad(loss)(scene)
 
