@@ -254,7 +254,7 @@ def test_gradients_are_those_of_differences_in_all_adjoints():
         "mean free path": (lambda s: s[2][1].mean_free_path, 0.03),
         "anisotropy": (lambda s: s[4], 0.05),
         "extinction": (lambda s: s[1].extinction, 0.2),
-        "voxels": (lambda s: s[0].data, 0.3),
+        "voxels": (lambda s: s[0].data, 0.03),
     }
     with in_float64():
         scene, seen = jax.tree.map(
