@@ -230,9 +230,7 @@ def test_light_changes_with_the_mean_free_path_as_its_derivative_says():
 
 @pytest.mark.slow
 def test_gradients_are_those_of_differences_in_all_adjoints():
-    # in float64, by steps so short that no end of a flight passes an edge of a material; visible everywhere,
-    # since points where the extinction jumps do not move under the derivative; and no voxel has the value of
-    # a control point, where the extinction has two derivatives
+    # no voxel has the value of a control point, where the extinction has two derivatives
     volume = eqx.tree_at(lambda volume: volume.data, nested(), nested().data + 5)
     scene = volume, transfer(2.0, least=0.5), materials(0.5, 0.25), lit(SUN, LAMP, SKY), jnp.float32(0.3)
     weights = np.random.default_rng(0).uniform(0, 2, size=(8, 8, 3))
