@@ -1,8 +1,8 @@
 """Draws charts and pages from their records; nothing is measured.
 
 `python -m experiments.redraw` draws all, `--only speed kisti` some. They are not kept beside the records, and
-the documentation draws its own. `path_traced.webp`, `tomography.png` and `lit.png` are drawn by their
-experiments alone. `pareto.html` holds images only if its experiment left some here.
+the documentation draws its own. `path_traced.webp`, `transport.webp`, `tomography.png` and `lit.png` are
+drawn by their experiments alone. `pareto.html` holds images only if its experiment left some here.
 
 To measure a result again, run the `command` of its record, on a machine that does nothing else.
 """
@@ -15,7 +15,7 @@ from .harness import command, some_of
 
 
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
-IMAGES = {"path_traced", "tomography"}
+IMAGES = {"path_traced", "tomography", "transport"}
 """Records whose charts show images that no record holds."""
 OTHERS = {
     *("bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),

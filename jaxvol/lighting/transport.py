@@ -48,13 +48,14 @@ LOCAL_STEPS = 6
 LOCAL = 2.25
 """Length of these, in the grid's spacing."""
 
-OWN = 0.85
-"""Share of flights whose length is drawn at the rate of collisions where they begin. The others' is drawn at
-that of any material, or of thin matter, so that no weight is large where a flight goes on in thinner matter,
-or beyond a cavity."""
+LOOKS = 8
+"""Steps of a flight up to the volume's end, each as deep as the matter at one place in it."""
 
-THIN = 4
-"""Mean free paths of thin matter along the diagonal of the volume."""
+GOLDEN = (math.sqrt(5) - 1) / 2
+"""By which the places in steps differ, so that all depths of steps are seen."""
+
+SPREAD = 0.02
+"""Share of flights that end in any of the steps, in matter or not, so that derivatives see thin matter."""
 
 COPIES = 3
 """Of the radiance on the finer grid, that are held at once."""
@@ -63,7 +64,7 @@ NODES = 2**9, 2**12
 """Nodes at a time for walks, and for what is simpler."""
 
 LEAST = 1e-6
-"""Least rate of collisions by which anything is divided, relative to that of thin matter, and its density."""
+"""Least optical depth by which anything is divided."""
 
 
 class ScatteredLight(Shading):
@@ -223,9 +224,9 @@ class Transport(NamedTuple):
             4 * math.prod(_finer(grid.shape)) * COPIES * 3 * harmonics_,
             f"light at {nx} x {ny} x {nz} nodes for baked={nodes}; use fewer",
         )
-        matter, near, far = grid.matter()
+        rates, near, far = grid.matter()
         depths = grid.depths(far)
-        radiance = refined(grid.radiance(near, matter, depths).reshape(*grid.shape, -1))
+        radiance = refined(grid.radiance(near, rates, depths).reshape(*grid.shape, -1))
         if self.order == 0:
             radiance = jnp.maximum(radiance, 0)
         radiance = radiance.reshape(-1, radiance.shape[-1])
@@ -251,12 +252,6 @@ class Transport(NamedTuple):
         constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
         return apart(sum(constant, jnp.zeros(3, self.dtype)))
 
-    @property
-    def rates(self) -> list[Scalar]:
-        """Rates of collision at which the lengths of flights are proposed, besides that where they begin."""
-        thin = THIN / jax.lax.stop_gradient(self.around.space.diagonal)
-        return [thin, *(1 / material.mean_free_path for material in self.materials)]
-
     def flights(self) -> Float[Array, "flights 4"]:
         """Direction and length, in mean free paths, of each flight: by level, walk and set."""
         key = jax.random.key(self.seed)
@@ -269,11 +264,10 @@ class Transport(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of a walk: where it is, extinction and rate of collisions there, the fraction of the light there that
-    arrives where the walk began, and the radiance gathered so far."""
+    """Of a walk: where it is, the rate of collisions there, the fraction of the light there that arrives
+    where the walk began, and the radiance gathered so far."""
 
     point: Vec3
-    extinction: Scalar
     rate: Scalar
     throughput: Vec3
     light: Vec3
@@ -320,11 +314,10 @@ class _Grid(NamedTuple):
         whole = jnp.zeros((self.size, *found.shape[1:]), found.dtype)
         return whole.at[chunks.reshape(-1)].set(found, mode="drop")
 
-    def matter(self) -> tuple[tuple[Array, Array], Int[Array, " nodes"], Int[Array, " nodes"]]:
-        """The extinction at all nodes and the rate of collisions around them; and the numbers of the nodes
-        near visible ones, and of those farther off, too, followed by numbers past the last."""
-        offsets = np.array([(0, 0, 0), *np.ndindex(2, 2, 2)]) / 2 - 0.25
-        offsets[0] = 0
+    def matter(self) -> tuple[Float[Array, " nodes"], Int[Array, " nodes"], Int[Array, " nodes"]]:
+        """The rate of collisions around all nodes; and the numbers of the nodes near visible ones, and of
+        those farther off, too, followed by numbers past the last."""
+        offsets = np.array([(0.5, 0.5, 0.5), *np.ndindex(2, 2, 2)]) / 2 - 0.25
 
         def one(number: Int[Array, ""]) -> Array:
             def there(offset: Float[Array, "3"]) -> Scattering:
@@ -333,17 +326,17 @@ class _Grid(NamedTuple):
             around = jax.vmap(there)(jnp.asarray(offsets, self.transport.dtype))
             seen = (around.extinction > 0).astype(around.rate.dtype)
             rate = jnp.sum(seen * around.rate) / jnp.maximum(jnp.sum(seen), 1)
-            return jnp.stack([around.extinction[0], rate, jnp.max(seen)])
+            return jnp.stack([rate, jnp.max(seen)])
 
         found = self.mapped(one, jnp.arange(self.size, dtype=jnp.int32), NODES[1])
-        rate, known = (found[:, i].reshape(*self.shape, 1) for i in (1, 2))
+        rate, known = (found[:, i].reshape(*self.shape, 1) for i in (0, 1))
         reached = []
         for _ in range(FAR):
             total, number = sum_neighbors(rate * known), sum_neighbors(known)
             rate = jnp.where(known > 0, rate, total / jnp.maximum(number, 1))
             known = (number > 0).astype(rate.dtype)
             reached.append(jnp.nonzero(known.reshape(-1) > 0, size=self.size, fill_value=self.size)[0])
-        return (found[:, 0], rate.reshape(-1)), reached[NEAR - 1], reached[-1]
+        return rate.reshape(-1), reached[NEAR - 1], reached[-1]
 
     def depths(self, nodes: Int[Array, " nodes"]) -> Float[Array, "nodes lights"]:
         """Optical depths from nodes towards the lights."""
@@ -370,7 +363,7 @@ class _Grid(NamedTuple):
         return self.mapped(one, nodes, NODES[1])
 
     def radiance(
-        self, near: Int[Array, " nodes"], matter: tuple[Array, Array], depths: Float[Array, "nodes lights"]
+        self, near: Int[Array, " nodes"], rates: Float[Array, " nodes"], depths: Float[Array, "nodes lights"]
     ) -> Float[Array, "nodes channels"]:
         """Radiance at nodes of light that was scattered before, or that comes from a constant light."""
         transport, flights = self.transport, self.transport.flights()
@@ -378,7 +371,7 @@ class _Grid(NamedTuple):
         seed, zero = jnp.uint32(transport.seed), jnp.zeros((), transport.dtype)
 
         def one(number: Int[Array, ""]) -> Array:
-            word, extinction, rate = number.astype(jnp.uint32), matter[0][number], matter[1][number]
+            word = number.astype(jnp.uint32)
             *turn, which = (u.astype(dtype) for u in hashed_uniforms_4(word, word, jnp.uint32(2**31), seed))
             axes, chosen = _rotation(*turn), (which * transport.sets).astype(jnp.int32)
 
@@ -391,17 +384,18 @@ class _Grid(NamedTuple):
 
                 def advance(state: _State, level: Int[Array, ""]) -> tuple[_State, None]:
                     words = word, index.astype(jnp.uint32), level.astype(jnp.uint32), seed
-                    choice = hashed_uniforms_4(*words)[0].astype(dtype)
+                    u = hashed_uniforms_4(*words)[0].astype(dtype)
                     direction, length = flight(level)
+                    quantile = -jnp.expm1(-length)
                     if (g := transport.anisotropy) is not None:  # 1, with the derivative of turns
                         before, _ = flight(jnp.maximum(level - 1, 0))
                         density = jnp.where(level > 0, phase(dot(before, direction), g), 1)
                         turned = scaled(state.throughput, density / jax.lax.stop_gradient(density))
                         state = state._replace(throughput=turned)
-                    return self.advanced(state, direction, length, choice, depths), None
+                    return self.advanced(state, direction, quantile, u, depths), None
 
                 none, all_ = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
-                start = _State(self.point(number), extinction, rate, all_, none)
+                start = _State(self.point(number), rates[number], all_, none)
                 end, _ = jax.lax.scan(advance, start, jnp.arange(levels, dtype=jnp.int32))
                 basis = harmonics(flight(jnp.zeros((), jnp.int32))[0], transport.order)
                 return packed([scaled(end.light, 4 * math.pi * each) for each in basis])
@@ -410,32 +404,49 @@ class _Grid(NamedTuple):
 
         return self.mapped(one, near, NODES[0])
 
-    def advanced(
-        self, state: _State, direction: Vec3, length: Scalar, choice: Scalar, depths: Array
-    ) -> _State:
-        """A walk after its next flight, of this length in mean free paths, and the light that it gathers."""
-        transport, (point, extinction, own, throughput, light) = self.transport, state
+    def advanced(self, state: _State, direction: Vec3, quantile: Scalar, u: Scalar, depths: Array) -> _State:
+        """A walk after its next flight, and the light that it gathers. The flight ends where the matter in
+        front of it leaves a fraction 1 - `quantile` of those that it meets; `u` varies where it looks."""
+        transport, (point, rate, throughput, light) = self.transport, state
+        pixel = jnp.zeros((), jnp.int32)
+        length = enter(transport.around.space, point, direction, (pixel, pixel)).length
         # Walks stay where they are under the derivative, which is that of their weights: as they moved, it
         # would lack what they gain or lose where the extinction jumps, at every surface.
-        own, rates = jax.lax.stop_gradient((own, transport.rates))
-        least = LEAST * rates[0]
-        own = jnp.maximum(own, least)
-        distance = length / jnp.maximum(_proposed(own, rates, choice), least)
-        density = jnp.maximum(_density(own, rates, distance), LEAST * least)
-        ends = jnp.stack([distance / 2, distance])
-        reads = jax.vmap(lambda s: transport.at(along(point, direction, s)))(ends)
-        middle, there = (jax.tree.map(lambda leaf, i=i: leaf[i], reads) for i in (0, 1))
-        depth = distance * (extinction + 4 * middle.extinction + there.extinction) / 6  # Simpson's rule
-        weight = there.extinction * jnp.exp(-depth) / density
+        places, widths = _looks(*jax.lax.stop_gradient((rate, length)), u)
+        met = jax.vmap(lambda s: transport.at(along(point, direction, s)).extinction)(places)
+        distance, weight = _ending(met * widths, places, quantile)
+        end = along(point, direction, distance)
+        there = transport.at(end)
         # the mean of 1 - weight is the fraction of flights that leave
         light = plus(light, scaled(times(throughput, transport.sky), 1 - weight))
         throughput = times(scaled(throughput, weight), there.albedo)
-        end = along(point, direction, distance)
         row = interpolated(depths, _on_grid(transport.around, self.shape, end))
         for i, source in enumerate(located(transport.lights)):
             added = arrived(source, end, direction, transport.anisotropy, jnp.exp(-row[i]))
             light = plus(light, times(throughput, added))
-        return _State(end, there.extinction, there.rate, throughput, light)
+        return _State(end, jnp.where(there.rate > 0, there.rate, rate), throughput, light)
+
+
+def _looks(rate: Scalar, length: Scalar, u: Scalar) -> tuple[Float[Array, "looks"], Float[Array, "looks"]]:
+    """A place in each step of a flight, and the steps' widths, which grow in proportion to the distance from
+    a mean free path on. In each step, places are distributed as collisions at this rate."""
+    number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(rate * length, LEAST)
+    ends = jnp.expm1(number / LOOKS * jnp.log1p(depth)) / depth
+    widths = jnp.diff(ends)
+    u = (u + GOLDEN * number[:-1]) % 1
+    within = -jnp.log1p(u * jnp.expm1(-depth * widths)) / depth
+    return length * (ends[:-1] + within), length * widths
+
+
+def _ending(depths: Float[Array, "looks"], places: Float[Array, "looks"], u: Scalar) -> tuple[Scalar, Scalar]:
+    """Which of the places is the end of a flight for a uniform number, and its weight: the probability of a
+    collision in steps of these optical depths over that by which the place is drawn."""
+    each = -jnp.expm1(-depths) * jnp.exp(depths - jnp.cumsum(depths))
+    drawn = jax.lax.stop_gradient(each + (SPREAD * jnp.sum(each) + LEAST) / LOOKS)
+    drawn = drawn / jnp.sum(drawn)
+    chosen = jnp.arange(LOOKS) == jnp.sum(jnp.cumsum(drawn)[:-1] < u)
+    place, weight = (jnp.sum(jnp.where(chosen, values, 0)) for values in (places, each / drawn))
+    return place, weight
 
 
 def _scattered(row: Float[Array, "channels"], direction: Vec3, anisotropy: Scalar | None) -> Vec3:
@@ -448,20 +459,6 @@ def _scattered(row: Float[Array, "channels"], direction: Vec3, anisotropy: Scala
     for coefficient, basis, power in each:
         total = plus(total, scaled(coefficient, basis * power))
     return total
-
-
-def _proposed(own: Scalar, rates: list[Scalar], u: Scalar) -> Scalar:
-    """The rate of collisions at which a flight's length is drawn, of those that `_density` mixes."""
-    chosen = own
-    for i, rate in enumerate(rates):
-        chosen = jnp.where(u >= OWN + (1 - OWN) * i / len(rates), rate, chosen)
-    return chosen
-
-
-def _density(own: Scalar, rates: list[Scalar], distance: Scalar) -> Scalar:
-    """Density of the length of a flight."""
-    others = sum(rate * jnp.exp(-rate * distance) for rate in rates) / len(rates)
-    return OWN * own * jnp.exp(-own * distance) + (1 - OWN) * others
 
 
 def _rotation(u: Scalar, v: Scalar, w: Scalar) -> tuple[Vec3, Vec3, Vec3]:
