@@ -75,22 +75,22 @@ class ScattererTemplates(Lighting):
     free paths".
 
     **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths can be
-    found from path-traced images. The medium is that of `path_trace` with these materials: the
-    extinction is 1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the
-    transfer function's, and samples in no material are lit, too. (Only the rays of the camera meet the
-    transfer function's extinction everywhere: let it be 1/λ for the same image.) The paper's photons become
-    the vertices of random walks: the sample itself counts; directions follow the phase function, not
-    refraction; a photon counts only if all those that it descends from are inside; and the scale is that of
-    scattering, not of a half-space's reflectance. Where the medium changes along a flight, weights make up
-    for it. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a
+    found from path-traced images. The medium is that of `path_trace` with these materials: the extinction is
+    1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the transfer function's,
+    and samples in no material are lit, too. (Only the rays of the camera meet the transfer function's
+    extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices of
+    random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
+    counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
+    half-space's reflectance. Flights are as long as the matter in front of them, seen at eight places, lets
+    them be. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a
     template at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`,
     `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the
     last `levels`, in materials at most `threshold` of all; the grid, whose nodes should be no further apart
     than half the mean free path (a ball under the sun is within 1 %, at three quarters of it 3 % too dark);
-    optical depths along flights, by Simpson's rule, which miss gaps narrower than a flight; with anisotropy,
-    the directions of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of
-    the march should be short against the mean free path, too: of a third of it, they make images up to 3 %
-    too bright. How near it comes to path tracing: `experiments/transport.py`.
+    places that flights see, which are farther apart the farther off they are; with anisotropy, the directions
+    of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of the march should
+    be short against the mean free path, too: of a third of it, they make images up to 3 % too bright. How
+    near it comes to path tracing: `experiments/transport.py`.
 
     Its derivatives are those of the mean over all walks: under them walks stay where they are, and count
     more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ or g change, so
@@ -129,7 +129,7 @@ class ScattererTemplates(Lighting):
             all templates is computed once and then fetched, as long as volume, transfer function and lighting
             stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
             With `"transport"`: the number of nodes, by default 48; its light carries gradients.
-        packets: of the templates, see `scatterer_template`; by default 4, and 8 for `"transport"`.
+        packets: of the templates, see `scatterer_template`; of `"transport"`, how many walks.
         threshold: of the templates.
         threshold_on: of the templates; the paper's is `"level"`.
         levels: of the templates; one number, or one for each material (of the published form).
@@ -176,7 +176,7 @@ class ScattererTemplates(Lighting):
         cutoff: float | None = None,
         seed: int = 0,
         baked: int | bool | Any = False,
-        packets: int | None = None,
+        packets: int = 4,
         threshold: float = 0.01,
         threshold_on: ThresholdOn | Any = "photon",
         levels: int | Sequence[int] | None = None,
@@ -196,7 +196,6 @@ class ScattererTemplates(Lighting):
             _check_unused({**published, "cutoff": cutoff, "interpolation": interpolation, "given": given})
         else:
             check_isotropic(anisotropy)
-        packets = (8 if form == "transport" else 4) if packets is None else packets
         templates = (256 if form == "transport" else 8) if templates is None else templates
         self.form = form
         self.anisotropy = None
