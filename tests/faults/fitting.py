@@ -72,6 +72,12 @@ FAULTS: list[Fault] = [
         ),
     ),
     Fault(
+        "fit by the path tracer: no step is longer than 1 in the parameters' own unit",
+        "fitting.sampled_steps:LONGEST",
+        lambda _: (1.0, 0.0),
+        ("fitting/test_path_traced_fit.py::test_any_unit_will_do[100.0]",),
+    ),
+    Fault(
         "fit: checkpoints of other fits are used",
         "fitting.checkpoints:load",
         lambda load: lambda path, like, about: load(path, like, {}),

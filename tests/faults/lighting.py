@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 
 from . import Fault
@@ -10,7 +11,7 @@ from . import Fault
 PHOTONS, SHADING = "lighting/test_photons.py::", "lighting/test_shading.py::"
 PHONG, PATHS = "lighting/test_phong.py::", "path_tracing/test_path_trace.py::"
 SLOPES = "path_tracing/test_derivatives.py::"
-TRANSPORT = "lighting/test_transport.py::test_light_is_that_of_path_tracing"
+TRANSPORT = "lighting/test_transport.py::"
 
 
 def between_ends(values, extinction, low, high):
@@ -61,19 +62,37 @@ FAULTS: list[Fault] = [
         "light: nothing shadows a sample but what is near",
         "lighting.transport:interpolated",
         lambda f: lambda rows, at: f(rows, at) * (rows.shape[-1] == 3),
-        (f"{TRANSPORT}[sun]",),
+        (f"{TRANSPORT}test_light_is_that_of_path_tracing[sun]",),
     ),
     Fault(
         "light: flights are longer than the mean free path",
         "lighting.transport:unit_walks",
         lambda f: lambda *given: (lambda turns, lengths: (turns, 1.5 * lengths))(*f(*given)),
-        (f"{TRANSPORT}[sky]",),
+        (f"{TRANSPORT}test_light_is_that_of_path_tracing[sky]",),
     ),
     Fault(
-        "light: flights at other rates than their own are not counted",
-        "lighting.transport:_density",
-        lambda f: lambda own, rates, length: own * jnp.exp(-own * length),
-        ("lighting/test_transport.py::test_lengths_of_flights_are_distributed_as_weights_take_them_to_be",),
+        "light: of flights, none leaves",
+        "lighting.transport:_ending",
+        lambda f: lambda *given: (f(*given)[0], 0 * f(*given)[1] + 1),
+        (f"{TRANSPORT}test_flights_end_as_often_as_light_is_scattered",),
+    ),
+    Fault(
+        "light: flights end as they do, whatever the derivative of the matter they meet",
+        "lighting.transport:_ending",
+        lambda f: lambda depths, *of: f(jax.lax.stop_gradient(depths), *of),
+        (f"{TRANSPORT}test_light_changes_with_the_mean_free_path_as_its_derivative_says",),
+    ),
+    Fault(
+        "light: flights look at the same places each time",
+        "lighting.transport:_looks",
+        lambda f: lambda rate, length, u: f(rate, length, 0 * u),
+        (f"{TRANSPORT}test_flights_end_as_often_as_light_is_scattered",),
+    ),
+    Fault(
+        "light: where two materials meet, some of the matter is in neither",
+        "lighting.materials:smoothstep",
+        lambda f: lambda x: f(x) * f(x),
+        (f"{TRANSPORT}test_where_two_materials_meet_nothing_is_in_neither",),
     ),
     Fault(
         "light: photons at voxels are not moved by refraction",

@@ -49,6 +49,12 @@ FAULTS: list[Fault] = [
         ("scene/test_own_transfer.py::test_what_is_read_beside_the_value_has_its_gradient",),
     ),
     Fault(
+        "selection: a sample stays where a moving face cuts its cell",
+        "ray:_movement",
+        lambda _: lambda march, ray, volume, depth, scale: depth * (scale - 1),
+        ("compositing/test_mode_images.py::test_a_selected_sample_moves_with_the_face_that_cuts_its_cell",),
+    ),
+    Fault(
         "transfer function: extinction below 0 has a gradient",
         "_util.piecewise_linear:not_negative",
         lambda _: lambda extinction: extinction,
