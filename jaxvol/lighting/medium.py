@@ -6,8 +6,13 @@ import jax
 import jax.numpy as jnp
 
 from .._util.vec3 import Scalar, Vec3
-from .materials import EDGE, Material, shares
+from .materials import Material, shares
 from .shading import Surroundings
+
+
+EDGE = 0.02
+"""Materials fade in and out over this fraction of the narrowest value range, so that their edges have
+derivatives. It is small, since matter at an edge absorbs too little."""
 
 
 class Scattering(NamedTuple):

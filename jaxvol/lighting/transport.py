@@ -28,8 +28,8 @@ from ..xla.memory import gather
 from .baked import sum_neighbors
 from .harmonics import harmonics, packed, powers, unpacked
 from .lights import ConstantLight, Light
-from .materials import EDGE, Material, shares
-from .medium import Scattering, clipped, scattering_at
+from .materials import Material, shares
+from .medium import EDGE, Scattering, clipped, scattering_at
 from .phase import phase
 from .random_walks import unit_walks
 from .shading import Sample, Shading, Surroundings
