@@ -21,8 +21,8 @@ class Scattering(NamedTuple):
     Attributes:
         extinction: 1/length; 0 where nothing is visible.
         albedo: of single scattering, (r, g, b).
-        rate: the extinction, without its fall to 0 at the volume's faces; along a flight from here,
-            collisions are proposed at this rate.
+        rate: the extinction, without its fall to 0 at the volume's faces; a flight from here looks
+            at places as far apart as light goes at this rate.
     """
 
     extinction: Scalar

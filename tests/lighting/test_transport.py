@@ -250,7 +250,7 @@ def test_light_changes_in_the_mean_over_walks_as_its_derivatives_say():
         return jnp.mean(transport.Transport(around, of_material, *how).solved(10).radiance)
 
     value, gradient = jax.jit(light), jax.jit(jax.grad(light))
-    steps, seeds = np.float32([0.05, 0.05, 0.04, 0.1]), range(24)
+    steps, seeds = np.array([0.05, 0.05, 0.04, 0.1], np.float32), range(24)
     found = np.array([gradient(jnp.zeros(4), seed) for seed in seeds])
     ends = np.array(
         [[[value(by, seed) for by in np.diag(sign * steps)] for sign in (1, -1)] for seed in seeds]
