@@ -129,9 +129,9 @@ MATCH = 1e-3
 
 FINAL: dict[type, str] = {
     Volume: "jaxvol.Field instead, and pass it as Volume(..., field=...)",
-    TransferFunction: "jaxvol.scene.transfer.Transfer instead",
-    TransferFunction2D: "jaxvol.scene.transfer.Transfer instead",
-    LabelTransferFunction: "jaxvol.scene.transfer.Transfer instead",
+    TransferFunction: "jaxvol.Transfer instead",
+    TransferFunction2D: "jaxvol.Transfer instead",
+    LabelTransferFunction: "jaxvol.Transfer instead",
 }
 """Classes whose subclasses may disagree with what the fast engine computes for the class itself (packed
 voxels, ranges of blocks, the VJP), and what to subclass instead."""

@@ -52,38 +52,38 @@ class _Index(EmptySpaceIndex):
 
 
 class _Space(Space):
-    """A space of which a part is left out, or all of it. What does not differ is that of the whole."""
+    """A space of which a part is left out, or all of it. What does not differ is that of the inner."""
 
     clipped: Space
-    whole: Space
+    inner: Space
     on: Bool[Array, ""]
 
     @property
     def searches(self):
-        return self.whole.searches
+        return self.inner.searches
 
     @property
     def diagonal(self):
-        return self.whole.diagonal
+        return self.inner.diagonal
 
     @property
     def middle(self):
-        return self.whole.middle
+        return self.inner.middle
 
     def coordinate(self, point):
-        return self.whole.coordinate(point)
+        return self.inner.coordinate(point)
 
     def point(self, coordinate):
-        return self.whole.point(coordinate)
+        return self.inner.point(coordinate)
 
     def least_distances(self, low, high):
-        return self.whole.least_distances(low, high)
+        return self.inner.least_distances(low, high)
 
     def path(self, entry, direction):
-        return self.whole.path(entry, direction)
+        return self.inner.path(entry, direction)
 
     def interval(self, origin, direction):
-        return either(self.on, *(s.interval(origin, direction) for s in (self.clipped, self.whole)))
+        return either(self.on, *(s.interval(origin, direction) for s in (self.clipped, self.inner)))
 
     def gaps(self, entry, direction, length):
         nowhere = jnp.full_like(length, jnp.inf)
@@ -92,10 +92,10 @@ class _Space(Space):
         )
 
     def occupancy(self, visible, first=None):
-        return either(self.on, *(s.occupancy(visible, first) for s in (self.clipped, self.whole)))
+        return either(self.on, *(s.occupancy(visible, first) for s in (self.clipped, self.inner)))
 
     def visible_at_faces(self, visible):
-        faces = self.whole.visible_at_faces(visible)
+        faces = self.inner.visible_at_faces(visible)
         cut = self.clipped.visible_at_faces(visible)
         return *faces, *(seen & self.on for seen in cut[len(faces) :])
 

@@ -32,7 +32,7 @@ from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..scene.transfer import Transfer, classification_of
+from ..scene.transfer import classification_of
 from ..scene.volume import with_fetch, with_voxels, without_voxels
 from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
 from ..xla.trees import PyTree, added, floats, zeros_of
@@ -193,8 +193,7 @@ class Replay(SampleVisitor):
     @property
     def reads_transfer(self) -> bool:
         """Whether what is measured at a sample may depend on the transfer function, and has a gradient."""
-        overridden = type(self.scene.transfer).attributes is not Transfer.attributes
-        return self.total.transfer is not None and overridden
+        return self.total.transfer is not None and self.scene.transfer.reads_more
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]

@@ -32,7 +32,7 @@ from .uncertainty import spreads
 
 
 LONGEST = 1.0, 0.5
-"""A step moves no free variable by more than the first, or by more than this part of itself."""
+"""A step moves no free variable by more than the first, or than this part of itself, whichever is more."""
 
 FLOOR = 0.3
 """Smallest curvature in any direction by a single sample, relative to that with noise, which is larger: the
@@ -270,6 +270,8 @@ class SampledRun(eqx.Module):
         ended = (
             "converged" if result == Outcome.successful else "reached the maximum number of steps, max_steps"
         )
+        if not self.settled:
+            return f"The fit {ended}: some of its last steps were shortened, since the answer is far off."
         ratio = self.ratio(problem, limits)
         return (
             f"The fit {ended}: noise of its own paths adds {ratio:.2g} times the standard error that the "

@@ -10,9 +10,10 @@ from .materials import Material, shares
 from .shading import Surroundings
 
 
-EDGE = 0.02
+FADE = 0.02
 """Materials fade in and out over this fraction of the narrowest value range, so that their edges have
-derivatives. It is small, since matter at an edge absorbs too little."""
+derivatives. It is small: at an outer edge, only half of what is visible counts as the material, and absorbs
+so."""
 
 
 class Scattering(NamedTuple):
@@ -21,13 +22,10 @@ class Scattering(NamedTuple):
     Attributes:
         extinction: 1/length; 0 where nothing is visible.
         albedo: of single scattering, (r, g, b).
-        rate: the extinction, without its fall to 0 at the volume's faces; a flight from here looks
-            at places as far apart as light goes at this rate.
     """
 
     extinction: Scalar
     albedo: Vec3
-    rate: Scalar
 
 
 def scattering_at(around: Surroundings, materials: tuple[Material, ...], point: Vec3) -> Scattering:
@@ -37,7 +35,7 @@ def scattering_at(around: Surroundings, materials: tuple[Material, ...], point: 
     measured = around.measured(point)
     there = around.classified(point, measured)
     color, own = around.classification.classify(measured)
-    fractions = shares(materials, around.volume, there.coordinate, there.value, edge=EDGE)
+    fractions = shares(materials, around.volume, there.coordinate, there.value, edge=FADE)
     rate, rest, kept = jnp.zeros_like(own), jnp.ones_like(own), jnp.ones_like(own)
     for fraction, material in zip(fractions, materials, strict=True):
         rate = rate + fraction / material.mean_free_path
@@ -46,7 +44,7 @@ def scattering_at(around: Surroundings, materials: tuple[Material, ...], point: 
     rate = rate + rest * own
     visible = there.extinction > 0
     r, g, b = (clipped(c) * kept for c in color)
-    return Scattering(jnp.where(visible, rate * there.inside, 0), (r, g, b), jnp.where(visible, rate, 0))
+    return Scattering(jnp.where(visible, rate * there.inside, 0), (r, g, b))
 
 
 @jax.custom_jvp

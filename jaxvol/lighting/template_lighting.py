@@ -81,7 +81,7 @@ class ScattererTemplates(Lighting):
     extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices of
     random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
     counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
-    half-space's reflectance. Flights are as long as the matter in front of them, seen at eight places, lets
+    half-space's reflectance. Flights are as long as the matter in front of them, seen at 16 places, lets
     them be. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a
     template at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`,
     `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the

@@ -21,7 +21,7 @@ from .._util.checks import all_finite
 from .._util.memory import require_room
 from .._util.noise import hashed_uniforms_4
 from .._util.vec3 import Scalar, Vec3, along, apart, dot, plus, scaled, times
-from ..scene.space import enter
+from ..scene.space import Space, enter
 from ..scene.volume import without_voxels
 from ..scene.voxel_fetch import corners
 from ..xla.memory import gather
@@ -29,7 +29,7 @@ from .baked import sum_neighbors
 from .harmonics import harmonics, packed, powers, unpacked
 from .lights import ConstantLight, Light
 from .materials import Material, shares
-from .medium import EDGE, Scattering, clipped, scattering_at
+from .medium import FADE, Scattering, clipped, scattering_at
 from .phase import phase
 from .random_walks import unit_walks
 from .shading import Sample, Shading, Surroundings
@@ -48,7 +48,7 @@ LOCAL_STEPS = 6
 LOCAL = 2.25
 """Length of these, in the grid's spacing."""
 
-LOOKS = 8
+LOOKS = 16
 """Steps of a flight up to the volume's end, each as deep as the matter at one place in it."""
 
 GOLDEN = (math.sqrt(5) - 1) / 2
@@ -63,8 +63,13 @@ COPIES = 3
 NODES = 2**9, 2**12
 """Nodes at a time for walks, and for what is simpler."""
 
+EVEN = 3.0
+"""Mean free paths of a step above which places in it are distributed as if it had so many: else none would
+lie in the far part of wide steps."""
+
 LEAST = 1e-6
-"""Least optical depth by which anything is divided."""
+"""Least optical depth by which anything is divided, and share of flights that end in matter or not even where
+they meet none."""
 
 
 class ScatteredLight(Shading):
@@ -96,7 +101,7 @@ class ScatteredLight(Shading):
         coordinate = around.space.coordinate(sample.point)
         row = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
         light = _scattered(row, sample.direction, self.anisotropy)
-        fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=EDGE)
+        fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=FADE)
         kept = jnp.ones_like(fractions[0])
         for fraction, material in zip(fractions, self.materials, strict=True):
             kept = kept - fraction * material.opacity
@@ -132,8 +137,18 @@ class ScatteredLight(Shading):
     def _ways(self, around: Surroundings, sample: Sample) -> list[tuple[Vec3, Scalar, Bool[Array, ""]]]:
         """Of each light, the direction, how far steps go, and whether they reach it."""
         near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
-        ways = (_way(light, sample.point, sample.direction) for light in located(self.lights))
-        return [(direction, jnp.minimum(near, distance), distance <= near) for direction, distance in ways]
+        found = []
+        for light in located(self.lights):
+            direction, distance = _way(light, sample.point, sample.direction)
+            reach = jnp.minimum(jnp.minimum(near, distance), _exit(around.space, sample.point, direction))
+            found.append((direction, reach, distance <= near))
+        return found
+
+
+def _exit(space: Space, point: Vec3, direction: Vec3) -> Scalar:
+    """Distance from a point in the volume to where a line leaves it."""
+    pixel = jnp.zeros((), jnp.int32)
+    return enter(space.whole, point, direction, (pixel, pixel)).length
 
 
 def located(lights: tuple[Light, ...]) -> list[Light]:
@@ -217,7 +232,8 @@ class Transport(NamedTuple):
         volume = self.around.volume
         nx, ny, nz = (max(2, round(nodes * n / max(volume.shape))) for n in volume.shape)
         # the transfer function's tables are computed once, before all loops
-        around = dataclasses.replace(self.around, tables=self.around.classification)
+        space, tables = self.around.space.whole, self.around.classification
+        around = dataclasses.replace(self.around, space=space, tables=tables)
         grid = _Grid(self._replace(around=around), (nx, ny, nz))
         harmonics_ = 9 if self.order else 1
         require_room(
@@ -324,8 +340,8 @@ class _Grid(NamedTuple):
                 return self.transport.at(self.point(number, apart(offset)))
 
             around = jax.vmap(there)(jnp.asarray(offsets, self.transport.dtype))
-            seen = (around.extinction > 0).astype(around.rate.dtype)
-            rate = jnp.sum(seen * around.rate) / jnp.maximum(jnp.sum(seen), 1)
+            seen = (around.extinction > 0).astype(around.extinction.dtype)
+            rate = jnp.sum(around.extinction) / jnp.maximum(jnp.sum(seen), 1)
             return jnp.stack([rate, jnp.max(seen)])
 
         found = self.mapped(one, jnp.arange(self.size, dtype=jnp.int32), NODES[1])
@@ -346,13 +362,12 @@ class _Grid(NamedTuple):
         steps = jnp.asarray(_growing(STEPS * max(self.shape)), transport.dtype)
 
         def toward(point: Vec3, light: Light) -> Scalar:
-            (direction, distance), pixel = _way(light, point, point), jnp.zeros((), jnp.int32)
-            ray = enter(transport.around.space, point, direction, (pixel, pixel))
-            length = jnp.minimum(ray.length, distance)
+            direction, distance = _way(light, point, point)
+            length = jnp.minimum(_exit(transport.around.space, point, direction), distance)
 
             def add(depth: Scalar, step: Float[Array, "2"]) -> tuple[Scalar, None]:
                 width, middle = step
-                place = along(ray.entry, direction, middle * length)
+                place = along(point, direction, middle * length)
                 return depth + width * transport.at(place).extinction, None
 
             return length * jax.lax.scan(add, jnp.zeros_like(length), steps)[0]
@@ -408,13 +423,9 @@ class _Grid(NamedTuple):
         """A walk after its next flight, and the light that it gathers. The flight ends where the matter in
         front of it leaves a fraction 1 - `quantile` of those that it meets; `u` varies where it looks."""
         transport, (point, rate, throughput, light) = self.transport, state
-        pixel = jnp.zeros((), jnp.int32)
-        length = enter(transport.around.space, point, direction, (pixel, pixel)).length
-        # Walks stay where they are under the derivative, which is that of their weights: as they moved, it
-        # would lack what they gain or lose where the extinction jumps, at every surface.
-        places, widths = _looks(*jax.lax.stop_gradient((rate, length)), u)
-        met = jax.vmap(lambda s: transport.at(along(point, direction, s)).extinction)(places)
-        distance, weight = _ending(met * widths, places, quantile)
+        looks = _looks(rate, _exit(transport.around.space, point, direction), u)
+        met = jax.vmap(lambda s: transport.at(along(point, direction, s)).extinction)(looks.places)
+        distance, weight = _ending(met, looks, quantile)
         end = along(point, direction, distance)
         there = transport.at(end)
         # the mean of 1 - weight is the fraction of flights that leave
@@ -424,29 +435,48 @@ class _Grid(NamedTuple):
         for i, source in enumerate(located(transport.lights)):
             added = arrived(source, end, direction, transport.anisotropy, jnp.exp(-row[i]))
             light = plus(light, times(throughput, added))
-        return _State(end, jnp.where(there.rate > 0, there.rate, rate), throughput, light)
+        return _State(end, jnp.where(there.extinction > 0, there.extinction, rate), throughput, light)
 
 
-def _looks(rate: Scalar, length: Scalar, u: Scalar) -> tuple[Float[Array, "looks"], Float[Array, "looks"]]:
-    """A place in each step of a flight, and the steps' widths, which grow in proportion to the distance from
-    a mean free path on. In each step, places are distributed as collisions at this rate."""
-    number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(rate * length, LEAST)
+class _Looks(NamedTuple):
+    """Where a flight looks for matter: a place in each of its steps, and the steps' widths. `density` is 1,
+    with the derivative of the places' density, by the rate at which they are distributed.
+
+    Walks stay where they are under the derivative, which is that of their weights: as they moved, it would
+    lack what they gain or lose where the extinction jumps, at every surface."""
+
+    places: Float[Array, "looks"]
+    widths: Float[Array, "looks"]
+    density: Float[Array, "looks"]
+
+
+def _looks(rate: Scalar, length: Scalar, u: Scalar) -> _Looks:
+    """Steps grow in proportion to the distance from a mean free path on. In each, places are distributed as
+    collisions at this rate."""
+    fixed = jax.lax.stop_gradient(rate), jax.lax.stop_gradient(length)
+    number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(fixed[0] * fixed[1], LEAST)
     ends = jnp.expm1(number / LOOKS * jnp.log1p(depth)) / depth
     widths = jnp.diff(ends)
+    across = jnp.clip(widths * depth, 0, EVEN)
     u = (u + GOLDEN * number[:-1]) % 1
-    within = -jnp.log1p(u * jnp.expm1(-depth * widths)) / depth
-    return length * (ends[:-1] + within), length * widths
+    within = -jnp.log1p(u * jnp.expm1(-across)) / across
+    across = jnp.where(across < EVEN, widths * jnp.maximum(rate * fixed[1], LEAST), EVEN)
+    density = across * jnp.exp(-across * within) / -jnp.expm1(-across)
+    places = fixed[1] * (ends[:-1] + within * widths)
+    return _Looks(places, length * widths, density / jax.lax.stop_gradient(density))
 
 
-def _ending(depths: Float[Array, "looks"], places: Float[Array, "looks"], u: Scalar) -> tuple[Scalar, Scalar]:
-    """Which of the places is the end of a flight for a uniform number, and its weight: the probability of a
-    collision in steps of these optical depths over that by which the place is drawn."""
+def _ending(extinction: Float[Array, "looks"], looks: _Looks, u: Scalar) -> tuple[Scalar, Scalar]:
+    """How far a flight goes for a uniform number, and its weight: the probability of a collision in the step
+    where it ends over that by which the step is drawn."""
+    depths = extinction * looks.widths
     each = -jnp.expm1(-depths) * jnp.exp(depths - jnp.cumsum(depths))
     drawn = jax.lax.stop_gradient(each + (SPREAD * jnp.sum(each) + LEAST) / LOOKS)
     drawn = drawn / jnp.sum(drawn)
     chosen = jnp.arange(LOOKS) == jnp.sum(jnp.cumsum(drawn)[:-1] < u)
-    place, weight = (jnp.sum(jnp.where(chosen, values, 0)) for values in (places, each / drawn))
-    return place, weight
+    values = looks.places, looks.density * each / drawn
+    distance, weight = (jnp.sum(jnp.where(chosen, value, 0)) for value in values)
+    return distance, weight
 
 
 def _scattered(row: Float[Array, "channels"], direction: Vec3, anisotropy: Scalar | None) -> Vec3:

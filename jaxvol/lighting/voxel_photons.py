@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt8
 
 from .._util.vec3 import Scalar, Vec3, along, scaled
-from ..scene.transfer import Transfer
 from ..xla.memory import gather
 from .photons import PhotonShading, PhotonsOfSample
 from .shading import Sample, Shading, Surroundings
@@ -52,7 +51,7 @@ class VoxelPhotons(Shading):
         volume, kind = around.volume, around.volume.data.dtype
         if not jnp.issubdtype(kind, jnp.integer) or kind.itemsize > 2 or volume.field is not None:
             raise ValueError(f'interpolation="nearest" takes voxels of 8- or 16-bit integers; got {kind}.')
-        if type(around.transfer).attributes is not Transfer.attributes:
+        if around.transfer.reads_more:
             name = type(around.transfer).__name__
             raise ValueError(
                 f'interpolation="nearest" takes transfer functions of the value alone; got {name}.'

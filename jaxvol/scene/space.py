@@ -39,6 +39,11 @@ class Space(eqx.Module):
         return False
 
     @property
+    def whole(self) -> "Space":
+        """The space without what is clipped from it: light is that of the whole volume."""
+        return self
+
+    @property
     @abstractmethod
     def diagonal(self) -> Scalar:
         """Upper bound on the length of a ray through the grid."""

@@ -84,6 +84,11 @@ class Transfer(eqx.Module):
         return ()
 
     @property
+    def reads_more(self) -> bool:
+        """Whether `attributes` reads anything. By default, if it is overridden."""
+        return type(self).attributes is not Transfer.attributes
+
+    @property
     def reads_gradient(self) -> bool:
         """Whether `attributes` reads the volume's gradient, so that slopes are stored. By default not."""
         return False

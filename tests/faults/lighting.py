@@ -79,7 +79,7 @@ FAULTS: list[Fault] = [
     Fault(
         "light: flights end as they do, whatever the derivative of the matter they meet",
         "lighting.transport:_ending",
-        lambda f: lambda depths, *of: f(jax.lax.stop_gradient(depths), *of),
+        lambda f: lambda extinction, *of: f(jax.lax.stop_gradient(extinction), *of),
         (f"{TRANSPORT}test_light_changes_with_the_mean_free_path_as_its_derivative_says",),
     ),
     Fault(

@@ -24,8 +24,8 @@ from jaxvol.lighting import (
     scatterer_templates,
     transport,
 )
-from jaxvol.lighting.materials import EDGE, shares
-from jaxvol.lighting.medium import scattering_at
+from jaxvol.lighting.materials import shares
+from jaxvol.lighting.medium import FADE, scattering_at
 from jaxvol.lighting.shading import Surroundings
 
 from ..scenes import in_float64
@@ -85,15 +85,15 @@ def image(volume: Any, function: Any, lighting: Any, adjoint: Any = "replay") ->
 def test_where_two_materials_meet_nothing_is_in_neither():
     volume = nested()
     values = np.linspace(5, 190, 400, dtype=np.float32)
-    each = jax.jit(jax.vmap(lambda v: shares(materials(1, 1), volume, (v, v, v), v, edge=EDGE)))(values)
+    each = jax.jit(jax.vmap(lambda v: shares(materials(1, 1), volume, (v, v, v), v, edge=FADE)))(values)
     np.testing.assert_allclose(np.sum(each, axis=0)[values > 13], 1, rtol=1e-6)
-    assert each[0][np.searchsorted(values, 60)] == pytest.approx(0.5, abs=0.1)
+    assert np.interp(60, values, each[0]) == pytest.approx(0.5, abs=0.1)
 
 
 def test_two_labels_of_one_material_are_one():
     labels = np.where(np.indices(SHAPE)[0] < 5, 1, 2).astype(np.uint8)
     volume = jv.Volume(np.ones(SHAPE, np.uint8), nested().spacing, nested().origin, labels)
-    one = jv.TransferFunction([0, 1], [(0.8, 0.5, 0.9)] * 2, [2.0, 2.0])
+    one = jv.TransferFunction([0, 1], [(0.8, 0.5, 0.9)] * 2, [5.0, 5.0])
     around = Surroundings(volume, jv.LabelTransferFunction({1: one, 2: one}), MARCH.locate(volume))
     of_labels = tuple(Material(0.3, 0.5, label=label) for label in (1, 2))
     places = np.random.default_rng(0).uniform(-0.95, 0.95, (3, 300)).astype(np.float32)
@@ -144,9 +144,9 @@ def test_flights_end_as_often_as_light_is_scattered():
 
     @jax.jit
     def flights(quantile: Any, u: Any, rate: Any) -> Any:
-        places, widths = jax.vmap(transport._looks, (None, None, 0))(rate, jnp.float32(length), u)
-        depths = jnp.where(places > gap, 3 * (places - gap), 0) * widths
-        return jax.vmap(transport._ending)(depths, places, quantile)
+        looks = jax.vmap(transport._looks, (None, None, 0))(rate, jnp.float32(length), u)
+        extinction = jnp.where(looks.places > gap, 3 * (looks.places - gap), 0)
+        return jax.vmap(transport._ending)(extinction, looks, quantile)
 
     for rate in (0.5, 2.0, 8.0):
         distance, weight = (np.asarray(each, float) for each in flights(quantile, u, np.float32(rate)))
@@ -257,12 +257,12 @@ def test_light_changes_in_the_mean_over_walks_as_its_derivatives_say():
     )
     off = found - (ends[:, 0] - ends[:, 1]) / (2 * steps)
     error = off.std(axis=0, ddof=1) / np.sqrt(len(seeds))
-    assert np.all(error < 0.2 * np.abs(found.mean(axis=0)))
+    assert np.all(error < 0.1 * np.abs(found.mean(axis=0)))
     assert np.all(np.abs(off.mean(axis=0)) < 3 * error)
 
 
 @pytest.mark.slow
-def test_gradients_of_images_are_those_of_differences_in_all_adjoints():
+def test_gradients_of_images_are_those_of_differences_and_forward_as_reverse():
     # no voxel has the value of a control point, where the extinction has two derivatives
     volume = eqx.tree_at(lambda volume: volume.data, nested(), nested().data + 5)
     scene = volume, transfer(2.0, least=0.5), materials(0.5, 0.25), lit(SUN, LAMP, SKY), jnp.float32(0.3)

@@ -137,6 +137,10 @@ class _Clipped(Space):
         return self.inner.searches
 
     @property
+    def whole(self) -> Space:
+        return self.inner.whole
+
+    @property
     def diagonal(self) -> Scalar:
         return self.inner.diagonal
 
