@@ -7,11 +7,13 @@ composited front to back into a `Rendering`.
 
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
+from ._util.version import VERSION as __version__
 from .app.automatic import automatic_transfer as automatic_transfer
 from .app.viewer import serve as serve, view as view
 from .bricks import render_bricks as render_bricks
 from .compositing.blending import Compositing as Compositing, Over as Over, Weighting as Weighting
 from .compositing.isosurface import Isosurface as Isosurface
+from .compositing.line_integral import LineIntegral as LineIntegral
 from .compositing.projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .compositing.selection import FirstVisible as FirstVisible, Selection as Selection
 from .fitting import (
@@ -24,6 +26,7 @@ from .fitting import (
     Pose as Pose,
     Positive as Positive,
     ProbeGeometry as ProbeGeometry,
+    Uncertainty as Uncertainty,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
     choose as choose,
@@ -61,7 +64,12 @@ from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .scene.camera import Camera as Camera
 from .scene.labels import LabelTransferFunction as LabelTransferFunction
-from .scene.presets import PRESETS as PRESETS, colormap as colormap, preset as preset
+from .scene.presets import (
+    PRESETS as PRESETS,
+    attenuation as attenuation,
+    colormap as colormap,
+    preset as preset,
+)
 from .scene.rendering import Rendering as Rendering
 from .scene.transfer import Transfer as Transfer, TransferFunction as TransferFunction
 from .scene.transfer2d import TransferFunction2D as TransferFunction2D

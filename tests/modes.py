@@ -43,6 +43,7 @@ MODES: dict[str, jv.Weighting | jv.Selection] = {
     "over": jv.Over(),
     "additive": Additive(),
     "average": jv.Average(0.5),
+    "integral": jv.LineIntegral(),
     "maximum": jv.Maximum(0.5),
     "minimum": jv.Minimum(0.5),
     "first visible": jv.FirstVisible(),
@@ -145,15 +146,22 @@ def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
     values = rays.value(depth)
     color, extinction = classified(transfer, values)
     alpha = -np.expm1(-extinction * width)
-    if name in ("over", "additive", "average"):
+    if name in ("over", "additive", "average", "integral"):
         hidden = np.concatenate([np.ones((len(alpha), 1)), np.cumprod(1 - alpha, axis=1)[:, :-1]], axis=1)
-        weight = {"over": hidden * alpha, "additive": 0.01 * alpha, "average": width}[name]
+        weight = {
+            "over": hidden * alpha,
+            "additive": 0.01 * alpha,
+            "average": width,
+            "integral": extinction * width,
+        }[name]
         opacity = weight.sum(axis=1)
         whole = np.where(opacity > 0, opacity, 1)
         depth = np.where(opacity > 0, (weight * depth).sum(axis=1) / whole, np.inf)
         premultiplied = (weight[..., None] * color).sum(axis=1)
         if name == "average":
             premultiplied, opacity = layer(transfer, (weight * values).sum(axis=1) / whole, rays.hit)
+        elif name == "integral":
+            opacity = -np.expm1(-opacity)
     else:
         least = np.where(valid, values, -np.inf if name == "maximum" else np.inf)
         chosen = {

@@ -52,7 +52,7 @@ class _Index(EmptySpaceIndex):
 
 
 class _Space(Space):
-    """A space of which a part is left out, or all of it. What does not differ is that of the inner."""
+    """A space of which a part is left out, or all of it. What does not differ is that of the whole."""
 
     clipped: Space
     inner: Space

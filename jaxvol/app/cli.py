@@ -6,10 +6,10 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from importlib import metadata
 
 import jax
 
+from .._util.version import VERSION
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
 from .commands.animate import add_animate
@@ -87,11 +87,7 @@ def parser_of_all() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    try:
-        version = metadata.version("jaxvol")
-    except metadata.PackageNotFoundError:  # run from a checkout
-        version = "(not installed)"
-    parser.add_argument("--version", action="version", version=f"%(prog)s {version} (jax {jax.__version__})")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION} (jax {jax.__version__})")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in COMMANDS:
         add(commands)

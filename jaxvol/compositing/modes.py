@@ -6,11 +6,12 @@ import jax
 
 from .._util.checks import described
 from .blending import Compositing, Over, Weighting
+from .line_integral import LineIntegral
 from .projections import Average, Maximum, Minimum
 from .selection import Selection
 
 
-Mode: TypeAlias = Literal["over", "maximum", "minimum", "average"]
+Mode: TypeAlias = Literal["over", "maximum", "minimum", "average", "integral"]
 """The keys of `MODES`."""
 
 MODES: dict[str, type[Compositing[Any]]] = {
@@ -18,6 +19,7 @@ MODES: dict[str, type[Compositing[Any]]] = {
     "maximum": Maximum,
     "minimum": Minimum,
     "average": Average,
+    "integral": LineIntegral,
 }
 
 

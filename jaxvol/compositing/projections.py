@@ -140,7 +140,7 @@ class Average(Weighting):
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         """Through a fog of constant extinction whose colours are the values: optical depths are widths."""
-        if type(transfer).attributes is not Transfer.attributes:
+        if transfer.reads_more:
             raise ValueError(
                 "compositing by an average needs a transfer function that depends on the value alone; "
                 f"{type(transfer).__name__} reads more."

@@ -81,16 +81,16 @@ class ScattererTemplates(Lighting):
     extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices of
     random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
     counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
-    half-space's reflectance. Flights are as long as the matter in front of them, seen at 16 places, lets
-    them be. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a
-    template at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`,
-    `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the
-    last `levels`, in materials at most `threshold` of all; the grid, whose nodes should be no further apart
-    than half the mean free path (a ball under the sun is within 1 %, at three quarters of it 3 % too dark);
-    places that flights see, which are farther apart the farther off they are; with anisotropy, the directions
-    of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of the march should
-    be short against the mean free path, too: of a third of it, they make images up to 3 % too bright. How
-    near it comes to path tracing: `experiments/transport.py`.
+    half-space's reflectance. Flights are as long as the matter in front of them, seen at 16 places, lets them
+    be. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a template
+    at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`, `occlusion`,
+    `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the last `levels`,
+    in materials at most `threshold` of all; the grid, which blurs light where nodes are further apart than
+    the mean free path (in thick matter, blotches are seen, of nodes whose walks differ; fewer with more
+    `packets`); places that flights see, which are farther apart the farther off they are; with anisotropy,
+    the directions of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of
+    the march should be short against the mean free path, too: of a third of it, they make images up to 3 %
+    too bright. How near it comes to path tracing: `experiments/transport.py`.
 
     Its derivatives are those of the mean over all walks: under them walks stay where they are, and count
     more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ or g change, so

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, described, finite_array, integer, unit_interval
+from .._util.checks import Arrayable, described, finite_array, integer, number, unit_interval
 from .._util.srgb import from_srgb
 from .transfer import TransferFunction, extinction_of
 
@@ -150,6 +150,23 @@ def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1
     values, colors, opacities = zip(*points, strict=True)
     stretched = np.interp(values, own_range, _range(own_range if clim is None else clim))
     return TransferFunction(stretched, colors, extinction_of(opacities, unit_distance))
+
+
+def attenuation(water: Arrayable) -> TransferFunction:
+    """The attenuation of X-rays in CT of Hounsfield units, for `compositing="integral"`: white, of an
+    extinction μ = water (1 + HU / 1000), 0 below -1000.
+
+    Args:
+        water: attenuation of water at the energy of the image, 1/length in the unit of the volume, > 0:
+            0.0206 /mm at 60 keV, 0.0171 /mm at 100 keV (NIST, tables of X-ray mass attenuation coefficients).
+            Bone attenuates relatively more at lower energies than at that of the CT.
+
+    Raises:
+        ValueError: for a `water` that is not positive and finite.
+    """
+    densest = 31_000.0  # Hounsfield units of 16-bit integers end at 32767
+    water = number("water", water, above=0)
+    return TransferFunction([-1000.0, densest], jnp.ones((2, 3)), water * jnp.array([0, 1 + densest / 1000]))
 
 
 def colormap(

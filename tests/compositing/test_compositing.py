@@ -81,6 +81,7 @@ def test_weightings_sum_cells_as_numpy_does(fragments, composited):
         "joined": back_to_front(alpha, own),
         "additive": 0.01 * np.sum(alpha[..., None] * own, axis=1),
         "average": np.sum(-np.log1p(-alpha)[..., None] * own, axis=1),
+        "integral": np.sum(-np.log1p(-alpha)[..., None] * own, axis=1),
     }
     for name, expected in sums.items():
         rgba, depth = composited[0][name]
@@ -266,7 +267,7 @@ def test_what_is_refused_is_named(case):
 
 
 def test_names_stand_for_modes():
-    for name in ("over", "maximum", "minimum", "average"):
+    for name in ("over", "maximum", "minimum", "average", "integral"):
         assert type(compositing_of(name)) is type(MODES[name])
         assert all(leaf == 1 for leaf in jax.tree.leaves(compositing_of(name)))  # thicknesses
 

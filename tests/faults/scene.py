@@ -70,6 +70,14 @@ FAULTS: list[Fault] = [
         ("compositing/test_compositing.py::test_leaps_are_over_what_cannot_win_alone",),
     ),
     Fault(
+        "line integral: how deep a cell is, is lost in its opacity",
+        "compositing.line_integral:SCALE",
+        lambda _: 1.0,
+        (
+            "compositing/test_line_integral.py::test_a_box_is_as_deep_as_its_chords_and_its_derivative_at_any_depth",
+        ),
+    ),
+    Fault(
         "average: cells weigh their opacity",
         "compositing.projections:Average.weight",
         lambda _: lambda self, alpha, before: alpha,
