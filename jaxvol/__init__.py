@@ -7,7 +7,7 @@ composited front to back into a `Rendering`.
 
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
-from ._util.version import VERSION as __version__
+from ._util.version import __version__ as __version__
 from .app.automatic import automatic_transfer as automatic_transfer
 from .app.viewer import serve as serve, view as view
 from .bricks import render_bricks as render_bricks

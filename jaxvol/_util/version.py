@@ -4,6 +4,6 @@ from importlib import metadata
 
 
 try:
-    VERSION = metadata.version("jaxvol")
+    __version__ = metadata.version("jaxvol")
 except metadata.PackageNotFoundError:  # run from a checkout
-    VERSION = "(not installed)"
+    __version__ = "(not installed)"

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 
-from .._util.version import VERSION
+from .._util.version import __version__
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
 from .commands.animate import add_animate
@@ -87,7 +87,7 @@ def parser_of_all() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION} (jax {jax.__version__})")
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__} (jax {jax.__version__})")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in COMMANDS:
         add(commands)
