@@ -87,7 +87,9 @@ def parser_of_all() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__} (jax {jax.__version__})")
+    parser.add_argument(
+        "--version", action="version", version=f"%(prog)s {__version__} (jax {jax.__version__})"
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in COMMANDS:
         add(commands)
