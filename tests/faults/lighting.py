@@ -89,6 +89,12 @@ FAULTS: list[Fault] = [
         (f"{TRANSPORT}test_flights_end_as_often_as_light_is_scattered",),
     ),
     Fault(
+        "light: by transport, what is clipped away lets light in",
+        "march.transforms.clip:_Clipped.whole",
+        lambda _: property(lambda self: self),
+        (f"{TRANSPORT}test_light_is_that_of_the_whole_volume_where_it_is_clipped",),
+    ),
+    Fault(
         "light: where two materials meet, some of the matter is in neither",
         "lighting.materials:smoothstep",
         lambda f: lambda x: f(x) * f(x),

@@ -196,6 +196,26 @@ def test_light_that_is_scattered_ahead_is_nearly_that_of_path_tracing(lights):
     np.testing.assert_allclose(ratio, 1, atol=0.12)
 
 
+def test_light_is_that_of_the_whole_volume_where_it_is_clipped():
+    """And matter ends at the volume's face, where it ends for direct light."""
+    volume = eqx.tree_at(lambda v: v.data, nested(), jnp.full(SHAPE, 40.0))
+    cut = jv.Clip(box=(-1, 0, -1, 1, -1, 1))
+    around = [Surroundings(volume, transfer(2.5), jv.March(0.1, t).locate(volume)) for t in ((), (cut,))]
+    of_materials, lights = (Material(0.2, 0.4),), lit(SUN, SKY)
+
+    @jax.jit
+    def light(around: Any) -> Any:
+        return transport.Transport(around, of_materials, lights, None, 0, 4, 4, 4).solved(6)
+
+    whole, clipped = (light(one) for one in around)
+    np.testing.assert_allclose(clipped.radiance, whole.radiance, rtol=1e-5)
+    np.testing.assert_allclose(clipped.depths, whole.depths, rtol=1e-5)
+    direction = tuple(-c for c in np.asarray(SUN.direction) / np.linalg.norm(SUN.direction))
+    inside = tuple(jnp.float32(0.999 * np.sign(c)) for c in direction)
+    exit_ = jax.jit(transport._exit)(around[1].space, inside, direction)
+    assert 0 < exit_ < 0.01
+
+
 def test_light_between_nodes_is_that_of_a_cubic_and_at_faces_of_a_line():
     def values(x: Any, y: Any, z: Any) -> Any:
         return np.stack([x**3 - 2 * x * y + 3 * z, x + 2 * y - z], axis=-1)
