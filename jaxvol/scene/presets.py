@@ -161,6 +161,9 @@ def attenuation(water: Arrayable) -> TransferFunction:
             0.0206 /mm at 60 keV, 0.0171 /mm at 100 keV (NIST, tables of X-ray mass attenuation coefficients).
             Bone attenuates relatively more at lower energies than at that of the CT.
 
+    Returns:
+        The `TransferFunction`.
+
     Raises:
         ValueError: for a `water` that is not positive and finite.
     """
