@@ -216,6 +216,21 @@ class Over(Weighting):
         return transfer.variation(windows)
 
 
+class OpticalDepths(Weighting):
+    """A mode whose weights are the cells' optical depths: what is in front hides nothing. A subclass scales
+    its sums (`marched`, `resolved`), so that the depth of a cell is known from its opacity in float32."""
+
+    def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
+        return -jnp.log1p(-alpha)
+
+    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
+        return worth
+
+    @abstractmethod
+    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+        """The pixel, from sums of optical depths."""
+
+
 def joined(front: Composite, back: Composite) -> Composite:
     """A front and a back part of a ray, each marched independently under "over", which is associative: what
     is behind is weighted by the transmittance in front."""

@@ -10,7 +10,7 @@ from ..march.march import March
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Classification, Classify, Measured, Transfer
 from ..scene.volume import Volume
-from .blending import Weighting
+from .blending import OpticalDepths
 
 
 SCALE = 2.0**-20
@@ -18,7 +18,7 @@ SCALE = 2.0**-20
 power of two changes no other digit."""
 
 
-class LineIntegral(Weighting):
+class LineIntegral(OpticalDepths):
     """The line integral of the extinction along a ray, ∫ μ ds: an X-ray image.
 
     The colours of `Rendering.rgba` are those of the transfer function, integrated with the extinction: with
@@ -39,12 +39,6 @@ class LineIntegral(Weighting):
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         return _Thinner(transfer), march
-
-    def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
-        return -jnp.log1p(-alpha)  # the optical depth
-
-    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        return worth
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         whole = sums / SCALE

@@ -18,7 +18,7 @@ from ..march.march import March
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Classification, Classify, Measured, Transfer
 from ..scene.volume import Volume
-from .blending import Fragment, Outputs, Weighting
+from .blending import Fragment, OpticalDepths, Outputs
 from .selection import RaySampler, Selection
 
 
@@ -113,7 +113,7 @@ class Minimum(Extreme):
         return transfer.visible(Blocks(blocks.low, jnp.full_like(blocks.high, jnp.nanmax(blocks.high)), None))
 
 
-class Average(Weighting):
+class Average(OpticalDepths):
     """The mean value along a ray, as classified by the transfer function.
 
     With the values v_k in cells of widths e_k, the mean is Σ e_k v_k / Σ e_k over what lies in the volume. It
@@ -148,12 +148,6 @@ class Average(Weighting):
         # so that the optical depth of a ray is at most 1, where float32 resolves it well
         longest = march.locate(volume).diagonal + march.step
         return _Values(jax.lax.stop_gradient(1 / longest)), march
-
-    def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
-        return -jnp.log1p(-alpha)  # the optical depth
-
-    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        return worth
 
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         # of rays that only fill up a chunk, sums are 0, and derivatives must not be NaN

@@ -88,7 +88,7 @@ class ScattererTemplates(Lighting):
     in materials at most `threshold` of all; the grid, which blurs light where nodes are further apart than
     the mean free path (in thick matter, blotches are seen, of nodes whose walks differ; fewer with more
     `packets`); places that flights see, which are farther apart the farther off they are; with anisotropy,
-    the directions of scattered light up to spherical harmonics of order 2 (5 to 10 % at g = 0.5). Steps of
+    the directions of scattered light up to spherical harmonics of order 2 (up to 3 % at g = 0.5). Steps of
     the march should be short against the mean free path, too: of a third of it, they make images up to 3 %
     too bright. How near it comes to path tracing: `experiments/transport.py`.
 

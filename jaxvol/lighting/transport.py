@@ -9,7 +9,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -72,6 +72,10 @@ LEAST = 1e-6
 they meet none."""
 
 
+_Way: TypeAlias = tuple[Vec3, Scalar, Bool[Array, ""]]
+_Begun: TypeAlias = tuple[Vec3, Scalar, list[_Way], tuple[Scalar, ...]]
+
+
 class ScatteredLight(Shading):
     """Light in a scene, on grids that span the volume's.
 
@@ -94,10 +98,11 @@ class ScatteredLight(Shading):
     def terms(self) -> int:
         return 1 if self.depths.shape[-1] else 0
 
-    def begin(self, around: Surroundings, sample: Sample) -> tuple[Vec3, Scalar, tuple[Scalar, ...]]:
-        """Radiance from the grid, scattered towards the camera; the share that is not absorbed; and the
-        optical depth towards each light, beyond the steps near the sample. (Between a node outside of matter
-        and one inside, depths do not grow linearly, so that they are not interpolated at the sample.)"""
+    def begin(self, around: Surroundings, sample: Sample) -> _Begun:
+        """Radiance from the grid, scattered towards the camera; the share that is not absorbed; the way to
+        each light; and the optical depth towards it, beyond the steps near the sample. (Between a node
+        outside of matter and one inside, depths do not grow linearly, so that they are not interpolated at
+        the sample.)"""
         coordinate = around.space.coordinate(sample.point)
         row = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
         light = _scattered(row, sample.direction, self.anisotropy)
@@ -105,26 +110,27 @@ class ScatteredLight(Shading):
         kept = jnp.ones_like(fractions[0])
         for fraction, material in zip(fractions, self.materials, strict=True):
             kept = kept - fraction * material.opacity
-        beyond = []
-        for light_, (direction, reach, lit) in enumerate(self._ways(around, sample)):
+        ways, beyond = self._ways(around, sample), []
+        for light_, (direction, reach, lit) in enumerate(ways):
             point = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, point))
             beyond.append(jnp.where(lit, 0, row[light_]))
-        return light, kept, tuple(beyond)
+        return light, kept, ways, tuple(beyond)
 
     def term(
-        self, around: Surroundings, sample: Sample, shared: Any, number: Int[Array, ""]
+        self, around: Surroundings, sample: Sample, shared: _Begun, number: Int[Array, ""]
     ) -> tuple[Scalar, ...]:
         """The optical depth towards each light, near the sample: all of it, since places that are read
         together take less time."""
-        ways, steps = self._ways(around, sample), _growing(LOCAL_STEPS)
+        _, _, ways, _ = shared
+        steps = _growing(LOCAL_STEPS)
         places = [along(sample.point, to, middle * reach) for to, reach, _ in ways for _, middle in steps]
         read = around.stored(lambda: [self._extinction(around, place) for place in places])
         each = iter(read)
         return tuple(reach * sum(width * next(each) for width, _ in steps) for _, reach, _ in ways)
 
-    def color(self, sample: Sample, shared: tuple[Vec3, Scalar, tuple[Scalar, ...]], sums: Any) -> Vec3:
-        light, kept, beyond = shared
+    def color(self, sample: Sample, shared: _Begun, sums: Any) -> Vec3:
+        light, kept, _, beyond = shared
         for source, near, far in zip(located(self.lights), sums or (), beyond, strict=True):
             how = self.anisotropy, jnp.exp(-near - far)
             light = plus(light, arrived(source, sample.point, sample.direction, *how))
@@ -134,7 +140,7 @@ class ScatteredLight(Shading):
     def _extinction(self, around: Surroundings, point: Vec3) -> Scalar:
         return scattering_at(around, self.materials, point).extinction
 
-    def _ways(self, around: Surroundings, sample: Sample) -> list[tuple[Vec3, Scalar, Bool[Array, ""]]]:
+    def _ways(self, around: Surroundings, sample: Sample) -> list[_Way]:
         """Of each light, the direction, how far steps go, and whether they reach it."""
         near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
         found = []

@@ -79,7 +79,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "average: cells weigh their opacity",
-        "compositing.projections:Average.weight",
+        "compositing.blending:OpticalDepths.weight",
         lambda _: lambda self, alpha, before: alpha,
         ("compositing/test_compositing.py::test_weightings_sum_cells_as_numpy_does",),
     ),

@@ -145,14 +145,14 @@ def test_flights_end_as_often_as_light_is_scattered():
     @jax.jit
     def flights(quantile: Any, u: Any, rate: Any) -> Any:
         looks = jax.vmap(transport._looks, (None, None, 0))(rate, jnp.float32(length), u)
-        extinction = jnp.where(looks.places > gap, 3 * (looks.places - gap), 0)
+        extinction = jnp.where(looks.places > gap, looks.places - gap, 0)
         return jax.vmap(transport._ending)(extinction, looks, quantile)
 
     for rate in (0.5, 2.0, 8.0):
         distance, weight = (np.asarray(each, float) for each in flights(quantile, u, np.float32(rate)))
         assert weight.max() < 1.1  # no walk counts more than others
         for far in (0.5, 1.0, 1.5, length):
-            expected = 1 - np.exp(-1.5 * (far - gap) ** 2)
+            expected = 1 - np.exp(-0.5 * (far - gap) ** 2)
             np.testing.assert_allclose(np.mean(weight * (distance < far)), expected, atol=0.04)
 
 
@@ -193,27 +193,26 @@ def test_light_is_that_of_path_tracing(lights):
 def test_light_that_is_scattered_ahead_is_nearly_that_of_path_tracing(lights):
     ratio, error = compared(lights, jnp.float32(0.5))
     assert np.all(error < 0.02)
-    np.testing.assert_allclose(ratio, 1, atol=0.12)
+    np.testing.assert_allclose(ratio, 1, atol=0.05)
 
 
 def test_light_is_that_of_the_whole_volume_where_it_is_clipped():
     """And matter ends at the volume's face, where it ends for direct light."""
-    volume = eqx.tree_at(lambda v: v.data, nested(), jnp.full(SHAPE, 40.0))
-    cut = jv.Clip(box=(-1, 0, -1, 1, -1, 1))
-    around = [Surroundings(volume, transfer(2.5), jv.March(0.1, t).locate(volume)) for t in ((), (cut,))]
-    of_materials, lights = (Material(0.2, 0.4),), lit(SUN, SKY)
+    volume = jv.Volume(np.full(SHAPE, 40.0, np.float32), [2 / (n - 1) for n in SHAPE], (-1.0, -1.0, -1.0))
+    function, of_materials, lights = transfer(2.5), materials(0.4, 0.4), lit(SUN, SKY)
 
-    @jax.jit
-    def light(around: Any) -> Any:
-        return transport.Transport(around, of_materials, lights, None, 0, 4, 4, 4).solved(6)
+    @eqx.filter_jit
+    def light(march: Any) -> Any:
+        around = Surroundings(volume, function, march.locate(volume))
+        half, near, zero, one = (jnp.float32(number) for number in (0.5, 0.999, 0, 1))
+        outwards = transport._exit(around.space, (half, half, near), (zero, zero, one))
+        found = transport.Transport(around, of_materials, lights, None, 0, 4, 4, 4).solved(6)
+        return found.radiance, found.depths, outwards
 
-    whole, clipped = (light(one) for one in around)
-    np.testing.assert_allclose(clipped.radiance, whole.radiance, rtol=1e-5)
-    np.testing.assert_allclose(clipped.depths, whole.depths, rtol=1e-5)
-    direction = tuple(-c for c in np.asarray(SUN.direction) / np.linalg.norm(SUN.direction))
-    inside = tuple(jnp.float32(0.999 * np.sign(c)) for c in direction)
-    exit_ = jax.jit(transport._exit)(around[1].space, inside, direction)
-    assert 0 < exit_ < 0.01
+    whole, clipped = light(MARCH), light(jv.March(0.1, (jv.Clip(box=(-1, 0, -1, 1, -1, 1)),)))
+    for one, other in zip(whole, clipped, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-5)
+    np.testing.assert_allclose(whole[2], 0.001, rtol=1e-3)
 
 
 def test_light_between_nodes_is_that_of_a_cubic_and_at_faces_of_a_line():
