@@ -70,6 +70,7 @@ from .scene.presets import (
     colormap as colormap,
     preset as preset,
 )
+from .scene.radiance import RadianceField as RadianceField
 from .scene.rendering import Rendering as Rendering
 from .scene.transfer import Transfer as Transfer, TransferFunction as TransferFunction
 from .scene.transfer2d import TransferFunction2D as TransferFunction2D

@@ -54,10 +54,10 @@ def _on_device(array: Array | np.ndarray) -> Array:
 
 def check_shape(shape: tuple[int, ...]) -> None:
     """Raises `ValueError` unless an array of this shape can be a volume's voxels."""
-    if len(shape) != 3 or min(shape) < 2:
+    if len(shape) not in (3, 4) or min(shape[:3]) < 2 or 0 in shape:
         raise ValueError(
-            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {shape}. "
-            "For a stack of images, stack them along the last axis."
+            "data must be data[x, y, z] with at least 2 voxels along each axis, or data[x, y, z, channel]; "
+            f"got shape {shape}. For a stack of images, stack them along the last axis."
         )
 
 

@@ -183,7 +183,7 @@ def _march(
     voxels: Shaped[Array, "x y z"],
 ) -> Share:
     """Each device's rays behind its brick."""
-    part = part_of(with_voxels(scene.volume, voxels), first, grid.shape)
+    part = part_of(with_voxels(scene.volume, [voxels]), first, grid.shape)
     acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
     cells, here = share.of_brick(grid, scene, brick), scene._replace(volume=part)
     return Share(march_brick(here, options, acceleration, share.underway, cells, exact=True), share.own)

@@ -130,7 +130,7 @@ class Traversal:
                 give_back()
                 given_back = self.bytes_read
             # on a CPU, aligned voxels are not copied
-            brick = with_voxels(self.scene.volume, jax.device_put(load.voxels.result()))
+            brick = with_voxels(self.scene.volume, [jax.device_put(load.voxels.result())])
             brick = part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
             cells = load.cells
             assert cells is not None

@@ -61,6 +61,10 @@ class _Thinner(Transfer):
         return self.transfer.attributes(volume, coordinate)
 
     @property
+    def channels(self) -> int | None:
+        return self.transfer.channels
+
+    @property
     def reads_more(self) -> bool:
         return self.transfer.reads_more
 

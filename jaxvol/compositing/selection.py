@@ -122,7 +122,7 @@ class Selection(Compositing[State]):
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         """All blocks, by default: what is transparent may still be chosen."""
-        return jnp.ones(blocks.low.shape, bool)
+        return jnp.ones(blocks.shape, bool)
 
 
 class FirstVisible(Selection[Scalar]):

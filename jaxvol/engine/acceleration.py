@@ -6,6 +6,7 @@ neighbour along z, and for 8-bit voxels the two next to these along y, which sav
 for each array of them. The slopes of 8-bit voxels take as much again.
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import cast
 
@@ -26,7 +27,7 @@ from ..scene.camera import GivenRays
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Transfer
 from ..scene.variation import Windows
-from ..scene.volume import Volume, read_as
+from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
@@ -44,8 +45,9 @@ class VolumeAcceleration(eqx.Module):
     blocks, and how values vary around them; None where the image has no use for it. Made once for each array
     of voxels."""
 
-    words: UInt32[Array, " voxels"] | None
-    slopes: UInt32[Array, " voxels"] | None
+    words: list[UInt32[Array, " voxels"] | None]
+    """Of each of the volume's `grids`."""
+    slopes: list[UInt32[Array, " voxels"] | None]
     blocks: Blocks | None
     windows: Windows | None
 
@@ -59,8 +61,8 @@ class VolumeAcceleration(eqx.Module):
         # unless gradients fetch six cubes of them for each sample
         packs = slopes or volume.first is None
         return cls(
-            words_of(volume) if packs else None,
-            slopes_of(volume) if slopes else None,
+            [words_of(grid) if packs else None for grid in grids(volume)],
+            [slopes_of(grid) if slopes else None for grid in grids(volume)],
             Blocks.of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
             None if stride_control(march) is None else Windows.of(volume),
         )
@@ -74,7 +76,7 @@ class VolumeAcceleration(eqx.Module):
         return self.packed(scene).prepared(self.windows)
 
 
-NO_ACCELERATION = VolumeAcceleration(None, None, None, None)
+NO_ACCELERATION = VolumeAcceleration([], [], None, None)
 
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
@@ -120,10 +122,11 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     """The packed copy of a volume's voxels: of integers of 8 or 16 bits in a JAX array that is not traced.
     None for others, where a field replaces them, and where the copy would take too much memory."""
-    data = cast(Array | np.ndarray, volume.data)
-    small = data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
+    data = cast(Array | np.ndarray | None, volume.data)
+    small = data is not None and data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
     if (
         not small
+        or data.ndim > 3
         or volume.field is not None
         or is_traced(data)
         or not isinstance(data, jax.Array)
@@ -141,10 +144,11 @@ def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
 
 
 def with_words(
-    volume: Volume, words: UInt32[Array, " voxels"] | None, slopes: UInt32[Array, " voxels"] | None = None
+    volume: Volume, words: Sequence[Array | None], slopes: Sequence[Array | None] | None = None
 ) -> Volume:
-    """The volume, with its packed copy where there is one, and with the slopes of its nodes."""
-    return volume if words is None else read_as(volume, Packed(words, slopes))
+    """The volume, with packed copies of its `grids` where there are some, and with their slopes."""
+    both = zip(words, [None] * len(words) if slopes is None else slopes, strict=True)
+    return read_as(volume, *(None if word is None else Packed(word, slope) for word, slope in both))
 
 
 @jax.jit

@@ -17,7 +17,7 @@ from ..march.beams import EmptySpaceIndex
 from ..ray import Progress, Scene
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..scene.volume import Volume, with_voxels, without_voxels
+from ..scene.volume import Volume, voxels_of, with_voxels, without_voxels
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added, floats, zeros_of
 from .acceleration import VolumeAcceleration, empty_space_of
@@ -25,6 +25,7 @@ from .devices import on_devices
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
 from .tiling import RenderOptions
+from .voxel_gradient import asked_of, cotangents_of
 from .wavefront import Beams, CellRange, State, march_rays
 
 
@@ -101,7 +102,9 @@ class ImageVjp(NamedTuple):
         lit = prepared = acceleration.prepared(scene._replace(lighting=None))
         shader, pull_shader = None, None
         if scene.lighting is not None:
-            shader, pull_shader = _shader_of(scene, prepared.volume, voxels=_of_voxels(scene, perturbed))
+            shader, pull_shader = _shader_of(
+                scene, prepared.volume, voxels=asked_of(scene.volume, perturbed.volume)
+            )
             if shader.inline:
                 lit = prepared._replace(classification=prepared.classification._replace(light=shader))
         tiles = RayTiles.of(scene.source, options.tiling)
@@ -117,7 +120,7 @@ class ImageVjp(NamedTuple):
             self.shader,
             transfer=of_transfer,
             geometric=geometric,
-            voxels=_of_voxels(self.scene, perturbed),
+            voxels=asked_of(self.scene.volume, perturbed.volume),
         )
         return Sums(total, zeros_of(self.scene.source) if geometric else None)
 
@@ -127,7 +130,7 @@ class ImageVjp(NamedTuple):
 
         def made(moving: PyTree) -> Ray:
             volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
-            space = march_.locate(with_voxels(volume_, volume.data))
+            space = march_.locate(with_voxels(volume_, voxels_of(volume)))
             return self.tiles.rays(source_, space, number, self.fault)
 
         return eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
@@ -176,9 +179,7 @@ class ImageVjp(NamedTuple):
         of_volume, of_transfer, of_source, of_march = (
             zeros_of(part) if found is None else found for part, found in zip(parts, of_parts, strict=True)
         )
-        if total.voxels is not None:
-            voxels = total.voxels.reshape(volume.data.shape).astype(volume.data.dtype)
-            of_volume = with_voxels(of_volume, voxels)
+        of_volume = with_voxels(of_volume, cotangents_of(volume, total.voxels))
         of_lighting = None
         if self.pull_shader is not None:
             more_volume, more_transfer, more_march, of_lighting = self.pull_shader(total.shader)[0]
@@ -188,10 +189,6 @@ class ImageVjp(NamedTuple):
         return Scene(
             of_volume, of_transfer, of_source, of_march, zeros_of(self.scene.compositing), of_lighting
         )
-
-
-def _of_voxels(scene: Scene, perturbed: Any) -> bool:
-    return eqx.is_inexact_array(scene.volume.data) and perturbed.volume.data
 
 
 @on_devices("replicated", sharded=("ranges",))
@@ -221,17 +218,19 @@ def _vjp_by_tiles(
     return image.cotangents(sums)
 
 
-def _shader_of(scene: Scene, packed: Volume, *, voxels: bool) -> tuple[Shader, Callable[[PyTree], Any]]:
+def _shader_of(scene: Scene, packed: Volume, *, voxels: list[bool]) -> tuple[Shader, Callable[[PyTree], Any]]:
     """What shades an image; and the pull-back of its leaves to volume, transfer function, march and
     lighting."""
     volume, transfer, march, lighting = scene.volume, scene.transfer, scene.march, scene.lighting
-    parts = volume if voxels else without_voxels(volume), transfer, march, lighting
-    moving, fixed = eqx.partition(parts, eqx.is_inexact_array)
+    data = voxels_of(volume)
+    asked = with_voxels(volume, [each if a else None for each, a in zip(data, voxels, strict=True)])
+    moving, fixed = eqx.partition((asked, transfer, march, lighting), eqx.is_inexact_array)
 
     def made(moving: PyTree) -> tuple[PyTree, Shader]:
         moved, transfer, march, lighting = eqx.combine(moving, fixed)
         # the packed copy serves fetching only
-        whole = moved if voxels else with_voxels(moved, volume.data)
+        both = zip(voxels_of(moved), data, strict=True)
+        whole = with_voxels(moved, [given if own is None else own for own, given in both])
         around = Surroundings(whole, transfer, march.locate(whole))
         shader = Shader.of(lighting, around)
         return floats(shader.leaves), shader

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .._util.vec3 import Scalar, Vec3, along
 from ..compositing.blending import Weighting
@@ -33,12 +33,13 @@ from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..scene.transfer import classification_of
-from ..scene.volume import with_fetch, with_voxels, without_voxels
-from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from ..scene.volume import fetches_of, voxels_of, with_fetches, with_voxels, without_voxels
+from ..scene.voxel_fetch import Fetched
 from ..xla.trees import PyTree, added, floats, zeros_of
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
+from .voxel_gradient import Sums, recorded, with_cotangents, zero_perturbations, zero_sums
 
 
 class Cotangents(NamedTuple):
@@ -71,9 +72,14 @@ class Total(NamedTuple):
     march: PyTree
     volume: PyTree
     """Of everything in it but the voxels."""
-    voxels: Float[Array, " voxels"] | None
+    voxels: Sums
     shader: PyTree
     """Of `Shader.leaves`."""
+
+    @property
+    def of_voxels(self) -> bool:
+        """Whether voxels have a gradient."""
+        return any(sums is not None for sums in self.voxels)
 
     @property
     def geometric(self) -> bool:
@@ -82,19 +88,15 @@ class Total(NamedTuple):
 
     @classmethod
     def zeros(
-        cls, scene: Scene, shader: Shader | None, *, transfer: bool, geometric: bool, voxels: bool
+        cls, scene: Scene, shader: Shader | None, *, transfer: bool, geometric: bool, voxels: list[bool]
     ) -> "Total":
         """Zeros for these parts."""
-        volume, sums = scene.volume, None
-        if voxels:
-            # many small parts are summed, which 16 bits would lose
-            dtype = volume.data.dtype
-            sums = jnp.zeros(volume.data.size, dtype if jnp.finfo(dtype).bits >= 32 else jnp.float32)
+        volume = scene.volume
         return cls(
             zeros_of(scene.transfer) if transfer else None,
             zeros_of(scene.march) if geometric else None,
             zeros_of(without_voxels(volume)) if geometric else None,
-            sums,
+            zero_sums(volume, voxels),
             None if shader is None else zeros_of(shader.leaves),
         )
 
@@ -174,19 +176,19 @@ class Replay(SampleVisitor):
                 of_value, *rest = of_read
                 of_read = (of_value + shaded[i].of_value, *rest)
             of_measured.append(of_read)
-        if not (total.geometric or self.reads_transfer) and total.voxels is None:
+        if not (total.geometric or self.reads_transfer or total.of_voxels):
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_place = [None] * len(depths) if shaded is None else [part.of_place for part in shaded]
-        (of_march, of_volume, of_rays, of_transfer), bases, of_cubes = self._geometric_vjp(
+        (of_march, of_volume, of_rays, of_transfer), fetched, of_fetched = self._geometric_vjp(
             ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         )
         total = total._replace(march=added(total.march, of_march), volume=added(total.volume, of_volume))
         if self.reads_transfer:
             total = total._replace(transfer=added(total.transfer, of_transfer))
-        if total.voxels is not None:
-            voxels = scatter_add(total.voxels, self.scene.volume.shape, bases, of_cubes)
+        if total.of_voxels:
+            voxels = with_cotangents(total.voxels, self.scene.volume, fetched, of_fetched)
             total = total._replace(voxels=voxels)
         return carry, of_rays, total
 
@@ -197,13 +199,13 @@ class Replay(SampleVisitor):
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
-    ) -> tuple[tuple[PyTree, PyTree, PyTree, PyTree], list[Array], list[Cube]]:
+    ) -> tuple[tuple[PyTree, PyTree, PyTree, PyTree], list[list[Fetched]], list[Any]]:
         """From the cotangents of each piece's measured values and width, of its depth where the loss depends
         on that, and of its point where it is shaded: those of march, volume, rays, and of the transfer
-        function where samples are measured by it; the index at which each fetched cube of voxels begins; and
-        the cubes' cotangents. The number of samples counts as constant."""
+        function where samples are measured by it; what was fetched of each array of voxels; and the
+        cotangents of that. The number of samples counts as constant."""
         parts = self.prepared.march, without_voxels(self.scene.volume), ray, self.scene.transfer
-        geometric, voxels = self.total.geometric, self.total.voxels is not None
+        geometric, voxels = self.total.geometric, self.total.of_voxels
         asked = geometric, geometric, geometric, self.reads_transfer
         moving = tuple(floats(part) if a else None for part, a in zip(parts, asked, strict=True))
         fixed = tuple(
@@ -221,12 +223,15 @@ class Replay(SampleVisitor):
             ray_fixed: PyTree,
             at: Progress,
             number: Int[Array, ""],
-        ) -> tuple[list[Any], list[Array]]:
+        ) -> tuple[list[Any], list[list[Fetched]]]:
             march, volume, ray, transfer = eqx.combine(
                 (march, volume, ray, transfer), (*shared, ray_fixed, transfer_fixed)
             )
-            whole, record = with_voxels(volume, self.scene.volume.data), Recording(perturbations or [], [])
-            here = with_fetch(whole, record if voxels else self.prepared.volume.fetch)
+            whole, fetched = with_voxels(volume, voxels_of(self.scene.volume)), []
+            if voxels:
+                here, fetched = recorded(whole, perturbations)
+            else:
+                here = with_fetches(whole, fetches_of(self.prepared.volume))
             classification = classification_of(transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # what it finds has no gradient
             scene = self.prepared._replace(march=march, volume=here, classification=classification)
@@ -237,29 +242,30 @@ class Replay(SampleVisitor):
                 place = None if self.shader is None else (point, ray.direction)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, place))
-            return found, record.bases
+            return found, fetched
 
         rays = jax.vmap(one, in_axes=(None, None, 0, None, 0, 0, 0, None))
         cells = jax.vmap(rays, in_axes=(None, None, None, None, 0, None, None, 0))
 
-        def all_(moving: tuple[PyTree, PyTree, PyTree, PyTree], perturbations: list[Cube]) -> PyTree:
+        def all_(moving: tuple[PyTree, PyTree, PyTree, PyTree], perturbations: list[Any]) -> PyTree:
             each = jnp.arange(number, dtype=at.index.dtype)
             return cells(*moving, perturbations, ray_fixed, at, each)
 
         perturbations = []
         if voxels:
-            _, bases = jax.eval_shape(all_, moving, [])
-            if not bases and self.scene.volume.field is not None:
+            _, fetched = jax.eval_shape(all_, moving, [])
+            if self.total.voxels[0] is not None and not fetched[0]:
                 kind = type(self.scene.volume.field).__name__
                 raise ValueError(
                     f"the gradient to the voxels of a volume with the field {kind}, which asks for none by"
                     ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
                     " values do not depend on its voxels, leave volume.data out of what is differentiated."
                 )
-            perturbations = cubes_of_zeros(bases, ray.length.dtype)
-        _, pull, bases = jax.vjp(all_, moving, perturbations, has_aux=True)
-        of_moving, of_cubes = pull(cotangents)
-        return of_moving, bases, of_cubes
+            given = self.scene.volume, fetched, self.total.voxels, ray.length.dtype
+            perturbations = zero_perturbations(*given)
+        _, pull, fetched = jax.vjp(all_, moving, perturbations, has_aux=True)
+        of_moving, of_fetched = pull(cotangents)
+        return of_moving, fetched, of_fetched
 
     def _slopes(
         self, alphas: list[Scalar], weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar

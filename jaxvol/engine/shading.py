@@ -18,7 +18,7 @@ from ..march.march import Cell
 from ..ray import Progress, Scene, stopped
 from ..scene.space import Ray
 from ..scene.transfer import Measured
-from ..scene.volume import with_fetch
+from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree
@@ -48,7 +48,8 @@ def light_terms(
 
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
         sample = _inline_sample(scene, ray, cell)
-        here = replace(around, volume=with_fetch(volume, volume.fetch.of_slopes_at(begin)))
+        first, *inner = fetches_of(volume)
+        here = replace(around, volume=with_fetches(volume, [first.of_slopes_at(begin), *inner]))
         return shading.term(here, sample, shading.begin(here, sample), jnp.zeros((), jnp.int32))
 
     def all_(f: Callable[..., PyTree], *more: list[PyTree]) -> list[PyTree]:

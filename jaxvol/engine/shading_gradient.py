@@ -6,19 +6,19 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from .._util.vec3 import Scalar, Vec3
 from ..lighting.shading import Sample, Shader, Shading, Surroundings, needed_terms, terms_needed
 from ..ray import Scene
 from ..scene.space import Ray
-from ..scene.volume import read_as
-from ..scene.voxel_fetch import Cube, Recording, cubes_of_zeros, scatter_add
+from ..scene.voxel_fetch import Fetched
 from ..xla.compaction import Chosen
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added
 from .segment import Samples
 from .shading import Weights, samples_of
+from .voxel_gradient import Sums, recorded, with_cotangents, zero_perturbations
 
 
 class ShadingTotal(NamedTuple):
@@ -26,7 +26,7 @@ class ShadingTotal(NamedTuple):
 
     shader: PyTree
     transfer: PyTree | None
-    voxels: Float[Array, " voxels"] | None
+    voxels: Sums
 
 
 class ShadingVjp(NamedTuple):
@@ -102,32 +102,32 @@ def _chunk_vjp(
     *of_inputs, of_sums = pull_color(cotangent)
 
     def term(
-        moving: PyTree, shared: PyTree, perturbations: list[Cube] | None, number: Int[Array, ""]
-    ) -> tuple[PyTree, list[Array]]:
+        moving: PyTree, shared: PyTree, perturbations: list[Any] | None, number: Int[Array, ""]
+    ) -> tuple[PyTree, list[list[Fetched]]]:
         shading, around, samples = rebuilt(moving)
 
-        def one(sample: Sample, shared: PyTree, perturbations: list[Cube] | None) -> tuple[PyTree, Any]:
+        def one(sample: Sample, shared: PyTree, perturbations: list[Any] | None) -> tuple[PyTree, Any]:
             if perturbations is None:
                 return shading.term(around.in_memory_by(number >= 0, sample), sample, shared, number), []
-            record = Recording(perturbations, [])
-            here = Surroundings(read_as(around.volume, record), around.transfer, around.space)
-            return shading.term(here, sample, shared, number), record.bases
+            volume, fetched = recorded(around.volume, perturbations)
+            here = Surroundings(volume, around.transfer, around.space)
+            return shading.term(here, sample, shared, number), fetched
 
         return jax.vmap(one)(samples, eqx.combine(shared, fixed_shared), perturbations)
 
     def add(number: Int[Array, ""], carry: tuple[list[PyTree], PyTree]) -> tuple[list[PyTree], PyTree]:
         of_inputs, voxels = carry
-        _, pull, bases = jax.vjp(partial(term, number=number), moving, shared, perturbations, has_aux=True)
-        *more, of_cubes = pull(of_sums)
-        if voxels is not None:
-            voxels = scatter_add(voxels, around.volume.shape, bases, of_cubes)
+        _, pull, fetched = jax.vjp(partial(term, number=number), moving, shared, perturbations, has_aux=True)
+        *more, of_fetched = pull(of_sums)
+        if perturbations is not None:
+            voxels = with_cotangents(voxels, around.volume, fetched, of_fetched)
         return added(of_inputs, more), voxels
 
     perturbations, voxels = None, total.voxels
     if shading.terms > 0:
-        if voxels is not None:
-            _, bases = jax.eval_shape(term, moving, shared, [], jnp.zeros((), jnp.int32))
-            perturbations = cubes_of_zeros(bases, cotangent[0].dtype)
+        if any(sums is not None for sums in voxels):
+            _, fetched = jax.eval_shape(term, moving, shared, [], jnp.zeros((), jnp.int32))
+            perturbations = zero_perturbations(around.volume, fetched, voxels, cotangent[0].dtype)
         start = varying((of_inputs, voxels), samples)
         needed = terms_needed(shading, samples.transmittance)
         of_inputs, voxels = jax.lax.fori_loop(0, needed, add, start)

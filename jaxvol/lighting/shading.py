@@ -20,7 +20,16 @@ from .._util.checks import check_answer
 from .._util.vec3 import Scalar, Vec3
 from ..scene.space import Space
 from ..scene.transfer import Classification, Measured, Transfer, classification_of
-from ..scene.volume import Volume, read_as, with_fetch, with_voxels, without_voxels
+from ..scene.volume import (
+    Volume,
+    fetches_of,
+    grids,
+    read_as,
+    voxels_of,
+    with_fetches,
+    with_voxels,
+    without_voxels,
+)
 from ..scene.voxel_fetch import OneByOne
 from ..xla.memory import in_memory
 from ..xla.sharding import varying
@@ -203,12 +212,13 @@ class Shader(NamedTuple):
     @property
     def leaves(self) -> PyTree:
         """All that has a gradient, except the transfer function and the voxels."""
-        plain = read_as(self.around.volume, OneByOne())  # without the packed copy of its voxels
+        volume = self.around.volume
+        plain = read_as(volume, *[OneByOne()] * len(grids(volume)))  # without the packed copies of its voxels
         return self.shading, self.around.space, without_voxels(plain)
 
     def with_leaves(self, leaves: PyTree, transfer: Transfer) -> "Shader":
         (shading, space, rest), volume = leaves, self.around.volume
-        whole = with_fetch(with_voxels(rest, volume.data), volume.fetch)
+        whole = with_fetches(with_voxels(rest, voxels_of(volume)), fetches_of(volume))
         return Shader(shading, Surroundings(whole, transfer, space))
 
     def __call__(self, sample: Sample) -> Vec3:

@@ -36,8 +36,8 @@ def with_constant_paths(
     """The same. Raises `RuntimeError` where what moves paths or jumps of the medium is differentiated."""
     place = "the volume's spacing, origin and direction"
     data, field = volume.data, volume.field
-    volume = constant(place, eqx.tree_at(_field_of, without_voxels(volume), None, is_leaf=_is_none))
-    volume = eqx.tree_at(_field_of, with_voxels(volume, data), field, is_leaf=_is_none)
+    volume = constant(place, without_voxels(eqx.tree_at(_field_of, volume, None, is_leaf=_is_none)))
+    volume = eqx.tree_at(_field_of, with_voxels(volume, [data]), field, is_leaf=_is_none)
 
     lines = constant("the control points' values of transfer", _lines_of(transfer), "they are constants")
     transfer = eqx.tree_at(_lines_of, transfer, lines) if lines else transfer

@@ -56,7 +56,7 @@ class Majorants(eqx.Module):
             name = type(transfer).__name__
             raise ValueError(f"transfer must have a majorant; {name} does not override Transfer.majorant.")
         blocks, transfer, materials = jax.lax.stop_gradient((blocks, transfer, materials))
-        own, none = transfer.majorant(blocks), jnp.zeros(blocks.low.shape, bool)
+        own, none = transfer.majorant(blocks), jnp.zeros(blocks.shape, bool)
         bound, open_ = jnp.zeros_like(blocks.low), ~none
         for material in materials:  # what comes after a material that fills the block is ignored
             if material.label is not None:

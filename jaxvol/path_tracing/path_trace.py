@@ -363,7 +363,7 @@ def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
             lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, (inputs, constants)
         )
     )
-    packed, (width, height) = with_words(volume, words), camera.size
+    packed, (width, height) = with_words(volume, [words]), camera.size
     medium = Medium.of(packed, blocks, transfer, materials, how.sampling)
     scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings, how.sampling)
     # Checked here, since comparisons in the walks would hide a NaN. The values of a volume with its own field

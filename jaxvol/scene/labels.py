@@ -95,6 +95,10 @@ class LabelTransferFunction(Transfer):
         return [(integer(f"{name}'s label", label, 0, last), each) for label, each in changes.items()]
 
     @property
+    def channels(self) -> int:
+        return 1
+
+    @property
     def _seen(self) -> TransferFunction:
         """All functions, with the extinctions that are seen."""
         factor = jnp.where(self.shown, self.opacity, 0)

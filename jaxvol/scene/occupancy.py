@@ -41,8 +41,9 @@ Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 class Blocks(eqx.Module):
     """Ranges of the values in each block of BLOCK³ cells, including the nodes on its faces."""
 
-    low: Float[Array, "bx by bz"]
-    high: Float[Array, "bx by bz"]
+    low: Float[Array, "*c bx by bz"]
+    """Of a volume of several channels, one after the other."""
+    high: Float[Array, "*c bx by bz"]
     labels: UInt32[Array, "bx by bz"] | None
     """Bit `label % 32` is set for each label of the block's nodes."""
     slopes: tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]] | None = None
@@ -59,9 +60,16 @@ class Blocks(eqx.Module):
         return cls(low, high, labels, _magnitudes(volume) if known else None)
 
     @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of blocks along x, y, z."""
+        return self.low.shape[-3:]
+
+    @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
         """Blocks that hold NaN, also as a slope."""
         unordered = ~(self.low <= self.high)
+        if unordered.ndim > 3:
+            unordered = jnp.any(unordered, axis=0)
         least, most = self.magnitudes
         return unordered | ~(least <= most)
 
@@ -69,13 +77,14 @@ class Blocks(eqx.Module):
     def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
         """`slopes`, or what is known without them: from 0 to infinity."""
         if self.slopes is None:
-            return jnp.zeros_like(self.low), jnp.full_like(self.high, jnp.inf)
+            unknown = jnp.zeros(self.shape, self.low.dtype)
+            return unknown, unknown + jnp.inf
         return self.slopes
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
         """Which blocks may hold this label."""
         if self.labels is None:
-            return jnp.ones(self.low.shape, bool)
+            return jnp.ones(self.shape, bool)
         return (self.labels >> (label % 32)) & 1 == 1
 
 
@@ -152,12 +161,13 @@ def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Ar
 
 
 @jax.jit
-def _ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
-    return widened(*extremes(data))
+def _ranges(data: Shaped[Array, "nx ny nz *c"]) -> tuple[Array, Array]:
+    low, high = widened(*extremes(data))
+    return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
 
 
 @jax.jit
-def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
+def extremes(data: Shaped[Array, "nx ny nz *c"]) -> tuple[Array, Array]:
     """Least and greatest node of each block; NaN where a node is."""
 
     def of(nodes: Array) -> tuple[Array, Array]:
@@ -178,7 +188,7 @@ def extremes(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
 
 
 @jax.jit
-def widened(low: Shaped[Array, "bx by bz"], high: Shaped[Array, "bx by bz"]) -> tuple[Array, Array]:
+def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"]) -> tuple[Array, Array]:
     """Ranges of the values interpolated between nodes, from those of the nodes."""
     low, high = low.astype(jnp.float32), high.astype(jnp.float32)
     slack = ROUNDING * jnp.maximum(abs(low), abs(high))
@@ -240,7 +250,7 @@ def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]
 
 def over_blocks(values: Array, combine: Callable[[Array, Array], Array], margin: int = 0) -> Array:
     """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
-    for axis in range(values.ndim):
+    for axis in range(min(values.ndim, 3)):  # channels stay
         cells = values.shape[axis] - 1
         if margin:
             missing = -cells % BLOCK

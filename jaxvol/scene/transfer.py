@@ -25,7 +25,8 @@ from .volume import Volume
 
 
 Measured: TypeAlias = tuple[Any, ...]
-"""What a transfer function reads at a place: the value first, then whatever else it depends on. Of a cell
+"""What a transfer function reads at a place: the value, or those of all channels, first, then whatever else
+it depends on. Of a cell
 that is integrated (`Classification.spanned`): the mean of the values at its ends, then what else is read in
 its middle, and last two tuples, `front` and `back`: the value at each end, and what `search` found for it."""
 
@@ -97,7 +98,12 @@ class Transfer(eqx.Module):
         """An upper bound of the extinction (1/length) in each block, without a gradient; 0 only where that is
         proven to be 0. Of blocks that hold NaN (`Blocks.unordered`) it may be anything: rays do not leap over
         these. By default infinite."""
-        return jnp.full(blocks.low.shape, jnp.inf)
+        return jnp.full(blocks.shape, jnp.inf)
+
+    @property
+    def channels(self) -> int | None:
+        """How many channels a volume must have; None, the default, if that is not known."""
+        return None
 
     def integrator(self) -> Classify | None:
         """The function from what is measured of a cell (`Measured`) to its mean extinction, and its mean of
@@ -144,7 +150,9 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
         raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
-        return (volume.value(coordinate), *transfer.attributes(volume, coordinate))
+        value = volume.value(coordinate)
+        values = value if isinstance(value, tuple) else (value,)
+        return (*values, *transfer.attributes(volume, coordinate))
 
     attributes = partial(transfer.attributes, volume)
     return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)
@@ -210,6 +218,10 @@ class TransferFunction(Transfer):
     def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
         """Opacity at the control points of a layer of thickness `unit_distance`."""
         return -jnp.expm1(-self._seen * number("unit_distance", unit_distance, above=0))
+
+    @property
+    def channels(self) -> int:
+        return 1
 
     @property
     def _seen(self) -> Float[Array, " n"]:

@@ -111,6 +111,10 @@ class TransferFunction2D(Transfer):
         return self.classifier()((value, magnitude, *self.search()((value, magnitude))))
 
     @property
+    def channels(self) -> int:
+        return 1
+
+    @property
     def reads_gradient(self) -> bool:
         return True
 

@@ -5,9 +5,11 @@ Values are interpolated trilinearly; outside the grid they are those of its near
 """
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
@@ -19,27 +21,28 @@ from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
-from .voxel_fetch import Fetch, OneByOne, Window, corners, flat_index, trilinear
+from .voxel_fetch import Fetch, OneByOne, Window, corners, flat_index
 
 
 class Field(eqx.Module):
-    """A user-defined scalar field in place of interpolated voxels: `Volume(data, field=...)`.
+    """A user-defined field in place of interpolated voxels: `Volume(data, field=...)`.
 
     Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`. `SpaceLeaping`
     leaps over no part of it, since its range is unknown.
     """
 
     @abstractmethod
-    def value(self, volume: "Volume", coordinate: Vec3) -> Scalar:
+    def value(self, volume: "Volume", coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
         """Value at a grid coordinate, whose world position is
-        `volume.origin + volume.direction @ (coordinate * volume.spacing)`."""
+        `volume.origin + volume.direction @ (coordinate * volume.spacing)`; of several channels, a tuple."""
 
 
 class Volume(eqx.Module):
-    """A scalar field sampled on a regular grid, `data[x, y, z]`.
+    """A field sampled on a regular grid, `data[x, y, z]`, or `data[x, y, z, channel]`.
 
     Args:
-        data: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library. 8- and 16-bit
+        data: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library; or (nx, ny, nz, c)
+            of several numbers each, for a transfer function that reads them (`RadianceField`). 8- and 16-bit
             integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are
             enabled. Others become the first of uint8, int8, uint16, int16 and float32 that holds every value
             exactly. Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates,
@@ -56,12 +59,12 @@ class Volume(eqx.Module):
     Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
 
     Raises:
-        ValueError: for data that are not 3-D, have an axis of one voxel or an unsupported type, or hold NaN,
-            infinity or integers that no type holds exactly; for spacing that is not positive; for a
+        ValueError: for data that are not 3-D or 4-D, have an axis of one voxel or an unsupported type, or
+            hold NaN, infinity or integers that no type holds exactly; for spacing that is not positive; for a
             direction that is not orthonormal to 1e-4; and for labels of another shape, or beyond int32.
     """
 
-    data: Shaped[Array, "nx ny nz"]
+    data: Shaped[Array, "nx ny nz *c"]
     spacing: Float[Array, "3"]
     origin: Float[Array, "3"]
     direction: Float[Array, "3 3"] | None
@@ -88,7 +91,7 @@ class Volume(eqx.Module):
         self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive; got {got}.")
         self.origin = finite_array("origin", origin, (3,))
         self.direction = None if direction is None else _checked_direction(direction)
-        self.labels = None if labels is None else label_array(labels, self.data.shape)
+        self.labels = None if labels is None else label_array(labels, self.data.shape[:3])
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()
@@ -97,6 +100,14 @@ class Volume(eqx.Module):
     def shape(self) -> tuple[int, int, int]:
         """Number of nodes along x, y, z."""
         return self.fetch.shape(self.data)
+
+    @property
+    def channels(self) -> int:
+        """How many numbers there are at a place."""
+        if self.field is None:
+            return self.data.shape[3] if self.data.ndim > 3 else 1
+        at = (jax.ShapeDtypeStruct((), self.spacing.dtype),) * 3
+        return len(jax.tree.leaves(eqx.filter_eval_shape(Volume.value, self, at)))
 
     @property
     def first(self) -> Vec3 | None:
@@ -137,13 +148,15 @@ class Volume(eqx.Module):
         low, high = self.corners
         return (low + high) / 2
 
-    def value(self, coordinate: Vec3) -> Scalar:
-        """Value at a grid coordinate, in the coordinate's float type; from `field` if there is one."""
+    def value(self, coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
+        """Value at a grid coordinate, in the coordinate's float type; from `field` if there is one. Of
+        several channels, a tuple."""
         return self.interpolated(coordinate) if self.field is None else self.field.value(self, coordinate)
 
-    def interpolated(self, coordinate: Vec3) -> Scalar:
-        """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type."""
-        return trilinear(*self.fetch.cube(self.data, coordinate))
+    def interpolated(self, coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
+        """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type; of
+        several channels, a tuple."""
+        return self.fetch.interpolated(self.data, coordinate)
 
     def gradient(self, coordinate: Vec3) -> Vec3:
         """Gradient of the value along the grid axes, in value units per world length: interpolated central
@@ -208,12 +221,30 @@ def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
     return x, y, z
 
 
+def grids(volume: Volume) -> list[Volume]:
+    """The volumes whose voxels are read: itself, and those that its field holds."""
+    inner = jax.tree.leaves(volume.field, is_leaf=_is_volume)
+    return [volume, *(grid for each in inner if _is_volume(each) for grid in grids(each))]
+
+
+def voxels_of(volume: Volume) -> tuple[Any, ...]:
+    """The voxels of all its `grids`."""
+    return tuple(grid.data for grid in grids(volume))
+
+
 def without_voxels(volume: Volume) -> Volume:
-    return eqx.tree_at(lambda v: v.data, volume, None)
+    return with_voxels(volume, (None,) * len(grids(volume)))
 
 
-def with_voxels(volume: Volume, data: Array) -> Volume:
-    return eqx.tree_at(lambda v: v.data, volume, data, is_leaf=lambda leaf: leaf is None)
+def with_voxels(volume: Volume, data: Sequence[Any]) -> Volume:
+    """The volume with these arrays as voxels of its `grids`."""
+    return eqx.tree_at(
+        lambda v: [grid.data for grid in grids(v)], volume, list(data), is_leaf=lambda leaf: leaf is None
+    )
+
+
+def _is_volume(node: Any) -> bool:
+    return isinstance(node, Volume)
 
 
 def part_of(
@@ -226,13 +257,28 @@ def part_of(
     return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=lambda leaf: leaf is None)
 
 
-def read_as(volume: Volume, fetch: Fetch) -> Volume:
-    """The volume with another way to read its voxels, which are the same, and the same window."""
-    window = volume.fetch.window
-    return with_fetch(
-        volume, eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=lambda leaf: leaf is None)
+def read_as(volume: Volume, *fetches: Fetch | None) -> Volume:
+    """The volume with other ways to read the voxels of its `grids`, which are the same, and the same windows;
+    None: as before."""
+
+    def in_window(grid: Volume, fetch: Fetch | None) -> Fetch:
+        if fetch is None:
+            return grid.fetch
+        window = grid.fetch.window
+        return eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=lambda leaf: leaf is None)
+
+    return with_fetches(volume, list(map(in_window, grids(volume), fetches)))
+
+
+def with_fetches(volume: Volume, fetches: list[Fetch]) -> Volume:
+    """The volume with these ways to read the voxels of its `grids`."""
+    return eqx.tree_at(
+        lambda v: [grid.fetch for grid in grids(v)],
+        volume,
+        fetches,
+        is_leaf=lambda leaf: isinstance(leaf, Fetch),
     )
 
 
-def with_fetch(volume: Volume, fetch: Fetch) -> Volume:
-    return eqx.tree_at(lambda v: v.fetch, volume, fetch, is_leaf=lambda leaf: isinstance(leaf, Fetch))
+def fetches_of(volume: Volume) -> list[Fetch]:
+    return [grid.fetch for grid in grids(volume)]

@@ -3,24 +3,27 @@
 import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.vec3 import Scalar, Vec3
-from ..xla.memory import gather, without_zeros
+from ..xla.memory import gather, in_memory, without_zeros
 from ..xla.platform import on_gpu
 
 
 T = TypeVar("T")
 
-Cube: TypeAlias = list[list[list[Scalar]]]
+Voxel: TypeAlias = Any
+"""A number; of a volume of several channels, a tuple of numbers."""
+
+Cube: TypeAlias = list[list[list[Voxel]]]
 """Eight voxels, [x][y][z]."""
 
 Node: TypeAlias = tuple[Int[Array, ""], Int[Array, ""], Int[Array, ""]]
@@ -47,7 +50,7 @@ class Fetch(eqx.Module):
     window: Window | None = eqx.field(default=None, kw_only=True)
 
     @abstractmethod
-    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
         """The eight voxels from this one of the array on, along its axes."""
 
     @property
@@ -55,19 +58,23 @@ class Fetch(eqx.Module):
         """Those of `Window`."""
         return XYZ if self.window is None else self.window.axes
 
-    def cube(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+    def cube(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
         node, fraction = self.split(data, coordinate)
         return transposed(self.cube_at(data, node, coordinate[0].dtype), self.axes), fraction
 
-    def shape(self, data: Shaped[Array, "nx ny nz"]) -> tuple[int, int, int]:
+    def interpolated(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> Voxel:
+        """Trilinear interpolation at a grid coordinate."""
+        return trilinear(*self.cube(data, coordinate))
+
+    def shape(self, data: Shaped[Array, "nx ny nz *c"]) -> tuple[int, int, int]:
         """Number of nodes of the grid."""
         if self.window is not None:
             return self.window.whole
-        nx, ny, nz = data.shape
+        nx, ny, nz = data.shape[:3]
         return nx, ny, nz
 
-    def split(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> tuple[Node, Vec3]:
+    def split(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> tuple[Node, Vec3]:
         """The node of the array below a grid coordinate, along its axes, and the fractions past it, along
         x, y, z."""
         node, fraction = split(coordinate, self.shape(data))
@@ -75,7 +82,7 @@ class Fetch(eqx.Module):
             return node, fraction
         # of integers, so that the fractions are those of the whole grid
         past = [node[axis] - self.window.first[axis] for axis in self.axes]
-        i, j, k = (jnp.clip(index, 0, n - 2) for index, n in zip(past, data.shape, strict=True))
+        i, j, k = (jnp.clip(index, 0, n - 2) for index, n in zip(past, data.shape[:3], strict=True))
         return (i, j, k), fraction
 
     def nearest(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
@@ -145,11 +152,11 @@ def _with_first(axis: int, cube: Cube) -> Cube:
     return transposed(cube, ((0, 1, 2), (1, 0, 2), (2, 1, 0))[axis])
 
 
-def trilinear(cube: Cube, fraction: Vec3) -> Scalar:
+def trilinear(cube: Cube, fraction: Vec3) -> Voxel:
     """Trilinear interpolation."""
 
-    def mix(f: Scalar, a: Scalar, b: Scalar) -> Scalar:
-        return a * (1 - f) + b * f  # exactly a and b at the ends
+    def mix(f: Scalar, a: Voxel, b: Voxel) -> Voxel:
+        return jax.tree.map(lambda a, b: a * (1 - f) + b * f, a, b)  # exactly a and b at the ends
 
     fx, fy, fz = fraction
     (y0, y1), (y2, y3) = ((mix(fz, *row) for row in plane) for plane in cube)
@@ -159,7 +166,7 @@ def trilinear(cube: Cube, fraction: Vec3) -> Scalar:
 class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
-    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
         return voxels_from(data, node, dtype)
 
 
@@ -223,26 +230,49 @@ class Packed(Fetch):
         return x * factor, y * factor, z * factor
 
 
+class Fetched(NamedTuple):
+    """Eight voxels that were read: flat index of the first one; and, if they were interpolated, where between
+    them, along the array's axes."""
+
+    base: Int[Array, "..."]
+    fraction: Vec3 | None = None
+
+
 class Recording(Fetch):
-    """Records every fetch, so that its VJP returns one cotangent per fetch."""
+    """Records every fetch, so that its VJP returns one cotangent per fetch: of a cube of voxels, or of what
+    was interpolated between them."""
 
-    perturbations: list[Cube]
-    """Are added to the voxels, in the order of the fetches; if empty, nothing is."""
-    bases: list[Int[Array, "..."]] = eqx.field(static=True)
-    """Flat index of the first voxel of each cube, filled while tracing."""
+    perturbations: list[Any]
+    """Are added to what is fetched, in this order; if empty, nothing is."""
+    fetched: list[Fetched] = eqx.field(static=True)
+    """Filled while tracing."""
 
-    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        number = len(self.bases)
+    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
         cube = voxels_from(jax.lax.stop_gradient(data), node, dtype)
-        self.bases.append(flat_index(node, data.shape))
-        if self.perturbations:
-            cube = jax.tree.map(jnp.add, cube, self.perturbations[number])
-        return cube
+        return self._perturbed(cube, Fetched(flat_index(node, data.shape)))
+
+    def interpolated(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> Voxel:
+        node, fraction = self.split(data, coordinate)
+        cube = voxels_from(jax.lax.stop_gradient(data), node, coordinate[0].dtype)
+        along = permuted(jax.lax.stop_gradient(fraction), self.axes)
+        value = trilinear(transposed(cube, self.axes), fraction)
+        return self._perturbed(value, Fetched(flat_index(node, data.shape), along))
+
+    def _perturbed(self, found: Any, fetched: Fetched) -> Any:
+        number = len(self.fetched)
+        self.fetched.append(fetched)
+        return jax.tree.map(jnp.add, found, self.perturbations[number]) if self.perturbations else found
 
 
-def cubes_of_zeros(bases: list[Any], dtype: Any) -> list[Cube]:
-    """Perturbations of 0 for the cubes at these `bases`."""
-    return [cube_of(lambda *at, base=base: jnp.zeros(base.shape, dtype)) for base in bases]
+def perturbations_of(data: Shaped[Array, "nx ny nz *c"], fetched: list[Fetched], dtype: Any) -> list[Any]:
+    """Perturbations of 0 for what was fetched from an array."""
+
+    def zeros(each: Fetched) -> Any:
+        zero = jnp.zeros(each.base.shape, dtype)
+        voxel = (zero,) * data.shape[3] if data.ndim > 3 else zero
+        return voxel if each.fraction is not None else cube_of(lambda *_: voxel)
+
+    return [zeros(each) for each in fetched]
 
 
 _PAIRS = jax.lax.ScatterDimensionNumbers(
@@ -250,30 +280,72 @@ _PAIRS = jax.lax.ScatterDimensionNumbers(
 )
 
 
-def scatter_add(voxels: Array, shape: tuple[int, ...], bases: list[Any], cubes: list[Cube]) -> Array:
-    """Adds the cotangents of the cubes at these `bases` to the flattened voxels of an array of this shape."""
-    _, ny, nz = shape
-    for base, cube in zip(bases, cubes, strict=True):
-        for x, y in itertools.product((0, 1), repeat=2):
-            # both voxels of a pair along z at once: XLA adds one update after the other
-            pair = jnp.stack(cube[x][y], axis=-1).reshape(-1, 2).astype(voxels.dtype)
-            index, mode = (base + (x * ny + y) * nz).reshape(-1), "promise_in_bounds"
+def scatter_add(sums: Array, shape: tuple[int, ...], fetched: list[Fetched], cotangents: list[Any]) -> Array:
+    """Adds the cotangents of what was fetched to the flattened numbers of an array of this shape."""
+    _, ny, nz, *channels = shape
+    count = math.prod(channels)
+    for (base, fraction), cotangent in zip(fetched, cotangents, strict=True):
+        flat = base.reshape(-1)
+        if fraction is None:
+            base = flat
+            pairs = ((x, y, _rows(jax.tree.leaves(cotangent[x][y]))) for x in (0, 1) for y in (0, 1))
+        else:  # in memory, or each product would compute them again
+            given = base, fraction, jax.tree.leaves(cotangent)
+            base, fraction, rows = in_memory(flat[0] >= 0, _flattened, *given)
+            pairs = _interpolated_pairs(fraction, rows)
+        for x, y, pair in pairs:
+            # both voxels of a pair along z at once, with all channels: XLA adds one update after the other
+            pair = pair.reshape(-1, 2 * count).astype(sums.dtype)
+            index, mode = count * (base + (x * ny + y) * nz), "promise_in_bounds"
             if on_gpu():
-                index, mode = without_zeros(index, pair, voxels.size), "drop"
-            voxels = jax.lax.scatter_add(voxels, index[:, None], pair, _PAIRS, mode=mode)
-    return voxels
+                index, mode = without_zeros(index, pair, sums.size), "drop"
+            sums = jax.lax.scatter_add(sums, index[:, None], pair, _PAIRS, mode=mode)
+    return sums
 
 
-def voxels_from(data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-    """The eight voxels from a node on, each fetched by itself."""
-    (_, ny, nz), base, flat = data.shape, flat_index(node, data.shape), data.reshape(-1)
-    return cube_of(lambda x, y, z: gather(flat, base + (x * ny + y) * nz + z).astype(dtype))
+def _interpolated_pairs(
+    fraction: Vec3, side_by_side: Float[Array, "batch channels"]
+) -> Iterator[tuple[int, int, Float[Array, "batch 2 channels"]]]:
+    """The cotangents of the pairs of voxels along z, at x and y, that were interpolated, from those of what
+    was found.
+
+    Each is one product of numbers that lie side by side: to put together rows of eight would take three times
+    as long as to add them (in all, 45 ms in place of 14 for 393 000 samples of four channels)."""
+    fx, fy, fz = (part[:, None] for part in fraction)
+    along = jnp.where(jnp.arange(2)[None] == 1, fz, 1 - fz)
+    for x, y in itertools.product((0, 1), repeat=2):
+        across = (fx if x else 1 - fx) * (fy if y else 1 - fy)
+        yield x, y, (across * along)[:, :, None] * side_by_side[:, None, :]
+
+
+def _flattened(base: Array, fraction: Vec3, parts: list[Array]) -> tuple[Array, Vec3, Array]:
+    fx, fy, fz = (part.reshape(-1) for part in fraction)
+    return base.reshape(-1), (fx, fy, fz), _rows(parts)
+
+
+def _rows(parts: Sequence[Array]) -> Float[Array, "batch parts"]:
+    """Arrays, flattened and side by side."""
+    return jnp.stack([part.reshape(-1) for part in parts], axis=-1)
+
+
+def voxels_from(data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+    """The eight voxels from a node on, each number fetched by itself."""
+    (_, ny, nz, *channels), base, flat = data.shape, flat_index(node, data.shape), data.reshape(-1)
+
+    def voxel(x: int, y: int, z: int) -> Voxel:
+        at = base + (x * ny + y) * nz + z
+        if not channels:
+            return gather(flat, at).astype(dtype)
+        (c,) = channels
+        return tuple(gather(flat, c * at + k).astype(dtype) for k in range(c))
+
+    return cube_of(voxel)
 
 
 def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
     """The index of a node into the flattened array."""
     i, j, k = node
-    _, ny, nz = shape
+    _, ny, nz, *_ = shape
     return (i * ny + j) * nz + k
 
 

@@ -37,7 +37,7 @@ SHAPE = (6, 5, 7)
 
 def accelerated(volume):
     """The volume as engines fetch it, with slopes stored where they can be."""
-    return with_words(volume, words_of(volume), slopes_of(volume))
+    return with_words(volume, [words_of(volume)], [slopes_of(volume)])
 
 
 @jax.jit

@@ -212,7 +212,7 @@ def test_bricks_and_parts_keep_the_direction():
     parts = jv.render_bricks(TURNED, SPARSE, camera, march, bricks=(2, 1, 2))
     np.testing.assert_allclose(parts.rgba, whole.rgba, rtol=0, atol=2e-6)
     # the whole as a part of itself, with its voxels in another order in memory
-    stored = with_voxels(TURNED, jnp.asarray(TURNED.data).transpose(1, 2, 0))
+    stored = with_voxels(TURNED, [jnp.asarray(TURNED.data).transpose(1, 2, 0)])
     part = part_of(stored, jnp.zeros(3, jnp.int32), TURNED.shape, (1, 2, 0))
     found = jv.render(part, SPARSE, camera, march)
     np.testing.assert_allclose(found.rgba, whole.rgba, rtol=0, atol=2e-6)

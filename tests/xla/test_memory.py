@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxvol.scene.voxel_fetch import scatter_add
+from jaxvol.scene.voxel_fetch import Fetched, scatter_add
 from jaxvol.xla import platform
 from jaxvol.xla.memory import COPIES, ROWS, row_sums, without_zeros
 
@@ -60,7 +60,7 @@ def test_cubes_are_added_to_the_voxels_that_they_were_fetched_from(name, monkeyp
     @jax.jit
     def added(voxels, base, parts):
         cube = [[[parts[:, x, y, z] for z in (0, 1)] for y in (0, 1)] for x in (0, 1)]
-        return scatter_add(voxels, shape, [base], [cube])
+        return scatter_add(voxels, shape, [Fetched(base)], [cube])
 
     found = added(np.ones(np.prod(shape), np.float32), base, parts)
     np.testing.assert_allclose(found.reshape(shape), expected, rtol=0, atol=1e-5)

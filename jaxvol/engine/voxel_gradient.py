@@ -1,0 +1,61 @@
+"""How does a gradient reach the voxels? Each sample's cotangent is added to the voxels that it was read from.
+
+JAX would make an array like the voxels for each segment, to add them up. Here each fetch is recorded, with a
+perturbation of 0, whose cotangent is added in place. A volume has several arrays of voxels if its field holds
+others (`scene.volume.grids`): lists here have one entry for each, None where no gradient is asked for.
+"""
+
+from typing import Any, TypeAlias
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..scene.volume import Volume, grids, voxels_of, with_fetches
+from ..scene.voxel_fetch import Fetched, Recording, perturbations_of, scatter_add
+
+
+Sums: TypeAlias = list[Float[Array, " numbers"] | None]
+"""Of the numbers of each array, flattened."""
+
+
+def asked_of(volume: Volume, perturbed: Volume) -> list[bool]:
+    """Of which arrays of voxels the gradient is asked for, and exists."""
+    each = zip(voxels_of(volume), voxels_of(perturbed), strict=True)
+    return [eqx.is_inexact_array(data) and bool(asked) for data, asked in each]
+
+
+def zero_sums(volume: Volume, asked: list[bool]) -> Sums:
+    """Sums of 0. Many small parts are summed, which 16 bits would lose."""
+
+    def zeros(data: Any) -> Array:
+        return jnp.zeros(data.size, data.dtype if jnp.finfo(data.dtype).bits >= 32 else jnp.float32)
+
+    return [zeros(data) if a else None for data, a in zip(voxels_of(volume), asked, strict=True)]
+
+
+def recorded(volume: Volume, perturbations: list[Any]) -> tuple[Volume, list[list[Fetched]]]:
+    """The volume, whose fetches are recorded and perturbed; and the lists that this fills while tracing."""
+    given = perturbations or [[]] * len(grids(volume))
+    records = [Recording(each, []) for each in given]
+    return with_fetches(volume, list(records)), [record.fetched for record in records]
+
+
+def zero_perturbations(volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: Any) -> list[Any]:
+    """Perturbations of 0 of what was fetched, where its gradient is asked for."""
+    each = zip(voxels_of(volume), fetched, sums, strict=True)
+    return [[] if sum_ is None else perturbations_of(data, found, dtype) for data, found, sum_ in each]
+
+
+def with_cotangents(sums: Sums, volume: Volume, fetched: list[list[Fetched]], cotangents: list[Any]) -> Sums:
+    """The sums with the cotangents of what was fetched."""
+    each = zip(sums, voxels_of(volume), fetched, cotangents, strict=True)
+    return [
+        None if sum_ is None else scatter_add(sum_, data.shape, found, of) for sum_, data, found, of in each
+    ]
+
+
+def cotangents_of(volume: Volume, sums: Sums) -> list[Array | None]:
+    """The sums, like the arrays of voxels."""
+    each = zip(sums, voxels_of(volume), strict=True)
+    return [None if sum_ is None else sum_.reshape(data.shape).astype(data.dtype) for sum_, data in each]
