@@ -163,6 +163,25 @@ def check_arguments(call: str, **arguments: Any) -> None:
         raise ValueError(f"{name} must be {expected}; got {described(value)}. {remedy}")
 
 
+def check_channels(
+    volume: Volume, transfer: Transfer, march: March, compositing: Compositing[Any], lighting: Lighting | None
+) -> None:
+    """Raises `ValueError` for a transfer function that reads another number of channels than the volume has,
+    and for what needs a single one."""
+    channels, reads = volume.channels, transfer.channels
+    if reads not in (None, channels):
+        raise ValueError(
+            f"volume must have as many channels as {type(transfer).__name__} reads, {reads}; got {channels}. "
+            "Several volumes are given as lists: render([a, b], [of_a, of_b], ...)."
+        )
+    adaptive = strides.stride_control(march)
+    single = {"compositing": compositing if compositing.reads_value else None, "lighting": lighting}
+    for name, given in (single | {"march.transforms": adaptive}).items():
+        if channels > 1 and given is not None:
+            kind = type(given).__name__
+            raise ValueError(f"{name}: {kind} needs a volume of one channel; got one of {channels}.")
+
+
 class Progress(eqx.Module):
     """How far a ray has come.
 
@@ -230,13 +249,30 @@ def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 
     return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
+def read(scene: Scene, ray: Ray, piece: Cell) -> Measured:
+    """What is read from memory at a piece's sample; of several volumes, also which share of the piece lies in
+    each."""
+    measured = scene.classification.measure(ray.path(scene.march.sample(piece)))
+    return (*measured, tuple(_share(piece, *span) for span in ray.spans)) if ray.spans else measured
+
+
+def _share(piece: Cell, enters: Scalar, leaves: Scalar) -> Scalar:
+    """The share of a piece that lies between two depths."""
+    # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
+    back = piece.front + piece.width
+    begin, end = jnp.where(enters > piece.front, enters, piece.front), jnp.where(leaves < back, leaves, back)
+    within = jnp.where(end > begin, end - begin, 0)
+    whole = (begin == piece.front) & (end == back)
+    return jnp.where(whole, 1, within / jnp.where(piece.width > 0, piece.width, 1))
+
+
 def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
     """The measured values at a piece's sample, or over the piece where it is integrated, and what the
     transfer function's search finds for them. `recorded`: by the engine's `Recording`, which cannot record
     fetches inside branches."""
     march, classification = scene.march, scene.classification
     if not march.integrates:
-        return classification.at(ray.path(march.sample(piece)))
+        return classification.searched(read(scene, ray, piece))
 
     def measured(depth: Scalar) -> Measured:
         return classification.measure(ray.path(depth))[:1]

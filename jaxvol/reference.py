@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ._util.checks import Arrayable, finite_array
 from ._util.vec3 import apart
-from .compositing.blending import Compositing
+from .compositing.blending import Compositing, Weighting
 from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting
@@ -22,6 +22,7 @@ from .ray import (
     add,
     begin,
     check_arguments,
+    check_channels,
     end,
     measure,
     move,
@@ -32,6 +33,7 @@ from .ray import (
     with_stride,
 )
 from .scene.rendering import Rendering
+from .scene.several import together
 from .scene.space import Line, Ray, enter, invalid
 from .scene.transfer import Transfer
 from .scene.variation import Windows
@@ -74,8 +76,10 @@ def render_ray_reference(
             `march.max_samples` is not given: the length of the scan cannot be known.
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
+    volume, transfer = together(volume, transfer)
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
     scene = Scene(volume, transfer, None, march, compositing_of(compositing), lighting)
+    check_channels(volume, transfer, march, scene.compositing, lighting)
     length, shown = steps_across(volume, march), scene.prepared()
     column, row = (jnp.asarray(number, jnp.int32) for number in pixel)
     line = Line(apart(_vector("origin", origin)), apart(_vector("direction", direction)), (column, row))
@@ -119,7 +123,9 @@ def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:
     found = rendering.depth, details.selected
     found = jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), found)
     pixel = resolve(scene, line, rendering.rgba, *found)
-    rgba, depth = jnp.where(visible, pixel.rgba, 0), jnp.where(visible, pixel.depth, jnp.inf)
+    compositing = scene.compositing
+    shown = visible | (isinstance(compositing, Weighting) and compositing.resolves_transparent)
+    rgba, depth = jnp.where(shown, pixel.rgba, 0), jnp.where(visible, pixel.depth, jnp.inf)
     normal = None if pixel.normal is None else jnp.where(visible, pixel.normal, 0)
     return replace(rendering, rgba=rgba, details=details._replace(depth=depth, normal=normal, selected=None))
 

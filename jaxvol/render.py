@@ -19,6 +19,7 @@ from .planning import plan
 from .ray import Scene, check_arguments
 from .scene.camera import Camera, GivenRays
 from .scene.rendering import Rendering
+from .scene.several import together
 from .scene.transfer import Transfer
 from .scene.volume import Volume
 from .xla.sharding import shard_number
@@ -96,6 +97,7 @@ def render(
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
     order = "render(volume, transfer, camera, march)"
+    volume, transfer = together(volume, transfer)
     if isinstance(march, str):
         if march != "auto":
             raise ValueError(f'march must be a jaxvol March or "auto"; got {march!r}.')
@@ -145,6 +147,7 @@ def render_rays(
             directions of length 0.
     """
     order = "render_rays(volume, transfer, origins, directions, march)"
+    volume, transfer = together(volume, transfer)
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
     origins = finite_array("origins", origins, (..., 3))
     directions = finite_array("directions", directions, (..., 3))

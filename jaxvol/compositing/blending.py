@@ -80,6 +80,11 @@ class Compositing(eqx.Module, Generic[State]):
         marched without light, and what it shows lies at no one place."""
         return not self.resolves
 
+    @property
+    def reads_value(self) -> bool:
+        """Whether it compares or averages values, so that there must be one at a place."""
+        return True
+
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         """The transfer function and the march for the cells of a mode that `resolves`; by default those that
         are given."""
@@ -158,6 +163,15 @@ class Weighting(Compositing[Composite]):
         march. `classification`: of the transfer function that was given, not of that of `marched`. JAX also
         differentiates it at sums of 0, where neither value nor derivative may be NaN."""
         return sums
+
+    @property
+    def reads_value(self) -> bool:
+        return False
+
+    @property
+    def resolves_transparent(self) -> bool:
+        """Whether `resolved` has a derivative to be known where nothing is seen. By default not."""
+        return False
 
     @property
     @final

@@ -40,6 +40,10 @@ class LineIntegral(OpticalDepths):
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         return _Thinner(transfer), march
 
+    @property
+    def resolves_transparent(self) -> bool:
+        return True
+
     def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
         whole = sums / SCALE
         return whole.at[3].set(-jnp.expm1(-whole[3]))
@@ -85,6 +89,17 @@ class _Thinner(Transfer):
         self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
         of = self.transfer.vjp(measured, color, SCALE * extinction, integrated=integrated)
+        return _Thinner(of[0]), of[1]
+
+    @property
+    def mixes(self) -> bool:
+        return self.transfer.mixes
+
+    def emission_vjp(
+        self, measured: Measured, emission: Vec3, extinction: Scalar
+    ) -> tuple[Transfer, Measured]:
+        r, g, b = (SCALE * of for of in emission)
+        of = self.transfer.emission_vjp(measured, (r, g, b), SCALE * extinction)
         return _Thinner(of[0]), of[1]
 
 

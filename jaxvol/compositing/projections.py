@@ -138,6 +138,10 @@ class Average(OpticalDepths):
     def __init__(self, thickness: Any = 1.0):
         self.thickness = number("thickness", thickness, above=0)
 
+    @property
+    def reads_value(self) -> bool:
+        return True
+
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         """Through a fog of constant extinction whose colours are the values: optical depths are widths."""
         if transfer.reads_more:

@@ -25,6 +25,7 @@ from ..march.strides import stride_control
 from ..ray import Scene, end
 from ..scene.camera import GivenRays
 from ..scene.occupancy import Blocks
+from ..scene.several import Several, SeveralBlocks
 from ..scene.transfer import Transfer
 from ..scene.variation import Windows
 from ..scene.volume import Volume, grids, read_as
@@ -48,7 +49,7 @@ class VolumeAcceleration(eqx.Module):
     words: list[UInt32[Array, " voxels"] | None]
     """Of each of the volume's `grids`."""
     slopes: list[UInt32[Array, " voxels"] | None]
-    blocks: Blocks | None
+    blocks: Blocks | SeveralBlocks | None
     windows: Windows | None
 
     @classmethod
@@ -63,7 +64,7 @@ class VolumeAcceleration(eqx.Module):
         return cls(
             [words_of(grid) if packs else None for grid in grids(volume)],
             [slopes_of(grid) if slopes else None for grid in grids(volume)],
-            Blocks.of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
+            _blocks_of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
             None if stride_control(march) is None else Windows.of(volume),
         )
 
@@ -74,6 +75,11 @@ class VolumeAcceleration(eqx.Module):
     def prepared(self, scene: Scene) -> Scene:
         """The scene, packed, and with what is computed once for each image."""
         return self.packed(scene).prepared(self.windows)
+
+
+def _blocks_of(volume: Volume, *, slopes: bool) -> Blocks | SeveralBlocks:
+    several = isinstance(volume.field, Several)
+    return SeveralBlocks.of(volume, slopes=slopes) if several else Blocks.of(volume, slopes=slopes)
 
 
 NO_ACCELERATION = VolumeAcceleration([], [], None, None)

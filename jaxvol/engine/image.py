@@ -14,7 +14,7 @@ from jaxtyping import Array, Int
 
 from ..compositing.selection import Selection
 from ..lighting.template_lighting import with_baked_light
-from ..ray import Scene, begin, end
+from ..ray import Scene, begin, check_channels, end
 from ..reference import step, steps_across
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
@@ -61,6 +61,7 @@ def render_scene(
     check_not_sharded(tiling.devices, scene)
     scene = strong(scene)
     volume, march, lighting = scene.volume, scene.march, scene.lighting
+    check_channels(volume, scene.transfer, march, scene.compositing, lighting)
     steps = None
     if adjoint == "direct":
         # rounded up to one of few lengths, so that a change of step rarely compiles the program again

@@ -27,12 +27,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.vec3 import Scalar, Vec3, along
-from ..compositing.blending import Weighting
+from ..compositing.blending import Composite, Weighting
 from ..lighting.shading import Shader
+from ..march.march import Cell
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..scene.transfer import classification_of
+from ..scene.transfer import Measured, Transfer, classification_of
 from ..scene.volume import fetches_of, voxels_of, with_fetches, with_voxels, without_voxels
 from ..scene.voxel_fetch import Fetched
 from ..xla.trees import PyTree, added, floats, zeros_of
@@ -168,9 +169,20 @@ class Replay(SampleVisitor):
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
-            of_transfer, of_read = self.scene.transfer.vjp(
-                measured, of_color[i], of_extinction, integrated=self.prepared.march.integrates
-            )
+            if self.scene.transfer.mixes:
+                of_transfer, of_read = self._mixed_vjp(
+                    cell,
+                    measured,
+                    classified[i],
+                    each.color,
+                    weights.weight[i],
+                    weights.before[i],
+                    of_extinction,
+                )
+            else:
+                of_transfer, of_read = self.scene.transfer.vjp(
+                    measured, of_color[i], of_extinction, integrated=self.prepared.march.integrates
+                )
             total = total._replace(transfer=added(total.transfer, of_transfer))
             if shaded is not None:
                 of_value, *rest = of_read
@@ -191,6 +203,26 @@ class Replay(SampleVisitor):
             voxels = with_cotangents(total.voxels, self.scene.volume, fetched, of_fetched)
             total = total._replace(voxels=voxels)
         return carry, of_rays, total
+
+    def _mixed_vjp(
+        self,
+        cell: Cell,
+        measured: Measured,
+        classified: tuple[Vec3, Scalar],
+        of_pixel: Vec3,
+        weight: Scalar,
+        before: Scalar,
+        of_extinction: Scalar,
+    ) -> tuple[Transfer, Measured]:
+        """`Transfer.vjp` where colours are weighted by extinction, from the cotangents of the emission, which
+        exist also where nothing is visible: a unit of it shows as weight / extinction, or, where that is 0,
+        as the transmittance times the width."""
+        color, extinction = classified
+        clear = self.prepared.compositing.transmittance(Composite(before)) * cell.width
+        seen = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
+        r, g, b = (of * seen for of in of_pixel)
+        of_extinction = of_extinction - (r * color[0] + g * color[1] + b * color[2])
+        return self.scene.transfer.emission_vjp(measured, (r, g, b), of_extinction)
 
     @property
     def reads_transfer(self) -> bool:

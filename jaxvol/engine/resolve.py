@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .._util.vec3 import Scalar
+from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
 from ..ray import Scene, resolve
 from ..scene.space import Line
@@ -45,7 +46,8 @@ def resolve_pixels(
     def some(indices: Int[Array, " chunk"], *found: PyTree) -> Float[Array, "chunk numbers"]:
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
-    resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal)
+    whole = isinstance(mode, Weighting) and mode.resolves_transparent
+    resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal, whole=whole)
     return resolved * jnp.where(scene.has_fault, jnp.nan, 1).astype(resolved.dtype)
 
 
@@ -53,10 +55,16 @@ resolve_image = on_devices("replicated")(resolve_pixels)
 
 
 def of_visible(
-    some: Callable[..., Float[Array, "chunk numbers"]], tiling: Tiling, found: Found, numbers: int
+    some: Callable[..., Float[Array, "chunk numbers"]],
+    tiling: Tiling,
+    found: Found,
+    numbers: int,
+    *,
+    whole: bool = False,
 ) -> Float[Array, "*rays numbers"]:
     """Pixels of so many numbers by `some(indices, *found)`, called for a chunk of visible pixels at a time,
-    or once, for all pixels, if `Tiling.chunk` is 0. Transparent pixels stay 0, at infinite depth."""
+    or once, for all pixels, if `Tiling.chunk` is 0. Transparent pixels are 0, at infinite depth; they are
+    computed, too, for their derivatives, if asked for the `whole`."""
     shape, size, mesh = found[1].shape, tiling.chunk, tiling.devices
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
@@ -65,11 +73,12 @@ def of_visible(
         return nothing.reshape(*shape, numbers)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
-    number, count = devices.number_of(mesh), jnp.sum(visible, dtype=jnp.int32)
+    asked = jnp.ones_like(visible) if whole else visible
+    number, count = devices.number_of(mesh), jnp.sum(asked, dtype=jnp.int32)
     if size > 0:
-        chosen = in_front(visible, size * number)
+        chosen = in_front(asked, size * number)
     else:
-        chosen = in_place(jnp.pad(visible, (0, -visible.size % number)))
+        chosen = in_place(jnp.pad(asked, (0, -visible.size % number)))
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
@@ -86,4 +95,7 @@ def of_visible(
     own = devices.own_share(mesh, starts)
     pixels = jax.lax.map(chunk, own) if size > 0 else computed(own)
     pixels = devices.gathered(mesh, pixels).reshape(-1, numbers)
-    return nothing.at[chosen].set(pixels, mode="drop").reshape(*shape, numbers)
+    pixels = nothing.at[chosen].set(pixels, mode="drop")
+    if whole:
+        pixels = pixels.at[:, 4].set(jnp.where(visible, pixels[:, 4], jnp.inf))
+    return pixels.reshape(*shape, numbers)

@@ -21,7 +21,7 @@ from .._util.vec3 import Scalar, Vec3
 from ..compositing.selection import Selection
 from ..march.march import Cell, March
 from ..march.strides import RUN, steps_of
-from ..ray import Progress, Scene, add, move, opacity, pieces, stop
+from ..ray import Progress, Scene, add, move, opacity, pieces, read, stop
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
@@ -157,10 +157,7 @@ def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
         return given if divided else pieces_of(at)
 
     def measured(at: Progress, given: Any) -> list[Measured]:
-        def one(ray: Ray, piece: Cell) -> Measured:
-            return classification.measure(ray.path(march.sample(piece)))
-
-        each = vmap_cells(one, (False, True))
+        each = vmap_cells(partial(read, scene), (False, True))
         return [each(ray, piece) for piece in cells(at, given)]
 
     def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
@@ -203,7 +200,8 @@ def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
         return [classify(each)[0] for each in measured]
 
     # Means would be computed again for each use if they were fused into the compositing of each cell.
-    return in_memory(always(at), all_, measured) if scene.march.integrates else all_(measured)
+    means = scene.march.integrates or scene.transfer.mixes
+    return in_memory(always(at), all_, measured) if means else all_(measured)
 
 
 def _measured_over(

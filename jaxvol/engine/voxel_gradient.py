@@ -36,9 +36,11 @@ def zero_sums(volume: Volume, asked: list[bool]) -> Sums:
 
 def recorded(volume: Volume, perturbations: list[Any]) -> tuple[Volume, list[list[Fetched]]]:
     """The volume, whose fetches are recorded and perturbed; and the lists that this fills while tracing."""
-    given = perturbations or [[]] * len(grids(volume))
-    records = [Recording(each, []) for each in given]
-    return with_fetches(volume, list(records)), [record.fetched for record in records]
+    own = grids(volume)
+    records = [Recording(each, []) for each in perturbations or [[]] * len(own)]
+    each = zip(own, records, strict=True)
+    fetches = [grid.fetch if grid.data is None else record for grid, record in each]
+    return with_fetches(volume, fetches), [record.fetched for record in records]
 
 
 def zero_perturbations(volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: Any) -> list[Any]:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Frame, Scalar, Vec3, along, apart
 from .occupancy import BLOCK, Occupancy
+from .several import Several
 from .volume import Volume
 
 
@@ -60,6 +61,11 @@ class Space(eqx.Module):
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
         """Where a line is outside the grid between its entry and its exit, `length` from there: a static
         number of gaps, in any order, which may overlap; missing ones begin at infinity."""
+        return ()
+
+    def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
+        """Of several volumes (`several.Several`), the depths between which a line is in each; none for one.
+        What it is not in ends before it begins."""
         return ()
 
     @abstractmethod
@@ -115,6 +121,8 @@ class Ray(eqx.Module):
     """(column, row); keys everything random along the ray."""
     gaps: tuple[Gap, ...] = ()
     """Depths between entry and exit where the ray is outside the volume."""
+    spans: tuple[Gap, ...] = ()
+    """Of several volumes, the depths between which the ray is in each."""
 
     def contains(self, depth: Scalar) -> Bool[Array, "..."]:
         """Whether this depth is inside the volume: neither past the exit nor in a gap."""
@@ -140,7 +148,7 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
     entry = along(close, direction, start)
     length = jnp.where(hit, far - start, 0)
     path, gaps = space.path(entry, direction), space.gaps(entry, direction, length)
-    ray = Ray(entry, direction, base + start, length, path, pixel, gaps)
+    ray = Ray(entry, direction, base + start, length, path, pixel, gaps, space.spans(entry, direction))
     return invalid(ray, ~jnp.isfinite(toward))
 
 
@@ -179,8 +187,12 @@ class Affine(Space):
     high: Vec3
     spacing: Vec3
     frame: Frame
+    inner: "tuple[Affine, ...]"
+    """The grids of several volumes that this one holds."""
 
     def __init__(self, volume: Volume):
+        several = isinstance(volume.field, Several)
+        self.inner = tuple(map(Affine, volume.field.volumes)) if several else ()
         self.spacing, self.frame = apart(volume.spacing), Frame()
         if volume.direction is None:
             self.low, self.high = (apart(end) for end in volume.corners)
@@ -202,6 +214,9 @@ class Affine(Space):
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         origin, direction = self.frame.coordinates(origin), self.frame.components(direction)
         return slab_interval(origin, direction, self.low, self.high)
+
+    def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
+        return tuple(grid.interval(entry, direction) for grid in self.inner)
 
     def coordinate(self, point: Vec3) -> Vec3:
         point = self.frame.coordinates(point)

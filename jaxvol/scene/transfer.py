@@ -141,6 +141,18 @@ class Transfer(eqx.Module):
         _, pull = eqx.filter_vjp(classified, self, measured)
         return pull((color, extinction))
 
+    @property
+    def mixes(self) -> bool:
+        """Whether it is of several volumes (`several.Together`), whose colours are weighted by extinction:
+        `emission_vjp` is then called in place of `vjp`."""
+        return False
+
+    def emission_vjp(
+        self, measured: Measured, emission: Vec3, extinction: Scalar
+    ) -> tuple["Transfer", Measured]:
+        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction."""
+        raise NotImplementedError
+
 
 def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
     """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
@@ -150,9 +162,7 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
         raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
-        value = volume.value(coordinate)
-        values = value if isinstance(value, tuple) else (value,)
-        return (*values, *transfer.attributes(volume, coordinate))
+        return (*volume.values(coordinate), *transfer.attributes(volume, coordinate))
 
     attributes = partial(transfer.attributes, volume)
     return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)

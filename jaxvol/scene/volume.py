@@ -153,6 +153,11 @@ class Volume(eqx.Module):
         several channels, a tuple."""
         return self.interpolated(coordinate) if self.field is None else self.field.value(self, coordinate)
 
+    def values(self, coordinate: Vec3) -> tuple[Scalar, ...]:
+        """The value, or those of all channels."""
+        value = self.value(coordinate)
+        return value if isinstance(value, tuple) else (value,)
+
     def interpolated(self, coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
         """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type; of
         several channels, a tuple."""

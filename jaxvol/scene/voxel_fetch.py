@@ -163,6 +163,18 @@ def trilinear(cube: Cube, fraction: Vec3) -> Voxel:
     return mix(fx, mix(fy, y0, y1), mix(fy, y2, y3))
 
 
+class Extent(Fetch):
+    """No voxels, only how large the grid is: a field gives the values."""
+
+    nodes: tuple[int, int, int] = eqx.field(static=True)
+
+    def cube_at(self, data: None, node: Node, dtype: Any) -> Cube:
+        raise ValueError("volume has no voxels of its own to be interpolated; read those of its field.")
+
+    def shape(self, data: None) -> tuple[int, int, int]:
+        return self.nodes
+
+
 class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 

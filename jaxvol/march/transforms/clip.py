@@ -188,6 +188,9 @@ class _Clipped(Space):
         between = (leaves > enters) & (enters > 0) & (leaves < length)
         return *gaps, (jnp.where(between, enters, jnp.inf), jnp.where(between, leaves, jnp.inf))
 
+    def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
+        return self.inner.spans(entry, direction)
+
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         grid = self.inner.occupancy(visible, first)
         over = [side.over(grid) for side in self.sides]
