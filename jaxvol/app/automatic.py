@@ -11,7 +11,7 @@ from .._util.checks import described
 from .._util.srgb import from_srgb
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import TransferFunction, extinction_of
-from ..scene.volume import Volume
+from ..scene.volume import Volume, check_one_channel
 from ..xla.platform import is_traced
 
 
@@ -80,6 +80,7 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
     """
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
+    check_one_channel(volume, "automatic_transfer")
     if is_traced(volume):
         raise ValueError(
             "volume is traced here, and its histogram is needed: call automatic_transfer outside of jax.jit, "

@@ -20,7 +20,7 @@ from .._util.files import check_size, file_size
 from .._util.named_axes import along_xyz, is_named
 from ..io.formats.raw import raw_header
 from ..scene.camera import Camera, axes_of
-from ..scene.volume import Volume
+from ..scene.volume import Volume, check_one_channel
 from .sources import SPACE, VoxelSource
 
 
@@ -92,6 +92,7 @@ def levels_of(
     if isinstance(thing, Volume):
         if thing.labels is not None or thing.field is not None:
             raise ValueError("source must be a Volume without labels and field. Use jv.render.")
+        check_one_channel(thing, "bricks")
         own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
         return (VoxelSource(thing.data, **(own | place), axes="xyz", **options, name="volume"),)
     if is_named(thing):

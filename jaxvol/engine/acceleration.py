@@ -32,6 +32,7 @@ from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
+from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
 from .tiling import Tiling
 from .wavefront import Beams, march_rays
@@ -87,7 +88,7 @@ NO_ACCELERATION = VolumeAcceleration([], [], None, None)
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
     """Where the scene is empty; None where the march does not leap. It carries no gradient."""
-    scene = jax.lax.stop_gradient(scene)
+    scene = constant(scene)
     volume, transfer, march, compositing = scene.volume, scene.transfer, scene.march, scene.compositing
     blocks = acceleration.blocks
     if blocks is None:

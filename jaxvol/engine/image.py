@@ -22,7 +22,7 @@ from ..xla.compiling import compiled, recomputed
 from ..xla.differentiation import forward_mode, forward_only, transformations
 from ..xla.platform import is_traced
 from ..xla.sharding import varying
-from ..xla.trees import strong
+from ..xla.trees import constant, strong
 from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import check_not_sharded, mesh_of, on_all, on_devices
 from .gradients import render_vjp
@@ -81,7 +81,7 @@ def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAccelera
     # a mode's parameters have no gradient through the march: it ignores them, or its result is a constant
     marched = scene.marched._replace(compositing=jax.lax.stop_gradient(scene.compositing))
     if isinstance(scene.compositing, Selection):
-        marched = jax.lax.stop_gradient(marched)
+        marched = constant(marched)
     all_ = options.outputs == "all"
     options = replace(options, outputs="all" if all_ else "depth")
     rendering = _image(marched, options, acceleration)

@@ -123,6 +123,9 @@ def _default(node: Any) -> PyTree:
     if isinstance(node, LabelTransferFunction):  # factors of its extinctions are free in `stacked`
         return eqx.tree_at(lambda t: t.stacked, fixed, _default(node.stacked))
     if isinstance(node, Volume):
+        own = jax.tree.map(_default, node.field, is_leaf=lambda n: isinstance(n, KNOWN))
+        if any(not isinstance(b, Fixed) for b in jax.tree.leaves(own, is_leaf=_is_bijection)):
+            return eqx.tree_at(lambda v: v.field, fixed, own)  # its voxels only set its extent
         return eqx.tree_at(lambda v: v.data, fixed, _default(node.data))
     if isinstance(node, Material):
         return eqx.tree_at(lambda m: m.mean_free_path, fixed, Positive(node.mean_free_path))

@@ -20,10 +20,11 @@ from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer
-from ..scene.volume import Volume, without_voxels
+from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_only
 from ..xla.platform import is_traced
+from ..xla.trees import constant
 from .fixed_paths import check_voxels, has_step, with_constant_paths
 from .lanes import walk_all
 from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
@@ -256,6 +257,7 @@ def path_trace(
     """
     order = "path_trace(volume, transfer, camera, lights)"
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
+    check_one_channel(volume, "path_trace")
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):
@@ -271,7 +273,7 @@ def path_trace(
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
     volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials)
-    blocks = Blocks.of(jax.lax.stop_gradient(volume), slopes=transfer.reads_gradient)
+    blocks = Blocks.of(constant(volume), slopes=transfer.reads_gradient)
     inputs = Inputs(volume, transfer, materials, lights, anisotropy)
     how = How(paths, groups, lanes, pixels, antialias)
     limit = jnp.asarray(limit, jnp.int32)

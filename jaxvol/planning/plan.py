@@ -21,6 +21,7 @@ from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.rendering import BrickReport, Rendering
+from ..scene.several import Several
 from ..scene.space import Space, median_node_distance
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
@@ -189,6 +190,9 @@ def plan(
     """
     begun = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
+    several = isinstance(volume, Volume) and isinstance(volume.field, Several)
+    if several or isinstance(volume, list | tuple):
+        raise ValueError("volume must be a single one to be planned for; got several. Pass a March.")
     check_arguments(order, transfer=transfer, camera=camera, lighting=lighting)
     gradients, once = flag("gradients", gradients), flag("once", once)
     source, room, stride = None, None, 1

@@ -200,6 +200,12 @@ class Volume(eqx.Module):
         return slope(0), slope(1), slope(2)
 
 
+def check_one_channel(volume: Volume, use: str) -> None:
+    """Raises `ValueError` for a volume of several channels, which has no such use."""
+    if (channels := volume.channels) > 1:
+        raise ValueError(f"volume must have one channel for {use}; got one of {channels}.")
+
+
 def corners_of(
     origin: Float[Array, "3"], spacing: Float[Array, "3"], direction: Float[Array, "3 3"] | None, cells: Any
 ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

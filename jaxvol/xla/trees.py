@@ -21,6 +21,11 @@ def zeros_of(tree: PyTree) -> PyTree:
     return jax.tree.map(jnp.zeros_like, floats(tree))
 
 
+def constant(tree: PyTree) -> PyTree:
+    """The tree, without gradient. Leaves that are no arrays stay: a field may hold functions."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, tree)
+
+
 def strong(tree: PyTree) -> PyTree:
     """The tree with leaves of weak type, which come from Python numbers, as plain arrays: `jax.custom_vjp`
     loses the gradients of weak ones."""

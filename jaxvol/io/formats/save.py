@@ -9,7 +9,7 @@ import numpy as np
 from ..._util.checks import described, output_file
 from ..._util.files import reason
 from ..._util.whole_files import whole_file
-from ...scene.volume import Volume
+from ...scene.volume import Volume, check_one_channel
 from .medical import simple_itk
 
 
@@ -49,6 +49,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     if volume.field is not None:
         raise ValueError("volume must have voxels; got one with a field. Save an array of its values.")
     path = output_file("path", path)
+    if not path.name.lower().endswith(".npz"):
+        check_one_channel(volume, f"{path.suffix} (.npz holds several)")
     name = path.name.lower()
     if not name.endswith(ENDINGS):
         raise ValueError(f"path must end in {', '.join(ENDINGS)}; got {path}.")
