@@ -12,8 +12,8 @@ from . import Fault
 def _from_base(enter):
     """`enter`, with distances from where a ray of a far camera is restarted, and not from its origin."""
 
-    def entered(space, origin, direction, pixel):
-        ray = enter(space, origin, direction, pixel)
+    def entered(space, origin, direction, *rest):
+        ray = enter(space, origin, direction, *rest)
         toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
         return eqx.tree_at(lambda r: r.t_in, ray, ray.t_in - jnp.maximum(toward - space.diagonal / 2, 0))
 
