@@ -286,7 +286,7 @@ class Camera(eqx.Module):
         Returns:
             The points; NaN where the depth is infinite, since nothing is visible.
         """
-        return _point(self, *(jnp.asarray(each, self.position.dtype) for each in (column, row, depth)))
+        return _points(self, *(jnp.asarray(each, self.position.dtype) for each in (column, row, depth)))
 
     @eqx.filter_jit  # compiled like the renderer's rays, so that both round the same way
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
@@ -376,10 +376,12 @@ def _fitted_view(place: Any, direction: Array, up: Array, angle: Array, aspect: 
 
 
 @eqx.filter_jit
-def _point(camera: Camera, column: Array, row: Array, depth: Array) -> Float[Array, "*pixels 3"]:
-    seen = ~jnp.isinf(depth)
-    point = along(*camera.ray(column, row), jnp.where(seen, depth, 0))
-    return jnp.where(seen[..., None], jnp.stack(point, axis=-1), jnp.nan)
+def _points(camera: Camera, columns: Array, rows: Array, depths: Array) -> Float[Array, "*pixels 3"]:
+    def one(column: Scalar, row: Scalar, depth: Scalar) -> Float[Array, "3"]:
+        point = jnp.stack(along(*camera.ray(column, row), jnp.where(jnp.isinf(depth), 0, depth)))
+        return jnp.where(jnp.isinf(depth), jnp.nan, point)
+
+    return jnp.vectorize(one, signature="(),(),()->(k)")(columns, rows, depths)
 
 
 @jax.jit

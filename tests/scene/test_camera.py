@@ -14,6 +14,8 @@ from jaxvol.engine.tiling import Tiling
 from jaxvol.scene.camera import axes_of
 from jaxvol.scene.space import Affine
 
+from ..scenes import in_float64
+
 
 POSITION, FOCUS = (3.0, -4.0, 2.0), (0.5, 1.0, 0.0)
 BOX = jv.Volume(np.zeros((4, 5, 6), np.uint8), spacing=(10, 3, 1), origin=(7, -5, 2))
@@ -56,6 +58,10 @@ def test_parallel_scale_is_half_the_height():
     np.testing.assert_allclose(np.asarray(origins)[-1, -1], (5.85, -2.85, 1), rtol=1e-6)
 
 
+def rays_of_crop(camera, left, top):
+    return camera.crop(left, top, 12, 9).rays()
+
+
 @pytest.mark.parametrize("parallel_scale", [None, 2.0])
 def test_crop_gives_the_same_rays(parallel_scale):
     camera = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=SIZE, parallel_scale=parallel_scale)
@@ -63,6 +69,8 @@ def test_crop_gives_the_same_rays(parallel_scale):
     assert crop.size == (12, 9)
     whole = [np.asarray(part) for part in camera.rays()]
     for part, full in zip(crop.rays(), whole, strict=True):
+        np.testing.assert_allclose(part, full[3:12, 17:29], atol=1e-6)
+    for part, full in zip(eqx.filter_jit(rays_of_crop)(camera, *jax.device_put((17, 3))), whole, strict=True):
         np.testing.assert_allclose(part, full[3:12, 17:29], atol=1e-6)
     twice = camera.crop(10, 1, 25, 15).crop(7, 2, 12, 9)
     for part, full in zip(twice.rays(), whole, strict=True):
@@ -162,6 +170,67 @@ def test_rays_round_alike_whether_or_not_they_are_differentiated():
             np.testing.assert_array_equal(one, two)
 
 
+K = np.array([[210.0, 0, 61], [0, 205, 50], [0, 0, 1]])
+R = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+R = R * np.linalg.det(R)
+T = np.array([0.4, -0.3, 5.0])
+
+
+def test_a_calibrated_camera_sees_points_where_opencv_projects_them():
+    """And its derivatives are those of OpenCV's formula."""
+
+    def unprojected(K, R, t, u, depth):
+        way = np.append((u - K[:2, 2]) / np.diag(K)[:2], 1)
+        return R.T @ (depth * way / np.linalg.norm(way) - t)
+
+    def point(K, R, t, u, depth):
+        return jv.Camera.from_intrinsics(K, R, t, (128, 96)).point(u[0] - 0.5, u[1] - 0.5, depth)
+
+    with in_float64():
+        found = jax.jit(lambda *given: (point(*given), jax.jacrev(point, argnums=(0, 1, 2))(*given)))
+        for world in np.random.default_rng(1).normal(size=(5, 3)):
+            there = R @ world + T
+            u, depth = ((K @ there) / there[2])[:2], np.linalg.norm(there)
+            seen, slopes = jax.device_get(found(*jax.device_put((K, R, T, u, depth))))
+            np.testing.assert_allclose(seen, world, atol=1e-12)
+            turn = np.cross(np.eye(3), (0.3, -0.5, 0.8)) @ R  # of rotations
+            for i, way in enumerate((np.where(K > 1, 1.0, 0), turn, np.array([0.5, 1, -1]))):
+                ends: list = []
+                for step in (1e-6, -1e-6):
+                    k, r, t = (part + step * way if i == n else part for n, part in enumerate((K, R, T)))
+                    ends.append(unprojected(k, r, t, u, depth))
+                expected = (ends[0] - ends[1]) / 2e-6
+                np.testing.assert_allclose(np.tensordot(slopes[i], way, way.ndim), expected, atol=1e-8)
+    # concrete, and where nothing is seen
+    camera = jv.Camera.from_intrinsics(K, R, T, (128, 96))
+    np.testing.assert_allclose(camera.position, -R.T @ T, atol=1e-6)
+    assert np.isnan(camera.point(3, 4, np.inf)).all()
+
+
+def test_a_detector_is_seen_pixel_by_pixel():
+    """From in front, from behind, and by parallel rays."""
+    source, center, right = np.array([300.0, -400, 90]), np.array([-20.0, 150, 10]), np.array([0, 0.1, 2.0])
+    pitch, size = np.array([0.7, 0.4]), (12, 9)
+    row, column = np.mgrid[: size[1], : size[0]] * 1.0
+
+    def points(parallel, source, center, right, down, pitch, far):
+        camera = jv.Camera.from_detector(source, center, right, down, pitch, size, parallel=parallel)
+        return camera.point(column, row, far)
+
+    with in_float64():
+        for down in (np.array([1.0, 2.0, -0.1]), -np.array([1.0, 2.0, -0.1])):
+            x, y = ((n + 0.5 - m / 2) * p for n, m, p in zip((column, row), size, pitch, strict=True))
+            pixels = center + x[..., None] * unit(right) + y[..., None] * unit(down)
+            far = (
+                np.linalg.norm(pixels - source, axis=-1),
+                abs((center - source) @ unit(np.cross(right, down))),
+            )
+            for parallel, away in zip((False, True), far, strict=True):
+                given = source, center, right, down, pitch, np.broadcast_to(away, row.shape).copy()
+                seen = jax.jit(points, static_argnums=0)(parallel, *jax.device_put(given))
+                np.testing.assert_allclose(seen, pixels, atol=1e-9)
+
+
 def camera(**how):
     return jv.Camera(POSITION, FOCUS, **how)
 
@@ -179,6 +248,24 @@ BAD = {
         "left must be an integer of at least 0; got 1.5",
     ),
     "crop outside": (lambda: camera(size=(9, 9)).crop(5, 5, 5, 2), "crop must be a rectangle inside"),
+    "crop by traced halves": (
+        lambda: jax.jit(lambda left: camera(size=(9, 9)).crop(left, 0, 5, 2).rays())(1.5),
+        "left must be an integer; got a traced array",
+    ),
+    "skew": (lambda: jv.Camera.from_intrinsics(K + np.eye(3, k=1), R, T, SIZE), "K must be .*without skew"),
+    "a mirror": (lambda: jv.Camera.from_intrinsics(K, -R, T, SIZE), "R must be a rotation"),
+    "a slanted detector": (
+        lambda: jv.Camera.from_detector(POSITION, FOCUS, (1, 0, 0), (1, 1, 0), 0.1, SIZE),
+        "right must be perpendicular to down",
+    ),
+    "pitch 0": (
+        lambda: jv.Camera.from_detector(POSITION, FOCUS, (1, 0, 0), (0, 1, 0), (0.1, 0), SIZE),
+        "pixel_pitch must be greater than 0",
+    ),
+    "a source in the detector": (
+        lambda: jv.Camera.from_detector((1, 2, 3), (4, 4, 3), (1, 0, 0), (0, 1, 0), 0.1, SIZE),
+        "source must not lie in the detector's plane",
+    ),
     "angle 180": (lambda: camera(view_angle=180), "view_angle must be .* less than 180 degrees"),
     "NaN": (lambda: jv.Camera((0, np.nan, 0), FOCUS), "position must be finite"),
     "scale 0": (lambda: camera(parallel_scale=0), "parallel_scale must be greater than 0"),
