@@ -137,15 +137,15 @@ class Camera(eqx.Module):
         Args:
             K: ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) in pixels, without skew. The first pixel reaches from 0
                 to 1 and has its center at 0.5, as in COLMAP. OpenCV's `calibrateCamera` has centers at whole
-                numbers: add 0.5 to its cx and cy.
+                numbers: add 0.5 to its cx and cy. Distorted images must be undistorted before.
             R: (3, 3), the rotation from the world to the camera's axes: x to the right of the image, y down,
                 z forward.
             t: (3,), the world's origin in these axes, world length.
             size: (width, height) of the image in pixels.
 
         Raises:
-            ValueError: for another form of `K`, an `R` that is no rotation (up to 0.001), a mirrored one
-                among them, and as `Camera` does. Images with distortion must be undistorted before.
+            ValueError: for another form of `K`, an `R` that is no rotation (up to 0.001), and as `Camera`
+                does.
         """
         K = require(
             finite_array("K", K, (3, 3)),
@@ -173,25 +173,21 @@ class Camera(eqx.Module):
         *,
         parallel: bool | Any = False,
     ) -> "Camera":
-        """The camera of an X-ray machine, a C-arm for example: a flat detector as seen from the source. Rays
-        go on behind the detector; `render(until=)` can end them there. Differentiable with respect to all
-        places, directions and the pitch.
+        """The camera of an X-ray machine, a C-arm for example: a flat detector as seen from the source, with
+        gradients with respect to all of its geometry. Rays go on behind it; `render(until=)` can end them.
 
         Args:
             source: world position of the focal spot.
             center: world position of the middle of the detector.
-            right: direction in which the image's columns count up, of any length. The image is mirrored where
-                `right` and `down` are those of someone behind the detector.
-            down: direction in which its rows count up; perpendicular to `right`.
-            pixel_pitch: distance between pixels on the detector, world length; or one along `right` and one
-                along `down`.
+            right: direction in which the image's columns count up, of any length.
+            down: that of its rows, perpendicular to `right`. The detector may be looked at from behind.
+            pixel_pitch: distance between pixels, world length; or those along `right` and along `down`.
             size: (width, height) of the detector in pixels.
-            parallel: whether rays are parallel, perpendicular to the detector; they begin in the plane
-                through `source`.
+            parallel: whether rays run perpendicular to the detector, from the plane through `source`.
 
         Raises:
             ValueError: for directions that are not perpendicular (up to 0.001), a pitch that is not positive,
-                a source in the detector's plane, and as `Camera` does.
+                and as `Camera` does (whose position is the source).
         """
         source, center = finite_array("source", source, (3,)), finite_array("center", center, (3,))
         right = require(
@@ -204,42 +200,33 @@ class Camera(eqx.Module):
         pitch = require(pitch, lambda p: p > 0, "pixel_pitch must be greater than 0; got {got}.")
         size, parallel = _image_size(size), flag("parallel", parallel)
         place, window = _facing(source, center, right, down, pitch, np.array(size, source.dtype), parallel)
-        message = "source must not lie in the detector's plane; got {got}."
-        source = require(place[0], lambda here, there: (here != there).any(), message, place[1])
         scale = 1 if parallel else None
-        return cls(source, *place[1:], view_angle=90, size=size, window=window, parallel_scale=scale)
+        return cls(*place, view_angle=90, size=size, window=window, parallel_scale=scale)
 
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """A camera that renders only this rectangle of the image: the same pixels, jitter included.
 
         Args:
-            left: column of the rectangle's first pixel. It and `top` may be traced, so that patches anywhere
-                are one program. What of a traced rectangle lies outside of the image shows what the camera
-                would see there, since that cannot be checked.
-            top: its row.
+            left: column of the rectangle's first pixel.
+            top: its row. Where one of the two is traced, so that patches anywhere are one program, what lies
+                outside of the image cannot be refused: it shows what the camera would see there.
             width: number of columns.
             height: number of rows.
 
         Raises:
-            ValueError: for a rectangle that is empty or extends beyond the image, and for traced corners that
-                are no integers.
+            ValueError: for a rectangle that is empty or extends beyond the image, and corners that are no
+                integers.
         """
         width, height = integer("width", width, 1), integer("height", height, 1)
-        first: list[Any] = []
-        given: Any
-        names = "left", "top"
-        for name, given, n, whole in zip(names, (left, top), (width, height), self.size, strict=True):
-            if not is_traced(given):
-                given = integer(name, given, 0)
-                if given + n > whole:
-                    got = f"got left={left}, top={top}, width={width}, height={height}"
-                    raise ValueError(
-                        f"crop must be a rectangle inside the image of {self.size} pixels; {got}."
-                    )
-            elif given.shape or not jnp.issubdtype(given.dtype, jnp.integer):
-                raise ValueError(f"{name} must be an integer; got {described(given)}.")
-            first.append(given)
-        left, top = first
+        if is_traced(left, top):
+            if not all(jnp.issubdtype(jnp.result_type(edge), jnp.integer) for edge in (left, top)):
+                got = f"got {described(left)} and {described(top)}"
+                raise ValueError(f"left and top must be integers; {got}.")
+        else:
+            left, top = integer("left", left, 0), integer("top", top, 0)
+            if left + width > self.size[0] or top + height > self.size[1]:
+                got = f"got left={left}, top={top}, width={width}, height={height}"
+                raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
         x = [self._column(edge) for edge in (left, left + width)]
         y = [self._row(edge) for edge in (top + height, top)]
         camera = replace(self, window=jnp.stack([*x, *y]), size=(width, height), corner=None)
@@ -274,17 +261,16 @@ class Camera(eqx.Module):
         return position, (dx / norm, dy / norm, dz / norm)
 
     def point(self, column: Any, row: Any, depth: Any) -> Float[Array, "*pixels 3"]:
-        """The world points at these distances along the rays of pixels, as when something is picked:
-        `camera.point(column, row, rendering.depth[row, column])`.
+        """The world point at a distance along a pixel's ray, as when something is picked:
+        `camera.point(column, row, rendering.depth[row, column])`; of arrays, an array of points.
 
         Args:
-            column: of the pixel, or an array of columns; of all pixels, `column, row =
-                np.meshgrid(*map(np.arange, camera.size))`.
-            row: of the same shape.
-            depth: distance from the ray's origin, of the same shape.
+            column: of the pixel.
+            row: of the pixel.
+            depth: distance from the ray's origin.
 
         Returns:
-            The points; NaN where the depth is infinite, since nothing is visible.
+            The point; NaN where the depth is infinite, since nothing is visible.
         """
         return _points(self, *(jnp.asarray(each, self.position.dtype) for each in (column, row, depth)))
 

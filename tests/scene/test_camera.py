@@ -58,10 +58,6 @@ def test_parallel_scale_is_half_the_height():
     np.testing.assert_allclose(np.asarray(origins)[-1, -1], (5.85, -2.85, 1), rtol=1e-6)
 
 
-def rays_of_crop(camera, left, top):
-    return camera.crop(left, top, 12, 9).rays()
-
-
 @pytest.mark.parametrize("parallel_scale", [None, 2.0])
 def test_crop_gives_the_same_rays(parallel_scale):
     camera = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=SIZE, parallel_scale=parallel_scale)
@@ -69,8 +65,6 @@ def test_crop_gives_the_same_rays(parallel_scale):
     assert crop.size == (12, 9)
     whole = [np.asarray(part) for part in camera.rays()]
     for part, full in zip(crop.rays(), whole, strict=True):
-        np.testing.assert_allclose(part, full[3:12, 17:29], atol=1e-6)
-    for part, full in zip(eqx.filter_jit(rays_of_crop)(camera, *jax.device_put((17, 3))), whole, strict=True):
         np.testing.assert_allclose(part, full[3:12, 17:29], atol=1e-6)
     twice = camera.crop(10, 1, 25, 15).crop(7, 2, 12, 9)
     for part, full in zip(twice.rays(), whole, strict=True):
@@ -80,6 +74,16 @@ def test_crop_gives_the_same_rays(parallel_scale):
     assert float(other.view_angle) == 20
     np.testing.assert_array_equal(other.corner, (17, 3))
     assert eqx.tree_equal(replace(other, view_angle=crop.view_angle), crop)
+
+
+def test_crops_at_traced_corners_are_one_program():
+    camera, crops = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=SIZE), []
+    rays = jax.jit(lambda left: crops.append(left) or camera.crop(left, 3, 12, 9).rays()[1])
+    for left in (17, 0):
+        np.testing.assert_allclose(
+            rays(left), np.asarray(camera.rays()[1])[3:12, left : left + 12], atol=1e-6
+        )
+    assert len(crops) == 1
 
 
 def test_zoom_magnifies_around_a_point():
@@ -201,10 +205,7 @@ def test_a_calibrated_camera_sees_points_where_opencv_projects_them():
                     ends.append(unprojected(k, r, t, u, depth))
                 expected = (ends[0] - ends[1]) / 2e-6
                 np.testing.assert_allclose(np.tensordot(slopes[i], way, way.ndim), expected, atol=1e-8)
-    # concrete, and where nothing is seen
-    camera = jv.Camera.from_intrinsics(K, R, T, (128, 96))
-    np.testing.assert_allclose(camera.position, -R.T @ T, atol=1e-6)
-    assert np.isnan(camera.point(3, 4, np.inf)).all()
+        assert np.isnan(jax.device_get(found(*jax.device_put((K, R, T, K[:2, 2], np.inf)))[0])).all()
 
 
 def test_a_detector_is_seen_pixel_by_pixel():
@@ -213,21 +214,19 @@ def test_a_detector_is_seen_pixel_by_pixel():
     pitch, size = np.array([0.7, 0.4]), (12, 9)
     row, column = np.mgrid[: size[1], : size[0]] * 1.0
 
-    def points(parallel, source, center, right, down, pitch, far):
-        camera = jv.Camera.from_detector(source, center, right, down, pitch, size, parallel=parallel)
-        return camera.point(column, row, far)
+    @jax.jit
+    def points(source, center, right, down, pitch, far):
+        places = source, center, right, down, pitch, size
+        cameras = (jv.Camera.from_detector(*places, parallel=parallel) for parallel in (False, True))
+        return [camera.point(column, row, away) for camera, away in zip(cameras, far, strict=True)]
 
     with in_float64():
         for down in (np.array([1.0, 2.0, -0.1]), -np.array([1.0, 2.0, -0.1])):
             x, y = ((n + 0.5 - m / 2) * p for n, m, p in zip((column, row), size, pitch, strict=True))
             pixels = center + x[..., None] * unit(right) + y[..., None] * unit(down)
-            far = (
-                np.linalg.norm(pixels - source, axis=-1),
-                abs((center - source) @ unit(np.cross(right, down))),
-            )
-            for parallel, away in zip((False, True), far, strict=True):
-                given = source, center, right, down, pitch, np.broadcast_to(away, row.shape).copy()
-                seen = jax.jit(points, static_argnums=0)(parallel, *jax.device_put(given))
+            height = abs((center - source) @ unit(np.cross(right, down)))
+            far = np.linalg.norm(pixels - source, axis=-1), np.full(row.shape, height)
+            for seen in points(*jax.device_put((source, center, right, down, pitch, far))):
                 np.testing.assert_allclose(seen, pixels, atol=1e-9)
 
 
@@ -250,7 +249,7 @@ BAD = {
     "crop outside": (lambda: camera(size=(9, 9)).crop(5, 5, 5, 2), "crop must be a rectangle inside"),
     "crop by traced halves": (
         lambda: jax.jit(lambda left: camera(size=(9, 9)).crop(left, 0, 5, 2).rays())(1.5),
-        "left must be an integer; got a traced array",
+        r"left and top must be integers; got a traced array .* and 0",
     ),
     "skew": (lambda: jv.Camera.from_intrinsics(K + np.eye(3, k=1), R, T, SIZE), "K must be .*without skew"),
     "a mirror": (lambda: jv.Camera.from_intrinsics(K, -R, T, SIZE), "R must be a rotation"),
@@ -261,10 +260,6 @@ BAD = {
     "pitch 0": (
         lambda: jv.Camera.from_detector(POSITION, FOCUS, (1, 0, 0), (0, 1, 0), (0.1, 0), SIZE),
         "pixel_pitch must be greater than 0",
-    ),
-    "a source in the detector": (
-        lambda: jv.Camera.from_detector((1, 2, 3), (4, 4, 3), (1, 0, 0), (0, 1, 0), 0.1, SIZE),
-        "source must not lie in the detector's plane",
     ),
     "angle 180": (lambda: camera(view_angle=180), "view_angle must be .* less than 180 degrees"),
     "NaN": (lambda: jv.Camera((0, np.nan, 0), FOCUS), "position must be finite"),
