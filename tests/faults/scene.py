@@ -96,6 +96,12 @@ FAULTS: list[Fault] = [
         ("scene/test_space.py::test_entry_and_length_are_right",),
     ),
     Fault(
+        "ends of rays: no derivative by them",
+        "scene.space:enter",
+        lambda f: lambda *given: f(*given[:4], *jax.lax.stop_gradient(given[4:])),
+        ("engine/test_ends.py::test_a_uniform_box_is_seen_up_to_a_depth_by_several_rays_a_pixel",),
+    ),
+    Fault(
         "toroidal map: the first gap of a ray only",
         "march.transforms.sector_faces:GAPS",
         lambda _: 1,
