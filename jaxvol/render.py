@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ._util.checks import Arrayable, described, finite_array, require
+from ._util.checks import Arrayable, described, finite_array, integer, require
 from .compositing.blending import Compositing
 from .compositing.modes import Mode, compositing_of
 from .engine.devices import Devices
@@ -17,8 +17,8 @@ from .lighting.shading import Lighting
 from .march.march import March
 from .planning import plan
 from .ray import Scene, check_arguments
-from .scene.camera import Camera, GivenRays
-from .scene.rendering import Rendering
+from .scene.camera import Camera, Ending, GivenRays, finer
+from .scene.rendering import Rendering, pooled
 from .scene.several import together
 from .scene.transfer import Transfer
 from .scene.volume import Volume
@@ -41,6 +41,8 @@ def render(
     outputs: RenderOutputs | Any = "all",
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
+    antialias: int | Any = 1,
+    until: Arrayable | None = None,
 ) -> Rendering:
     """Renders an image of a volume.
 
@@ -71,6 +73,16 @@ def render(
             chooses one device. In a program of several processes (`jax.distributed.initialize()`) pass
             `jax.devices()` and make the same calls in all of them; each gets the whole image
             (`examples/several_processes.py`).
+        antialias: number n of rays along the width and the height of each pixel, through the centers of
+            n x n equal parts of it; by default one. A pixel is their mean (a box filter), its depth that of
+            their opacity. Time and memory grow with n². With a single ray, what is smaller than a pixel
+            moves the image by jumps: the gradient of image statistics (entropy, histograms, edges) with
+            respect to the camera is then mostly noise.
+        until: (height, width) distances from the rays' origins, world length, at which rays end: what lies
+            behind something opaque that is drawn otherwise, a mesh, is not seen. Infinite where a ray goes on
+            to the exit; nothing is seen where it is below the entry. It is an exit like the volume's:
+            `AlphaCorrection` cuts the last cell there, and makes gradients by `until` complete. Another
+            renderer's planar depth z along the view lies at the distance z / cos of the ray's angle to it.
 
     Returns:
         A `Rendering` of shape (height, width), in JAX's default float type. If a number on which all pixels
@@ -83,6 +95,7 @@ def render(
             for unknown outputs or adjoint; for `"direct"` where the step, the volume's place or a transform
             that bends space is traced and `march.max_samples` is not given; for `"auto"` where arrays are
             traced, and for a tolerance without it; for wrong `devices`, and for any inside a `jax.shard_map`;
+            for an `antialias` that is no integer of at least 1; for an `until` of another shape or with NaN;
             and under a mode of differentiation that is not the adjoint's. (`jax.jvp` of a `jax.jit` under
             `"replay"` is JAX's own `TypeError`.)
 
@@ -111,8 +124,15 @@ def render(
         raise ValueError(f'tolerance goes with march="auto"; got {tolerance!r} with {described(march)}.')
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
     assert isinstance(march, March)
-    scene = Scene(volume, transfer, camera, march, compositing_of(compositing), lighting)
-    return render_scene(scene, outputs, adjoint, devices=devices)
+    n, source = integer("antialias", antialias, 1), camera
+    if n > 1:
+        source = finer(camera, n)
+    if until is not None:
+        until = finite_array("until", until, camera.size[::-1], infinite=True)
+        source = Ending(source, until if n == 1 else jnp.kron(until, jnp.ones((n, n), until.dtype)))
+    scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
+    rendering = render_scene(scene, outputs, adjoint, devices=devices)
+    return rendering if n == 1 else pooled(rendering, n)
 
 
 def render_rays(
@@ -128,6 +148,7 @@ def render_rays(
     outputs: RenderOutputs | Any = "all",
     adjoint: Adjoint | Any = "replay",
     devices: Devices | Any | None = None,
+    until: Arrayable | None = None,
 ) -> Rendering:
     """Renders arbitrary rays. All other arguments are as for `render`.
 
@@ -138,6 +159,7 @@ def render_rays(
             (index in the flattened array, 0). Within a `jax.shard_map` over the first axis that is the index
             in the whole array; but under `check_vma=False`, where JAX does not tell a shard that it is one,
             give pixels, or each shard draws the same numbers.
+        until: (*rays,) distances at which rays end.
 
     Returns:
         A `Rendering` of shape `*rays`.
@@ -161,6 +183,8 @@ def render_rays(
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
     source = GivenRays(origins, directions, _pixels(pixels, origins), first)
+    if until is not None:
+        source = Ending(source, finite_array("until", until, origins.shape[:-1], infinite=True))
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
     return render_scene(scene, outputs, adjoint, devices=devices)
 

@@ -76,6 +76,18 @@ BAD = {
         lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, lighting=LIGHT),
         r"lighting must be None or a Lighting; got a ConstantLight\. " + LIGHTINGS,
     ),
+    "half a ray": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, antialias=0.5),
+        "antialias must be an integer of at least 1; got 0.5",
+    ),
+    "ends of another image": (
+        lambda: jv.render(VOLUME, TRANSFER, CAMERA, MARCH, until=np.ones((4, 5))),
+        r"until must have shape \(4, 4\); got shape \(4, 5\)",
+    ),
+    "an end that is NaN": (
+        lambda: jv.render_rays(VOLUME, TRANSFER, *RAYS, MARCH, until=[np.nan]),
+        "until must not be NaN",
+    ),
     "rays' order": (
         lambda: jv.render_rays(TRANSFER, VOLUME, *RAYS, MARCH),
         r"the order is render_rays\(volume, transfer, origins, directions, march\)",

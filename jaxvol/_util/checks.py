@@ -87,9 +87,15 @@ def all_finite(tree: Any) -> Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves])) if leaves else jnp.array(True)
 
 
-def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | None, ...]) -> Array:
+def finite_array(
+    name: str,
+    value: Arrayable,
+    shape: tuple[int | EllipsisType | None, ...],
+    *,
+    infinite: bool = False,
+) -> Array:
     """`value` as an array of JAX's default float type and of this shape (None: any length; a leading `...`:
-    any axes)."""
+    any axes). `infinite`: infinity may come, too, but not NaN."""
     expected = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
     try:
         if isinstance(value, jax.Array):
@@ -110,6 +116,8 @@ def finite_array(name: str, value: Arrayable, shape: tuple[int | EllipsisType | 
     found = array.shape[array.ndim - len(lengths) :] if ... in shape else array.shape
     if len(found) != len(lengths) or any(n not in (None, m) for n, m in zip(lengths, found, strict=True)):
         raise ValueError(f"{name} must have shape {expected}; got shape {array.shape}.")
+    if infinite:
+        return require(array, lambda values: abs(values) <= np.inf, f"{name} must not be NaN; got {{got}}.")
     if isinstance(given, np.ndarray) and not np.all(finite(cast)):
         beyond = f" in {array.dtype}" if np.all(finite(given)) else ""
         raise ValueError(f"{name} must be finite{beyond}; got {given}.")

@@ -230,7 +230,7 @@ def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:
     finest = levels[0]
     width, height = camera.size
     left, right, low, high = np.asarray(camera.window, float)
-    pixel = min((right - left) / width, (high - low) / height)
+    pixel = min(abs(right - left) / width, (high - low) / height)  # mirrored if `right` is the lesser
     if camera.parallel_scale is not None:
         pixel *= float(camera.parallel_scale)
     else:

@@ -23,7 +23,7 @@ from ..march.beams import EmptySpaceIndex, View
 from ..march.march import March
 from ..march.strides import stride_control
 from ..ray import Scene, end
-from ..scene.camera import GivenRays
+from ..scene.camera import GivenRays, without_ends
 from ..scene.occupancy import Blocks
 from ..scene.several import Several, SeveralBlocks
 from ..scene.transfer import Transfer
@@ -101,7 +101,9 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         visible |= transfer.visible(blocks)
     corner = volume.first
     occupancy = space.occupancy(visible) if corner is None else space.occupancy(visible, corner)
-    if isinstance(scene.source, GivenRays):
+    # ends leave more empty, but would hide from the corners of a cell what the rays between them see
+    source = without_ends(scene.source)
+    if isinstance(source, GivenRays):
         return march.empty_space(occupancy, None)
 
     def first_hit(index: EmptySpaceIndex, columns: Int[Array, "*rays"], rows: Int[Array, "*rays"]) -> Array:
@@ -112,7 +114,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
                 "lies before. Use another method."
             )
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
-        seen_by = lines(scene.source, columns.reshape(1, -1), rows.reshape(1, -1), no_fault)
+        seen_by = lines(source, columns.reshape(1, -1), rows.reshape(1, -1), no_fault)
         own = GivenRays(jnp.stack(seen_by.origin, axis=-1), jnp.stack(seen_by.direction, axis=-1))
         one_tile = tiling._replace(tile=columns.size, devices=None)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
@@ -122,7 +124,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         rendering = vmap_rays(partial(end, seen))(rays, at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)
 
-    no_fault, source = jnp.zeros((), bool), scene.source
+    no_fault = jnp.zeros((), bool)
     return march.empty_space(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))
 
 

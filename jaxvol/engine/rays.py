@@ -10,7 +10,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.checks import all_finite
 from ..march.beams import Box
-from ..scene.camera import Camera, GivenRays
+from ..scene.camera import Camera, Ending, GivenRays, without_ends
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
 from ..xla.memory import in_memory
@@ -29,6 +29,8 @@ from .tiling import Tiling
 
 
 Lanes = Int[Array, "groups rays"]
+
+Source: TypeAlias = Camera | GivenRays | Ending
 
 
 class RayTiles(eqx.Module):
@@ -47,8 +49,9 @@ class RayTiles(eqx.Module):
     tiling: Tiling = eqx.field(static=True)
 
     @classmethod
-    def of(cls, source: Camera | GivenRays, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
+    def of(cls, source: Source, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
         """The tiles of a camera's pixels, or of given rays; small ones for `"direct"`."""
+        source = without_ends(source)
         side, most = tiling.beam, tiling.direct_tile if direct else tiling.tile
         shares = devices.number_of(tiling.devices)
 
@@ -100,10 +103,19 @@ class RayTiles(eqx.Module):
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
-    @abstractmethod
-    def rays(self, source: Any, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
+    def rays(self, source: Source, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         """The rays of a tile, cut to the volume. Those that only fill up groups miss it. If there is a
         `fault` in the scene, all of them are NaN, and so invalid."""
+        found, wanted = self.lines_of(without_ends(source), tile, fault)
+        if isinstance(source, Ending):
+            found = found._replace(until=self.disassemble(source.until)[tile])
+        return entering(space, found, wanted, self.tiling.searched)
+
+    @abstractmethod
+    def lines_of(
+        self, source: Any, tile: Int[Array, ""], fault: Bool[Array, ""]
+    ) -> tuple[Line, Bool[Array, "groups rays"]]:
+        """The rays of a tile, and which of them are of the image."""
 
     @abstractmethod
     def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
@@ -125,17 +137,19 @@ class _PixelTiles(RayTiles):
     across: int = eqx.field(static=True)
     down: int = eqx.field(static=True)
 
-    def rays(self, source: Camera, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
+    def lines_of(
+        self, source: Camera, tile: Int[Array, ""], fault: Bool[Array, ""]
+    ) -> tuple[Line, Bool[Array, "groups rays"]]:
         side, group = self.tiling.side, self.tiling.group
         order = jnp.arange(self.tiling.rays_per_beam)
         group_y, group_x, y, x = jnp.unravel_index(order, (2, 2, side, side))
         column, row = self._pixels(tile, group_y * side + y, group_x * side + x)
         column, row = column.reshape(-1, group), row.reshape(-1, group)
         width, height = self.size
-        wanted = (column < width) & (row < height)
-        return entering(space, lines(source, column, row, fault), wanted, self.tiling.searched)
+        return lines(source, column, row, fault), (column < width) & (row < height)
 
-    def box(self, source: Camera, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+        source = without_ends(source)
         y, x = jnp.divmod(jnp.arange(4), 2)
         last = self.tiling.beam - 1
         column, row = self._pixels(tile, y * last, x * last)
@@ -169,7 +183,9 @@ class _GivenRayTiles(RayTiles):
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
-    def rays(self, source: GivenRays, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
+    def lines_of(
+        self, source: GivenRays, tile: Int[Array, ""], fault: Bool[Array, ""]
+    ) -> tuple[Line, Bool[Array, "groups rays"]]:
         count = math.prod(self.shape)
         if count == 0:  # a row for the look-ups below
             source = GivenRays(
@@ -181,9 +197,9 @@ class _GivenRayTiles(RayTiles):
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
         own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
-        return entering(space, own, number < count, self.tiling.searched)
+        return own, number < count
 
-    def box(self, source: GivenRays, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
         return lambda occupancy: Box.around(occupancy, by_beam)
 
@@ -199,8 +215,10 @@ class _GivenRayTiles(RayTiles):
         return self.of_tiles(padded.reshape(-(-count // size), size, *rest))
 
 
-def lines_at(source: Camera | GivenRays, indices: Int[Array, " rays"]) -> Line:
+def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
     """The rays of indices into the flattened image, as the march rounds them."""
+    if isinstance(source, Ending):
+        return lines_at(source.rays, indices)._replace(until=source.until.reshape(-1)[indices])
     if not isinstance(source, Camera):
         return jax.vmap(source.line)(indices)
     rows, columns = jnp.divmod(indices, source.size[0])

@@ -158,7 +158,7 @@ class ImageResidual(eqx.Module):
                     f"scene must return a camera of its view's size {of_view.size}; got {camera.size}."
                 )
             if pieces > 1:
-                camera = camera.part(0, first, (camera.size[0], rows))
+                camera = camera.crop(0, first, camera.size[0], rows)
             how: Any = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
             rendered = rendering.rgba if channels == 4 else rendering.image(self.references.background)

@@ -5,6 +5,7 @@ the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its cent
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from jaxtyping import Array, Float, Int, Num
 
 from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require
 from .._util.vec3 import Scalar, Vec3, along, apart
+from ..xla.platform import is_traced
 from .space import Line
 from .volume import Volume, corners_of
 
@@ -125,30 +127,109 @@ class Camera(eqx.Module):
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
+    @classmethod
+    def from_intrinsics(
+        cls, K: Arrayable, R: Arrayable, t: Arrayable, size: tuple[int, int] | Any
+    ) -> "Camera":
+        """The calibrated camera of OpenCV and COLMAP: it sees a world point x at the pixel coordinates
+        K (R x + t), divided by the third of them. Differentiable with respect to K, R and t.
+
+        Args:
+            K: ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) in pixels, without skew. The first pixel reaches from 0
+                to 1 and has its center at 0.5, as in COLMAP. OpenCV's `calibrateCamera` has centers at whole
+                numbers: add 0.5 to its cx and cy. Distorted images must be undistorted before.
+            R: (3, 3), the rotation from the world to the camera's axes: x to the right of the image, y down,
+                z forward.
+            t: (3,), the world's origin in these axes, world length.
+            size: (width, height) of the image in pixels.
+
+        Raises:
+            ValueError: for another form of `K`, an `R` that is no rotation (up to 0.001), and as `Camera`
+                does.
+        """
+        K = require(
+            finite_array("K", K, (3, 3)),
+            lambda k: (
+                ((k[0, 0] > 0) & (k[1, 1] > 0) & (k[2, 2] == 1))
+                & ((k[0, 1] == 0) & (k[1, 0] == 0) & (k[2, 0] == 0) & (k[2, 1] == 0))
+            ),
+            "K must be ((fx, 0, cx), (0, fy, cy), (0, 0, 1)), fx and fy above 0, without skew; got {got}.",
+        )
+        message = "R must be a rotation, whose rows are orthonormal and right-handed; got {got}."
+        R, t = require(finite_array("R", R, (3, 3)), _is_rotation, message), finite_array("t", t, (3,))
+        size = _image_size(size)
+        place, window = _calibrated(K, R, t, np.array(size, K.dtype))
+        return cls(*place, view_angle=90, size=size, window=window)
+
+    @classmethod
+    def from_detector(
+        cls,
+        source: Arrayable,
+        center: Arrayable,
+        right: Arrayable,
+        down: Arrayable,
+        pixel_pitch: Arrayable,
+        size: tuple[int, int] | Any,
+        *,
+        parallel: bool | Any = False,
+    ) -> "Camera":
+        """The camera of an X-ray machine, a C-arm for example: a flat detector as seen from the source, with
+        gradients with respect to all of its geometry. Rays go on behind it; `render(until=)` can end them.
+
+        Args:
+            source: world position of the focal spot.
+            center: world position of the middle of the detector.
+            right: direction in which the image's columns count up, of any length.
+            down: that of its rows, perpendicular to `right`. The detector may be looked at from behind.
+            pixel_pitch: distance between pixels, world length; or those along `right` and along `down`.
+            size: (width, height) of the detector in pixels.
+            parallel: whether rays run perpendicular to the detector, from the plane through `source`.
+
+        Raises:
+            ValueError: for directions that are not perpendicular (up to 0.001), a pitch that is not positive,
+                and as `Camera` does (whose position is the source).
+        """
+        source, center = finite_array("source", source, (3,)), finite_array("center", center, (3,))
+        right = require(
+            finite_array("right", right, (3,)),
+            lambda a, b: abs((a * b).sum()) < 1e-3 * ((a * a).sum() * (b * b).sum()) ** 0.5,
+            "right must be perpendicular to down, and neither may be zero; got {got} for right.",
+            down := finite_array("down", down, (3,)),
+        )
+        pitch = finite_array("pixel_pitch", pixel_pitch, (2,) if np.shape(pixel_pitch) else ())
+        pitch = require(pitch, lambda p: p > 0, "pixel_pitch must be greater than 0; got {got}.")
+        size, parallel = _image_size(size), flag("parallel", parallel)
+        place, window = _facing(source, center, right, down, pitch, np.array(size, source.dtype), parallel)
+        scale = 1 if parallel else None
+        return cls(*place, view_angle=90, size=size, window=window, parallel_scale=scale)
+
     def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
         """A camera that renders only this rectangle of the image: the same pixels, jitter included.
 
         Args:
             left: column of the rectangle's first pixel.
-            top: its row.
+            top: its row. Where one of the two is traced, so that patches anywhere are one program, what lies
+                outside of the image cannot be refused: it shows what the camera would see there.
             width: number of columns.
             height: number of rows.
 
         Raises:
-            ValueError: for a rectangle that is empty or extends beyond the image.
+            ValueError: for a rectangle that is empty or extends beyond the image, and corners that are no
+                integers.
         """
-        left, top = integer("left", left, 0), integer("top", top, 0)
         width, height = integer("width", width, 1), integer("height", height, 1)
-        if left + width > self.size[0] or top + height > self.size[1]:
-            got = f"got left={left}, top={top}, width={width}, height={height}"
-            raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
-        return self.part(left, top, (width, height))
-
-    def part(self, left: Any, top: Any, size: tuple[int, int]) -> "Camera":
-        """`crop` without checks: from a row and column, which may be traced, also beyond the image."""
-        x = [self._column(edge) for edge in (left, left + size[0])]
-        y = [self._row(edge) for edge in (top + size[1], top)]
-        camera = replace(self, window=jnp.stack([*x, *y]), size=size, corner=None)
+        if is_traced(left, top):
+            if not all(jnp.issubdtype(jnp.result_type(edge), jnp.integer) for edge in (left, top)):
+                got = f"got {described(left)} and {described(top)}"
+                raise ValueError(f"left and top must be integers; {got}.")
+        else:
+            left, top = integer("left", left, 0), integer("top", top, 0)
+            if left + width > self.size[0] or top + height > self.size[1]:
+                got = f"got left={left}, top={top}, width={width}, height={height}"
+                raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
+        x = [self._column(edge) for edge in (left, left + width)]
+        y = [self._row(edge) for edge in (top + height, top)]
+        camera = replace(self, window=jnp.stack([*x, *y]), size=(width, height), corner=None)
         corner = self.corner + jnp.asarray([left, top], self.corner.dtype)
         return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
@@ -178,6 +259,20 @@ class Camera(eqx.Module):
         dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return position, (dx / norm, dy / norm, dz / norm)
+
+    def point(self, column: Any, row: Any, depth: Any) -> Float[Array, "*pixels 3"]:
+        """The world point at a distance along a pixel's ray, as when something is picked:
+        `camera.point(column, row, rendering.depth[row, column])`; of arrays, an array of points.
+
+        Args:
+            column: of the pixel.
+            row: of the pixel.
+            depth: distance from the ray's origin.
+
+        Returns:
+            The point; NaN where the depth is infinite, since nothing is visible.
+        """
+        return _points(self, *(jnp.asarray(each, self.position.dtype) for each in (column, row, depth)))
 
     @eqx.filter_jit  # compiled like the renderer's rays, so that both round the same way
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
@@ -226,6 +321,24 @@ class GivenRays(eqx.Module):
         return Line((x, y, z), (dx, dy, dz), self.pixel(index))
 
 
+class Ending(eqx.Module):
+    """Rays that end at these distances from their origins; infinite where they go on to the exit."""
+
+    rays: Camera | GivenRays
+    until: Float[Array, "*rays"]
+
+
+def without_ends(source: Camera | GivenRays | Ending) -> Camera | GivenRays:
+    """Where rays come from, whether they end or not."""
+    return source.rays if isinstance(source, Ending) else source
+
+
+def finer(camera: Camera, n: int) -> Camera:
+    """The same view with n x n pixels in place of each."""
+    width, height = camera.size
+    return replace(camera, size=(n * width, n * height), corner=n * camera.corner)
+
+
 def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
     """Unit vectors to the right of the image, up in it, and forward."""
     forward = camera.focal_point - camera.position
@@ -248,6 +361,45 @@ def _fitted_view(place: Any, direction: Array, up: Array, angle: Array, aspect: 
     return position, center, up, radius / aspect
 
 
+@eqx.filter_jit
+def _points(camera: Camera, columns: Array, rows: Array, depths: Array) -> Float[Array, "*pixels 3"]:
+    def one(column: Scalar, row: Scalar, depth: Scalar) -> Float[Array, "3"]:
+        point = jnp.stack(along(*camera.ray(column, row), jnp.where(jnp.isinf(depth), 0, depth)))
+        return jnp.where(jnp.isinf(depth), jnp.nan, point)
+
+    return jnp.vectorize(one, signature="(),(),()->(k)")(columns, rows, depths)
+
+
+@jax.jit
+def _calibrated(k: Array, r: Array, t: Array, size: Array) -> tuple[list[Array], Array]:
+    """Position, focal point and up direction of a calibrated camera; and its window, for a view angle of
+    90°."""
+    position = -jnp.sum(r * t[:, None], axis=0)
+    # as far away as the world's origin, since a near point would be rounded
+    away = 1 + jax.lax.stop_gradient(jnp.linalg.norm(t))
+    focal, middle = jnp.diagonal(k)[:2], k[:2, 2]
+    low, high = -middle / focal, (size - middle) / focal
+    window = jnp.stack([low[0], high[0], -high[1], -low[1]])
+    return [position, position + away * r[2], -r[1]], window
+
+
+@partial(jax.jit, static_argnums=6)
+def _facing(
+    source: Array, center: Array, right: Array, down: Array, pitch: Array, size: Array, parallel: bool
+) -> tuple[list[Array], Array]:
+    """Position, focal point and up direction of a camera that faces a detector; and its window, for a view
+    angle of 90° or a parallel scale of 1."""
+    right, down = (axis / jnp.linalg.norm(axis) for axis in (right, down))
+    to_center, normal = center - source, jnp.cross(right, down)
+    distance = jnp.sum(normal * to_center)
+    middle = jnp.stack([jnp.sum(axis * to_center) for axis in (right, down)])
+    scale = 1 if parallel else jnp.abs(distance)
+    low, high = ((middle + sign * size * pitch / 2) / scale for sign in (-1, 1))
+    side = jnp.sign(distance)  # seen from behind, the image's columns run to the left of the camera
+    window = jnp.stack([side * low[0], side * high[0], -high[1], -low[1]])
+    return [source, source + distance * normal, -down], window
+
+
 @jax.jit
 def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     """1/`factor` of a window."""
@@ -262,6 +414,14 @@ def _sine(a: Any, b: Any) -> Any:
     across = sum((a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2]) ** 2 for i in range(3))
     lengths = (a * a).sum() * (b * b).sum()
     return (across / (lengths + (lengths == 0).astype(lengths.dtype))) ** 0.5
+
+
+def _is_rotation(r: Any) -> Any:
+    """Whether the rows of a matrix are orthonormal and right-handed, up to 0.001."""
+    x, y, z = r
+    across = [x[i - 2] * y[i - 1] - x[i - 1] * y[i - 2] - z[i] for i in range(3)]
+    off = (x * x).sum() - 1, (y * y).sum() - 1, (x * y).sum(), *across
+    return sum(each * each for each in off) < 1e-6
 
 
 def _image_size(size: Any) -> tuple[int, int]:

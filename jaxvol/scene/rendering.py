@@ -1,5 +1,6 @@
 """What does a render return?"""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -60,6 +61,9 @@ class Rendering(eqx.Module):
         normal: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
         bricks: the `BrickReport` of `render_bricks`.
 
+    With `antialias`, a pixel has the mean of its rays' `rgba` and `error`, that of `depth` and `normal`
+    weighted by opacity, and the sum of `samples`; it is `exhausted` or `aligned` where any of them is.
+
     All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
     other than `"over"` say what their depth is.
     """
@@ -110,6 +114,34 @@ class Rendering(eqx.Module):
             expected = f"one colour (3,) or an image {shape}"
             raise ValueError(f"background must be {expected}; got shape {background.shape}.")
         return _over(self.rgba, background)
+
+
+@partial(jax.jit, static_argnums=1)
+def pooled(rendering: Rendering, n: int) -> Rendering:
+    """The image of which each pixel is the mean of n x n of this one."""
+    height, width = (size // n for size in rendering.exhausted.shape)
+
+    def of_pixels(reduce: Any, tree: PyTree) -> Any:
+        return jax.tree.map(
+            lambda leaf: reduce(leaf.reshape(height, n, width, n, *leaf.shape[2:]), axis=(1, 3)), tree
+        )
+
+    mean, details, opacity = partial(of_pixels, jnp.mean), rendering.details, rendering.rgba[..., 3]
+    depth, normal, samples = details.depth, details.normal, details.samples
+    if depth is not None:
+        visible = ~jnp.isinf(depth)
+        weight = jnp.where(visible, opacity, 0)
+        total, sums = mean((weight, weight * jnp.where(visible, depth, 0)))
+        depth = jnp.where(total == 0, jnp.inf, sums / jnp.where(total == 0, 1, total))
+    if normal is not None:
+        normal = mean(opacity[..., None] * normal)
+        square = jnp.sum(normal * normal, axis=-1, keepdims=True)
+        normal = normal / jnp.sqrt(jnp.where(square == 0, 1, square))
+    if samples is not None:
+        samples = of_pixels(partial(jnp.sum, dtype=samples.dtype), samples)
+    exhausted, aligned = of_pixels(jnp.any, (rendering.exhausted, details.aligned))
+    details = Details(depth, samples, mean(details.error), aligned, normal)
+    return Rendering(mean(rendering.rgba), exhausted, details)
 
 
 @jax.jit

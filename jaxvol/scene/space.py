@@ -97,11 +97,13 @@ class Space(eqx.Module):
 
 
 class Line(NamedTuple):
-    """A ray before it is cut to the volume: world origin, unit direction, and (column, row) of its pixel."""
+    """A ray before it is cut to the volume: world origin, unit direction, (column, row) of its pixel, and the
+    distance from the origin at which it ends, if not at the volume's exit."""
 
     origin: Vec3
     direction: Vec3
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
+    until: Scalar | None = None
 
 
 class Ray(eqx.Module):
@@ -135,8 +137,15 @@ class Ray(eqx.Module):
         return within
 
 
-def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, ""], Int[Array, ""]]) -> Ray:
-    """Clip a ray to the volume and to what lies ahead of its origin; `invalid` if a number is not finite."""
+def enter(
+    space: Space,
+    origin: Vec3,
+    direction: Vec3,
+    pixel: tuple[Int[Array, ""], Int[Array, ""]],
+    until: Scalar | None = None,
+) -> Ray:
+    """Clip a ray to the volume, to what lies ahead of its origin, and to its first part, up to the distance
+    `until`; `invalid` if a number is not finite (or `until` NaN)."""
     # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
@@ -147,9 +156,18 @@ def enter(space: Space, origin: Vec3, direction: Vec3, pixel: tuple[Int[Array, "
     start = jnp.where(hit, start, 0)  # a miss has infinite distances, whose products are NaN
     entry = along(close, direction, start)
     length = jnp.where(hit, far - start, 0)
+    # also those gaps that reach past where the ray ends
     path, gaps = space.path(entry, direction), space.gaps(entry, direction, length)
-    ray = Ray(entry, direction, base + start, length, path, pixel, gaps, space.spans(entry, direction))
-    return invalid(ray, ~jnp.isfinite(toward))
+    spans = space.spans(entry, direction)
+    fault = ~jnp.isfinite(toward)
+    if until is not None:
+        left = until - base - start
+        length, fault = (
+            jnp.where(left < length, jnp.where(left > 0, left, 0), length),
+            fault | jnp.isnan(until),
+        )
+    ray = Ray(entry, direction, base + start, length, path, pixel, gaps, spans)
+    return invalid(ray, fault)
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:

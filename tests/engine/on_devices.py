@@ -130,6 +130,8 @@ def numbers_of_devices(_: Any):
     parts = blocks(), thin(), around(blocks(), SIZE), jv.March(0.05, MOVING)
     one = jv.render(*parts)
     assert_same(jv.render(*parts, devices=all_devices()[:3]), one)
+    how: Any = {"antialias": 2, "until": one.depth}
+    assert_same(jv.render(*parts, devices=all_devices()[:3], **how), jv.render(*parts, **how))
     # arrays that lie on one device only
     moved = jax.device_put(parts, all_devices()[3])
     assert_same(jv.render(*moved, devices=jax.make_mesh((8,), ("x",))), one)

@@ -12,8 +12,8 @@ from . import Fault
 def _from_base(enter):
     """`enter`, with distances from where a ray of a far camera is restarted, and not from its origin."""
 
-    def entered(space, origin, direction, pixel):
-        ray = enter(space, origin, direction, pixel)
+    def entered(space, origin, direction, *rest):
+        ray = enter(space, origin, direction, *rest)
         toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
         return eqx.tree_at(lambda r: r.t_in, ray, ray.t_in - jnp.maximum(toward - space.diagonal / 2, 0))
 
@@ -94,6 +94,12 @@ FAULTS: list[Fault] = [
         "scene.space:enter",
         _from_base,
         ("scene/test_space.py::test_entry_and_length_are_right",),
+    ),
+    Fault(
+        "ends of rays: no derivative by them",
+        "scene.space:enter",
+        lambda f: lambda *given: f(*given[:4], *jax.lax.stop_gradient(given[4:])),
+        ("engine/test_ends.py::test_a_uniform_box_is_seen_up_to_a_depth_by_several_rays_a_pixel",),
     ),
     Fault(
         "toroidal map: the first gap of a ray only",

@@ -14,6 +14,8 @@ from jaxvol.engine.tiling import Tiling
 from jaxvol.scene.camera import axes_of
 from jaxvol.scene.space import Affine
 
+from ..scenes import in_float64
+
 
 POSITION, FOCUS = (3.0, -4.0, 2.0), (0.5, 1.0, 0.0)
 BOX = jv.Volume(np.zeros((4, 5, 6), np.uint8), spacing=(10, 3, 1), origin=(7, -5, 2))
@@ -72,6 +74,16 @@ def test_crop_gives_the_same_rays(parallel_scale):
     assert float(other.view_angle) == 20
     np.testing.assert_array_equal(other.corner, (17, 3))
     assert eqx.tree_equal(replace(other, view_angle=crop.view_angle), crop)
+
+
+def test_crops_at_traced_corners_are_one_program():
+    camera, crops = jv.Camera(POSITION, FOCUS, (0, 0, 1), size=SIZE), []
+    rays = jax.jit(lambda left: crops.append(left) or camera.crop(left, 3, 12, 9).rays()[1])
+    for left in (17, 0):
+        np.testing.assert_allclose(
+            rays(left), np.asarray(camera.rays()[1])[3:12, left : left + 12], atol=1e-6
+        )
+    assert len(crops) == 1
 
 
 def test_zoom_magnifies_around_a_point():
@@ -162,6 +174,62 @@ def test_rays_round_alike_whether_or_not_they_are_differentiated():
             np.testing.assert_array_equal(one, two)
 
 
+K = np.array([[210.0, 0, 61], [0, 205, 50], [0, 0, 1]])
+R = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+R = R * np.linalg.det(R)
+T = np.array([0.4, -0.3, 5.0])
+
+
+def test_a_calibrated_camera_sees_points_where_opencv_projects_them():
+    """And its derivatives are those of OpenCV's formula."""
+
+    def unprojected(K, R, t, u, depth):
+        way = np.append((u - K[:2, 2]) / np.diag(K)[:2], 1)
+        return R.T @ (depth * way / np.linalg.norm(way) - t)
+
+    def point(K, R, t, u, depth):
+        return jv.Camera.from_intrinsics(K, R, t, (128, 96)).point(u[0] - 0.5, u[1] - 0.5, depth)
+
+    with in_float64():
+        found = jax.jit(lambda *given: (point(*given), jax.jacrev(point, argnums=(0, 1, 2))(*given)))
+        for world in np.random.default_rng(1).normal(size=(5, 3)):
+            there = R @ world + T
+            u, depth = ((K @ there) / there[2])[:2], np.linalg.norm(there)
+            seen, slopes = jax.device_get(found(*jax.device_put((K, R, T, u, depth))))
+            np.testing.assert_allclose(seen, world, atol=1e-12)
+            turn = np.cross(np.eye(3), (0.3, -0.5, 0.8)) @ R  # of rotations
+            for i, way in enumerate((np.where(K > 1, 1.0, 0), turn, np.array([0.5, 1, -1]))):
+                ends: list = []
+                for step in (1e-6, -1e-6):
+                    k, r, t = (part + step * way if i == n else part for n, part in enumerate((K, R, T)))
+                    ends.append(unprojected(k, r, t, u, depth))
+                expected = (ends[0] - ends[1]) / 2e-6
+                np.testing.assert_allclose(np.tensordot(slopes[i], way, way.ndim), expected, atol=1e-8)
+        assert np.isnan(jax.device_get(found(*jax.device_put((K, R, T, K[:2, 2], np.inf)))[0])).all()
+
+
+def test_a_detector_is_seen_pixel_by_pixel():
+    """From in front, from behind, and by parallel rays."""
+    source, center, right = np.array([300.0, -400, 90]), np.array([-20.0, 150, 10]), np.array([0, 0.1, 2.0])
+    pitch, size = np.array([0.7, 0.4]), (12, 9)
+    row, column = np.mgrid[: size[1], : size[0]] * 1.0
+
+    @jax.jit
+    def points(source, center, right, down, pitch, far):
+        places = source, center, right, down, pitch, size
+        cameras = (jv.Camera.from_detector(*places, parallel=parallel) for parallel in (False, True))
+        return [camera.point(column, row, away) for camera, away in zip(cameras, far, strict=True)]
+
+    with in_float64():
+        for down in (np.array([1.0, 2.0, -0.1]), -np.array([1.0, 2.0, -0.1])):
+            x, y = ((n + 0.5 - m / 2) * p for n, m, p in zip((column, row), size, pitch, strict=True))
+            pixels = center + x[..., None] * unit(right) + y[..., None] * unit(down)
+            height = abs((center - source) @ unit(np.cross(right, down)))
+            far = np.linalg.norm(pixels - source, axis=-1), np.full(row.shape, height)
+            for seen in points(*jax.device_put((source, center, right, down, pitch, far))):
+                np.testing.assert_allclose(seen, pixels, atol=1e-9)
+
+
 def camera(**how):
     return jv.Camera(POSITION, FOCUS, **how)
 
@@ -179,6 +247,20 @@ BAD = {
         "left must be an integer of at least 0; got 1.5",
     ),
     "crop outside": (lambda: camera(size=(9, 9)).crop(5, 5, 5, 2), "crop must be a rectangle inside"),
+    "crop by traced halves": (
+        lambda: jax.jit(lambda left: camera(size=(9, 9)).crop(left, 0, 5, 2).rays())(1.5),
+        r"left and top must be integers; got a traced array .* and 0",
+    ),
+    "skew": (lambda: jv.Camera.from_intrinsics(K + np.eye(3, k=1), R, T, SIZE), "K must be .*without skew"),
+    "a mirror": (lambda: jv.Camera.from_intrinsics(K, -R, T, SIZE), "R must be a rotation"),
+    "a slanted detector": (
+        lambda: jv.Camera.from_detector(POSITION, FOCUS, (1, 0, 0), (1, 1, 0), 0.1, SIZE),
+        "right must be perpendicular to down",
+    ),
+    "pitch 0": (
+        lambda: jv.Camera.from_detector(POSITION, FOCUS, (1, 0, 0), (0, 1, 0), (0.1, 0), SIZE),
+        "pixel_pitch must be greater than 0",
+    ),
     "angle 180": (lambda: camera(view_angle=180), "view_angle must be .* less than 180 degrees"),
     "NaN": (lambda: jv.Camera((0, np.nan, 0), FOCUS), "position must be finite"),
     "scale 0": (lambda: camera(parallel_scale=0), "parallel_scale must be greater than 0"),
