@@ -18,11 +18,12 @@ from ..ray import Scene, begin, check_channels, end
 from ..reference import step, steps_across
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..xla.compiling import compiled, recomputed
-from ..xla.differentiation import forward_mode, forward_only, transformations
+from ..xla.compiling import compiled
+from ..xla.differentiation import forward_only, transformations
+from ..xla.linear import differentiable, moving_leaves, recomputed
 from ..xla.platform import is_traced
 from ..xla.sharding import varying
-from ..xla.trees import constant, strong
+from ..xla.trees import constant, floats, strong
 from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import check_not_sharded, mesh_of, on_all, on_devices
 from .gradients import render_vjp
@@ -102,9 +103,8 @@ def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleratio
         return forward_only(_forward_image(scene, options, acceleration), WRONG_MODE["forward"])
     if not is_traced(scene):  # nothing is differentiated; to go through a custom rule takes milliseconds
         return _plain_image(scene, options, acceleration)
-    kinds = _checked_for_forward_mode(scene)
     # inside `jax.shard_map`, JAX has custom rules only under `jax.jit`
-    sharded = any("ShardMapTracer" in kind for kind in kinds)
+    sharded = any("ShardMapTracer" in transformations(leaf) for leaf in jax.tree.leaves(scene))
     image = _replayed_in_shard if sharded else _replayed
     return image(scene, options, jax.lax.stop_gradient(acceleration))
 
@@ -112,18 +112,9 @@ def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleratio
 def _pixels(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found) -> Array:
     """Pixels that are computed after the march, with the derivatives of its adjoint."""
     if options.adjoint == "replay":
-        _checked_for_forward_mode(scene)
         return _pixels_recomputed(scene, options, acceleration, found)
     pixels = _pixels_kept(scene, options, acceleration, found)
     return forward_only(pixels, WRONG_MODE["forward"]) if options.adjoint == "forward" else pixels
-
-
-def _checked_for_forward_mode(scene: Scene) -> list[list[str]]:
-    """The transformations of JAX that each leaf of the scene undergoes. Raises where one is forward mode."""
-    kinds = [transformations(leaf) for leaf in jax.tree.leaves(scene)]
-    if forward_mode(kinds):
-        raise ValueError(WRONG_MODE["replay"])
-    return kinds
 
 
 @on_devices("both")
@@ -181,31 +172,31 @@ def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcc
 
 _forward_image = compiled(_marched_image, has_jvp=True)
 _plain_image = compiled(_marched_image)
-_recorded_image = compiled(partial(march_image, record=True))
-_image_vjp = compiled(render_vjp)
+_recorded_image = compiled(partial(march_image, record=True), has_jvp=True)
+_image_vjp = compiled(render_vjp, has_jvp=True)
 _direct_image = compiled(scan_image, has_jvp=True)
 _pixels_kept = compiled(resolve_image, has_jvp=True)
-_pixels_recomputed = recomputed(resolve_image)
+_pixels_recomputed = recomputed(resolve_image, WRONG_MODE["replay"])
 
 
-@eqx.filter_custom_vjp
-def _replayed(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
-    return _plain_image(scene, options, acceleration)
-
-
-@_replayed.def_fwd
-def _(
-    perturbed: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
-) -> tuple[Rendering, Any]:
+def _recorded(
+    scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
+) -> tuple[Rendering, tuple[Rendering, CellRange | None]]:
     rendering, ranges = _recorded_image(scene, options, acceleration)
     return rendering, (rendering, ranges)
 
 
-@_replayed.def_bwd
-def _(
-    residuals: Any,
+def _push(tangents: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Any:
+    def floats_of(moving: Any) -> Any:
+        return floats(march_image(eqx.combine(moving, scene), options, acceleration)[0])
+
+    return jax.jvp(floats_of, (moving_leaves(scene, tangents),), (tangents,))[1]
+
+
+def _pull(
     cotangent: Rendering,
     perturbed: Any,
+    residuals: Any,
     scene: Scene,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
@@ -213,4 +204,7 @@ def _(
     return _image_vjp(scene, perturbed, options, acceleration, residuals, cotangent)
 
 
+_replayed = differentiable(
+    _plain_image, _recorded, compiled(_push, has_jvp=True), _pull, WRONG_MODE["replay"]
+)
 _replayed_in_shard = eqx.filter_jit(_replayed)

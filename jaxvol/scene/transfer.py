@@ -303,7 +303,7 @@ class TransferFunction(Transfer):
         if integrated:
             _, front, back = measured
             rows, pull_rows = jax.vjp(lambda of: of.span_rows(), self)
-            (a, i), (b, j) = (_span_of(jax.lax.stop_gradient(rows), end) for end in (front, back))
+            (a, i), (b, j) = (_span_of(rows, end) for end in (front, back))
             _, pull = jax.vjp(partial(mean_by_rows, same=i == j), a, b, front[0], back[0])
             of_a, of_b, of_front, of_back = pull((color, extinction))
             fronts, backs = (
@@ -311,7 +311,7 @@ class TransferFunction(Transfer):
             )
             (transfer,) = pull_rows(fronts + backs)
             return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
-        rows, value = jax.lax.stop_gradient(self.rows()), measured[0]
+        rows, value = self.rows(), measured[0]
         if self.values.shape[0] <= linear.FEW:
             interval = jnp.maximum(linear.points_below(self.values, value) - 1, 0)
             past = linear.clip_below(value - linear.table_row(rows, interval)[0], jnp.zeros_like(value))

@@ -146,7 +146,7 @@ class TransferFunction2D(Transfer):
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         value, magnitude, cell, along, across = measured
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
-        row = table_row(jax.lax.stop_gradient(rows), cell)
+        row = table_row(rows, cell)
         _, pull = jax.vjp(bilinear.interpolate_corners, row, along, across)
         of_row, of_along, of_across = pull((*color, extinction))
         (transfer,) = pull_rows(row_sums(len(rows), cell, jnp.stack(of_row, axis=-1)))

@@ -252,7 +252,7 @@ class Fetched(NamedTuple):
 
 class Recording(Fetch):
     """Records every fetch, so that its VJP returns one cotangent per fetch: of a cube of voxels, or of what
-    was interpolated between them."""
+    was interpolated between them. Voxels must be constants of that VJP."""
 
     perturbations: list[Any]
     """Are added to what is fetched, in this order; if empty, nothing is."""
@@ -260,13 +260,13 @@ class Recording(Fetch):
     """Filled while tracing."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
-        cube = voxels_from(jax.lax.stop_gradient(data), node, dtype)
+        cube = voxels_from(data, node, dtype)
         return self._perturbed(cube, Fetched(flat_index(node, data.shape)))
 
     def interpolated(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> Voxel:
         node, fraction = self.split(data, coordinate)
-        cube = voxels_from(jax.lax.stop_gradient(data), node, coordinate[0].dtype)
-        along = permuted(jax.lax.stop_gradient(fraction), self.axes)
+        cube = voxels_from(data, node, coordinate[0].dtype)
+        along = permuted(fraction, self.axes)
         value = trilinear(transposed(cube, self.axes), fraction)
         return self._perturbed(value, Fetched(flat_index(node, data.shape), along))
 

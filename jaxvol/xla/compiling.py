@@ -115,29 +115,3 @@ def _each(function: Callable[..., Any], batched: tuple[bool, ...], args: tuple[A
 
 
 _batch = compiled(_each)
-
-
-def recomputed(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as one program, and its reverse-mode derivative as another, which recomputes the function
-    instead of keeping residuals. Both are `compiled`. For functions from trees to one array."""
-    forward, backward = compiled(function), compiled(_vjp_of)
-
-    @eqx.filter_custom_vjp
-    def run(args: tuple[Any, ...]) -> Any:
-        return forward(*args)
-
-    @run.def_fwd
-    def _(perturbed: Any, args: tuple[Any, ...]) -> tuple[Any, None]:
-        return forward(*args), None
-
-    @run.def_bwd
-    def _(left: None, cotangent: Any, perturbed: Any, args: tuple[Any, ...]) -> Any:
-        return backward(function, perturbed, args, cotangent)
-
-    return lambda *args: run(args)
-
-
-def _vjp_of(function: Callable[..., Any], perturbed: PyTree, args: tuple[Any, ...], cotangent: Any) -> Any:
-    moving, fixed = eqx.partition(args, perturbed)
-    _, pull = jax.vjp(lambda moving: function(*eqx.combine(moving, fixed)), moving)
-    return pull(cotangent)[0]

@@ -37,9 +37,14 @@ def forward_only(tree: PyTree, message: str) -> PyTree:
 
     @same.defjvp
     def _(primal: tuple[Array], tangent: tuple[Array]) -> tuple[Array, Array]:
-        return primal[0], _TANGENT.bind(*tangent, message=message)
+        return primal[0], not_transposed(*tangent, message)
 
     return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def not_transposed(tangents: PyTree, message: str) -> PyTree:
+    """Tangents, unchanged. To transpose them raises `ValueError` with this message."""
+    return jax.tree.map(lambda tangent: _TANGENT.bind(tangent, message=message), tangents)
 
 
 def _refuse(cotangent: Any, tangent: Any, *, message: str) -> Any:
