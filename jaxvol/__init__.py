@@ -39,6 +39,7 @@ from .fitting import (
     read_transfer as read_transfer,
     read_views as read_views,
     refined as refined,
+    unconstrain as unconstrain,
     write_transfer as write_transfer,
 )
 from .io import datasets as datasets

@@ -17,6 +17,7 @@ from .candidates import (
     refined as refined,
 )
 from .choice import Choice as Choice, Evidence as Evidence, choose as choose
+from .constraints import unconstrain as unconstrain
 from .driver import (
     Fit as Fit,
     Outcome as Outcome,
