@@ -27,5 +27,6 @@ from .driver import (
 )
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
 from .path_traced import PathTracedResidual as PathTracedResidual
+from .registration import Registration as Registration, RigidMotion as RigidMotion, register as register
 from .residuals import ImageResidual as ImageResidual
 from .uncertainty import Uncertainty as Uncertainty

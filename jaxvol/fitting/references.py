@@ -92,11 +92,16 @@ def _weights(given: Any, shapes: list[tuple[int, ...]]) -> list[np.ndarray] | No
     return [(scale * weight).astype(np.float32) for weight in full]
 
 
-def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera, Array, np.ndarray | None]:
-    """Camera, image, and the variance of its noise if the image is path-traced."""
+def camera_and_image(number: int, view: Any) -> tuple[Camera, Any]:
+    """A view's pair, whose image is not checked yet."""
     if not isinstance(view, tuple | list) or len(view) != 2 or not isinstance(view[0], Camera):
         raise ValueError(f"views[{number}] must be a pair (camera, image); got {described(view)}.")
-    camera, given = view
+    return view[0], view[1]
+
+
+def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera, Array, np.ndarray | None]:
+    """Camera, image, and the variance of its noise if the image is path-traced."""
+    camera, given = camera_and_image(number, view)
     variance, name = None, f"views[{number}]: the image"
     if isinstance(given, PathTraced):
         given, variance = path_traced_view(given, background)

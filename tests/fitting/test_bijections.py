@@ -79,7 +79,7 @@ def test_any_step_of_an_optimiser_keeps_parameters_within_bounds():
     np.testing.assert_allclose(begun, start, rtol=1e-5)
     # of a value v = scale · softplus(free), it is scale · (1 - exp(-v / scale))
     np.testing.assert_allclose(slope, 2 * (1 - np.exp(-start / 2)), rtol=1e-5)
-    assert np.all((0 < after) & (after < start))
+    assert np.all((after > 0) & (after < start))
 
 
 BAD = {
