@@ -86,23 +86,19 @@ def capture(volume: jv.Volume, camera: jv.Camera, counts: dict[str, int], rng: A
     image = -np.log(np.maximum(rng.poisson(PHOTONS * np.exp(-integral)), 1) / PHOTONS)
     each = [[drawn(rng, n, *ends) for ends in RANGES[name]] for name, n in counts.items()]
     turns, shifts = (np.concatenate(vectors) for vectors in zip(*each, strict=True))
-    starts: Any = jv.RigidMotion(np.deg2rad(turns), shifts, volume.center)
+    starts = jv.RigidMotion(np.deg2rad(turns), shifts, volume.center)
     begun = time.monotonic()
     found = jv.register(volume, jv.attenuation(WATER), [(camera, image)], starts)
     result: dict[str, Any] = {"seconds of all starts, compilation included": round(time.monotonic() - begun)}
-    owners = np.repeat(list(counts), list(counts.values()))
+    similar, owners = found.similarities[:, 1], np.repeat(list(counts), list(counts.values()))
     for name in counts:
         before, after = ({k: v[owners == name] for k, v in errors(m).items()} for m in found[3:5])
         inside = np.all([after[key] <= goal for key, goal in GOALS.items()], axis=0)
         result[name] = {
             "captured": float(np.mean(inside)),
-            **{
-                f"{k}, median of these": float(np.median(v[inside])) for k, v in after.items() if inside.any()
-            },
-            "least similar of these": float(found.similarities[owners == name, 1][inside].min(initial=1)),
-            "most similar of the others": float(
-                found.similarities[owners == name, 1][~inside].max(initial=-1)
-            ),
+            **{f"{k}, median": float(np.median(v[inside])) for k, v in after.items() if inside.any()},
+            "least similar of these": float(similar[owners == name][inside].min(initial=1)),
+            "most similar of the others": float(similar[owners == name][~inside].max(initial=-1)),
             "before": [{k: v.tolist() for k, v in before.items()}],
             "after": [{k: v.tolist() for k, v in after.items()}],
         }
@@ -120,10 +116,11 @@ def beside(python: str, volume: jv.Volume, camera: jv.Camera, repetitions: int) 
 
     @eqx.filter_jit
     def of_gradient(volume: jv.Volume, motion: jv.RigidMotion) -> Any:
-        def loss(moved: Any) -> jax.Array:
-            return jnp.mean(integrals(volume, jv.RigidMotion(*moved, motion.center).camera(camera)) ** 2)
+        def loss(turn: Any, shift: Any) -> jax.Array:
+            moved = jv.RigidMotion(turn, shift, motion.center).camera(camera)
+            return jnp.mean(integrals(volume, moved) ** 2)
 
-        return jax.value_and_grad(loss)((motion.rotation, motion.translation))
+        return jax.value_and_grad(loss, (0, 1))(motion.rotation, motion.translation)
 
     still = jv.RigidMotion(jnp.zeros(3), jnp.zeros(3), camera.position)
     result: dict[str, Any] = {}

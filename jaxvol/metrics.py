@@ -174,7 +174,7 @@ def _unit(image: Array, weights: Array) -> Array:
     away = image - jnp.sum(weights * image) / jnp.where(total > 0, total, 1)
     square = jnp.sum(weights * away**2)
     # rounding of the mean leaves so much of a constant image
-    varies = square > (4 * jnp.finfo(away.dtype).eps) ** 2 * jnp.sum(weights * image**2)
+    varies = square > image.size * jnp.finfo(away.dtype).eps ** 2 * jnp.sum(weights * image**2)
     return jnp.where(varies, jnp.sqrt(weights) * away / jnp.sqrt(jnp.where(varies, square, 1)), 0)
 
 

@@ -100,7 +100,7 @@ def _of_view(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray | None
         return None
     array = np.asarray(not_negative(name, given, (None,) * np.ndim(given)), np.float64)
     try:
-        return np.broadcast_to(array[..., None] if array.shape == shape[:2] else array, shape)
+        return np.broadcast_to(array[..., None] if array.shape == shape[:-1] else array, shape)
     except ValueError as fault:
-        expected = f"a number, {shape[:2]}, or an array like its image, {shape}"
+        expected = f"a number, {shape[:-1]}, or an array like its image, {shape}"
         raise ValueError(f"{name} must be {expected}; got shape {array.shape}.") from fault

@@ -55,13 +55,15 @@ class RigidMotion(NamedTuple):
     translation: Arrayable
     center: Arrayable
 
+    @eqx.filter_jit
     def camera(self, camera: Camera) -> Camera:
         """The camera, moved by a single motion. The volume that it sees moves the other way."""
+        turn, shift, center = (jnp.asarray(part, camera.position.dtype) for part in self)
 
         def moved(point: Array) -> Array:
-            return rotate(self.rotation, point - self.center) + self.center + self.translation
+            return rotate(turn, point - center) + center + shift
 
-        places = moved(camera.position), moved(camera.focal_point), rotate(self.rotation, camera.view_up)
+        places = moved(camera.position), moved(camera.focal_point), rotate(turn, camera.view_up)
         return eqx.tree_at(lambda c: (c.position, c.focal_point, c.view_up), camera, places)
 
 
@@ -143,7 +145,8 @@ def register(
     if len({jax.tree.structure(camera) for camera in cameras}) > 1:
         raise ValueError("views must have cameras of one size and kind, which one program renders.")
     images = [finite_array(f"views[{at}]: the image", image, shape) for at, (_, image) in enumerate(read)]
-    counted = [np.ones(shape) if w is None else w for w in of_pixels("weights", weights, [shape] * len(read))]
+    given = of_pixels("weights", weights, [(*shape, 1)] * len(read))
+    counted = [np.ones(shape) if weight is None else weight[..., 0] for weight in given]
     factors = [integer("levels", level, 1) for level in np.ravel(levels).tolist()]
     if not factors:
         raise ValueError("levels must hold at least one, such as 1; got none.")
@@ -151,30 +154,32 @@ def register(
         starts = RigidMotion(np.zeros((1, 3)), np.zeros((1, 3)), volume.center)
     if not isinstance(starts, RigidMotion):
         raise ValueError(f"starts must be a RigidMotion; got {described(starts)}.")
-    turns = finite_array("starts.rotation", starts.rotation, (None, 3))
-    shifts = finite_array("starts.translation", starts.translation, turns.shape)
+    turns = np.asarray(finite_array("starts.rotation", starts.rotation, (None, 3)))
+    shifts = np.asarray(finite_array("starts.translation", starts.translation, turns.shape))
     center = finite_array("starts.center", starts.center, (3,))
     march = March(np.min(volume.spacing), (AlphaCorrection(),), "midpoint") if march is None else march
     check_arguments("register(volume, transfer, views, march=...)", march=march)
     assert isinstance(march, March)
 
+    # in NumPy, which compiles nothing
     low, high = map(np.asarray, volume.corners)
-    radius = jnp.asarray(np.linalg.norm(high - low) / 2, center.dtype)
-    begun = ends = jnp.concatenate([turns, shifts / radius], axis=1)
+    radius = np.linalg.norm(high - low) / 2
+    begun = ends = np.concatenate([turns, shifts / radius], axis=1)
     most, level = integer("max_steps", max_steps, 1), cast(Any, None)
     for factor in factors:
         averaged = [_averaged(*view, factor) for view in zip(cameras, images, counted, strict=True)]
-        stacked: Any = jax.tree.map(lambda *leaves: jnp.stack(leaves), *averaged)
+        stacked: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *averaged)
         pixel = min(_pixel(camera, center) for camera, *_ in averaged)
         coarse = _coarser(volume, pixel)
-        step = march.step * (np.min(coarse.spacing) / np.min(volume.spacing))
+        step = np.asarray(march.step) * (np.min(coarse.spacing) / np.min(volume.spacing))
         scene = coarse, transfer, eqx.tree_at(lambda m: m.step, march, step)
-        near = NEAR * pixel / radius
-        level = _Level(scene, *stacked, center, radius, near, similarity == "gradient_ncc")
+        numbers = center, radius, NEAR * pixel / radius
+        level = _Level(*jax.device_put((scene, stacked, *numbers)), similarity == "gradient_ncc")
         with allow_promotion():
-            ends = _followed(level, ends, most)
-    found = np.asarray(_similarities(level, jnp.stack([begun, ends], axis=1)))
-    at, reached = int(np.nanargmax(found[:, 1])), RigidMotion(ends[:, :3], ends[:, 3:] * radius, center)
+            ends = np.asarray(_followed(level, ends, most))
+    found = np.asarray(_similarities(level, np.stack([begun, ends], axis=1)))
+    reached = RigidMotion(ends[:, :3], ends[:, 3:] * radius, center)
+    at = int(np.nanargmax(found[:, 1]))
     best = RigidMotion(reached.rotation[at], reached.translation[at], center)
     moved = [best.camera(camera) for camera in cameras]
     return Registration(best, moved, float(found[at, 1]), RigidMotion(turns, shifts, center), reached, found)
@@ -185,9 +190,8 @@ class _Level(eqx.Module):
     in units of the volume's radius, so that both move voxels as far."""
 
     scene: tuple[Volume, Transfer, March]
-    cameras: Camera
-    images: Float[Array, "views height width"]
-    weights: Float[Array, "views height width"]
+    views: tuple[Camera, Float[Array, "views height width"], Float[Array, "views height width"]]
+    """Cameras, images and weights."""
     center: Float[Array, "3"]
     radius: Float[Array, ""]
     near: Float[Array, ""]
@@ -204,8 +208,8 @@ class _Level(eqx.Module):
             both = (standardized(each, weight, gradient=self.gradient) for each in (seen, image))
             return next(both) - next(both)
 
-        difference = jax.lax.map(of_view, (self.cameras, self.images, self.weights))
-        return difference / math.sqrt(len(self.images))
+        difference = jax.lax.map(of_view, self.views)
+        return difference / math.sqrt(len(self.views[1]))
 
 
 @eqx.filter_jit
@@ -215,7 +219,7 @@ def _followed(level: _Level, starts: Float[Array, "n 6"], max_steps: int) -> Flo
 
     def of_start(start: Float[Array, "6"]) -> Float[Array, "6"]:
         problem = Problem.of(level, free, (start,), 2**30, True)
-        solver = LevenbergMarquardt(1e-3, level.near)
+        solver = LevenbergMarquardt(1e-3, cast(Any, level.near))
         found = optx.least_squares(problem, solver, (start,), has_aux=True, max_steps=max_steps, throw=False)
         return found.value[0]
 
@@ -230,18 +234,18 @@ def _similarities(level: _Level, motions: Float[Array, "n m 6"]) -> Float[Array,
     return jax.lax.map(of_motion, motions.reshape(-1, 6)).reshape(motions.shape[:2])
 
 
-def _averaged(camera: Camera, image: Array, weight: np.ndarray, factor: int) -> tuple[Camera, Array, Array]:
+def _averaged(camera: Camera, image: Array, weight: np.ndarray, factor: int) -> tuple[Camera, Any, Any]:
     """A view of pixels `factor` times as large; those that reach past the image count in part."""
     pads = [(0, -n % factor) for n in image.shape]
-    shape = [
-        m for n, (_, more) in zip(image.shape, pads, strict=True) for m in ((n + more) // factor, factor)
-    ]
+    shape = [m for n in image.shape for m in (-(-n // factor), factor)]
     of_pixel = weight * np.asarray(image), weight
     sums, counts = (np.pad(each, pads).reshape(shape).mean(axis=(1, 3)) for each in of_pixel)
-    height, width = sums.shape
-    larger = replace(camera.part(0, 0, (width * factor, height * factor)), size=(width, height))
+    left, right, bottom, top = np.asarray(camera.window)
+    across, down = (n * factor / m for n, m in zip(sums.shape[::-1], camera.size, strict=True))
+    window = left, left + (right - left) * across, top - (top - bottom) * down, top
+    larger = replace(camera, window=window, size=sums.shape[::-1], corner=None)
     averages = sums / np.where(counts > 0, counts, 1)
-    return larger, jnp.asarray(averages, image.dtype), jnp.asarray(counts, image.dtype)
+    return larger, averages.astype(image.dtype), counts.astype(image.dtype)
 
 
 def _pixel(camera: Camera, at: Float[Array, "3"]) -> float:

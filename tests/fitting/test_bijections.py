@@ -74,7 +74,7 @@ def test_any_step_of_an_optimiser_keeps_parameters_within_bounds():
         assert after["parts"] == ("x", 3)
         return constrain(free)["glow"], jax.tree.leaves(slope)[0], after["glow"]
 
-    start = np.float32([0.2, 3.0])
+    start = np.array([0.2, 3.0], np.float32)
     begun, slope, after = stepped(start)
     np.testing.assert_allclose(begun, start, rtol=1e-5)
     # of a value v = scale · softplus(free), it is scale · (1 - exp(-v / scale))
