@@ -100,9 +100,7 @@ def capture(volume: jv.Volume, camera: jv.Camera, counts: dict[str, int], rng: A
         inside = np.all([after[key] <= goal for key, goal in GOALS.items()], axis=0)
         result[name] = {
             "captured": float(np.mean(inside)),
-            **{
-                f"{k}, median of these": float(np.median(v[inside])) for k, v in after.items() if inside.any()
-            },
+            **{key: float(np.median(v[inside])) for key, v in medians if inside.any()},
             "least similar of these": float(similar[owners == name][inside].min(initial=1)),
             "most similar of the others": float(similar[owners == name][~inside].max(initial=-1)),
             "before": [{k: v.tolist() for k, v in before.items()}],

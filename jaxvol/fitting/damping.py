@@ -43,7 +43,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton[Any, Any, Any]):
     """`optimistix.LevenbergMarquardt` with Marquardt's scaling, and a step that grows after any fair step."""
 
     rtol: float
-    atol: float | Float[Array, ""]
+    atol: float
     norm: Callable[[PyTree], Float[Array, ""]] = optx.max_norm
     descent: optx.AbstractDescent[Any, Any, Any] = ScaledDescent(lx.QR())
     search: optx.AbstractSearch[Any, Any, Any, Any] = optx.ClassicalTrustRegion(high_cutoff=0.75)

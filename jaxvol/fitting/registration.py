@@ -173,8 +173,8 @@ def register(
         coarse = _coarser(volume, pixel)
         step = np.asarray(march.step) * (np.min(coarse.spacing) / np.min(volume.spacing))
         scene = coarse, transfer, eqx.tree_at(lambda m: m.step, march, step)
-        numbers = center, radius, NEAR * pixel / radius
-        level = _Level(*jax.device_put((scene, stacked, *numbers)), similarity == "gradient_ncc")
+        given = jax.device_put((scene, stacked, center, radius, NEAR * pixel / radius))
+        level = _Level(*given[:5], similarity == "gradient_ncc")
         with allow_promotion():
             ends = np.asarray(_followed(level, ends, most))
     found = np.asarray(_similarities(level, np.stack([begun, ends], axis=1)))
@@ -213,13 +213,13 @@ class _Level(eqx.Module):
 
 
 @eqx.filter_jit
-def _followed(level: _Level, starts: Float[Array, "n 6"], max_steps: int) -> Float[Array, "n 6"]:
-    """Where each start leads."""
+def _followed(level: _Level, starts: Arrayable, max_steps: int) -> Float[Array, "n 6"]:
+    """Where each start, a row, leads."""
     free, _ = Free.of(np.zeros(6), None, None)
 
     def of_start(start: Float[Array, "6"]) -> Float[Array, "6"]:
         problem = Problem.of(level, free, (start,), 2**30, True)
-        solver = LevenbergMarquardt(1e-3, cast(Any, level.near))
+        solver = eqx.tree_at(lambda s: s.atol, LevenbergMarquardt(1e-3, 0.0), level.near)
         found = optx.least_squares(problem, solver, (start,), has_aux=True, max_steps=max_steps, throw=False)
         return found.value[0]
 
@@ -227,7 +227,7 @@ def _followed(level: _Level, starts: Float[Array, "n 6"], max_steps: int) -> Flo
 
 
 @eqx.filter_jit
-def _similarities(level: _Level, motions: Float[Array, "n m 6"]) -> Float[Array, "n m"]:
+def _similarities(level: _Level, motions: Arrayable) -> Float[Array, "n m"]:
     def of_motion(motion: Float[Array, "6"]) -> Float[Array, ""]:
         return 1 - jnp.sum(level(motion, "replay") ** 2) / 2
 

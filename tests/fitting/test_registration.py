@@ -33,12 +33,8 @@ def moved(camera):
     """The camera, moved by the turn and the shift."""
     turn = Rotation.from_rotvec(TURN)
     ends = (np.asarray(point) - CENTER for point in (camera.position, camera.focal_point))
-    return jv.Camera(
-        *(turn.apply(end) + CENTER + SHIFT for end in ends),
-        turn.apply(np.asarray(camera.view_up)),
-        20,
-        size=SIZE,
-    )
+    position, focal_point = (turn.apply(end) + CENTER + SHIFT for end in ends)
+    return jv.Camera(position, focal_point, turn.apply(np.asarray(camera.view_up)), 20, size=SIZE)
 
 
 @jax.jit
