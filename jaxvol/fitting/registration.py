@@ -173,8 +173,8 @@ def register(
         coarse = _coarser(volume, pixel)
         step = np.asarray(march.step) * (np.min(coarse.spacing) / np.min(volume.spacing))
         scene = coarse, transfer, eqx.tree_at(lambda m: m.step, march, step)
-        given = jax.device_put((scene, stacked, center, radius, NEAR * pixel / radius))
-        level = _Level(*given[:5], similarity == "gradient_ncc")
+        given: Any = jax.device_put((scene, stacked, center, radius, NEAR * pixel / radius))
+        level = _Level(*given, gradient=similarity == "gradient_ncc")
         with allow_promotion():
             ends = np.asarray(_followed(level, ends, most))
     found = np.asarray(_similarities(level, np.stack([begun, ends], axis=1)))

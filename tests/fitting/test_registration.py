@@ -50,12 +50,16 @@ def test_the_motion_of_both_cameras_is_found_from_every_start_past_what_a_mask_h
     views = [(camera, 7 - image) for camera, image in zip(VIEWS, images, strict=True)]
     turns, shifts = [[0, 0, 0], -0.5 * TURN, [0.3, 0.1, -0.2]], [[0, 0, 0], -SHIFT, 2 * SHIFT]
     starts = jv.RigidMotion(turns, shifts, CENTER)
-    found = jv.register(VOLUME, TRANSFER, views, starts, weights=masks, levels=(3, 1), march=MARCH)
+    how: Any = {"weights": masks, "march": MARCH}
+    found = jv.register(VOLUME, TRANSFER, views, starts, levels=(3, 1), **how)
     assert found.similarity > 0.9999
     assert np.all(found.similarities[:, 0] < 0.9)
     for turn, shift in zip(found.ends.rotation, found.ends.translation, strict=True):
         np.testing.assert_allclose(turn, TURN, atol=2e-3)
         np.testing.assert_allclose(shift, SHIFT, atol=2e-2)
+    # the coarse images of what was found are those of the views, too
+    coarse = jv.register(VOLUME, TRANSFER, views, found.ends, levels=3, **how)
+    assert np.all(coarse.similarities > 0.98)
     assert found.similarity == found.similarities[:, 1].max()
     for camera, expected in zip(found.cameras, map(moved, VIEWS), strict=True):
         np.testing.assert_allclose(camera.position, expected.position, atol=0.2)
