@@ -119,7 +119,7 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
     choice = jv.choose(residual, problem.candidates, views[SEEN:], block=1, max_steps=40)
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
     # of independent Gaussian residuals of one unknown variance; losses below -80 dB count as equal
-    count, least = residual.references.count(), (1e-4 * residual.references.scale()) ** 2
+    count, least = residual.references.count, (1e-4 * residual.references.scale()) ** 2
     rows = [
         {
             "name": row.name,

@@ -26,6 +26,8 @@ from .fitting import (
     Pose as Pose,
     Positive as Positive,
     ProbeGeometry as ProbeGeometry,
+    Registration as Registration,
+    RigidMotion as RigidMotion,
     Uncertainty as Uncertainty,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
@@ -39,6 +41,8 @@ from .fitting import (
     read_transfer as read_transfer,
     read_views as read_views,
     refined as refined,
+    register as register,
+    unconstrain as unconstrain,
     write_transfer as write_transfer,
 )
 from .io import datasets as datasets

@@ -2,14 +2,16 @@
 
 Images are (height, width) or (height, width, channels), and are analysed in float64. Energies are mean
 squares per pixel, summed over channels: scaling an error by k scales them by k². Frequencies are (x, y)
-in cycles per pixel. This is NumPy, not JAX, since it analyses finished images.
+in cycles per pixel. This is NumPy, not JAX, since it analyses finished images. Similarities, `ncc` and
+`gradient_ncc`, are JAX, since they are maximised: of images of one channel, in the images' own type.
 """
 
 import math
 from typing import Any, TypeAlias, cast
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Array, Float, Float64
 
 from ._util import checks
 
@@ -87,6 +89,93 @@ def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     _at_least("image", image, 7)
     mean = structural_similarity(reference, image, data_range=data_range, channel_axis=-1)
     return float(cast(float, mean))  # a tuple only if more outputs are requested
+
+
+def ncc(image: Any, reference: Any, weights: Any | None = None) -> Float[Array, ""]:
+    """Normalised cross-correlation: Pearson's correlation of two images over their pixels, in [-1, 1]. It
+    does not change with brightness or contrast, is differentiable, and is 0 where an image is constant.
+
+    Args:
+        image: (height, width).
+        reference: an image of the same shape.
+        weights: of the pixels, (height, width), at least 0; a pixel of weight 0 does not count.
+
+    Returns:
+        The correlation, a scalar.
+
+    Raises:
+        ValueError: for images that are not (height, width), and shapes that differ.
+    """
+    _same_shape(image, reference)
+    return jnp.sum(standardized(image, weights) * standardized(reference, weights))
+
+
+def gradient_ncc(image: Any, reference: Any, weights: Any | None = None) -> Float[Array, ""]:
+    """Gradient correlation: the mean of the normalised cross-correlations of both derivatives of two images,
+    across and down, by Sobel's masks. It attends to edges, and is otherwise as `ncc`.
+
+    Args:
+        image: (height, width), at least 3 x 3 pixels.
+        reference: as for `ncc`.
+        weights: as for `ncc`. A derivative has the least weight of the 3 x 3 pixels that it is taken from.
+
+    Returns:
+        The correlation, a scalar.
+
+    Raises:
+        ValueError: as `ncc`, and for fewer pixels.
+
+    Source: Penney et al., "A comparison of similarity measures for use in 2-D-3-D medical image
+    registration", IEEE TMI 17(4), 1998.
+    """
+    _same_shape(image, reference)
+    how = {"gradient": True}
+    return jnp.sum(standardized(image, weights, **how) * standardized(reference, weights, **how))
+
+
+def standardized(image: Any, weights: Any | None = None, *, gradient: bool = False) -> Float[Array, "..."]:
+    """An image, or its derivatives, of weighted mean 0 and length 1: the sum of the products of two is their
+    `ncc`, or `gradient_ncc`. Half the sum of the squares of their difference is 1 minus that, so `fit`
+    maximises it with the residual `standardized(rendered) - standardized(reference)`.
+
+    Args:
+        image: (height, width).
+        weights: as for `ncc`.
+        gradient: whether to take Sobel's derivatives, as for `gradient_ncc`.
+
+    Returns:
+        (height, width), or (2, height - 2, width - 2). Of a constant image, 0.
+
+    Raises:
+        ValueError: as `ncc` and `gradient_ncc`.
+    """
+    image = jnp.asarray(image)
+    if image.ndim != 2 or min(image.shape) < (3 if gradient else 1):
+        least = ", of at least 3 x 3 pixels" if gradient else ""
+        raise ValueError(f"image must have shape (height, width){least}; got {image.shape}.")
+    weights = jnp.ones_like(image) if weights is None else jnp.asarray(weights, image.dtype)
+    if weights.shape != image.shape:
+        raise ValueError(f"weights must have the shape of the image, {image.shape}; got {weights.shape}.")
+    if not gradient:
+        return _unit(image, weights)
+    last = image.shape[0] - 2, image.shape[1] - 2
+    shifted = [[(slice(y, last[0] + y), slice(x, last[1] + x)) for x in range(3)] for y in range(3)]
+    least = jnp.min(jnp.stack([weights[at] for row in shifted for at in row]), axis=0)
+    found = []
+    for lines in (shifted, list(zip(*shifted, strict=True))):  # across, and down
+        slopes = [image[after] - image[before] for before, _, after in lines]
+        found.append(_unit(slopes[0] + 2 * slopes[1] + slopes[2], least))
+    return jnp.stack(found) * 0.5**0.5
+
+
+def _unit(image: Array, weights: Array) -> Array:
+    """Of weighted mean 0, times the square roots of the weights, of length 1; a constant image gives 0."""
+    total = jnp.sum(weights)
+    away = image - jnp.sum(weights * image) / jnp.where(total > 0, total, 1)
+    square = jnp.sum(weights * away**2)
+    # rounding of the mean leaves so much of a constant image
+    varies = square > image.size * jnp.finfo(away.dtype).eps ** 2 * jnp.sum(weights * image**2)
+    return jnp.where(varies, jnp.sqrt(weights) * away / jnp.sqrt(jnp.where(varies, square, 1)), 0)
 
 
 def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: float) -> tuple[float, float]:
@@ -242,10 +331,14 @@ def _windowed(error: Image) -> tuple[Image, Plane]:
 
 
 def _pair(image: Any, reference: Any) -> tuple[Image, Image]:
+    _same_shape(image, reference)
+    return _image("image", image), _image("reference", reference)
+
+
+def _same_shape(image: Any, reference: Any) -> None:
     shapes = np.shape(image), np.shape(reference)
     if shapes[0] != shapes[1]:
         raise ValueError(f"image and reference must agree in shape; got {shapes[0]} and {shapes[1]}.")
-    return _image("image", image), _image("reference", reference)
 
 
 def _image(name: str, value: Any) -> Image:

@@ -2,17 +2,24 @@
 
 from itertools import pairwise
 
+import jax
 import numpy as np
 import pytest
+from scipy.ndimage import sobel
 
 from jaxvol.metrics import (
     boundary_noise,
     comb_frequency,
+    gradient_ncc,
+    ncc,
     psnr,
     rmse,
     ssim,
+    standardized,
     wood_grain_energy,
 )
+
+from .scenes import in_float64
 
 
 H, W = 160, 192
@@ -50,6 +57,50 @@ def test_ssim_is_one_for_the_same_image_and_falls_with_noise():
     assert all(a > b + 0.05 for a, b in pairwise(seen))
     color = np.stack([image] * 3, axis=-1)
     assert ssim(color + 0.02 * noise(0)[..., None], color) == pytest.approx(seen[1])
+
+
+# -- similarities -------------------------------------------------------------------------------------
+
+
+def correlation(a, b, weights):
+    """By NumPy's covariance."""
+    (aa, ab), (_, bb) = np.cov(a.ravel(), b.ravel(), aweights=weights.ravel())
+    return ab / np.sqrt(aa * bb)
+
+
+def test_correlations_are_those_of_numpy_and_sobel_with_their_derivatives():
+    """In float64, with weights of which some are 0; derivatives by central differences. A wave and the same
+    wave shifted by a phase, over whole periods, correlate by its cosine; a constant image by 0."""
+
+    @jax.jit
+    def both(image, reference, weights):
+        measured = [
+            jax.value_and_grad(function)(image, reference, weights) for function in (ncc, gradient_ncc)
+        ]
+        return [part[0] for part in measured], [part[1] for part in measured]
+
+    size = 24, 32
+    image, reference = noise(1, size), noise(2, size)
+    reference = reference + image
+    weights = np.maximum(noise(3, size) + 1.5, 0)
+    least = np.lib.stride_tricks.sliding_window_view(weights, (3, 3)).min(axis=(2, 3))
+    slopes = [[sobel(each, axis=axis)[1:-1, 1:-1] for axis in (0, 1)] for each in (image, reference)]
+    expected = [
+        correlation(image, reference, weights),
+        np.mean([correlation(a, b, least) for a, b in zip(*slopes, strict=True)]),
+    ]
+    direction, h = noise(4, size), 1e-5
+    with in_float64():
+        found, gradients = both(3 - 2 * image, reference, weights)
+        np.testing.assert_allclose(found, -np.array(expected), rtol=1e-12)
+        ends = [both(3 - 2 * image + s * direction, reference, weights)[0] for s in (h, -h)]
+        rates = (np.array(ends[0]) - np.array(ends[1])) / (2 * h)
+        np.testing.assert_allclose([np.vdot(g, direction) for g in gradients], rates, rtol=1e-7)
+        assert not any(np.any(np.asarray(gradient)[weights == 0]) for gradient in gradients)
+        waves = [np.cos(2 * np.pi * np.arange(32) / 8 + phase) * np.ones(size) for phase in (0, 0.7)]
+        assert both(*waves, np.ones(size))[0][0] == pytest.approx(np.cos(0.7))
+        value, gradient = both(np.full(size, 0.1), reference, weights)
+        assert (value[0], value[1], np.any(gradient)) == (0, 0, False)
 
 
 # -- wood grain of known frequency ----------------------------------------------------------------------
@@ -206,6 +257,10 @@ BAD = [
     (lambda: boundary_noise(X, 1.0 * LEFT), "region must be booleans of shape"),
     (lambda: boundary_noise(X, LEFT[1:]), "region must be booleans of shape"),
     (lambda: boundary_noise(X, (X % 3) > 0), "3 x 3"),
+    (lambda: ncc(X, X[1:]), "image and reference must agree in shape"),
+    (lambda: ncc(X[0], X[0]), r"image must have shape \(height, width\); got"),
+    (lambda: gradient_ncc(X[:2], X[:2]), "of at least 3 x 3 pixels; got"),
+    (lambda: standardized(X, X[1:]), "weights must have the shape of the image"),
 ]
 
 

@@ -17,6 +17,7 @@ from .candidates import (
     refined as refined,
 )
 from .choice import Choice as Choice, Evidence as Evidence, choose as choose
+from .constraints import unconstrain as unconstrain
 from .driver import (
     Fit as Fit,
     Outcome as Outcome,
@@ -26,5 +27,6 @@ from .driver import (
 )
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
 from .path_traced import PathTracedResidual as PathTracedResidual
+from .registration import Registration as Registration, RigidMotion as RigidMotion, register as register
 from .residuals import ImageResidual as ImageResidual
 from .uncertainty import Uncertainty as Uncertainty

@@ -97,6 +97,7 @@ def choose(
     held_out: Sequence[Any] | Any,
     *,
     views: Sequence[Any] | Any | None = None,
+    weights: Any = None,
     errors: float | Any = 2.0,
     block: int | Any = 4,
     checkpoint: str | PathLike[str] | None = None,
@@ -128,6 +129,7 @@ def choose(
             `nested_points` and `nested_materials` make.
         held_out: views that none is fitted to: pairs (camera, image), or what the function takes.
         views: the training views, for a function.
+        weights: of the held-out views, with an `ImageResidual`, in the form of its own.
         errors: standard errors of the difference up to which a candidate is not significantly worse, ≥ 0. If
             both models hold the truth, the larger one seems better by more than 2 in at most 2.3 % of trials.
         block: pixels along a side of blocks within which noise may be correlated: 1 for noise of single
@@ -149,7 +151,7 @@ def choose(
         raise ValueError(f"{' and '.join(sorted(wrong))} must be given with each Candidate, not to choose.")
     candidates, held_out = _list("candidates", candidates), _list("held_out", held_out)
     _check(candidates)
-    training, validation = _residuals(residual, views, held_out)
+    training, validation = _residuals(residual, views, held_out, weights)
 
     fits: list[Fit] = []
     found: list[list[np.ndarray]] = []
@@ -170,14 +172,12 @@ def choose(
     if not any(map(math.isfinite, losses)):
         raise ValueError("held_out must have finite residuals for one candidate at least; got none.")
     best = int(np.nanargmin(losses))
-    norm = (
-        training.references.scale()
-        if isinstance(training, ImageResidual)
-        else math.sqrt(2 * fits[0].losses[0])
-    )
+    images = isinstance(training, ImageResidual)
+    count = sum(view.references.count for view in validation) if images else None
+    norm = training.references.scale() if images else math.sqrt(2 * fits[0].losses[0])
     rows, chosen = [], best
     for at, (candidate, own, loss) in enumerate(zip(candidates, fits, losses, strict=True)):
-        error = standard_error(found[at], found[best], block)
+        error = standard_error(found[at], found[best], block, count)
         if loss - losses[best] <= errors * error or 2 * loss <= (RESOLUTION * norm) ** 2:
             chosen = min(chosen, at)
         numbers = size(own.solution.value)
@@ -186,9 +186,11 @@ def choose(
     return Choice(rows, chosen, candidates[chosen].expand(fits[chosen].parameters))
 
 
-def standard_error(residuals: list[np.ndarray], best: list[np.ndarray], block: int) -> float:
+def standard_error(
+    residuals: list[np.ndarray], best: list[np.ndarray], block: int, count: int | None = None
+) -> float:
     """Of the difference of a mean loss from that of the best. Residuals of views are (entries,), or (height,
-    width, channels), where noise may be correlated within blocks."""
+    width, channels), where noise may be correlated within blocks. `count`: of entries, if not all count."""
     of_blocks = []
     for residual, least in zip(residuals, best, strict=True):
         products = least * (residual - least)
@@ -198,7 +200,7 @@ def standard_error(residuals: list[np.ndarray], best: list[np.ndarray], block: i
             products = products.sum(axis=-1)
         of_blocks.append(products.ravel())
     flat, least = (np.concatenate([view.ravel() for view in views]) for views in (residuals, best))
-    equal = np.mean(least**2) * np.sum((flat - least) ** 2)
+    equal = np.sum(least**2) / (count or least.size) * np.sum((flat - least) ** 2)
     return math.sqrt(max(np.sum(np.concatenate(of_blocks) ** 2), equal)) / len(best)
 
 
@@ -224,7 +226,7 @@ def _entries(residual: Any, parameters: PyTree) -> Array:
     """Of one view; (height, width, channels) of an image."""
     if not isinstance(residual, ImageResidual):
         return ravel_pytree(residual(parameters))[0]
-    ((function, items),) = residual.tiles(residual.references.count())
+    ((function, items),) = residual.tiles(residual.references.size())
     entries = jax.lax.map(lambda item: function(parameters, item, "replay"), items)
     return entries.reshape(residual.references.groups[0][1].shape[1:])
 
@@ -253,17 +255,26 @@ def _check(candidates: list[Any]) -> None:
             )
 
 
-def _residuals(residual: Any, views: Any, held_out: list[Any]) -> tuple[Any, list[Any]]:
+def _residuals(residual: Any, views: Any, held_out: list[Any], weights: Any) -> tuple[Any, list[Any]]:
     """The residual of the training views, and that of each held-out view."""
     if isinstance(residual, ImageResidual):
         if views is not None:
             raise ValueError("views must not be given with an ImageResidual, which has views of its own.")
         how = {"background": residual.references.background, "compositing": residual.compositing}
-        training, validation = residual, [ImageResidual(residual.scene, [view], **how) for view in held_out]
+        each = list(weights) if isinstance(weights, list | tuple) else [weights] * len(held_out)
+        if len(each) != len(held_out):
+            raise ValueError(f"weights must hold one entry for each of held_out; got {described(weights)}.")
+        training = residual
+        validation = [
+            ImageResidual(residual.scene, [view], **how, weights=None if weight is None else [weight])
+            for view, weight in zip(held_out, each, strict=True)
+        ]
         # another picture by the same camera tells nothing of other views
         fitted, others = residual.references.cameras(), [view[0] for view in held_out]
     else:
         check_residual(residual)
+        if weights is not None:
+            raise ValueError("weights go with an ImageResidual; a function weights its residual itself.")
         fitted, others = _list("views", views), held_out
         training, validation = residual(fitted), [residual([view]) for view in others]
     for at, view in enumerate(others):

@@ -77,6 +77,39 @@ class Free(eqx.Module):
         return names
 
 
+def unconstrain(
+    parameters: PyTree, *, constraints: PyTree = None, where: Where | None = None
+) -> tuple[FreeVariables, Callable[[FreeVariables], PyTree]]:
+    """Parameters as free variables, any real numbers, for a loop of one's own: what `fit` does inside.
+
+        free, constrain = jv.unconstrain(transfer)
+        optimizer = optax.adam(0.03)
+        state = optimizer.init(free)
+        for _ in range(100):
+            gradient = jax.grad(lambda free: loss(constrain(free)))(free)
+            updates, state = optimizer.update(gradient, state)
+            free = optax.apply_updates(free, updates)
+
+    Whatever the steps, `constrain(free)` is within its bounds: extinctions stay positive, colours in [0, 1].
+
+    Args:
+        parameters: any tree, as for `fit`.
+        constraints: as for `fit`: bijections, such as `Positive()`, or None for the defaults.
+        where: what is free, as for `fit`.
+
+    Returns:
+        The free variables, a tree of arrays of order 1 (None where nothing is free), and the function from
+        such a tree to the parameters, which `jax.jit`, `jax.grad` and `jax.vmap` take. What is fixed is held
+        by the function.
+
+    Raises:
+        ValueError: for parameters outside their bounds or not finite, and constraints or a `where` that do
+            not match them.
+    """
+    free, start = Free.of(parameters, constraints, where)
+    return start, jax.tree_util.Partial(Free.forward, free)
+
+
 def size(tree: PyTree) -> int:
     """Number of numbers in a tree of arrays."""
     return sum(leaf.size for leaf in jax.tree.leaves(tree))

@@ -346,13 +346,13 @@ class _Run(eqx.Module):
 
 @eqx.filter_jit
 def _init_state(solver: Any, problem: Problem, y: FreeVariables) -> Any:
-    with _allow_promotion():
+    with allow_promotion():
         return solver.init(problem, y, None, {}, *eqx.filter_eval_shape(problem, y), frozenset())
 
 
 @eqx.filter_jit
 def _advance(solver: Any, problem: Problem, y: FreeVariables, state: Any) -> Any:
-    with _allow_promotion():
+    with allow_promotion():
         y, state, previous_aux = solver.step(problem, y, None, {}, state, frozenset())
         done, result = solver.terminate(problem, y, None, {}, state, frozenset())
     # `previous_aux` is that of the previous point in solvers with trial points; their state has the new one's
@@ -360,7 +360,7 @@ def _advance(solver: Any, problem: Problem, y: FreeVariables, state: Any) -> Any
 
 
 @contextmanager
-def _allow_promotion() -> Iterator[None]:
+def allow_promotion() -> Iterator[None]:
     """Allow promotion of types and ranks, which solvers need, even if the user has forbidden it."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield

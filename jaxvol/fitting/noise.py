@@ -82,25 +82,25 @@ def path_traced_view(
     return image, np.maximum(deviations / traced.paths + of_background, 0) / (traced.paths - 1)
 
 
-def given_variances(
-    noise: Any, shapes: Sequence[tuple[int, ...]]
+def of_pixels(
+    name: str, given: Any, shapes: Sequence[tuple[int, ...]]
 ) -> list[Float[np.ndarray, "height width channels"] | None]:
-    """Variances of the pixels of each view, from standard deviations that a user gives; None if unknown."""
-    several = isinstance(noise, list | tuple)
-    if (several and len(noise) != len(shapes)) or (not several and np.ndim(noise) > 0):
+    """What a user gives for the pixels of each view, numbers of at least 0; None where nothing is given."""
+    several = isinstance(given, list | tuple)
+    if (several and len(given) != len(shapes)) or (not several and np.ndim(given) > 0):
         expected = f"a number, or a list with an entry for each of {len(shapes)} views"
-        raise ValueError(f"noise must be {expected}; got {described(noise)}.")
-    each = list(noise) if several else [noise] * len(shapes)
-    names = [f"noise[{view}]" if several else "noise" for view in range(len(shapes))]
-    return [_variance(name, sigma, shape) for name, sigma, shape in zip(names, each, shapes, strict=True)]
+        raise ValueError(f"{name} must be {expected}; got {described(given)}.")
+    each = list(given) if several else [given] * len(shapes)
+    names = [f"{name}[{view}]" if several else name for view in range(len(shapes))]
+    return [_of_view(*view) for view in zip(names, each, shapes, strict=True)]
 
 
-def _variance(name: str, sigma: Any, shape: tuple[int, ...]) -> np.ndarray | None:
-    if sigma is None:
+def _of_view(name: str, given: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    if given is None:
         return None
-    array = not_negative(name, sigma, (None,) * np.ndim(sigma))
+    array = np.asarray(not_negative(name, given, (None,) * np.ndim(given)), np.float64)
     try:
-        return np.broadcast_to(np.asarray(array, np.float64) ** 2, shape)
+        return np.broadcast_to(array[..., None] if array.shape == shape[:-1] else array, shape)
     except ValueError as fault:
-        expected = f"a number, or an array like its image, {shape}"
+        expected = f"a number, {shape[:-1]}, or an array like its image, {shape}"
         raise ValueError(f"{name} must be {expected}; got shape {array.shape}.") from fault

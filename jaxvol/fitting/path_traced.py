@@ -98,7 +98,7 @@ class SampledProblem(eqx.Module):
     @classmethod
     def of(cls, residual: PathTracedResidual, free: Free, y: FreeVariables, most: int) -> "SampledProblem":
         """Checks that the Jacobians that a step holds fit into `most` bytes."""
-        needed = HELD * 4 * residual.references.count() * (size(y) + 1)
+        needed = HELD * 4 * residual.references.count * (size(y) + 1)
         if needed > most:
             raise ValueError(
                 f"max_jacobian leaves no room for the Jacobian of {size(y)} parameters and all views, which "
@@ -109,7 +109,7 @@ class SampledProblem(eqx.Module):
     @property
     def count(self) -> int:
         """Number of entries."""
-        return self.residual.references.count()
+        return self.residual.references.count
 
     @property
     def noise(self) -> Noise | None:
@@ -125,7 +125,7 @@ class SampledProblem(eqx.Module):
         """At a point, by the random numbers of a step."""
         references, (flat, unravel) = self.residual.references, ravel_pytree(at)
         key = jax.random.fold_in(jax.random.key(self.residual.key), step)
-        weight, number, rows = 1 / math.sqrt(references.count()), 0, []
+        weight, number, rows = 1 / math.sqrt(references.count), 0, []
         for cameras, images in references.groups:
             numbers = jnp.arange(number, number + len(images), dtype=jnp.uint32)
             number += len(images)

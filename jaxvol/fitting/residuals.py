@@ -87,6 +87,10 @@ class ImageResidual(eqx.Module):
             the standard error of a view that is a `PathTraced` of more than one path, and else unknown. If it
             is known for all views, `fit` compares it with the residual, and warns of a model that does not
             fit. It doesn't weight the residual.
+        weights: of the pixels, in the form of `noise`, or (height, width) for all channels of a view: a pixel
+            of weight 0 does not count, as outside a mask, and None weights all pixels of a view by 1. The
+            loss is then half the weighted mean squared error, whatever the sum of the weights. For pixels of
+            known noise, 1 / noise² gives the smallest standard errors.
         blur: compare blurred images: standard deviation of a Gaussian, as a fraction of the image's height,
             for `fit_coarse_to_fine`. Whole images are then differentiated at once. Pixels beyond the border
             do not count. Standard errors are too small, since the noise of blurred pixels is not independent:
@@ -94,9 +98,9 @@ class ImageResidual(eqx.Module):
 
     Raises:
         ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or
-            infinite pixels, a negative `blur`, `noise` that is negative, infinite or of another shape, and a
-            scene that returns something else; and when it is fitted, for blurred images that `max_jacobian`
-            leaves no room for.
+            infinite pixels, a negative `blur`, `noise` or `weights` that are negative, infinite or of another
+            shape, weights that are all 0, and a scene that returns something else; and when it is fitted, for
+            blurred images that `max_jacobian` leaves no room for.
     """
 
     scene: SceneFunction
@@ -112,13 +116,14 @@ class ImageResidual(eqx.Module):
         *,
         compositing: Mode | Compositing[Any] | Any = "over",
         noise: Arrayable | Sequence[Arrayable | None] | None = None,
+        weights: Arrayable | Sequence[Arrayable | None] | None = None,
         blur: Arrayable | None = None,
     ):
         check_scene(scene)
         self.scene = cast(Any, scene)
         self.compositing = compositing_of(compositing)
         self.blur = None if blur is None else not_negative("blur", blur)
-        self.references = References.of(views, background, noise)
+        self.references = References.of(views, background, noise, weights)
 
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
@@ -127,9 +132,10 @@ class ImageResidual(eqx.Module):
 
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most `most` entries."""
-        return [self._tiles(*group, most) for group in self.references.groups]
+        each = zip(self.references.groups, self.references.weights, strict=True)
+        return [self._tiles(*group, weights, most) for group, weights in each]
 
-    def _tiles(self, cameras: Camera, images: Array, most: int) -> Tiles:
+    def _tiles(self, cameras: Camera, images: Array, weights: Array | None, most: int) -> Tiles:
         views, height, width, channels = images.shape
         what, least = ("one row of an image", 1) if self.blur is None else ("one blurred image", height)
         if most < least * width * channels:
@@ -139,7 +145,7 @@ class ImageResidual(eqx.Module):
             )
         pieces = math.ceil(height / min(height, most // (width * channels)))
         rows = math.ceil(height / pieces)
-        weight = 1 / math.sqrt(self.references.count())
+        share = 1 / math.sqrt(self.references.count)
 
         def residual(parameters: PyTree, item: tuple[Array, Array], adjoint: Adjoint) -> Array:
             view, first = item
@@ -163,18 +169,32 @@ class ImageResidual(eqx.Module):
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
             rendered = rendering.rgba if channels == 4 else rendering.image(self.references.background)
             row = first + jnp.arange(rows)
-            reference = images[view, jnp.minimum(row, height - 1)]
+            at = view, jnp.minimum(row, height - 1)
             # the last piece may reach past the image
             inside = (row < height)[:, None, None]
-            difference = jnp.where(inside, (rendered - reference) * weight, 0)
+            difference = jnp.where(inside, (rendered - images[at]) * share, 0)
+            weight = None if weights is None else weights[at]
             if self.blur is not None:
-                for axis, n in enumerate((height, width)):
-                    kernel = _blurring(n, self.blur * height)
-                    difference = jnp.moveaxis(jnp.tensordot(kernel, difference, axes=(1, axis)), 0, axis)
-            return difference.reshape(-1, channels)
+                difference = _blurred(difference, weight, self.blur * height)
+            return (difference if weight is None else jnp.sqrt(weight) * difference).reshape(-1, channels)
 
         view, piece = np.divmod(np.arange(views * pieces), pieces)
         return residual, (jnp.asarray(view), jnp.asarray(piece * rows))
+
+
+def _blurred(image: Array, weight: Array | None, sigma: Float[Array, ""]) -> Array:
+    """An image blurred by a Gaussian, `sigma` in pixels. Pixels of weight 0 do not count in the others."""
+
+    def blur(image: Array) -> Array:
+        for axis in (0, 1):
+            kernel = _blurring(image.shape[axis], sigma)
+            image = jnp.moveaxis(jnp.tensordot(kernel, image, axes=(1, axis)), 0, axis)
+        return image
+
+    if weight is None:
+        return blur(image)
+    sums = blur(weight)
+    return blur(weight * image) / jnp.where(weight > 0, sums, 1)
 
 
 def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
@@ -213,9 +233,10 @@ class Problem(eqx.Module):
     def of(cls, residual: Any, free: Free, y: FreeVariables, most: int, least_squares: bool) -> "Problem":
         """With as large tiles as fit into `most` bytes; without Jacobian, all of the residual."""
         images = isinstance(residual, ImageResidual)
-        count = (
-            residual.references.count() if images else size(eqx.filter_eval_shape(residual, free.forward(y)))
-        )
+        if images:
+            count, whole = residual.references.count, residual.references.size()
+        else:
+            count = whole = size(eqx.filter_eval_shape(residual, free.forward(y)))
         row = (size(y) + 1) * 4
         if count == 0:
             raise ValueError("residual must return at least one number; got none.")
@@ -224,7 +245,7 @@ class Problem(eqx.Module):
                 f"max_jacobian must hold the triangle of {size(y)} parameters, {row * (size(y) + 1)} bytes; "
                 f'got {most}. For so many parameters, use solver="adam" or "bfgs".'
             )
-        tile = most // row if least_squares else count
+        tile = most // row if least_squares else whole
         if not images and tile < count:
             raise ValueError(
                 f"max_jacobian leaves room for {tile} of the residual's {count} entries, and only an "

@@ -59,6 +59,29 @@ def test_starts_on_the_edge_begin_a_margin_away_from_it():
         np.testing.assert_allclose(np.abs(np.asarray(value) - edges), begun, rtol=1e-4)
 
 
+def test_any_step_of_an_optimiser_keeps_parameters_within_bounds():
+    """By Optax, in one program; the slope is that of the softplus, and what is fixed is there as it was."""
+    optax = pytest.importorskip("optax", reason="pip install -e '.[fit]'")
+    optimizer, bounds = optax.sgd(10.0), {"glow": jv.Positive(2.0), "parts": None}
+
+    @jax.jit
+    def stepped(glow):
+        start = {"glow": glow, "parts": ("x", 3)}
+        free, constrain = jv.unconstrain(start, constraints=bounds)
+        slope = jax.grad(lambda free: jnp.sum(constrain(free)["glow"]))(free)
+        updates, _ = optimizer.update(slope, optimizer.init(free))
+        after = constrain(optax.apply_updates(free, updates))
+        assert after["parts"] == ("x", 3)
+        return constrain(free)["glow"], jax.tree.leaves(slope)[0], after["glow"]
+
+    start = np.array([0.2, 3.0], np.float32)
+    begun, slope, after = stepped(start)
+    np.testing.assert_allclose(begun, start, rtol=1e-5)
+    # of a value v = scale · softplus(free), it is scale · (1 - exp(-v / scale))
+    np.testing.assert_allclose(slope, 2 * (1 - np.exp(-start / 2)), rtol=1e-5)
+    assert np.all((after > 0) & (after < start))
+
+
 BAD = {
     "negative": (jv.Positive(), [0.5, -0.1], r"glow must not be negative to be fitted; got \[ *0.5 *-0.1"),
     "above 1": (jv.UnitInterval(), [0.5, 1.1], r"glow must be in \[0, 1\] to be fitted"),

@@ -170,21 +170,51 @@ def test_every_solver_finds_the_same_curve(solver):
 
 def test_images_are_blurred_as_by_scipy():
     """Weights of a Gaussian over the pixels that exist, as SciPy's with zeros around, divided by its blur of
-    ones; of images that are not square."""
+    ones, or of the weights of pixels; of images that are not square."""
     target = np.random.default_rng(0).random((HEIGHT, WIDTH, 3), np.float32)
     residual = jv.ImageResidual(seen, [(camera(DIRECTIONS[0]), target)], blur=0.1)
+    weights = np.random.default_rng(1).random((HEIGHT, WIDTH)) * (np.arange(WIDTH) > 3)
+    weighted = jv.ImageResidual(seen, [(camera(DIRECTIONS[0]), target)], weights=[weights])
 
     @eqx.filter_jit
     def entries(residual):
-        ((function, items),) = residual.tiles(residual.references.count())
+        ((function, items),) = residual.tiles(residual.references.size())
         return function(TRUTH, jax.tree.map(lambda leaf: leaf[0], items), "forward")
 
     difference = (views()[0][1] - target).astype(np.float64)
     how = {"sigma": (0.1 * HEIGHT, 0.1 * HEIGHT, 0), "mode": "constant", "truncate": 20.0}
-    ones = gaussian_filter(np.ones_like(difference), **how)
-    for blur, expected in ((0.0, difference), (0.1, gaussian_filter(difference, **how) / ones)):
-        found = np.asarray(entries(residual.blurred(blur))).reshape(expected.shape) * expected.size**0.5
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+    for each, weight in ((residual, np.ones((HEIGHT, WIDTH))), (weighted, weights)):
+        weight = np.tile(weight[..., None], (1, 1, 3))
+        blurred = gaussian_filter(weight * difference, **how) / gaussian_filter(weight, **how)
+        for blur, expected in ((0.0, difference), (0.1, blurred)):
+            expected = np.sqrt(weight / weight.sum()) * np.where(weight > 0, expected, 0)
+            found = np.asarray(entries(each.blurred(blur))).reshape(expected.shape)
+            np.testing.assert_allclose(found, expected, atol=1e-7)
+
+
+def thicker(factor, view):
+    """The scene of a factor of the true extinctions."""
+    return seen(eqx.tree_at(lambda t: t.extinction, TRUTH, TRUTH.extinction * factor), view)
+
+
+def test_what_a_mask_leaves_counts_as_the_cropped_image_does():
+    """All that a fit, its standard errors and χ² are made of; what the mask hides is far off."""
+    (view, target), (left, top) = views()[0], (6, 4)
+    target = target + np.float32(0.02) * np.random.default_rng(1).normal(size=target.shape).astype("f4")
+    mask = 3 * (np.indices((HEIGHT, WIDTH))[0] >= top) * (np.indices((HEIGHT, WIDTH))[1] >= left)
+    wrong = np.where(mask[..., None] > 0, target, np.float32(7))
+    part = view.crop(left, top, WIDTH - left, HEIGHT - top), target[top:, left:]
+    free, y = Free.of(np.float32(1.2), None, None)
+    triangles = eqx.filter_jit(lambda problem, y: problem.condensed(y))
+    found = []
+    for of_view, weights in (((view, wrong), [mask]), (part, None)):
+        residual = jv.ImageResidual(thicker, [of_view], noise=0.02, weights=weights)
+        problem = Problem.of(residual, free, y, 2**20, True)
+        squares = [np.asarray(factor).T @ np.asarray(factor) for factor in triangles(problem, y)]
+        noise = [float(part) for part in jax.tree.leaves(residual.references.noise)[:2]]
+        found.append([*squares, problem.count, problem.scale, noise])
+    for masked, cropped in zip(*found, strict=True):
+        np.testing.assert_allclose(masked, cropped, rtol=1e-4)
 
 
 def test_coarse_to_fine_is_one_fit_after_the_other(monkeypatch):
@@ -211,20 +241,20 @@ def test_tiles_make_no_difference_and_the_gradient_is_that_of_the_triangle():
     """Of views of two sizes, one of them with transparency."""
     small = camera((0.2, 0.9, 0.5), (10, 8))
     residual = jv.ImageResidual(seen, [*views(), (small, jv.render(*seen(TRUTH, small)).rgba)])
-    assert residual.references.count() == 2 * WIDTH * HEIGHT * 3 + 10 * 8 * 4
+    assert residual.references.count == 2 * WIDTH * HEIGHT * 3 + 10 * 8 * 4
     free, y = Free.of(GREY, None, None)
     triangles = eqx.filter_jit(lambda problem, y: problem.condensed(y))
     (whole, scores), (tiled, of_tiles) = (
         [np.asarray(each, np.float64) for each in triangles(of_tile, y)]
         for of_tile in (
-            Problem(residual, free, residual.references.count(), t, True)
-            for t in (residual.references.count(), 3 * WIDTH * 3)
+            Problem(residual, free, residual.references.count, t, True)
+            for t in (residual.references.count, 3 * WIDTH * 3)
         )
     )
     np.testing.assert_allclose(tiled, whole, rtol=0, atol=2e-6 * abs(whole).max())
     scores, of_tiles = scores.T @ scores, of_tiles.T @ of_tiles  # the rows' signs are arbitrary
     np.testing.assert_allclose(of_tiles, scores, rtol=0, atol=1e-5 * abs(scores).max())
-    problem = Problem(residual, free, residual.references.count(), residual.references.count(), False)
+    problem = Problem(residual, free, residual.references.count, residual.references.count, False)
     gradient = eqx.filter_jit(lambda p, y: jax.grad(p.loss)(y))(problem, y)
     flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(gradient)])
     np.testing.assert_allclose(whole[:, :-1].T @ whole[:, -1], flat, rtol=0, atol=1e-5 * abs(flat).max())
@@ -337,6 +367,10 @@ BAD = [
         r"noise\[0\] .* like its image, \(16, 20, 3\); got shape \(4, 20, 3\)",
     ),
     (lambda: images(noise=[np.inf]), r"noise\[0\] must be finite; got inf"),
+    (lambda: images(weights=[-BLANK - 1]), r"weights\[0\] must not be negative"),
+    (lambda: images(weights=[np.nan]), r"weights\[0\] must be finite"),
+    (lambda: images(weights=[BLANK]), "weights must be positive for one pixel at least; got 0 for all"),
+    (lambda: images(weights=[BLANK[:4, :, 0]]), r"weights\[0\] must be .* got shape \(4, 20\)"),
     (lambda: jv.ImageResidual(seen, []), "views must hold at least one pair"),
     (lambda: jv.ImageResidual(seen, [BLANK]), r"views\[0\] must be a pair"),
     (

@@ -1,0 +1,276 @@
+"""Where does a volume lie, by X-ray images of it? 2D/3D registration from many starts, coarse to fine.
+
+The similarity c of rendered and given images is a correlation. Of images of mean 0 and length 1, half the
+squared length of their difference is 1 - c, so a least-squares solver maximises c: Levenberg–Marquardt,
+whose few steps of six tangents each cost less than the hundreds that gradients take. Coarse images come
+first, since a derivative describes only features that move by less than their own size.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple, cast, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from .._util.checks import Arrayable, described, finite_array, integer
+from ..march.march import March
+from ..march.transforms import AlphaCorrection
+from ..metrics import standardized
+from ..ray import check_arguments
+from ..render import Adjoint, render
+from ..scene.camera import Camera
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
+from .bijections import rotate
+from .constraints import Free
+from .damping import LevenbergMarquardt
+from .driver import allow_promotion
+from .noise import of_pixels
+from .references import camera_and_image
+from .residuals import Problem
+
+
+Similarity = Literal["gradient_ncc", "ncc"]
+
+NEAR = 0.01
+"""A search ends at a step that moves voxels by less than this part of a pixel."""
+
+
+class RigidMotion(NamedTuple):
+    """A rotation about a point, and a translation after it: p becomes R (p - center) + center + translation.
+
+    Attributes:
+        rotation: rotation vector (exponential map), (3,) radians; of many motions, (n, 3).
+        translation: (3,), in world length; of many motions, (n, 3).
+        center: the point, (3,), of all.
+    """
+
+    rotation: Arrayable
+    translation: Arrayable
+    center: Arrayable
+
+    @eqx.filter_jit
+    def camera(self, camera: Camera) -> Camera:
+        """The camera, moved by a single motion. The volume that it sees moves the other way."""
+        turn, shift, center = (jnp.asarray(part, camera.position.dtype) for part in self)
+
+        def moved(point: Array) -> Array:
+            return rotate(turn, point - center) + center + shift
+
+        places = moved(camera.position), moved(camera.focal_point), rotate(turn, camera.view_up)
+        return eqx.tree_at(lambda c: (c.position, c.focal_point, c.view_up), camera, places)
+
+
+class Registration(NamedTuple):
+    """Result of `register`; `print(result)` shows a table of the starts, the most similar first.
+
+    Attributes:
+        motion: of the cameras, the one whose images are the most similar.
+        cameras: those of the views, moved by it: they see the volume as the images show it.
+        similarity: by these, averaged over the views.
+        starts: where searches began.
+        ends: where they ended, in the same order.
+        similarities: at the starts and at the ends, (n, 2), of images of the last level.
+    """
+
+    motion: RigidMotion
+    cameras: list[Camera]
+    similarity: float
+    starts: RigidMotion
+    ends: RigidMotion
+    similarities: Float[np.ndarray, "n 2"]
+
+    def __str__(self) -> str:
+        moved = self.ends.rotation, self.ends.translation
+        turns, shifts = (np.linalg.norm(np.asarray(each), axis=1) for each in moved)
+        rows = ["start  similarity   after  turned by    moved by"]
+        for at in np.argsort(-self.similarities[:, 1]):
+            before, after = self.similarities[at]
+            rows.append(f"{at:5}{before:12.4f}{after:8.4f}{np.rad2deg(turns[at]):10.2f}°{shifts[at]:12.4g}")
+        return "\n".join(rows)
+
+
+def register(
+    volume: Volume | Any,
+    transfer: Transfer | Any,
+    views: Sequence[tuple[Camera, Arrayable]] | Any,
+    starts: RigidMotion | Any | None = None,
+    *,
+    similarity: Similarity | Any = "gradient_ncc",
+    weights: Sequence[Arrayable | None] | Any | None = None,
+    levels: Sequence[int] | Any = (8, 2, 1),
+    march: March | Any | None = None,
+    max_steps: int | Any = 20,
+) -> Registration:
+    """Registers a volume with X-ray images of it: finds the rigid motion of their cameras under which line
+    integrals through the volume are the most similar to the images.
+
+    Each start is followed to a maximum of the similarity, on images averaged over fewer and fewer pixels, and
+    through voxels averaged to about a pixel's size. From how far that succeeds: `experiments/register.py`.
+    All starts run in one program for each level, on concrete arrays (not under `jax.jit`).
+
+    Args:
+        volume: a CT, for example.
+        transfer: white, and the attenuation, such as `jaxvol.attenuation(0.02)`, whose scale doesn't matter.
+        views: pairs (camera, image), at least one; cameras of one size and kind, which are moved together. An
+            image is (height, width), of line integrals in any unit: -log(I / I₀) of an X-ray's intensity.
+        starts: motions to begin from, rotation and translation (n, 3), about any center; by default the
+            cameras as they are, and rotations about the volume's center.
+        similarity: `"gradient_ncc"`, of edges, or `"ncc"`: see `jaxvol.metrics`.
+        weights: of the pixels of each view, (height, width), as those of `ImageResidual`.
+        levels: pixels along a side that become one pixel, for each level in turn.
+        march: for the volume's own voxels; for larger ones, steps grow with them. By default, steps of the
+            smallest spacing by the midpoint rule, with `AlphaCorrection`.
+        max_steps: most steps of each start at each level.
+
+    Returns:
+        A `Registration`: the best motion, the cameras moved by it, and where all starts ended.
+
+    Raises:
+        ValueError: for arguments of another kind, shape or range, and views of several sizes or kinds.
+    """
+    check_arguments("register(volume, transfer, views)", volume=volume, transfer=transfer)
+    if similarity not in get_args(Similarity):
+        raise ValueError(f'similarity must be "gradient_ncc" or "ncc"; got {similarity!r}.')
+    if not isinstance(views, list | tuple) or not views:
+        raise ValueError(f"views must be a list of at least one (camera, image); got {described(views)}.")
+    read = [camera_and_image(number, view) for number, view in enumerate(views)]
+    cameras, shape = [camera for camera, _ in read], read[0][0].size[::-1]
+    if len({jax.tree.structure(camera) for camera in cameras}) > 1:
+        raise ValueError("views must have cameras of one size and kind, which one program renders.")
+    images = [finite_array(f"views[{at}]: the image", image, shape) for at, (_, image) in enumerate(read)]
+    given = of_pixels("weights", weights, [(*shape, 1)] * len(read))
+    counted = [np.ones(shape) if weight is None else weight[..., 0] for weight in given]
+    factors = [integer("levels", level, 1) for level in np.ravel(levels).tolist()]
+    if not factors:
+        raise ValueError("levels must hold at least one, such as 1; got none.")
+    if starts is None:
+        starts = RigidMotion(np.zeros((1, 3)), np.zeros((1, 3)), volume.center)
+    if not isinstance(starts, RigidMotion):
+        raise ValueError(f"starts must be a RigidMotion; got {described(starts)}.")
+    turns = np.asarray(finite_array("starts.rotation", starts.rotation, (None, 3)))
+    shifts = np.asarray(finite_array("starts.translation", starts.translation, turns.shape))
+    center = finite_array("starts.center", starts.center, (3,))
+    march = March(np.min(volume.spacing), (AlphaCorrection(),), "midpoint") if march is None else march
+    check_arguments("register(volume, transfer, views, march=...)", march=march)
+    assert isinstance(march, March)
+
+    # in NumPy, which compiles nothing
+    low, high = map(np.asarray, volume.corners)
+    radius = np.linalg.norm(high - low) / 2
+    begun = ends = np.concatenate([turns, shifts / radius], axis=1)
+    most, level = integer("max_steps", max_steps, 1), cast(Any, None)
+    for factor in factors:
+        averaged = [_averaged(*view, factor) for view in zip(cameras, images, counted, strict=True)]
+        stacked: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *averaged)
+        pixel = min(_pixel(camera, center) for camera, *_ in averaged)
+        coarse = _coarser(volume, pixel)
+        step = np.asarray(march.step) * (np.min(coarse.spacing) / np.min(volume.spacing))
+        scene = coarse, transfer, eqx.tree_at(lambda m: m.step, march, step)
+        given: Any = jax.device_put((scene, stacked, center, radius, NEAR * pixel / radius))
+        level = _Level(*given, gradient=similarity == "gradient_ncc")
+        with allow_promotion():
+            ends = np.asarray(_followed(level, ends, most))
+    found = np.asarray(_similarities(level, np.stack([begun, ends], axis=1)))
+    reached = RigidMotion(ends[:, :3], ends[:, 3:] * radius, center)
+    at = int(np.nanargmax(found[:, 1]))
+    best = RigidMotion(reached.rotation[at], reached.translation[at], center)
+    moved = [best.camera(camera) for camera in cameras]
+    return Registration(best, moved, float(found[at, 1]), RigidMotion(turns, shifts, center), reached, found)
+
+
+class _Level(eqx.Module):
+    """The images of a level, as the residual of a motion: six numbers, a rotation vector, and a translation
+    in units of the volume's radius, so that both move voxels as far."""
+
+    scene: tuple[Volume, Transfer, March]
+    views: tuple[Camera, Float[Array, "views height width"], Float[Array, "views height width"]]
+    """Cameras, images and weights."""
+    center: Float[Array, "3"]
+    radius: Float[Array, ""]
+    near: Float[Array, ""]
+    gradient: bool = eqx.field(static=True)
+
+    def __call__(self, motion: Float[Array, "6"], adjoint: Adjoint = "forward") -> Float[Array, "views ..."]:
+        volume, transfer, march = self.scene
+        moved = RigidMotion(motion[:3], motion[3:] * self.radius, self.center)
+
+        def of_view(view: tuple[Camera, Array, Array]) -> Array:
+            camera, image, weight = view
+            how: Any = {"compositing": "integral", "outputs": "rgba", "adjoint": adjoint}
+            seen = render(volume, transfer, moved.camera(camera), march, **how).rgba[..., 0]
+            both = (standardized(each, weight, gradient=self.gradient) for each in (seen, image))
+            return next(both) - next(both)
+
+        difference = jax.lax.map(of_view, self.views)
+        return difference / math.sqrt(len(self.views[1]))
+
+
+@eqx.filter_jit
+def _followed(level: _Level, starts: Arrayable, max_steps: int) -> Float[Array, "n 6"]:
+    """Where each start, a row, leads."""
+    free, _ = Free.of(np.zeros(6), None, None)
+
+    def of_start(start: Float[Array, "6"]) -> Float[Array, "6"]:
+        problem = Problem.of(level, free, (start,), 2**30, True)
+        solver = eqx.tree_at(lambda s: s.atol, LevenbergMarquardt(1e-3, 0.0), level.near)
+        found = optx.least_squares(problem, solver, (start,), has_aux=True, max_steps=max_steps, throw=False)
+        return found.value[0]
+
+    return jax.lax.map(of_start, starts)
+
+
+@eqx.filter_jit
+def _similarities(level: _Level, motions: Arrayable) -> Float[Array, "n m"]:
+    def of_motion(motion: Float[Array, "6"]) -> Float[Array, ""]:
+        return 1 - jnp.sum(level(motion, "replay") ** 2) / 2
+
+    return jax.lax.map(of_motion, motions.reshape(-1, 6)).reshape(motions.shape[:2])
+
+
+def _averaged(camera: Camera, image: Array, weight: np.ndarray, factor: int) -> tuple[Camera, Any, Any]:
+    """A view of pixels `factor` times as large; those that reach past the image count in part."""
+    pads = [(0, -n % factor) for n in image.shape]
+    shape = [m for n in image.shape for m in (-(-n // factor), factor)]
+    of_pixel = weight * np.asarray(image), weight
+    sums, counts = (np.pad(each, pads).reshape(shape).mean(axis=(1, 3)) for each in of_pixel)
+    left, right, bottom, top = np.asarray(camera.window)
+    across, down = (n * factor / m for n, m in zip(sums.shape[::-1], camera.size, strict=True))
+    window = left, left + (right - left) * across, top - (top - bottom) * down, top
+    larger = replace(camera, window=window, size=sums.shape[::-1], corner=None)
+    averages = sums / np.where(counts > 0, counts, 1)
+    return larger, averages.astype(image.dtype), counts.astype(image.dtype)
+
+
+def _pixel(camera: Camera, at: Float[Array, "3"]) -> float:
+    """Height of a pixel in the plane through a point, world length."""
+    low, high = np.asarray(camera.window)[2:]
+    half = camera.parallel_scale
+    if half is None:
+        away = np.linalg.norm(np.asarray(camera.position) - np.asarray(at))
+        half = away * np.tan(np.deg2rad(float(camera.view_angle)) / 2)
+    return float(half) * float(high - low) / camera.size[1]
+
+
+def _coarser(volume: Volume, size: float) -> Volume:
+    """The volume, of averages over blocks of voxels as large as fit into a size; a field stays as it is."""
+    spacing = np.asarray(volume.spacing)
+    blocks = np.maximum(size / spacing, 1).astype(int)
+    if volume.field is not None or np.all(blocks == 1):
+        return volume
+    pads = [(0, -n % block) for n, block in zip(volume.shape, blocks, strict=True)]
+    data = np.pad(np.asarray(volume.data, np.float32), pads, mode="edge")
+    shape = [m for n, block in zip(data.shape, blocks, strict=True) for m in (n // block, block)]
+    shift = (blocks - 1) / 2 * spacing
+    if volume.direction is not None:
+        shift = np.asarray(volume.direction) @ shift
+    origin = np.asarray(volume.origin) + shift
+    return Volume(
+        data.reshape(shape).mean(axis=(1, 3, 5)), spacing * blocks, origin, direction=volume.direction
+    )
