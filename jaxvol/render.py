@@ -47,8 +47,13 @@ def render(
     """Renders an image of a volume.
 
     Args:
-        volume: the values, on a grid.
-        transfer: their colours and extinctions.
+        volume: the values, on a grid. Or a list of several, each with its own grid and place: their
+            extinctions add at each sample, colours are means weighted by extinction, and a cell that a
+            volume's face divides counts for the part that lies in it. Without a lighting, by `"over"`,
+            `"integral"` or a `Weighting` of one's own.
+        transfer: their colours and extinctions; of several volumes, a list of one for each. (Where all of
+            their extinctions are exactly 0, `"direct"` and `"forward"` take the mean of their colours for the
+            derivative by extinction. `"replay"` is exact in reverse mode.)
         camera: makes one ray for each pixel.
         march: step and transforms; or `"auto"`: those of `plan`, which is called for each image, without
             transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
@@ -62,11 +67,12 @@ def render(
         lighting: how samples are shaded: `lighting.Phong(lights)` or
             `lighting.ScattererTemplates(materials, lights)`; by default not at all.
         outputs: `"all"`, or `"rgba"` for the image and `exhausted` only, in some 5 % less time.
-        adjoint: how the image is differentiated; the image itself is the same. `"replay"`, for reverse mode
-            (`jax.grad`): a second march computes the samples again, so that memory does not grow with their
-            number (one array like each leaf, and the rays of one tile). `"forward"`, for forward mode
-            (`jax.jvp`, `jax.jacfwd`). `"direct"`, for both and higher derivatives: JAX differentiates
-            the reference's march, and memory grows with the number of samples.
+        adjoint: how the image is differentiated; the image itself is the same. `"replay"`: in either mode,
+            and in forward mode over these (`jax.hessian`, `jax.jvp` of `jax.grad`); for `jax.grad`, a second
+            march computes the samples again, so that memory does not grow with their number (one array like
+            each leaf, and the rays of one tile). `"forward"`: in forward mode (`jax.jvp`, `jax.jacfwd`) only,
+            by one march in place of two. `"direct"`: in any mode and order; JAX differentiates the
+            reference's march, in some 15 times the time, and memory grows with the number of samples.
         devices: a sequence of JAX's devices, or a `jax.sharding.Mesh` of one axis, over which
             `jax.shard_map` shards the rays. Image and gradient are the same, and lie on all of these
             devices; so does the scene (a volume is copied to each once in its lifetime). By default JAX
@@ -96,8 +102,8 @@ def render(
             that bends space is traced and `march.max_samples` is not given; for `"auto"` where arrays are
             traced, and for a tolerance without it; for wrong `devices`, and for any inside a `jax.shard_map`;
             for an `antialias` that is no integer of at least 1; for an `until` of another shape or with NaN;
-            and under a mode of differentiation that is not the adjoint's. (`jax.jvp` of a `jax.jit` under
-            `"replay"` is JAX's own `TypeError`.)
+            for a volume of another number of channels than the transfer function reads, and several where
+            one value is needed; and under a mode of differentiation that is not the adjoint's.
 
     `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so do
     gradients. Under `"direct"` and `"forward"`, images that are also differentiated, or compiled by a

@@ -8,7 +8,7 @@ for each array of them. The slopes of 8-bit voxels take as much again.
 
 from collections.abc import Sequence
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -50,7 +50,8 @@ class VolumeAcceleration(eqx.Module):
     words: list[UInt32[Array, " voxels"] | None]
     """Of each of the volume's `grids`."""
     slopes: list[UInt32[Array, " voxels"] | None]
-    blocks: Blocks | SeveralBlocks | None
+    blocks: Any
+    """`Blocks`, or, of several volumes, `SeveralBlocks`."""
     windows: Windows | None
 
     @classmethod
@@ -134,7 +135,8 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     data = cast(Array | np.ndarray | None, volume.data)
     small = data is not None and data.dtype.kind in "ui" and data.dtype.itemsize in (1, 2)
     if (
-        not small
+        data is None
+        or not small
         or data.ndim > 3
         or volume.field is not None
         or is_traced(data)

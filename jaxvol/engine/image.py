@@ -38,8 +38,8 @@ RenderOutputs: TypeAlias = Literal["all", "rgba"]
 march.)"""
 
 WRONG_MODE = {
-    "replay": 'adjoint="replay" is for reverse mode (jax.grad, jax.vjp). For forward mode (jax.jvp, '
-    'jax.jacfwd) pass adjoint="forward"; for both, and for higher derivatives, adjoint="direct".',
+    "replay": 'adjoint="replay" is for derivatives in either mode, and for forward mode over these (jax.jvp '
+    'of jax.grad, jax.hessian). For reverse mode (jax.grad) over either one, pass adjoint="direct".',
     "forward": 'adjoint="forward" is for forward mode (jax.jvp, jax.jacfwd). For reverse mode (jax.grad, '
     'jax.vjp) pass adjoint="replay", the default; for both, adjoint="direct".',
 }

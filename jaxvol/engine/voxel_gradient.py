@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..scene.volume import Volume, grids, voxels_of, with_fetches
-from ..scene.voxel_fetch import Fetched, Recording, perturbations_of, scatter_add
+from ..scene.voxel_fetch import Extent, Fetch, Fetched, Recording, perturbations_of, scatter_add
 
 
 Sums: TypeAlias = list[Float[Array, " numbers"] | None]
@@ -39,7 +39,7 @@ def recorded(volume: Volume, perturbations: list[Any]) -> tuple[Volume, list[lis
     own = grids(volume)
     records = [Recording(each, []) for each in perturbations or [[]] * len(own)]
     each = zip(own, records, strict=True)
-    fetches = [grid.fetch if grid.data is None else record for grid, record in each]
+    fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else record for g, record in each]
     return with_fetches(volume, fetches), [record.fetched for record in records]
 
 

@@ -274,7 +274,7 @@ class Together(Transfer):
 
 def _mixed(classified: list[tuple[Vec3, Scalar]]) -> tuple[Vec3, Scalar]:
     """Colour and extinction of all together; where nothing is visible, the mean of the colours."""
-    whole = sum(extinction for _, extinction in classified)
+    whole = jnp.sum(jnp.stack([extinction for _, extinction in classified]), axis=0)
     empty, count = whole == 0, len(classified)
     safe = jnp.where(empty, 1, whole)
     mixed = [jnp.zeros_like(whole)] * 3

@@ -209,8 +209,8 @@ class Affine(Space):
     """The grids of several volumes that this one holds."""
 
     def __init__(self, volume: Volume):
-        several = isinstance(volume.field, Several)
-        self.inner = tuple(map(Affine, volume.field.volumes)) if several else ()
+        field = volume.field
+        self.inner = tuple(map(Affine, field.volumes)) if isinstance(field, Several) else ()
         self.spacing, self.frame = apart(volume.spacing), Frame()
         if volume.direction is None:
             self.low, self.high = (apart(end) for end in volume.corners)

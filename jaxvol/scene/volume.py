@@ -21,7 +21,7 @@ from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
-from .voxel_fetch import Fetch, OneByOne, Window, corners, flat_index
+from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
 
 
 class Field(eqx.Module):
@@ -32,7 +32,7 @@ class Field(eqx.Module):
     """
 
     @abstractmethod
-    def value(self, volume: "Volume", coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
+    def value(self, volume: "Volume", coordinate: Vec3) -> Voxel:
         """Value at a grid coordinate, whose world position is
         `volume.origin + volume.direction @ (coordinate * volume.spacing)`; of several channels, a tuple."""
 
@@ -148,7 +148,7 @@ class Volume(eqx.Module):
         low, high = self.corners
         return (low + high) / 2
 
-    def value(self, coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
+    def value(self, coordinate: Vec3) -> Voxel:
         """Value at a grid coordinate, in the coordinate's float type; from `field` if there is one. Of
         several channels, a tuple."""
         return self.interpolated(coordinate) if self.field is None else self.field.value(self, coordinate)
@@ -158,7 +158,7 @@ class Volume(eqx.Module):
         value = self.value(coordinate)
         return value if isinstance(value, tuple) else (value,)
 
-    def interpolated(self, coordinate: Vec3) -> Scalar | tuple[Scalar, ...]:
+    def interpolated(self, coordinate: Vec3) -> Voxel:
         """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type; of
         several channels, a tuple."""
         return self.fetch.interpolated(self.data, coordinate)

@@ -168,10 +168,10 @@ class Extent(Fetch):
 
     nodes: tuple[int, int, int] = eqx.field(static=True)
 
-    def cube_at(self, data: None, node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Any, node: Node, dtype: Any) -> Cube:
         raise ValueError("volume has no voxels of its own to be interpolated; read those of its field.")
 
-    def shape(self, data: None) -> tuple[int, int, int]:
+    def shape(self, data: Any) -> tuple[int, int, int]:
         return self.nodes
 
 

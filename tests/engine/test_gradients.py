@@ -346,9 +346,12 @@ def test_a_gradient_of_some_leaves_is_that_of_all():
 
 
 WRONG_WAYS = {
-    "jvp": ("replay", lambda loss, x: jax.jvp(loss, (x,), (x,)), 'pass adjoint="forward"'),
     "grad of grad": ("replay", lambda loss, x: jax.grad(lambda x: jax.grad(loss)(x) ** 2)(x), '"direct"'),
-    "hessian": ("replay", lambda loss, x: jax.hessian(loss)(x), 'higher derivatives, adjoint="direct"'),
+    "grad of jvp": (
+        "replay",
+        lambda loss, x: jax.grad(jax.jit(lambda x: jax.jvp(loss, (x,), (x,))[1]))(x),
+        'pass adjoint="direct"',
+    ),
     "grad": ("forward", lambda loss, x: jax.grad(loss)(x), 'pass adjoint="replay"'),
     "grad of jit": ("forward", lambda loss, x: jax.grad(jax.jit(loss))(x), 'pass adjoint="replay"'),
 }
