@@ -1,13 +1,13 @@
 """How much matter does a ray pass? X-ray images, digitally reconstructed radiographs, and tomography."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._util.vec3 import Scalar, Vec3
 from ..march.march import March
-from ..scene.occupancy import Blocks
 from ..scene.transfer import Classification, Classify, Measured, Transfer
 from ..scene.volume import Volume
 from .blending import OpticalDepths
@@ -76,10 +76,10 @@ class _Thinner(Transfer):
     def reads_gradient(self) -> bool:
         return self.transfer.reads_gradient
 
-    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+    def majorant(self, blocks: Any) -> Float[Array, "bx by bz"]:
         return SCALE * self.transfer.majorant(blocks)
 
-    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+    def visible(self, blocks: Any) -> Bool[Array, "bx by bz"]:
         return self.transfer.visible(blocks)
 
     def search(self) -> Callable[[Measured], Measured] | None:

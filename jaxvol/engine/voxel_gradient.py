@@ -9,13 +9,13 @@ from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..scene.volume import Volume, grids, voxels_of, with_fetches
 from ..scene.voxel_fetch import Extent, Fetch, Fetched, Recording, perturbations_of, scatter_add
 
 
-Sums: TypeAlias = list[Float[Array, " numbers"] | None]
+Sums: TypeAlias = list[Array | None]
 """Of the numbers of each array, flattened."""
 
 

@@ -87,8 +87,17 @@ class Several(Field):
         return tuple(value for each, at in read for value in each.values(at))
 
     def coordinates(self, volume: Volume, coordinate: Vec3) -> list[Vec3]:
-        """A grid coordinate of `volume`, in the grid of each."""
-        return [GridMap.between(volume, each)(coordinate) for each in self.volumes]
+        """A grid coordinate of `volume`, in the grid of each; outside of that, the nearest one, since a cell
+        which a face divides is sampled in its middle."""
+        at = [GridMap.between(volume, each)(coordinate) for each in self.volumes]
+        return [_within(place, each.shape) for place, each in zip(at, self.volumes, strict=True)]
+
+
+def _within(coordinate: Vec3, shape: tuple[int, ...]) -> Vec3:
+    # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
+    above = [jnp.where(c > 0, c, 0) for c in coordinate]
+    x, y, z = (jnp.where(c < n - 1, c, n - 1) for c, n in zip(above, shape, strict=True))
+    return x, y, z
 
 
 class GridMap(eqx.Module):
