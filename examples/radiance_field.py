@@ -18,14 +18,14 @@ MARCH = jv.March(1 / 80, (jv.AlphaCorrection(), jv.EarlyTermination(1e-2)), "mid
 
 
 def pictures(count, first, size=128):
-    """Cameras all around a head, on a spiral, and what they see before a white background."""
+    """Rays of cameras all around a head, on a spiral, and their colours before a white background."""
     file = os.environ["JAXVOL_DATA"] + "/cthead_256x256x113_uint16le.raw.gz"
     ct = jv.load(file, spacing=np.array([1, 1, 2]) / 255)
     z, turn = 1 - 2 * (np.arange(count) + first) / count, np.pi * (1 + 5**0.5) * (np.arange(count) + first)
     sides = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=-1)
     cameras = [jv.Camera.looking_at(ct, side, size=(size, size)).zoom(1.6) for side in sides]
     transfer, march = jv.automatic_transfer(ct), jv.March(1 / 510, (jv.AlphaCorrection(),), "midpoint")
-    return [(c, jv.render(ct, transfer, c, march, antialias=2).image(WHITE)) for c in cameras]
+    return [(*c.rays(), jv.render(ct, transfer, c, march, antialias=2).image(WHITE)) for c in cameras]
 
 
 def grid(n=64):
@@ -35,19 +35,20 @@ def grid(n=64):
 
 def train(volume_of, parameters, optimizer, views, held_out, seconds):
     """Yields seconds (without compilation), steps, PSNR and parameters."""
-    rays = [jnp.stack(p).reshape(-1, 3) for p in zip(*((*c.rays(), i) for c, i in views), strict=True)]
+    rays = [jnp.stack(part).reshape(-1, 3) for part in zip(*views, strict=True)]
 
-    def loss(parameters, origins, directions, colors):
+    def loss(parameters, view):
+        origins, directions, colors = view
         seen = jv.render_rays(volume_of(parameters), LOOK, origins, directions, MARCH, outputs="rgba")
         return jnp.mean((seen.image(WHITE) - colors) ** 2)
 
     @jax.jit
     def step(number, rate, parameters, state):
         chosen = jax.random.randint(jax.random.key(number), (4096,), 0, len(rays[0]))
-        updates, state = optimizer.update(jax.grad(loss)(parameters, *(p[chosen] for p in rays)), state)
+        updates, state = optimizer.update(jax.grad(loss)(parameters, [part[chosen] for part in rays]), state)
         return optax.apply_updates(parameters, jax.tree.map(lambda u: rate * u, updates)), state
 
-    errors = jax.jit(lambda p: jnp.stack([loss(p, *camera.rays(), image) for camera, image in held_out]))
+    errors = jax.jit(lambda p: jnp.stack([loss(p, view) for view in held_out]))
     spent, steps, state = 0.0, 0, optimizer.init(parameters)
     jax.block_until_ready(step(0, 1.0, parameters, state))  # compiles
     while spent < seconds:
@@ -59,6 +60,5 @@ def train(volume_of, parameters, optimizer, views, held_out, seconds):
 
 
 if __name__ == "__main__":
-    views = pictures(50, 0.5), pictures(5, 0.9)
-    for spent, steps, psnr, _ in train(*grid(), optax.adam(0.2), *views, seconds=60):
+    for spent, steps, psnr, _ in train(*grid(), optax.adam(0.2), pictures(50, 0.5), pictures(5, 0.9), 60):
         print(f"{spent:.0f} s, {steps} steps: {psnr:.2f} dB", flush=True)

@@ -112,15 +112,17 @@ def costs(chosen: Namespace) -> dict[str, Any]:
 
     def ours(volume_of: Any, look: jv.RadianceField, *transforms: jv.Transform) -> Any:
         march = jv.March(step, (jv.AlphaCorrection(), *transforms), "midpoint")
-        return lambda p: jv.render_rays(volume_of(p), look, *rays, march, outputs="rgba").rgba
+        origins, directions = rays
+        return lambda p: jv.render_rays(volume_of(p), look, origins, directions, march, outputs="rgba").rgba
 
     def by_hand(value: Any) -> Any:
         return lambda p: plain(value, p, rays, chosen.samples)
 
     volume_of, fog = grid(chosen.resolution)
     data = fog + jnp.asarray(np.random.default_rng(chosen.seed).normal(size=fog.shape), fog.dtype)
-    field_of, (levels, arrays) = neural()
-    network = eqx.filter(field_of((levels, arrays)).field.network, eqx.is_array, inverse=True)
+    field_of, start = neural()
+    field: Any = field_of(start).field
+    network = eqx.filter(field.network, eqx.is_array, inverse=True)
     sides = np.linspace(-1, 1, chosen.resolution)
     ball = sum(np.meshgrid(sides**2, sides**2, sides**2, indexing="ij")) < 0.33
     thing, clipped = data.at[..., 3].set(jnp.where(ball, jnp.exp(data[..., 3]), -1)), jv.RadianceField(100)
@@ -131,8 +133,8 @@ def costs(chosen: Namespace) -> dict[str, Any]:
             "jaxvol": (ours(volume_of, LOOK), data),
         },
         "neural field": {
-            "plain marcher": (by_hand(of_network(network)), (levels, arrays)),
-            "jaxvol": (ours(field_of, LOOK), (levels, arrays)),
+            "plain marcher": (by_hand(of_network(network)), start),
+            "jaxvol": (ours(field_of, LOOK), start),
         },
         "type of the grid": {
             name: (ours(volume_of, LOOK), data.astype(name)) for name in ("float32", "float16", "bfloat16")
@@ -150,7 +152,8 @@ def fits(chosen: Namespace) -> dict[str, Any]:
     views, held_out = pictures(chosen.views, 0.5, chosen.size), pictures(5, 0.9, chosen.size)
     found: dict[str, Any] = {}
     for name, (model, optimizer, _) in FITS.items():
-        rows = [row[:3] for row in train(*model(), optimizer, views, held_out, chosen.seconds)]
+        volume_of, start = model()
+        rows = [row[:3] for row in train(volume_of, start, optimizer, views, held_out, chosen.seconds)]
         spent, steps, psnr = zip(*rows, strict=True)
         found[name] = {"psnr at the end": psnr[-1], "steps": steps, "psnr": psnr, "seconds": spent}
     return found
