@@ -13,7 +13,7 @@ import jaxvol as jv
 from .radiance_field import BOX, grid, pictures, train
 
 
-RATES = optax.partition({"levels": optax.adam(0.1), "network": optax.adam(0.01)}, ("levels", "network"))
+RATES = optax.partition({"levels": optax.adam(0.2), "network": optax.adam(0.02)}, ("levels", "network"))
 
 
 class Neural(jv.Field):
@@ -28,7 +28,7 @@ class Neural(jv.Field):
         return tuple(self.network(jnp.stack(features)))
 
 
-def neural(sizes=(24, 72), features=4, width=32, seed=0):
+def neural(sizes=(16, 64), features=2, width=16, seed=0):
     """How parameters, features and arrays of the network, are a volume, and the first ones."""
     random, box = np.random.default_rng(seed), np.zeros((2, 2, 2), np.float32)
     levels = [jnp.asarray(random.normal(0, 0.1, (n, n, n, features)), jnp.float32) for n in sizes]
@@ -46,5 +46,5 @@ def neural(sizes=(24, 72), features=4, width=32, seed=0):
 if __name__ == "__main__":
     views = pictures(50, 0.5), pictures(5, 0.9)
     for name, fitted, optimizer in (("grid", grid(), optax.adam(0.2)), ("neural field", neural(), RATES)):
-        for spent, steps, psnr, _ in train(*fitted, optimizer, *views, 120):
+        for spent, steps, psnr, _ in train(*fitted, optimizer, *views, 60):
             print(f"{name}, {spent:.0f} s, {steps} steps: {psnr:.2f} dB in 5 held-out views", flush=True)

@@ -24,7 +24,8 @@ def pictures(count, first, size=128):
     z, turn = 1 - 2 * (np.arange(count) + first) / count, np.pi * (1 + 5**0.5) * (np.arange(count) + first)
     sides = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=-1)
     cameras = [jv.Camera.looking_at(ct, side, size=(size, size)).zoom(1.6) for side in sides]
-    transfer, march = jv.automatic_transfer(ct), jv.March(1 / 510, (jv.AlphaCorrection(),), "midpoint")
+    march = jv.March(1 / 510, (jv.SpaceLeaping(), jv.AlphaCorrection()), "midpoint")
+    transfer = jv.automatic_transfer(ct)
     return [(*c.rays(), jv.render(ct, transfer, c, march, antialias=2).image(WHITE)) for c in cameras]
 
 

@@ -2,7 +2,7 @@
 
 A step is image and gradient of 4096 random rays, with 96 samples on the mean ray, through the unit cube of
 `examples/radiance_field.py`. A grid of 64³ x 4 channels and a neural field (features on two grids, and a
-network of 32) are marched by jaxvol and by a plain marcher: a `jax.lax.scan` over as many samples for each
+network of 16) are marched by jaxvol and by a plain marcher: a `jax.lax.scan` over as many samples for each
 ray, all rays side by side. Both sample in the middle of cells, which are a little shorter or longer in one of
 them: so images differ by the error of their steps. Grids of 16 bits, and the grid of which nine tenths are
 empty, with the blocks of emptiness made anew in each step and without, are compared with jaxvol's own.
@@ -186,7 +186,7 @@ def draw(result: dict[str, Any]) -> Any:
     samples=96,
     resolution=64,
     repetitions=15,
-    seconds=120,
+    seconds=60,
     views=50,
     size=128,
     quick={
