@@ -52,7 +52,10 @@ FigureCanvasBase.print_figure = _checked
 have.)"""
 
 
-OWN = {"write_a_transform": ["class BallCut(jv.Transform):"]}
+OWN = {
+    "radiance_field": ["class Decoded(jv.Field):"],
+    "write_a_transform": ["class BallCut(jv.Transform):"],
+}
 """Classes that notebooks define, where that is what they are about."""
 
 
