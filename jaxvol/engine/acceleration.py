@@ -158,7 +158,9 @@ def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
 def with_words(
     volume: Volume, words: Sequence[Array | None], slopes: Sequence[Array | None] | None = None
 ) -> Volume:
-    """The volume, with packed copies of its `grids` where there are some, and with their slopes."""
+    """The volume, with packed copies of its `grids` where there are any, and with their slopes."""
+    if not words:
+        return volume
     both = zip(words, [None] * len(words) if slopes is None else slopes, strict=True)
     return read_as(volume, *(None if word is None else Packed(word, slope) for word, slope in both))
 

@@ -150,7 +150,11 @@ class Transfer(eqx.Module):
     def emission_vjp(
         self, measured: Measured, emission: Vec3, extinction: Scalar
     ) -> tuple["Transfer", Measured]:
-        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction."""
+        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction.
+
+        Raises:
+            NotImplementedError: unless it `mixes`.
+        """
         raise NotImplementedError
 
 

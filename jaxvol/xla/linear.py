@@ -13,7 +13,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -90,7 +89,9 @@ def differentiable(
             how = {"push": pushed, "pull": pulled, "avals": avals}
             tangent = iter(_PUSH.bind(*operands, count=known_, message=message, **how))
             of_outputs = [
-                next(tangent) if eqx.is_inexact_array(leaf) else np.zeros(leaf.shape, jax.dtypes.float0)
+                next(tangent)
+                if eqx.is_inexact_array(leaf)
+                else SymbolicZero(jax.typeof(leaf).to_tangent_aval())
                 for leaf in outputs
             ]
             return found, jax.tree.unflatten(out, of_outputs)

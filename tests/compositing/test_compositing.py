@@ -213,18 +213,16 @@ def first_hits_of(mode):
     return lambda: traced(lambda: jv.render(*SCENE, march, compositing=mode))
 
 
-def derivative(adjoint, of):
-    """Of a selection, by forward or reverse mode."""
+def gradient_of_forward():
+    """Of a selection."""
 
     def total(colors):
         transfer = eqx.tree_at(lambda t: t.colors, SCENE[1], colors)
         march = jv.March(0.11, max_samples=8)
-        image = jv.render(NOISE, transfer, SCENE[2], march, compositing="maximum", adjoint=adjoint)
+        image = jv.render(NOISE, transfer, SCENE[2], march, compositing="maximum", adjoint="forward")
         return jnp.sum(image.rgba)
 
-    colors = SCENE[1].colors
-    way = jax.grad(total) if of == "grad" else lambda colors: jax.jvp(total, (colors,), (colors,))
-    return traced(way, colors)
+    return traced(jax.grad(total), SCENE[1].colors)
 
 
 REFUSED = {
@@ -240,8 +238,7 @@ REFUSED = {
     "average, labels": (average_of_labels, "value alone; LabelTransferFunction reads more"),
     "average, light": (average_that_is_lit, "lighting must be None"),
     "resolved, light": (gained_that_is_lit, "lighting must be None under Gained"),
-    "jvp of replay": (lambda: derivative("replay", "jvp"), 'adjoint="forward"'),
-    "grad of forward": (lambda: derivative("forward", "grad"), 'adjoint="replay"'),
+    "grad of forward": (gradient_of_forward, 'adjoint="replay"'),
     **{
         f"first hits, {name}": (first_hits_of(MODES[name]), f"first; {type(MODES[name]).__name__} may show")
         for name in ("maximum", "minimum", "average", "isosurface")

@@ -67,7 +67,7 @@ def test_the_gradient_is_interpolated_between_central_differences(kind, shape):
 def test_slopes_are_stored_for_those_who_read_them():
     march = jv.March(0.1)
     for lighting, stored in ((None, False), (Phong(), True), (Deferred(Phong()), True)):
-        assert (VolumeAcceleration.of(shells(), soft(), march, lighting).slopes is not None) == stored
+        assert (VolumeAcceleration.of(shells(), soft(), march, lighting).slopes[0] is not None) == stored
 
 
 def normals(volume, space, points):

@@ -267,7 +267,7 @@ def test_slopes_are_stored_for_a_transfer_function_that_reads_them():
     for transfer, stored in ((soft(), False), (emphasised(), True)):
         found = VolumeAcceleration.of(shells("uint8"), transfer, march)
         assert found.blocks is not None
-        assert (found.slopes is not None) == (found.blocks.slopes is not None) == stored
+        assert (found.slopes[0] is not None) == (found.blocks.slopes is not None) == stored
 
 
 # ---------------------------------------------------------------- gradients
