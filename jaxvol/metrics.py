@@ -104,7 +104,7 @@ def ncc(image: Any, reference: Any, weights: Any | None = None) -> Float[Array, 
         The correlation, a scalar.
 
     Raises:
-        ValueError: for images that are not (height, width), and shapes that differ.
+        ValueError: for images that are not (height, width), shapes that differ, and negative weights.
     """
     _same_shape(image, reference)
     return jnp.sum(standardized(image, weights) * standardized(reference, weights))
@@ -150,12 +150,15 @@ def standardized(image: Any, weights: Any | None = None, *, gradient: bool = Fal
         ValueError: as `ncc` and `gradient_ncc`.
     """
     image = jnp.asarray(image)
+    if image.dtype not in (jnp.float32, jnp.float64):  # sums overflow in 16 bits
+        image = image.astype(jnp.float32)
     if image.ndim != 2 or min(image.shape) < (3 if gradient else 1):
         least = ", of at least 3 x 3 pixels" if gradient else ""
         raise ValueError(f"image must have shape (height, width){least}; got {image.shape}.")
     weights = jnp.ones_like(image) if weights is None else jnp.asarray(weights, image.dtype)
     if weights.shape != image.shape:
         raise ValueError(f"weights must have the shape of the image, {image.shape}; got {weights.shape}.")
+    weights: Array = checks.require(weights, lambda w: w >= 0, "weights must not be negative; got {got}.")
     if not gradient:
         return _unit(image, weights)
     last = image.shape[0] - 2, image.shape[1] - 2

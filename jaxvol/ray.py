@@ -28,6 +28,7 @@ from .march.strides import Strides, steps_of
 from .scene.camera import Camera
 from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
+from .scene.several import Several
 from .scene.space import Line, Ray, Space, enter, world_gradient
 from .scene.transfer import Classification, Measured, Transfer, TransferFunction
 from .scene.transfer2d import TransferFunction2D
@@ -168,6 +169,8 @@ def check_channels(
 ) -> None:
     """Raises `ValueError` for a transfer function that reads another number of channels than the volume has,
     and for what needs a single one."""
+    if isinstance(volume.field, Several) and (moved := march.overriding("locate")):
+        raise ValueError(f"march.transforms: {type(moved[0]).__name__} places one volume; got several.")
     channels, reads = volume.channels, transfer.channels
     if reads not in (None, channels):
         raise ValueError(
@@ -178,8 +181,10 @@ def check_channels(
     single = {"compositing": compositing if compositing.reads_value else None, "lighting": lighting}
     for name, given in (single | {"march.transforms": adaptive}).items():
         if channels > 1 and given is not None:
-            kind = type(given).__name__
-            raise ValueError(f"{name}: {kind} needs a volume of one channel; got one of {channels}.")
+            kind, got = type(given).__name__, f"one of {channels} channels"
+            if isinstance(volume.field, Several):
+                got = f"{len(volume.field.volumes)} volumes"
+            raise ValueError(f"{name}: {kind} needs a single volume of one channel; got {got}.")
 
 
 class Progress(eqx.Module):

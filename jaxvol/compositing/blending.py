@@ -5,7 +5,7 @@ weights is its opacity. A `Selection` picks one depth on the ray, such as that o
 """
 
 from abc import abstractmethod
-from typing import Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
+from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
 
 import equinox as eqx
 import jax
@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float
 
 from .._util.vec3 import Scalar, Vec3
 from ..march.march import Cell, March
-from ..scene.occupancy import Blocks
 from ..scene.transfer import Classification, Measured, Transfer
 from ..scene.variation import Variation, Windows
 from ..scene.volume import Volume
@@ -98,9 +97,9 @@ class Compositing(eqx.Module, Generic[State]):
         """Whether further fragments cannot change the pixel."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
-    def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume may change a pixel, from the ranges of their values; rays leap over the
-        others. `transfer`: that of `marched`."""
+    def occupied(self, transfer: Transfer, blocks: Any) -> Bool[Array, "bx by bz"]:
+        """Which blocks of a volume may change a pixel, from the ranges of their values, `Blocks` (of several
+        volumes, `SeveralBlocks`); rays leap over the others. `transfer`: that of `marched`."""
         return transfer.visible(blocks)
 
     def variation(self, transfer: Transfer, windows: Windows) -> Variation:

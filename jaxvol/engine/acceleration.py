@@ -95,8 +95,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
     if blocks is None:
         return None
     space = march.locate(volume)
-    several = isinstance(blocks, SeveralBlocks)  # modes that ask for more need a single value
-    visible = transfer.visible(blocks) if several else compositing.occupied(transfer, blocks)
+    visible = compositing.occupied(transfer, blocks)
     check_answer(compositing, "occupied", visible, blocks.unordered)
     visible |= blocks.unordered
     if march.may_shift:  # a leap applies the shift, so that it must not cross what `opacity` sees

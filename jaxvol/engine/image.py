@@ -172,8 +172,8 @@ def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcc
 
 _forward_image = compiled(_marched_image, has_jvp=True)
 _plain_image = compiled(_marched_image)
-_recorded_image = compiled(partial(march_image, record=True), has_jvp=True)
-_image_vjp = compiled(render_vjp, has_jvp=True)
+_recorded_image = compiled(partial(march_image, record=True), by_jvp=True)
+_image_vjp = compiled(render_vjp, by_jvp=True)
 _direct_image = compiled(scan_image, has_jvp=True)
 _pixels_kept = compiled(resolve_image, has_jvp=True)
 _pixels_recomputed = recomputed(resolve_image, WRONG_MODE["replay"])

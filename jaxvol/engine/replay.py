@@ -27,20 +27,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.vec3 import Scalar, Vec3, along
-from ..compositing.blending import Composite, Weighting
+from ..compositing.blending import Weighting
 from ..lighting.shading import Shader
-from ..march.march import Cell
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..scene.transfer import Measured, Transfer, classification_of
+from ..scene.transfer import classification_of
 from ..scene.volume import fetches_of, voxels_of, with_fetches, with_voxels, without_voxels
 from ..scene.voxel_fetch import Fetched
 from ..xla.trees import PyTree, added, floats, zeros_of
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
-from .voxel_gradient import Sums, recorded, with_cotangents, zero_perturbations, zero_sums
+from .voxel_gradient import Sums, reads_voxels, recorded, with_cotangents, zero_perturbations, zero_sums
 
 
 class Cotangents(NamedTuple):
@@ -170,15 +169,14 @@ class Replay(SampleVisitor):
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
             if self.scene.transfer.mixes:
-                of_transfer, of_read = self._mixed_vjp(
-                    cell,
-                    measured,
-                    classified[i],
-                    each.color,
-                    weights.weight[i],
-                    weights.before[i],
-                    of_extinction,
-                )
+                (color, extinction), weight = classified[i], weights.weight[i]
+                live = inside(ray, depths[i]) & ~weights.finished[i]
+                clear = jnp.where(live, self._weight_of_thin(weights.before[i]) * cell.width, 0)
+                # what a unit of emission shows as, where nothing is visible, too
+                seen = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
+                r, g, b = (of * seen for of in each.color)
+                of_extinction = of_extinction - (r * color[0] + g * color[1] + b * color[2])
+                of_transfer, of_read = self.scene.transfer.emission_vjp(measured, (r, g, b), of_extinction)
             else:
                 of_transfer, of_read = self.scene.transfer.vjp(
                     measured, of_color[i], of_extinction, integrated=self.prepared.march.integrates
@@ -204,25 +202,11 @@ class Replay(SampleVisitor):
             total = total._replace(voxels=voxels)
         return carry, of_rays, total
 
-    def _mixed_vjp(
-        self,
-        cell: Cell,
-        measured: Measured,
-        classified: tuple[Vec3, Scalar],
-        of_pixel: Vec3,
-        weight: Scalar,
-        before: Scalar,
-        of_extinction: Scalar,
-    ) -> tuple[Transfer, Measured]:
-        """`Transfer.vjp` where colours are weighted by extinction, from the cotangents of the emission, which
-        exist also where nothing is visible: a unit of it shows as weight / extinction, or, where that is 0,
-        as the transmittance times the width."""
-        color, extinction = classified
-        clear = self.prepared.compositing.transmittance(Composite(before)) * cell.width
-        seen = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
-        r, g, b = (of * seen for of in of_pixel)
-        of_extinction = of_extinction - (r * color[0] + g * color[1] + b * color[2])
-        return self.scene.transfer.emission_vjp(measured, (r, g, b), of_extinction)
+    def _weight_of_thin(self, before: Scalar) -> Scalar:
+        """The weight of a very thin cell behind this opacity, for a unit of its own opacity."""
+        compositing, zero = self.prepared.compositing, jnp.zeros_like(before)
+        assert isinstance(compositing, Weighting)
+        return jax.jvp(lambda alpha: compositing.weight(alpha, before), (zero,), (zero + 1,))[1]
 
     @property
     def reads_transfer(self) -> bool:
@@ -286,12 +270,12 @@ class Replay(SampleVisitor):
         perturbations = []
         if voxels:
             _, fetched = jax.eval_shape(all_, moving, [])
-            if self.total.voxels[0] is not None and not fetched[0]:
+            if self.total.voxels[0] is not None and not fetched[0] and reads_voxels(self.scene.volume):
                 kind = type(self.scene.volume.field).__name__
                 raise ValueError(
-                    f"the gradient to the voxels of a volume with the field {kind}, which asks for none by"
-                    ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct"; or, where'
-                    " values do not depend on its voxels, leave volume.data out of what is differentiated."
+                    f"the gradient to the voxels of a volume with the field {kind}, which reads them not by"
+                    ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct", or leave'
+                    " volume.data out of what is differentiated."
                 )
             given = self.scene.volume, fetched, self.total.voxels, ray.length.dtype
             perturbations = zero_perturbations(*given)

@@ -8,6 +8,7 @@ others (`scene.volume.grids`): lists here have one entry for each, None where no
 from typing import Any, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -41,6 +42,16 @@ def recorded(volume: Volume, perturbations: list[Any]) -> tuple[Volume, list[lis
     each = zip(own, records, strict=True)
     fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else record for g, record in each]
     return with_fetches(volume, fetches), [record.fetched for record in records]
+
+
+def reads_voxels(volume: Volume) -> bool:
+    """Whether a volume's values depend on its own voxels in any way."""
+    like = jax.ShapeDtypeStruct(volume.data.shape, volume.data.dtype)
+    place = (jax.ShapeDtypeStruct((), volume.spacing.dtype),) * 3
+    program = jax.make_jaxpr(lambda data, at: eqx.tree_at(lambda v: v.data, volume, data).value(at))
+    traced = program(like, place).jaxpr
+    read = [*traced.outvars, *(variable for step in traced.eqns for variable in step.invars)]
+    return any(variable is traced.invars[0] for variable in read)
 
 
 def zero_perturbations(volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: Any) -> list[Any]:

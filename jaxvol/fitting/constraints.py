@@ -91,6 +91,7 @@ def unconstrain(
             free = optax.apply_updates(free, updates)
 
     Whatever the steps, `constrain(free)` is within its bounds: extinctions stay positive, colours in [0, 1].
+    What lies on a bound begins a thousandth of its scale away from it.
 
     Args:
         parameters: any tree, as for `fit`.
@@ -158,7 +159,7 @@ def _default(node: Any) -> PyTree:
     if isinstance(node, Volume):
         own = jax.tree.map(_default, node.field, is_leaf=lambda n: isinstance(n, KNOWN))
         if any(not isinstance(b, Fixed) for b in jax.tree.leaves(own, is_leaf=_is_bijection)):
-            return eqx.tree_at(lambda v: v.field, fixed, own)  # its voxels only set its extent
+            return eqx.tree_at(lambda v: v.field, fixed, own)  # most fields read no voxels
         return eqx.tree_at(lambda v: v.data, fixed, _default(node.data))
     if isinstance(node, Material):
         return eqx.tree_at(lambda m: m.mean_free_path, fixed, Positive(node.mean_free_path))

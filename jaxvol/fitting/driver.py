@@ -116,7 +116,8 @@ def fit(
         constraints: a tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
             `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`, `ProbeGeometry(probe)`, or None
             for the default: of a transfer function, positive extinction, colours in [0, 1] and fixed values;
-            of a camera, its pose; of a `ToroidalMap`, its geometry; of a volume, its data if they are float;
+            of a camera, its pose; of a `ToroidalMap`, its geometry; of a volume, the arrays of its field
+            if it has any, or else its data if they are float;
             of a material, a positive mean free path; of a march, nothing is free; any other float array is
             unconstrained.
         where: what is free, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For

@@ -26,7 +26,7 @@ from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera
 from ..scene.transfer import Transfer
-from ..scene.volume import Volume
+from ..scene.volume import Volume, check_one_channel
 from .bijections import rotate
 from .constraints import Free
 from .damping import LevenbergMarquardt
@@ -136,6 +136,7 @@ def register(
         ValueError: for arguments of another kind, shape or range, and views of several sizes or kinds.
     """
     check_arguments("register(volume, transfer, views)", volume=volume, transfer=transfer)
+    check_one_channel(volume, "register")
     if similarity not in get_args(Similarity):
         raise ValueError(f'similarity must be "gradient_ncc" or "ncc"; got {similarity!r}.')
     if not isinstance(views, list | tuple) or not views:
@@ -156,6 +157,8 @@ def register(
         raise ValueError(f"starts must be a RigidMotion; got {described(starts)}.")
     turns = np.asarray(finite_array("starts.rotation", starts.rotation, (None, 3)))
     shifts = np.asarray(finite_array("starts.translation", starts.translation, turns.shape))
+    if not len(turns):
+        raise ValueError("starts must hold at least one motion; got none.")
     center = finite_array("starts.center", starts.center, (3,))
     march = March(np.min(volume.spacing), (AlphaCorrection(),), "midpoint") if march is None else march
     check_arguments("register(volume, transfer, views, march=...)", march=march)
@@ -261,7 +264,7 @@ def _pixel(camera: Camera, at: Float[Array, "3"]) -> float:
 def _coarser(volume: Volume, size: float) -> Volume:
     """The volume, of averages over blocks of voxels as large as fit into a size; a field stays as it is."""
     spacing = np.asarray(volume.spacing)
-    blocks = np.maximum(size / spacing, 1).astype(int)
+    blocks = np.clip(size / spacing, 1, np.array(volume.shape) // 2).astype(int)
     if volume.field is not None or np.all(blocks == 1):
         return volume
     pads = [(0, -n % block) for n, block in zip(volume.shape, blocks, strict=True)]

@@ -25,14 +25,16 @@ class RadianceField(Transfer):
 
     Args:
         scale: extinction (1/length) where the activated density is 1, at least 0. Differentiable.
-        density: from a stored density to one that is at least 0: a function of one number that does not
-            decrease, such as `jax.nn.softplus`; by default `max(density, 0)`, without a gradient below 0.
-        color: from a stored channel to linear colour, such as `jax.nn.sigmoid`; by default as it is stored.
+        density: from a stored density to the one that is seen: a function of one number that does not
+            decrease, such as `jax.nn.softplus`; by default as it is stored. Below 0 it counts as 0, and has
+            no gradient.
+        color: from a stored channel to linear colour, such as `jax.nn.sigmoid`; by default as it is stored,
+            also where that is an integer: of 8 bits, divide by 255, and give `scale` in these units.
 
     Give functions that exist once: each new `lambda` is compiled anew.
 
-    Gradients reach all channels (`Volume.data`), in every adjoint. Where density is 0, only that of the
-    activation is left, which the default has above 0 alone; and see `SpaceLeaping` about what is leapt over.
+    Gradients reach all channels (`Volume.data`), in every adjoint; but see `SpaceLeaping` about what is leapt
+    over.
     `quadrature="preintegrated"`, `AdaptiveSampling`, modes that compare values and lightings are refused, as
     they need one value.
 
@@ -57,8 +59,7 @@ class RadianceField(Transfer):
         for name, function in (("density", density), ("color", color)):
             if function is not None and not callable(function):
                 raise ValueError(f"{name} must be a function of a channel; got {described(function)}.")
-        self.density = clipped if density is None else density
-        self.color = _as_stored if color is None else color
+        self.density, self.color = (_as_stored if f is None else f for f in (density, color))
 
     @property
     def channels(self) -> int:
@@ -67,12 +68,12 @@ class RadianceField(Transfer):
     def classifier(self) -> Classify:
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             r, g, b, density = measured
-            return (self.color(r), self.color(g), self.color(b)), self.scale * self.density(density)
+            return (self.color(r), self.color(g), self.color(b)), self.scale * clipped(self.density(density))
 
         return classify
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        bound = jax.lax.stop_gradient(self.scale) * self.density(blocks.high[3])
+        bound = jax.lax.stop_gradient(self.scale) * clipped(self.density(blocks.high[3]))
         return (bound * (1 + ROUNDING)).astype(blocks.high.dtype)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:

@@ -39,7 +39,8 @@ def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
     for (name, given, kind), is_list in zip(kinds, listed, strict=True):
         expected = f"{name} must be a list of a {kind.__name__} for each volume, where either is a list"
         if not is_list or not given:
-            raise ValueError(f"{expected}; got {described(given)}.")
+            got = described(given) if given or not is_list else "none"
+            raise ValueError(f"{expected}; got {got}.")
         for number, each in enumerate(given):
             if not isinstance(each, kind) or (kind is Volume and type(each) is not Volume):
                 raise ValueError(f"{expected}; {name}[{number}] is {described(each)}.")

@@ -73,7 +73,8 @@ class Classification(NamedTuple):
 class Transfer(eqx.Module):
     """The interface of all transfer functions. A subclass overrides `classifier`; `attributes` if more than
     the value counts; `majorant`, so that rays leap over what is transparent; `integrator` and `variation` for
-    `quadrature="preintegrated"` and `AdaptiveSampling`. `search`, `visible` and `vjp` only save time.
+    `quadrature="preintegrated"` and `AdaptiveSampling`; `channels`, so that volumes of other numbers of them
+    are refused. `search`, `visible` and `vjp` only save time.
     """
 
     @abstractmethod
@@ -162,8 +163,8 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
     """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
-        name = type(transfer).__name__
-        raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
+        name = "several volumes have" if transfer.mixes else f"{type(transfer).__name__} has"
+        raise ValueError(f'quadrature="preintegrated" needs means: {name} no integrator; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
         return (*volume.values(coordinate), *transfer.attributes(volume, coordinate))

@@ -27,8 +27,10 @@ from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
 class Field(eqx.Module):
     """A user-defined field in place of interpolated voxels: `Volume(data, field=...)`.
 
-    Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`. `SpaceLeaping`
-    leaps over no part of it, since its range is unknown.
+    Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`. It may hold other
+    volumes, whose voxels have gradients in less time and memory than arrays have; under `adjoint="replay"` it
+    must read these outside of `jax.vmap`, loops and branches of its own. `SpaceLeaping` leaps over no part
+    of it, since its range is unknown.
     """
 
     @abstractmethod
@@ -278,7 +280,7 @@ def read_as(volume: Volume, *fetches: Fetch | None) -> Volume:
         window = grid.fetch.window
         return eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=lambda leaf: leaf is None)
 
-    return with_fetches(volume, list(map(in_window, grids(volume), fetches)))
+    return with_fetches(volume, [in_window(*each) for each in zip(grids(volume), fetches, strict=True)])
 
 
 def with_fetches(volume: Volume, fetches: list[Fetch]) -> Volume:

@@ -5,11 +5,13 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from importlib import import_module
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.extend import core
 from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
 
 from .._util.axes import XYZ, Axes, inverse, permuted
@@ -258,6 +260,8 @@ class Recording(Fetch):
     """Are added to what is fetched, in this order; if empty, nothing is."""
     fetched: list[Fetched] = eqx.field(static=True)
     """Filled while tracing."""
+    state: Any = eqx.field(static=True, default_factory=lambda: _trace_state())
+    """Of JAX, where recording began."""
 
     def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
         cube = voxels_from(data, node, dtype)
@@ -271,9 +275,21 @@ class Recording(Fetch):
         return self._perturbed(value, Fetched(flat_index(node, data.shape), along))
 
     def _perturbed(self, found: Any, fetched: Fetched) -> Any:
+        if _trace_state() != self.state:
+            raise ValueError(
+                "a field must read the volumes that it holds outside of jax.vmap, loops and branches of its "
+                'own, for adjoint="replay" to know the gradient to their voxels. Pass adjoint="direct", or let '
+                "it hold arrays."
+            )
         number = len(self.fetched)
         self.fetched.append(fetched)
         return jax.tree.map(jnp.add, found, self.perturbations[number]) if self.perturbations else found
+
+
+def _trace_state() -> Any:
+    """Which of JAX's transformations is being traced."""
+    home: Any = core if hasattr(core, "get_opaque_trace_state") else import_module("jax.core")
+    return home.get_opaque_trace_state()
 
 
 def perturbations_of(data: Shaped[Array, "nx ny nz *c"], fetched: list[Fetched], dtype: Any) -> list[Any]:

@@ -24,7 +24,7 @@ OPTIONS = {
 
 
 def compiled(
-    function: Callable[..., Any], *, has_jvp: bool = False, in_turn: bool = True
+    function: Callable[..., Any], *, has_jvp: bool = False, by_jvp: bool = False, in_turn: bool = True
 ) -> Callable[..., Any]:
     """The function under jit, compiled with `OPTIONS` where it is not part of a larger program.
 
@@ -35,6 +35,9 @@ def compiled(
     `has_jvp`: JAX itself is to differentiate the function. It cannot linearize a function with a batching
     rule, so the rule is used only where `jax.vmap` is the innermost transformation of the arguments. Where
     they are also differentiated, or a `jax.jit` lies between, operations are batched.
+
+    `by_jvp`: JAX is to differentiate it in forward mode alone, which goes through that rule, so that it is
+    used under a `jax.jit` within the `jax.vmap`, or around it, too.
 
     `in_turn`: False if operations are always to be batched, as for a batch of tangents, on which no branch
     and no loop depends.
@@ -47,7 +50,7 @@ def compiled(
         # inside a larger program or a transformation, compiler options are not allowed
         if not is_traced(args, _probe()):
             return outermost(*args)
-        batched = not in_turn or (has_jvp and not _only_vmapped(args))
+        batched = not in_turn or (has_jvp and not _only_vmapped(args)) or (by_jvp and _is_pushed(args))
         return nested(*args) if batched else looped(*args)
 
     return run
@@ -72,6 +75,12 @@ def _only_vmapped(args: PyTree) -> bool:
     """Whether `jax.vmap` is the innermost transformation of every traced argument."""
     kinds = {transformations(leaf)[0] for leaf in jax.tree.leaves(args) if is_traced(leaf)}
     return kinds == {"BatchTracer"}
+
+
+def _is_pushed(args: PyTree) -> bool:
+    """Whether a tangent is pushed through the arguments."""
+    kinds = [kind for leaf in jax.tree.leaves(args) for kind in transformations(leaf)[:1]]
+    return any(kind in ("JVPTracer", "LinearizeTracer") for kind in kinds)
 
 
 def _is_array(leaf: Any) -> bool:

@@ -67,6 +67,7 @@ def differentiable(
             if is_traced(primals):
                 found, residuals = forward_only((found, residuals), message)
             outputs, out = jax.tree.flatten(found)
+            is_float = [eqx.is_inexact_array(leaf) for leaf in outputs]
             kept, kept_structure = jax.tree.flatten(residuals)
             moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents[:of_tree]]
             known = len(primals)
@@ -78,10 +79,11 @@ def differentiable(
 
             def pulled(constants: Sequence[Array], cotangents: Sequence[Array]) -> list[Array]:
                 rest = iter(cotangents)
-                each = [next(rest) if eqx.is_inexact_array(leaf) else None for leaf in outputs]
+                each = [next(rest) if float_ else None for float_ in is_float]
                 residuals = jax.tree.unflatten(kept_structure, constants[known:])
                 parts = jax.tree.unflatten(out, each), like_tree(moves, False), residuals
                 of = jax.tree.leaves(pull(*parts, *given(constants[:known])))
+                assert len(of) == sum(moves)
                 return forward_only(of, message) if is_traced(constants, cotangents) else of
 
             operands = *primals, *kept, *(t for t, moves_ in zip(tangents, moves, strict=False) if moves_)
@@ -89,10 +91,8 @@ def differentiable(
             how = {"push": pushed, "pull": pulled, "avals": avals}
             tangent = iter(_PUSH.bind(*operands, count=known_, message=message, **how))
             of_outputs = [
-                next(tangent)
-                if eqx.is_inexact_array(leaf)
-                else SymbolicZero(jax.typeof(leaf).to_tangent_aval())
-                for leaf in outputs
+                next(tangent) if float_ else SymbolicZero(jax.typeof(leaf).to_tangent_aval())
+                for leaf, float_ in zip(outputs, is_float, strict=True)
             ]
             return found, jax.tree.unflatten(out, of_outputs)
 
@@ -116,7 +116,8 @@ def recomputed(function: Callable[..., PyTree], message: str) -> Callable[..., P
         _, back = jax.vjp(partial(floats_of, args), eqx.filter(args, perturbed))
         return back(cotangents)[0]
 
-    forward, pushed, pulled = compiled(function), compiled(push, has_jvp=True), compiled(pull, has_jvp=True)
+    forward, pulled = (compiled(each, by_jvp=True) for each in (function, pull))
+    pushed = compiled(push, has_jvp=True)
     run = differentiable(
         lambda args: forward(*args),
         lambda args: (forward(*args), ()),

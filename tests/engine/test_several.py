@@ -3,6 +3,8 @@
 Against an independent marcher in NumPy, which adds up at each sample, and central differences; in float64.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,7 @@ def march(on):
 
 
 @eqx.filter_jit
-def found(parts, along, on, second=False):
+def found(parts, along, on, second=False) -> Any:
     """The image; a loss, its derivative along a direction in forward mode, and its gradient. Or the gradient,
     and its derivative along the direction."""
     floats, fixed = eqx.partition(parts, eqx.is_inexact_array)
