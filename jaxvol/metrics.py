@@ -158,7 +158,8 @@ def standardized(image: Any, weights: Any | None = None, *, gradient: bool = Fal
     weights = jnp.ones_like(image) if weights is None else jnp.asarray(weights, image.dtype)
     if weights.shape != image.shape:
         raise ValueError(f"weights must have the shape of the image, {image.shape}; got {weights.shape}.")
-    weights: Array = checks.require(weights, lambda w: w >= 0, "weights must not be negative; got {got}.")
+    message = "weights must not be negative; got {got}."
+    weights = jnp.asarray(checks.require(weights, lambda w: w >= 0, message))
     if not gradient:
         return _unit(image, weights)
     last = image.shape[0] - 2, image.shape[1] - 2

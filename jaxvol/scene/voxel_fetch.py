@@ -278,8 +278,8 @@ class Recording(Fetch):
         if _trace_state() != self.state:
             raise ValueError(
                 "a field must read the volumes that it holds outside of jax.vmap, loops and branches of its "
-                'own, for adjoint="replay" to know the gradient to their voxels. Pass adjoint="direct", or let '
-                "it hold arrays."
+                'own, for adjoint="replay" to know the gradient to their voxels. Pass adjoint="direct", or '
+                "let it hold arrays."
             )
         number = len(self.fetched)
         self.fetched.append(fetched)

@@ -57,9 +57,6 @@ def test_the_motion_of_both_cameras_is_found_from_every_start_past_what_a_mask_h
     for turn, shift in zip(found.ends.rotation, found.ends.translation, strict=True):
         np.testing.assert_allclose(turn, TURN, atol=2e-3)
         np.testing.assert_allclose(shift, SHIFT, atol=2e-2)
-    # the coarse images of what was found are those of the views, too
-    coarse = jv.register(VOLUME, TRANSFER, views, found.ends, levels=3, **how)
-    assert np.all(coarse.similarities > 0.98)
     assert found.similarity == found.similarities[:, 1].max()
     for camera, expected in zip(found.cameras, map(moved, VIEWS), strict=True):
         np.testing.assert_allclose(camera.position, expected.position, atol=0.2)
