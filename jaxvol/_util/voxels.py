@@ -56,8 +56,8 @@ def check_shape(shape: tuple[int, ...]) -> None:
     """Raises `ValueError` unless an array of this shape can be a volume's voxels."""
     if len(shape) not in (3, 4) or min(shape[:3]) < 2 or 0 in shape:
         raise ValueError(
-            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {shape}. Of several "
-            "channels, data[x, y, z, channel]. For a stack of images, stack them along the last axis."
+            f"data must be data[x, y, z] with at least 2 voxels along each axis; got shape {shape}. (With "
+            "channels: data[x, y, z, channel].) For a stack of images, stack them along the last axis."
         )
 
 
