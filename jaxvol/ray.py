@@ -178,13 +178,18 @@ def check_channels(
             "Several volumes are given as lists: render([a, b], [of_a, of_b], ...)."
         )
     adaptive = strides.stride_control(march)
-    single = {"compositing": compositing if compositing.reads_value else None, "lighting": lighting}
-    for name, given in (single | {"march.transforms": adaptive}).items():
+    single = {
+        "compositing": described(compositing) if compositing.reads_value else None,
+        "lighting": None if lighting is None else described(lighting),
+        "march.transforms": None if adaptive is None else described(adaptive),
+        "march.quadrature": '"preintegrated"' if march.integrates else None,
+    }
+    for name, given in single.items():
         if channels > 1 and given is not None:
-            kind, got = type(given).__name__, f"one of {channels} channels"
-            if isinstance(volume.field, Several):
-                got = f"{len(volume.field.volumes)} volumes"
-            raise ValueError(f"{name}: {kind} needs a single volume of one channel; got {got}.")
+            field, got = volume.field, f"one of {channels} channels"
+            if isinstance(field, Several):
+                got = f"{len(field.volumes)} volumes"
+            raise ValueError(f"{name}: {given} needs a single volume of one channel; got {got}.")
 
 
 class Progress(eqx.Module):

@@ -1,13 +1,14 @@
 """How much matter does a ray pass? X-ray images, digitally reconstructed radiographs, and tomography."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._util.vec3 import Scalar, Vec3
 from ..march.march import March
+from ..scene.occupancy import Blocks
+from ..scene.several import Together
 from ..scene.transfer import Classification, Classify, Measured, Transfer
 from ..scene.volume import Volume
 from .blending import OpticalDepths
@@ -38,6 +39,8 @@ class LineIntegral(OpticalDepths):
     """
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
+        if isinstance(transfer, Together):  # which knows how to be differentiated where nothing is visible
+            return Together(tuple(map(_Thinner, transfer.transfers)), transfer.counts), march
         return _Thinner(transfer), march
 
     @property
@@ -76,10 +79,10 @@ class _Thinner(Transfer):
     def reads_gradient(self) -> bool:
         return self.transfer.reads_gradient
 
-    def majorant(self, blocks: Any) -> Float[Array, "bx by bz"]:
+    def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         return SCALE * self.transfer.majorant(blocks)
 
-    def visible(self, blocks: Any) -> Bool[Array, "bx by bz"]:
+    def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         return self.transfer.visible(blocks)
 
     def search(self) -> Callable[[Measured], Measured] | None:
@@ -89,17 +92,6 @@ class _Thinner(Transfer):
         self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
         of = self.transfer.vjp(measured, color, SCALE * extinction, integrated=integrated)
-        return _Thinner(of[0]), of[1]
-
-    @property
-    def mixes(self) -> bool:
-        return self.transfer.mixes
-
-    def emission_vjp(
-        self, measured: Measured, emission: Vec3, extinction: Scalar
-    ) -> tuple[Transfer, Measured]:
-        r, g, b = (SCALE * of for of in emission)
-        of = self.transfer.emission_vjp(measured, (r, g, b), SCALE * extinction)
         return _Thinner(of[0]), of[1]
 
 

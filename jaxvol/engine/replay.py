@@ -31,6 +31,7 @@ from ..compositing.blending import Weighting
 from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
+from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import classification_of
 from ..scene.volume import fetches_of, voxels_of, with_fetches, with_voxels, without_voxels
@@ -39,7 +40,7 @@ from ..xla.trees import PyTree, added, floats, zeros_of
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
-from .voxel_gradient import Sums, reads_voxels, recorded, with_cotangents, zero_perturbations, zero_sums
+from .voxel_gradient import Sums, check_fetched, recorded, with_cotangents, zero_perturbations, zero_sums
 
 
 class Cotangents(NamedTuple):
@@ -168,7 +169,7 @@ class Replay(SampleVisitor):
         of_measured = []
         for i, (cell, measured) in enumerate(zip(samples.cells, samples.measured, strict=True)):
             of_extinction = slopes[i] * cell.width + (0 if shaded is None else shaded[i].of_extinction)
-            if self.scene.transfer.mixes:
+            if isinstance(self.scene.transfer, Together):
                 (color, extinction), weight = classified[i], weights.weight[i]
                 live = inside(ray, depths[i]) & ~weights.finished[i]
                 clear = jnp.where(live, self._weight_of_thin(weights.before[i]) * cell.width, 0)
@@ -270,15 +271,9 @@ class Replay(SampleVisitor):
         perturbations = []
         if voxels:
             _, fetched = jax.eval_shape(all_, moving, [])
-            if self.total.voxels[0] is not None and not fetched[0] and reads_voxels(self.scene.volume):
-                kind = type(self.scene.volume.field).__name__
-                raise ValueError(
-                    f"the gradient to the voxels of a volume with the field {kind}, which reads them not by"
-                    ' volume.interpolated, is not known to adjoint="replay": pass adjoint="direct", or leave'
-                    " volume.data out of what is differentiated."
-                )
-            given = self.scene.volume, fetched, self.total.voxels, ray.length.dtype
-            perturbations = zero_perturbations(*given)
+            check_fetched(self.scene.volume, self.total.voxels)
+            dtype = ray.length.dtype
+            perturbations = zero_perturbations(self.scene.volume, fetched, self.total.voxels, dtype)
         _, pull, fetched = jax.vjp(all_, moving, perturbations, has_aux=True)
         of_moving, of_fetched = pull(cotangents)
         return of_moving, fetched, of_fetched

@@ -22,6 +22,7 @@ from ..compositing.selection import Selection
 from ..march.march import Cell, March
 from ..march.strides import RUN, steps_of
 from ..ray import Progress, Scene, add, move, opacity, pieces, read, stop
+from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
@@ -200,7 +201,7 @@ def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
         return [classify(each)[0] for each in measured]
 
     # Means would be computed again for each use if they were fused into the compositing of each cell.
-    means = scene.march.integrates or scene.transfer.mixes
+    means = scene.march.integrates or isinstance(scene.transfer, Together)
     return in_memory(always(at), all_, measured) if means else all_(measured)
 
 

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..scene.volume import Volume, grids, voxels_of, with_fetches
-from ..scene.voxel_fetch import Extent, Fetch, Fetched, Recording, perturbations_of, scatter_add
+from ..scene.volume import Volume, grids, voxels_of, with_fetches, with_voxels
+from ..scene.voxel_fetch import Extent, Fetch, Fetched, Recording, Zeros, perturbations_of, scatter_add
 
 
 Sums: TypeAlias = list[Array | None]
@@ -44,14 +44,29 @@ def recorded(volume: Volume, perturbations: list[Any]) -> tuple[Volume, list[lis
     return with_fetches(volume, fetches), [record.fetched for record in records]
 
 
-def reads_voxels(volume: Volume) -> bool:
-    """Whether a volume's values depend on its own voxels in any way."""
-    like = jax.ShapeDtypeStruct(volume.data.shape, volume.data.dtype)
+def check_fetched(volume: Volume, sums: Sums) -> None:
+    """Raises `ValueError` where a field reads voxels otherwise than by interpolation, and the gradient to
+    these, which would be lost, is asked for."""
+    if volume.field is None:
+        return
+    own, kind = grids(volume), type(volume.field).__name__
+    data = voxels_of(volume)
+    like = [None if each is None else jax.ShapeDtypeStruct(each.shape, each.dtype) for each in data]
+    fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else Zeros() for g in own]
+
+    def value(data: list[Any], at: Any) -> Any:
+        return with_fetches(with_voxels(volume, data), fetches).value(at)
+
     place = (jax.ShapeDtypeStruct((), volume.spacing.dtype),) * 3
-    program = jax.make_jaxpr(lambda data, at: eqx.tree_at(lambda v: v.data, volume, data).value(at))
-    traced = program(like, place).jaxpr
-    read = [*traced.outvars, *(variable for step in traced.eqns for variable in step.invars)]
-    return any(variable is traced.invars[0] for variable in read)
+    program = jax.make_jaxpr(value)(like, place).jaxpr
+    read = [*program.outvars, *(variable for step in program.eqns for variable in step.invars)]
+    asked = [sum_ is not None for sum_, data in zip(sums, like, strict=True) if data is not None]
+    if any(a and any(each is of for each in read) for a, of in zip(asked, program.invars, strict=False)):
+        raise ValueError(
+            f"the gradient to the voxels of a volume with the field {kind}, which reads them otherwise than"
+            ' by interpolation, is not known to adjoint="replay": pass adjoint="direct", or leave these'
+            " voxels (volume.data) out of what is differentiated."
+        )
 
 
 def zero_perturbations(volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: Any) -> list[Any]:

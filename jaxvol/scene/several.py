@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import described
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Scalar, Vec3, apart
 from .occupancy import BLOCK, Blocks, Sums
 from .transfer import Classify, Measured, Transfer
 from .volume import Field, Volume
@@ -120,7 +120,7 @@ class GridMap(eqx.Module):
             across = jnp.sum(turn[:, :, None] * across[:, None, :], axis=0)
         rates = across * source.spacing[None, :] / target.spacing[:, None]
         offset = there / target.spacing
-        return cls(_apart(offset), (_apart(rates[0]), _apart(rates[1]), _apart(rates[2])))
+        return cls(apart(offset), (apart(rates[0]), apart(rates[1]), apart(rates[2])))
 
     def __call__(self, coordinate: Vec3) -> Vec3:
         x, y, z = (
@@ -128,10 +128,6 @@ class GridMap(eqx.Module):
             for start, rates in zip(self.offset, self.rates, strict=True)
         )
         return x, y, z
-
-
-def _apart(vector: Float[Array, "3"]) -> Vec3:
-    return vector[0], vector[1], vector[2]
 
 
 @jax.jit
@@ -207,10 +203,6 @@ class Together(Transfer):
         return sum(self.counts)
 
     @property
-    def mixes(self) -> bool:
-        return True
-
-    @property
     def reads_more(self) -> bool:
         return any(each.reads_more for each in self.transfers)
 
@@ -255,6 +247,8 @@ class Together(Transfer):
     def emission_vjp(
         self, measured: Measured, emission: Vec3, extinction: Scalar
     ) -> tuple["Together", Measured]:
+        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction: where
+        that is 0, the cotangents of colours, which it weights, say nothing."""
         own, shares = self._own(measured)
         of_transfers, of_values, of_attributes, of_shares = [], [], [], []
         for transfer, count, part, share in zip(self.transfers, self.counts, own, shares, strict=True):

@@ -142,29 +142,13 @@ class Transfer(eqx.Module):
         _, pull = eqx.filter_vjp(classified, self, measured)
         return pull((color, extinction))
 
-    @property
-    def mixes(self) -> bool:
-        """Whether it is of several volumes (`several.Together`), whose colours are weighted by extinction:
-        `emission_vjp` is then called in place of `vjp`."""
-        return False
-
-    def emission_vjp(
-        self, measured: Measured, emission: Vec3, extinction: Scalar
-    ) -> tuple["Transfer", Measured]:
-        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction.
-
-        Raises:
-            NotImplementedError: unless it `mixes`.
-        """
-        raise NotImplementedError
-
 
 def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
     """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
-        name = "several volumes have" if transfer.mixes else f"{type(transfer).__name__} has"
-        raise ValueError(f'quadrature="preintegrated" needs means: {name} no integrator; use "midpoint".')
+        name = type(transfer).__name__
+        raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
         return (*volume.values(coordinate), *transfer.attributes(volume, coordinate))

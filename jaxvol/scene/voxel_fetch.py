@@ -184,6 +184,13 @@ class OneByOne(Fetch):
         return voxels_from(data, node, dtype)
 
 
+class Zeros(Fetch):
+    """Zeros in place of the voxels, to find out what reads these otherwise."""
+
+    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+        return cube_of(lambda *_: _zero_voxel(data, (), dtype))
+
+
 class Packed(Fetch):
     """Fetches the same voxels from a packed copy, in half or a quarter of the fetches."""
 
@@ -296,11 +303,15 @@ def perturbations_of(data: Shaped[Array, "nx ny nz *c"], fetched: list[Fetched],
     """Perturbations of 0 for what was fetched from an array."""
 
     def zeros(each: Fetched) -> Any:
-        zero = jnp.zeros(each.base.shape, dtype)
-        voxel = (zero,) * data.shape[3] if data.ndim > 3 else zero
+        voxel = _zero_voxel(data, each.base.shape, dtype)
         return voxel if each.fraction is not None else cube_of(lambda *_: voxel)
 
     return [zeros(each) for each in fetched]
+
+
+def _zero_voxel(data: Shaped[Array, "nx ny nz *c"], shape: tuple[int, ...], dtype: Any) -> Voxel:
+    zero = jnp.zeros(shape, dtype)
+    return (zero,) * data.shape[3] if data.ndim > 3 else zero
 
 
 _PAIRS = jax.lax.ScatterDimensionNumbers(

@@ -50,7 +50,7 @@ def scene():
     inner = jv.Volume(noise(4, 4, 4, seed=2))
     field = jv.Volume(np.zeros((4, 4, 4)), (0.3, 0.3, 0.3), (-0.5, 0.2, 0.1), field=Network(layers, inner))
     tables = [
-        jv.TransferFunction([0.3, 0.6, 1], np.eye(3), [0, 2, 5]),
+        jv.TransferFunction([0.5, 0.7, 1], np.eye(3), [0, 2, 5]),
         jv.RadianceField(3.0),
         jv.TransferFunction([0, 2], [[1, 1, 0], [0, 1, 1]], [0.1, 1]),
     ]

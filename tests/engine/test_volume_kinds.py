@@ -96,16 +96,47 @@ class Nearest(jv.Field):
         return volume.data[i, j, k]
 
 
-def test_voxels_that_a_volume_reads_by_itself_have_no_gradient_by_replay():
+class Both(jv.Field):
+    """Reads a volume that it holds in both ways."""
+
+    inner: jv.Volume
+
+    def value(self, volume, coordinate):
+        return self.inner.value(coordinate) + self.inner.data[0, 0, 0]
+
+
+class Looped(jv.Field):
+    inner: jv.Volume
+
+    def value(self, volume, coordinate):
+        return jax.lax.map(lambda c: self.inner.value((c, *coordinate[1:])), jnp.stack([coordinate[0]]))[0]
+
+
+BOX = np.zeros((5, 5, 5), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("volume", "message"),
+    [
+        (lambda data: jv.Volume(data, field=Nearest()), 'with the field Nearest, .* pass adjoint="direct"'),
+        (
+            lambda data: jv.Volume(BOX, field=Both(jv.Volume(data))),
+            "with the field Both, which reads them other",
+        ),
+        (
+            lambda data: jv.Volume(BOX, field=Looped(jv.Volume(data))),
+            "outside of jax.vmap, loops and branches",
+        ),
+    ],
+)
+def test_voxels_that_a_field_reads_by_itself_have_no_gradient_by_replay(volume, message):
     data = jnp.asarray(np.random.default_rng(0).random((5, 5, 5)), jnp.float32)
 
     def loss(data):
-        volume = jv.Volume(data, field=Nearest())
-        return jnp.sum(jv.render(volume, soft_transfer(), around(volume), jv.March(0.3)).rgba)
+        image = jv.render(volume(data), soft_transfer(), around(jv.Volume(BOX)), jv.March(0.3))
+        return jnp.sum(image.rgba)
 
-    with pytest.raises(
-        ValueError, match=r"the voxels of a volume with the field Nearest, .* pass adjoint=\"direct\""
-    ):
+    with pytest.raises(ValueError, match=message):
         jax.eval_shape(jax.grad(loss), data)
 
 

@@ -9,6 +9,12 @@ import jax.numpy as jnp
 from . import Fault
 
 
+SEVERAL = (
+    "engine/test_several.py::"
+    "test_extinctions_and_colors_add_at_each_sample_and_derivatives_are_central_differences"
+)
+
+
 def shifting_again(move):
     """`move`, after which the next transparent cell shifts the ray, too."""
 
@@ -120,6 +126,28 @@ FAULTS: list[Fault] = [
         "ray:Scene.has_fault",
         lambda _: property(lambda scene: jnp.zeros((), bool)),
         ("march/transforms/test_clip.py::test_nan_in_a_plane_shows",),
+    ),
+    Fault(
+        "several volumes: a cell that a face divides counts as a whole",
+        "ray:_share",
+        lambda _: (
+            lambda piece, enters, leaves: jnp.where(
+                (enters < piece.front + piece.width) & (leaves > piece.front), 1, jnp.zeros_like(piece.front)
+            )
+        ),
+        (SEVERAL,),
+    ),
+    Fault(
+        "several volumes: what is not visible has no emission to differentiate",
+        "engine.replay:Replay._weight_of_thin",
+        lambda _: lambda self, before: jnp.zeros_like(before),
+        (SEVERAL,),
+    ),
+    Fault(
+        "voxels: the interpolation's derivative is that of the node before",
+        "scene.voxel_fetch:_interpolated_pairs",
+        lambda f: lambda fraction, rows: f((fraction[0], fraction[1], 0 * fraction[2]), rows),
+        (SEVERAL,),
     ),
     Fault(
         "leap: a voxel too far",
