@@ -1,7 +1,7 @@
 """What does a step of fitting a radiance field cost, beside a plain JAX marcher, and how good do fits become?
 
 A step is image and gradient of 4096 random rays, with 96 samples on the mean ray, through the unit cube of
-`examples/radiance_field.py`. A grid of 64³ x 4 channels and a neural field (features on two grids, and a
+`examples/radiance_field.py`. A grid of 64³ x 4 channels, activated or as it is stored, and a neural field (features on two grids, and a
 network of 16) are marched by jaxvol and by a plain marcher: a `jax.lax.scan` over as many samples for each
 ray, all rays side by side. Both sample in the middle of cells, which are a little shorter or longer in one of
 them: so images differ by the error of their steps. Grids of 16 bits, and the grid of which nine tenths are
@@ -55,7 +55,7 @@ def of_network(network: Any) -> Callable[[Any, Any], Any]:
     return value
 
 
-def plain(value: Any, parameters: Any, rays: Any, samples: int) -> Any:
+def plain(value: Any, look: jv.RadianceField, parameters: Any, rays: Any, samples: int) -> Any:
     """Image of the plain marcher: the same number of samples between each ray's entry and exit."""
     origins, directions = rays
     faces = jnp.stack([-origins / directions, (BOX - origins) / directions])
@@ -65,8 +65,8 @@ def plain(value: Any, parameters: Any, rays: Any, samples: int) -> Any:
     def sample(state: Any, number: Any) -> Any:
         through, color = state
         channels = value(parameters, (origins + (near + (number + 0.5) * width) * directions) / BOX)
-        opacity = 1 - jnp.exp(-LOOK.scale * jax.nn.softplus(channels[:, 3:]) * width)
-        color += through * opacity * jax.nn.sigmoid(channels[:, :3])
+        opacity = 1 - jnp.exp(-look.scale * look.density(channels[:, 3:]) * width)
+        color += through * opacity * look.color(channels[:, :3])
         return (through * (1 - opacity), color), None
 
     start = jnp.ones_like(near), jnp.zeros_like(origins)
@@ -115,11 +115,13 @@ def costs(chosen: Namespace) -> dict[str, Any]:
         origins, directions = rays
         return lambda p: jv.render_rays(volume_of(p), look, origins, directions, march, outputs="rgba").rgba
 
-    def by_hand(value: Any) -> Any:
-        return lambda p: plain(value, p, rays, chosen.samples)
+    def by_hand(value: Any, look: jv.RadianceField = LOOK) -> Any:
+        return lambda p: plain(value, look, p, rays, chosen.samples)
 
     volume_of, fog = grid(chosen.resolution)
-    data = fog + jnp.asarray(np.random.default_rng(chosen.seed).normal(size=fog.shape), fog.dtype)
+    random = np.random.default_rng(chosen.seed)
+    data = fog + jnp.asarray(random.normal(size=fog.shape), fog.dtype)
+    stored, as_stored = jnp.asarray(random.uniform(size=fog.shape), fog.dtype), jv.RadianceField(4.0)
     field_of, start = neural()
     field: Any = field_of(start).field
     network = eqx.filter(field.network, eqx.is_array, inverse=True)
@@ -131,6 +133,10 @@ def costs(chosen: Namespace) -> dict[str, Any]:
         "grid": {
             "plain marcher": (by_hand(interpolated), data),
             "jaxvol": (ours(volume_of, LOOK), data),
+        },
+        "grid as stored": {
+            "plain marcher": (by_hand(interpolated, as_stored), stored),
+            "jaxvol": (ours(volume_of, as_stored), stored),
         },
         "neural field": {
             "plain marcher": (by_hand(of_network(network)), start),

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import jaxvol as jv
 
-from .. import switch
+from .. import oracle, switch
 from ..scenes import in_float64, slow
 
 
@@ -121,8 +121,8 @@ class Placed:
 
 
 def interval(origin, way, low, high):
-    ends = np.sort([(low - origin) / way, (high - origin) / way], axis=0)
-    return ends[0].max(), max(ends[1].min(), ends[0].max())
+    (near,), (far,) = oracle.box_interval(origin[None], way[None], low, high)
+    return near, max(far, near)
 
 
 def marched(parts):
