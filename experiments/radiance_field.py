@@ -1,11 +1,12 @@
 """What does a step of fitting a radiance field cost, beside a plain JAX marcher, and how good do fits become?
 
 A step is image and gradient of 4096 random rays, with 96 samples on the mean ray, through the unit cube of
-`examples/radiance_field.py`. A grid of 64³ x 4 channels, activated or as it is stored, and a neural field (features on two grids, and a
-network of 16) are marched by jaxvol and by a plain marcher: a `jax.lax.scan` over as many samples for each
-ray, all rays side by side. Both sample in the middle of cells, which are a little shorter or longer in one of
-them: so images differ by the error of their steps. Grids of 16 bits, and the grid of which nine tenths are
-empty, with the blocks of emptiness made anew in each step and without, are compared with jaxvol's own.
+`examples/radiance_field.py`. A grid of 64³ x 4 channels, activated or as it is stored, and a neural field
+(features on two grids, and a network of 16) are marched by jaxvol and by a plain marcher: a `jax.lax.scan`
+over as many samples for each ray, all rays side by side. Both sample in the middle of cells, which are a
+little shorter or longer in one of them: so images differ by the error of their steps. Grids of 16 bits, and
+the grid of which nine tenths are empty, with the blocks of emptiness made anew in each step and without, are
+compared with jaxvol's own.
 
 Then both examples are fitted for equal times, from 50 views of a CT of a head, and compared with 5 others.
 Runs of one comparison are interleaved; a ratio is the median of those of pairs, with its 95 % interval.

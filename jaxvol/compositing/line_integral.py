@@ -32,8 +32,8 @@ class LineIntegral(OpticalDepths):
     transparent; nothing ends them early. A transfer function of CT: `jaxvol.attenuation`. The camera stands
     where the source is. X-rays have one energy here, and do not scatter.
 
-    A volume ends at its outer nodes. Programs whose voxels are boxes see half a voxel more at each face, so where
-    matter is cut by a face, their integrals are larger there; with a voxel of air around, they agree.
+    A volume ends at its outer nodes. Programs whose voxels are boxes see half a voxel more at each face, so
+    that where a face cuts matter, their integrals are larger; with a voxel of air around, they agree.
 
     Source: Beer and Lambert, as in Siddon 1985, whose voxels are constant; here, values are interpolated.
 
