@@ -6,6 +6,7 @@ triples; what a user holds (a camera's position, an image) is stacked.
 """
 
 import math
+from functools import reduce
 from typing import TypeAlias
 
 import equinox as eqx
@@ -50,6 +51,11 @@ def scaled(a: Vec3, factor: Scalar) -> Vec3:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
+def cross(a: Vec3, b: Vec3) -> Vec3:
+    (x, y, z), (u, v, w) = a, b
+    return y * w - z * v, z * u - x * w, x * v - y * u
+
+
 def dot(a: Vec3, b: Vec3) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -92,35 +98,67 @@ def golden_spiral(n: int) -> Float[np.ndarray, "n 3"]:
 
 
 class Frame(eqx.Module):
-    """A Cartesian frame of coordinates in world length; by default the world itself."""
+    """Coordinates along three axes, in world length; by default those of the world itself."""
 
-    placed: tuple[Vec3, tuple[Vec3, Vec3, Vec3]] | None = None
-    """The world point that has coordinates 0, and the axes, orthogonal unit vectors of the world."""
+    placed: tuple[Vec3, tuple[Vec3, Vec3, Vec3], tuple[Vec3, Vec3, Vec3]] | None = None
+    """The world point that has coordinates 0; the axes, unit vectors of the world, which may be sheared; and
+    the gradients of the coordinates, which are the axes again where these are orthogonal."""
 
     @classmethod
     def of(cls, origin: Float[Array, "3"], direction: Float[Array, "3 3"]) -> "Frame":
         """`direction`: its columns are the axes."""
         x, y, z = (apart(direction[:, axis]) for axis in range(3))
-        return cls((apart(origin), (x, y, z)))
+        across = cross(y, z), cross(z, x), cross(x, y)
+        each = 1 / dot(x, across[0])
+        return cls((apart(origin), (x, y, z), tuple(scaled(normal, each) for normal in across)))
 
     def coordinates(self, point: Vec3) -> Vec3:
         """Coordinates of a world point."""
         if self.placed is None:
             return point
-        (x, y, z), ((ox, oy, oz), _) = point, self.placed
+        (x, y, z), ((ox, oy, oz), *_) = point, self.placed
         return self.components((x - ox, y - oy, z - oz))
 
     def components(self, direction: Vec3) -> Vec3:
         """Components of a world direction along the axes."""
         if self.placed is None:
             return direction
-        x, y, z = (dot(axis, direction) for axis in self.placed[1])
+        x, y, z = (dot(normal, direction) for normal in self.placed[2])
         return x, y, z
+
+    def rises(self, normal: Vec3) -> Vec3:
+        """How far one goes in the world direction `normal` by a unit along each axis."""
+        if self.placed is None:
+            return normal
+        x, y, z = (dot(axis, normal) for axis in self.placed[1])
+        return x, y, z
+
+    def gradient(self, slopes: Vec3) -> Vec3:
+        """The world's gradient of what has these slopes along the axes."""
+        if self.placed is None:
+            return slopes
+        a, b, c = (scaled(normal, slope) for normal, slope in zip(self.placed[2], slopes, strict=True))
+        return plus(plus(a, b), c)
+
+    @property
+    def stretch(self) -> Scalar | float:
+        """The most that a coordinate changes by a unit of world length, at least 1."""
+        return 1.0 if self.placed is None else greatest(tuple(length(normal) for normal in self.placed[2]))
+
+    def diagonal(self, sides: Vec3) -> Scalar:
+        """The longest diagonal of a box with these sides along the axes."""
+        if self.placed is None:
+            return jnp.sqrt(dot(sides, sides))
+        a, b, c = (scaled(axis, side) for axis, side in zip(self.placed[1], sides, strict=True))
+        (x, y, z), (u, v, w) = a, b
+        ends = plus(a, b), (x - u, y - v, z - w)
+        back = (-c[0], -c[1], -c[2])
+        return reduce(jnp.maximum, (length(plus(end, way)) for end in ends for way in (c, back)))
 
     def point(self, coordinates: Vec3) -> Vec3:
         """World point of coordinates."""
         if self.placed is None:
             return coordinates
-        (a, b, c), (origin, axes) = coordinates, self.placed
+        (a, b, c), (origin, axes, _) = coordinates, self.placed
         x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(origin, *axes, strict=True))
         return x, y, z

@@ -87,11 +87,12 @@ class Box(eqx.Module):
     def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
         """The box of all camera rays between a beam's corner rays, by beam and corner."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
-        origin, direction = occupancy.frame.coordinates(origin), occupancy.frame.components(direction)
-        spans = [size * n for size, n in zip(occupancy.size, occupancy.occupied.shape, strict=True)]
-        x, y, z = (low + span / 2 - o for o, low, span in zip(origin, occupancy.origin, spans, strict=True))
+        frame, shape = occupancy.frame, occupancy.occupied.shape
+        spans = tuple(size * n for size, n in zip(occupancy.size, shape, strict=True))
+        center = frame.point(tuple(low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True)))
+        x, y, z = (c - o for o, c in zip(origin, center, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
-        radius = jnp.sqrt(sum(span**2 for span in spans)) / 2
+        radius = frame.diagonal(spans) / 2
         # A direction between the corners is their normalized average: normalizing lengthens it by at most 1
         # minus the cosine of the widest angle to the mean direction.
         axis = [jnp.mean(d, axis=-1, keepdims=True) for d in direction]
@@ -101,8 +102,9 @@ class Box(eqx.Module):
         nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
         spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
         near, far = jnp.maximum(nearest - radius - spread, 0), farthest + radius + spread
-        start = along(origin, direction, near[..., None])
-        return cls._of(occupancy, start, direction, near, far, jnp.ones(start[0].shape, bool), bulge)
+        start = frame.coordinates(along(origin, direction, near[..., None]))
+        direction, counts = frame.components(direction), jnp.ones(start[0].shape, bool)
+        return cls._of(occupancy, start, direction, near, far, counts, bulge * frame.stretch)
 
     @classmethod
     def _of(
@@ -116,7 +118,8 @@ class Box(eqx.Module):
         sides = []
         for s, d, size, corner in zip(start, direction, occupancy.size, occupancy.origin, strict=True):
             # allows for rounding a ray's start to float32 when the camera is far away
-            slack = 1e-3 + (ROUNDING * (near + abs(corner) + size) + bulge * near) / size
+            far_off = near * occupancy.frame.stretch + abs(corner) + size
+            slack = 1e-3 + (ROUNDING * far_off + bulge * near) / size
             s, d, bulges = (s - corner) / size, d / size, bulge / size
             ends = least(s, 1) - slack, least(s, -1) + slack
             sides.append((*ends, least(d, 1) - bulges, least(d, -1) + bulges))

@@ -228,17 +228,26 @@ def _magnitudes(volume: Volume) -> tuple[Array, Array]:
     """Least and greatest magnitude of the gradient in each block, in value units per world length."""
     low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
     low, high = (jnp.stack([part[axis] for axis in inverse(volume.fetch.axes)]) for part in (low, high))
-    return _lengths(low, high, steepest, jax.lax.stop_gradient(volume.spacing).astype(low.dtype))
+    place = jax.lax.stop_gradient((volume.spacing, volume.direction))
+    return _lengths(low, high, steepest, *jax.tree.map(lambda leaf: leaf.astype(low.dtype), place))
 
 
 @jax.jit
-def _lengths(low: Array, high: Array, steepest: Array, spacing: Array) -> tuple[Array, Array]:
+def _lengths(
+    low: Array, high: Array, steepest: Array, spacing: Array, direction: Array | None
+) -> tuple[Array, Array]:
     least = most = jnp.zeros_like(steepest)
     for begin, end, step in zip(low, high, spacing, strict=True):  # XLA's sum over axis 0 is slow on CPU
         begin, end = begin / step, end / step
         least += jnp.maximum(jnp.maximum(begin, -end), 0) ** 2  # 0 where slopes change sign
         most += jnp.maximum(-begin, end) ** 2
     most = jnp.minimum(jnp.sqrt(most), steepest / jnp.min(spacing)) * (1 + ROUNDING)
+    if direction is not None:
+        # where axes are sheared, slopes along them give a length only up to this (Gershgorin's discs)
+        gram = jnp.sum(direction[:, :, None] * direction[:, None, :], axis=0)
+        shear = jnp.max(jnp.sum(jnp.abs(gram - jnp.eye(3, dtype=gram.dtype)), axis=1))
+        least = least / (1 + shear)
+        most = jnp.where(shear < 1, most / jnp.sqrt(jnp.where(shear < 1, 1 - shear, 1)), jnp.inf)
     return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import described
-from .._util.vec3 import Scalar, Vec3, apart
+from .._util.vec3 import Frame, Scalar, Vec3, apart
 from .occupancy import BLOCK, Blocks, Sums
 from .transfer import Classify, Measured, Transfer
 from .volume import Field, Volume
@@ -112,14 +112,12 @@ class GridMap(eqx.Module):
     def between(cls, source: Volume, target: Volume) -> "GridMap":
         # from origin to origin, where numbers are small: many origins are far away
         there = source.origin - target.origin
-        plain, turn = np.eye(3, dtype=source.spacing.dtype), target.direction
-        across = plain if source.direction is None else source.direction
-        if turn is not None:
-            # not by a matrix product, which some GPUs round to 10 bits
-            there = jnp.sum(turn * there[:, None], axis=0)
-            across = jnp.sum(turn[:, :, None] * across[:, None, :], axis=0)
-        rates = across * source.spacing[None, :] / target.spacing[:, None]
-        offset = there / target.spacing
+        frame = Frame() if target.direction is None else Frame.of(there, target.direction)
+        across = jnp.eye(3, dtype=source.spacing.dtype) if source.direction is None else source.direction
+        columns = (frame.components(apart(across[:, axis])) for axis in range(3))
+        rates = jnp.stack([jnp.stack(column) for column in columns], axis=1)
+        rates = rates * source.spacing[None, :] / target.spacing[:, None]
+        offset = jnp.stack(frame.components(apart(there))) / target.spacing
         return cls(apart(offset), (apart(rates[0]), apart(rates[1]), apart(rates[2])))
 
     def __call__(self, coordinate: Vec3) -> Vec3:

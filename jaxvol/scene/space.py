@@ -78,8 +78,8 @@ class Space(eqx.Module):
 
     @abstractmethod
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
-        """Least world distance between neighbouring nodes along each axis, in a box of grid coordinates that
-        may exceed the grid; 0 where nodes meet."""
+        """Least world distance between neighbouring layers of nodes across each axis, in a box of grid
+        coordinates that may exceed the grid; 0 where nodes meet."""
 
     @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
@@ -216,13 +216,14 @@ class Affine(Space):
             self.low, self.high = (apart(end) for end in volume.corners)
         else:
             # from the first node, where the numbers are small: many origins are far away
-            self.frame = Frame.of(volume.origin, volume.direction)
+            self.frame = volume.frame
             high = (jnp.asarray(volume.shape, volume.spacing.dtype) - 1) * volume.spacing
             self.low, self.high = apart(jnp.zeros_like(high)), apart(high)
 
     @property
     def diagonal(self) -> Scalar:
-        return jnp.sqrt(sum((high - low) ** 2 for low, high in zip(self.low, self.high, strict=True)))
+        x, y, z = (high - low for low, high in zip(self.low, self.high, strict=True))
+        return self.frame.diagonal((x, y, z))
 
     @property
     def middle(self) -> Vec3:
@@ -246,7 +247,8 @@ class Affine(Space):
         return self.frame.point(self._own_point(coordinate))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
-        return self.spacing
+        x, y, z = (step * (1 / self.frame.stretch) for step in self.spacing)
+        return x, y, z
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         x, y, z = (BLOCK * step for step in self.spacing)

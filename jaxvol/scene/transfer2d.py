@@ -30,9 +30,10 @@ class TransferFunction2D(Transfer):
         colors: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
         extinction: (n, m), in 1/length, ≥ 0; below, it counts as 0, and has no gradient.
 
-    The magnitude is that of `volume.gradient`, also under a `ToroidalMap`, which bends the grid: choose a
-    spacing for which that has a meaning. Where the gradient is 0, the derivative of its magnitude is taken as
-    0. `quadrature="preintegrated"` and `"average"` are refused; `AdaptiveSampling` takes its shortest steps.
+    The magnitude is that of the value's gradient in the volume's own grid, also under a `ToroidalMap`, which
+    bends the grid: choose a spacing for which that has a meaning. Where the gradient is 0, the derivative of
+    its magnitude is taken as 0. `quadrature="preintegrated"` and `"average"` are refused; `AdaptiveSampling`
+    takes its shortest steps.
 
     Raises:
         ValueError: for fewer than two lines, lines that do not increase or of which three are equal,
@@ -119,7 +120,7 @@ class TransferFunction2D(Transfer):
         return True
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
-        return (length(volume.gradient(coordinate)),)
+        return (length(volume.frame.gradient(volume.gradient(coordinate))),)
 
     def search(self) -> Callable[[Measured], Measured]:
         def search(measured: Measured) -> Measured:

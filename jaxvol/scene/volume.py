@@ -17,11 +17,15 @@ from jaxtyping import Array, Float, Int, Integer, Shaped
 from .._util.axes import XYZ, Axes
 from .._util.checks import Arrayable, described, finite_array, require
 from .._util.named_axes import along_xyz, is_named
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
 from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
+
+
+FLATTEST = 1e-3
+"""Least volume that three axes of length 1 span: less is no grid, but a mistake."""
 
 
 class Field(eqx.Module):
@@ -52,9 +56,9 @@ class Volume(eqx.Module):
             pass `stack.T`.
         spacing: distance between neighbouring nodes along x, y, z, world length (mm for CT); by default 1.
         origin: world position of node (0, 0, 0), by default 0.
-        direction: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
+        direction: 3 x 3 matrix whose columns, of length 1, are the world directions of the data's axes, as in
             ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`; by
-            default the world's axes. Its gradient is exact along changes that keep it orthonormal.
+            default the world's axes. Axes need not be orthogonal: a scan with a tilted gantry is sheared.
         labels: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
         field: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
@@ -63,7 +67,7 @@ class Volume(eqx.Module):
     Raises:
         ValueError: for data that are not 3-D or 4-D, have an axis of one voxel or an unsupported type, or
             hold NaN, infinity or integers that no type holds exactly; for spacing that is not positive; for a
-            direction that is not orthonormal to 1e-4; and for labels of another shape, or beyond int32.
+            direction whose columns are not of length 1 to 1e-4, or (nearly) lie in a plane; and for labels of another shape, or beyond int32.
     """
 
     data: Shaped[Array, "nx ny nz *c"]
@@ -124,6 +128,12 @@ class Volume(eqx.Module):
         if self.fetch.axes == XYZ:
             return of_data
         return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
+
+    @property
+    def frame(self) -> Frame:
+        """Coordinates along the grid's axes, in world length, from the first node on if there is a
+        `direction`; else those of the world."""
+        return Frame() if self.direction is None else Frame.of(self.origin, self.direction)
 
     @property
     def bounds(self) -> Float[Array, "6"]:
@@ -223,10 +233,15 @@ def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
     """None for a direction that is known to be the identity."""
     turn = require(
         finite_array("direction", direction, (3, 3)),
-        lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
-        "direction must be a 3 x 3 matrix of orthogonal columns of length 1; got {got}.",
+        lambda d: (abs((d * d).sum(0) - 1) < 2e-4).all() & (abs(_determinant(d)) > FLATTEST),
+        "direction must be a 3 x 3 matrix of columns of length 1 that do not lie in a plane; got {got}.",
     )
     return None if not is_traced(turn) and np.array_equal(turn, np.eye(3)) else turn
+
+
+def _determinant(turn: Any) -> Any:
+    (x, y, z), after, before = turn.T, np.array([1, 2, 0]), np.array([2, 0, 1])
+    return (x * (y[after] * z[before] - y[before] * z[after])).sum()
 
 
 def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:

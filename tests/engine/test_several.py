@@ -14,12 +14,13 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 import jaxvol as jv
 
-from .. import oracle, switch
+from .. import oracle
 from ..scenes import in_float64, slow
 
 
 STEP, SIZE = 0.17, (7, 6)
-TURN = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
+TURN = np.array([[0.8, -0.36, 0], [0.6, 0.8, 0.28], [0, 0.48, 0.96]])
+"""Sheared: its axes are 47° to 80° apart."""
 
 
 class Network(jv.Field):
@@ -39,7 +40,7 @@ def noise(*shape, seed):
 
 
 def scene():
-    """Values (the largest, whose axes the others share a grid with), colours that are turned, a network."""
+    """Values (the largest, whose axes the others share a grid with), colours on sheared axes, a network."""
     grid = jv.Volume(noise(9, 8, 7, seed=0), (0.2, 0.22, 0.25))
     colors = jv.Volume(noise(5, 6, 7, 4, seed=1), (0.3, 0.25, 0.2), (0.6, -0.3, 0.4), direction=TURN)
     shapes = eqx.filter_eval_shape(eqx.nn.MLP, 4, 1, 4, 1, activation=jax.nn.tanh, key=jax.random.key(0))
@@ -58,13 +59,14 @@ def scene():
     return [grid, colors, field], tables, camera
 
 
-def march(on):
-    leaps = switch.switch(jv.SpaceLeaping("distance"), on)
-    return jv.March(STEP, (jv.AlphaCorrection(), leaps), "midpoint", max_samples=64)
+def march(leaps):
+    # not by a switch: whoever may leap doesn't differentiate what is in front of all that is visible
+    transforms = jv.AlphaCorrection(), *([jv.SpaceLeaping("distance")] if leaps else [])
+    return jv.March(STEP, transforms, "midpoint", max_samples=64)
 
 
 @eqx.filter_jit
-def found(parts, along, on, second=False) -> Any:
+def found(parts, along, leaps, second=False) -> Any:
     """The image; a loss, its derivative along a direction in forward mode, and its gradient. Or the gradient,
     and its derivative along the direction."""
     floats, fixed = eqx.partition(parts, eqx.is_inexact_array)
@@ -72,7 +74,7 @@ def found(parts, along, on, second=False) -> Any:
 
     def loss(floats):
         volumes, tables, camera = eqx.combine(floats, fixed)
-        rgba = jv.render(volumes, tables, camera, march(on), outputs="rgba").rgba
+        rgba = jv.render(volumes, tables, camera, march(leaps), outputs="rgba").rgba
         return jnp.sum(weights * rgba + rgba**2), rgba
 
     gradient = jax.value_and_grad(loss, has_aux=True)
@@ -91,9 +93,10 @@ class Placed:
         )
         self.last = np.array(volume.shape) - 1
         self.turn = np.eye(3) if volume.direction is None else self.volume.direction
+        self.back = np.linalg.inv(self.turn).T / self.volume.spacing
 
     def at(self, point):
-        return (point - self.volume.origin) @ self.turn / self.volume.spacing
+        return (point - self.volume.origin) @ self.back
 
     @property
     def corners(self):
@@ -101,7 +104,7 @@ class Placed:
         return self.volume.origin + at @ self.turn.T
 
     def span(self, origin, way):
-        return interval(self.at(origin), way @ self.turn / self.volume.spacing, np.zeros(3), self.last)
+        return interval(self.at(origin), way @ self.back, np.zeros(3), self.last)
 
     def shown(self, point):
         """Colour and extinction."""
@@ -147,8 +150,8 @@ def marched(parts):
 
 
 def along(parts, seed):
-    """A random direction. Control points stay, which have no gradient, turns, which would not remain
-    orthonormal, and extinctions of 0, below which there is nothing."""
+    """A random direction. Control points stay, which have no gradient, and extinctions of 0, below which
+    there is nothing."""
     random = np.random.default_rng(seed)
 
     def of(path, leaf):
@@ -157,7 +160,7 @@ def along(parts, seed):
         name, way = jax.tree_util.keystr(path), random.normal(size=leaf.shape)
         if "extinction" in name:
             way = np.where(np.asarray(leaf) == 0, 0, way)
-        return jnp.asarray(0 * way if ".values" in name or ".direction" in name else way)
+        return jnp.asarray(0 * way if ".values" in name else way)
 
     return jax.tree_util.tree_map_with_path(of, parts)
 

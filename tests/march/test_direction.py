@@ -224,14 +224,58 @@ def test_what_is_a_direction():
     assert jax.tree.structure(volume) == jax.tree.structure(jv.Volume(np.zeros((2, 2, 2))))
     # a mirror image is allowed: some files are left-handed
     assert jv.Volume(np.zeros((2, 2, 2)), direction=np.diag([1, 1, -1])).direction is not None
-    askew = [[1, 0.01, 0], [0, 1, 0], [0, 0, 1]]
-    for wrong in (np.ones((3, 3)), 2 * np.eye(3), np.eye(3)[:2], "eye", askew):
+    long, flat = [[1, 0.1, 0], [0, 1, 0], [0, 0, 1]], [[1, 0.6, 0], [0, 0.8, 1], [0, 0, 0]]
+    for wrong in (np.ones((3, 3)), 2 * np.eye(3), np.eye(3)[:2], "eye", long, flat):
         with pytest.raises(ValueError, match="direction must"):
             jv.Volume(np.zeros((2, 2, 2)), direction=wrong)
     bounds = jax.jit(lambda turn: jv.Volume(np.zeros((2, 2, 2), np.float32), direction=turn).bounds)
     np.testing.assert_allclose(bounds(np.eye(3, dtype=np.float32)), (0, 1, 0, 1, 0, 1))
     with pytest.raises(Exception, match="direction must be a 3 x 3 matrix"):
         jax.block_until_ready(bounds(2 * np.eye(3, dtype=np.float32)))
+
+
+SLOPE, CENTER, BOX = np.array([0.3, -0.5, 0.4]), np.array([3.0, -2.0, 5.0]), np.array([1.0, 0.8, 0.9])
+SHEARED = R @ np.array([[1, 0.6, 0.28], [0, 0.8, -0.6], [0, 0, np.sqrt(1 - 0.36 - 0.28**2)]])
+
+
+def linear(direction, spacing):
+    """A grid around the box whose values, linear in the world, are interpolated exactly; 1 in the center."""
+    index = np.moveaxis(np.indices((14, 13, 12)), 0, -1) - np.array([13, 12, 11]) / 2
+    places = (index * spacing) @ direction.T
+    origin = CENTER + places[0, 0, 0]
+    return jv.Volume(1 + places @ SLOPE, spacing, origin, direction=direction)
+
+
+@jax.jit
+def boxed(volume, camera, box, cut):
+    """Of what is in the box, and on one side of a plane: an image lit by normals whose extinction depends on
+    the gradient's magnitude, its derivative by the camera, and the depth of a surface."""
+    clip = jv.Clip(box, planes=[cut])
+    march = jv.March(0.1, (clip, jv.SpaceLeaping(), jv.AlphaCorrection()), "midpoint", max_samples=64)
+    steep = jv.TransferFunction2D(
+        [0.9, 1.4, 2], [0.6, 0.8], np.eye(3)[:, None].repeat(2, axis=1), [[0, 0], [1, 6], [2, 8]]
+    )
+
+    def bright(camera):
+        rgba = jv.render(volume, steep, camera, march, lighting=Phong(), outputs="rgba").rgba
+        return jnp.sum(rgba**2), rgba
+
+    surface = jv.render(volume, soft_transfer(1.0), camera, march, compositing=jv.Isosurface(1.1))
+    return jax.value_and_grad(bright, has_aux=True)(camera), surface.depth
+
+
+def test_a_sheared_grid_shows_what_an_orthogonal_one_does():
+    """In float64. Voxels are a linear function of the world, which both interpolate exactly."""
+    with in_float64():
+        camera = jv.Camera(CENTER + (2, -5, 3), CENTER, (0, 0, 1), 30.0, size=(9, 8))
+        cut = CENTER, np.array([-0.2, 0.9, -0.3])
+        given = camera, np.stack([CENTER - BOX, CENTER + BOX], axis=-1).ravel(), cut
+        expected = jax.device_get(boxed(linear(np.asarray(R, float), (0.3, 0.32, 0.35)), *given))
+        found = jax.device_get(boxed(linear(SHEARED, (0.45, 0.5, 0.6)), *given))
+    assert 0.1 < np.mean(expected[0][0][1][..., 3] > 0.1) < 0.9
+    assert 0.05 < np.mean(np.isfinite(expected[1])) < 0.9
+    for one, other in zip(*map(jax.tree.leaves, (found, expected)), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-7)
 
 
 def test_a_swept_sector_takes_no_direction():

@@ -115,7 +115,7 @@ class HalfSpace(NamedTuple):
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
             for low, size, n in zip(grid.origin, grid.size, shape, strict=True)
         )
-        a, b, c = map(jnp.abs, grid.frame.components(self.normal))
+        a, b, c = map(jnp.abs, grid.frame.rises(self.normal))
         # the greatest coordinate, which rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
         if grid.frame.placed is not None:
