@@ -94,7 +94,7 @@ def kim_table1(result: dict[str, Any]) -> str:
     head = [
         "β, σ, γ",
         "*paper: overlap %*",
-        "formula, paper's unit %",
+        "formula, changed so %",
         "formula, these voxels %",
         "read: overlap / reload, times the volume",
         "loads: overlap / reload",

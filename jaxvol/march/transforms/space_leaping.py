@@ -32,7 +32,8 @@ class SpaceLeaping(Transform):
     Args:
         method: how what is empty is found.
             `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
-            bounding box holds no visible block of 4³ voxels.
+            bounding box holds no visible block of 4³ voxels. Blocks have one level; a table of their sums
+            tells of a box of any size whether it is empty, as coarser levels would.
             `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
             proves empty. Leaps are short where a ray runs along a surface.
             `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
