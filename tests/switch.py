@@ -31,6 +31,10 @@ class _Switch(jv.Transform):
     inner: jv.Transform
     on: Bool[Array, ""]
 
+    @property
+    def tested_every(self):
+        return self.inner.tested_every
+
 
 class _Index(EmptySpaceIndex):
     """Another index, or one to which nothing is empty."""
@@ -137,7 +141,7 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "ends_at_exit"
+STATIC = "joins", "ends_at_exit", "tested_every"
 
 
 @cache

@@ -59,6 +59,7 @@ def render_scene(
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
     tiling = Tiling.of_backend(mesh_of(devices)) if tiling is None else tiling
+    tiling = tiling._replace(cells=scene.march.tested_every or tiling.cells)
     check_not_sharded(tiling.devices, scene)
     scene = strong(scene)
     volume, march, lighting = scene.volume, scene.march, scene.lighting

@@ -75,6 +75,11 @@ class Transform(eqx.Module):
         """Whether the ray is finished, given the answer of the transforms before."""
         return stopped
 
+    @property
+    def tested_every(self) -> int | None:
+        """After how many samples rays that are finished are looked for, and left out; None: any number."""
+        return None
+
 
 class March(eqx.Module):
     """How rays step through a volume. Its methods combine the answers of all transforms at a seam.
@@ -156,6 +161,12 @@ class March(eqx.Module):
     @property
     def leaps(self) -> bool:
         return bool(self.overriding("empty_space"))
+
+    @property
+    def tested_every(self) -> int | None:
+        """The least number of samples that a transform asks for."""
+        given = [number for each in self.transforms if (number := each.tested_every) is not None]
+        return min(given, default=None)
 
     @property
     def may_shift(self) -> bool:

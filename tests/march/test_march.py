@@ -210,6 +210,10 @@ def test_early_termination_errs_by_less_than_what_is_left():
         assert 0 < off.max() <= left
         assert (ended.samples <= full.samples).all()
         assert int(ended.samples.sum()) < int(full.samples.sum())
+    sooner = jv.EarlyTermination(0.1, interval=3)
+    found = jv.render(volume, transfer, camera, jv.March(0.05, (switch(sooner, True),)))
+    np.testing.assert_allclose(found.rgba, ended.rgba, atol=1e-6)
+    np.testing.assert_array_equal(found.samples, ended.samples)
 
 
 def test_a_march_that_runs_out_of_samples_says_so():
@@ -261,6 +265,7 @@ BAD = {
         lambda: jv.EarlyTermination(0),
         "opacity_left must be greater than 0 and less than 1; got 0",
     ),
+    "interval 0": (lambda: jv.EarlyTermination(interval=0), "interval must be an integer from 1 to 64; got 0"),
     "opacity left 1": (lambda: jv.EarlyTermination(1), "opacity_left must be .*; got 1"),
 }
 
