@@ -419,11 +419,11 @@ def _selected(
     ray, march = enter(scene.space, *line), scene.march
     # a selected depth is a fixed number of steps: its derivative by the step is depth / step
     scale = march.step / jax.lax.stop_gradient(march.step)
-    gradient = partial(world_gradient, scene.volume, scene.space)
+    gradient = partial(world_gradient, scene.volume, scene.space.local)
     state = jax.lax.stop_gradient(state)
     chosen = compositing.depth(state)
     moving = chosen + _movement(march, ray, scene.volume, chosen, scale)
-    sampler = RaySampler(ray, scene.classification, scale, gradient, (chosen, moving))
+    sampler = RaySampler(ray, scene.classification, scale, gradient, (chosen, moving), scene.space)
     found = compositing.pixel(sampler, state)
     check_answer(compositing, "pixel", found, (rgba, rgba[3]))
     pixel, depth = found

@@ -98,7 +98,7 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, compositing = scene.march, scene.compositing
     at, _ = with_stride(scene, ray, at)
-    sampler = RaySampler(ray, scene.classification)
+    sampler = RaySampler(ray, scene.classification, space=scene.space)
     after, alphas, color = at, [], None
     cut = pieces(scene, ray, at)
     for piece in cut:

@@ -67,6 +67,14 @@ class _Space(Space):
         return self.inner.searches
 
     @property
+    def anchor(self):
+        return self.inner.anchor
+
+    @property
+    def local(self):
+        return _Space(self.clipped.local, self.inner.local, self.on)
+
+    @property
     def diagonal(self):
         return self.inner.diagonal
 

@@ -42,6 +42,10 @@ def plus(a: Vec3, b: Vec3) -> Vec3:
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
+def minus(a: Vec3, b: Vec3) -> Vec3:
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
 def times(a: Vec3, b: Vec3) -> Vec3:
     """The product of each component."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
@@ -98,67 +102,60 @@ def golden_spiral(n: int) -> Float[np.ndarray, "n 3"]:
 
 
 class Frame(eqx.Module):
-    """Coordinates along three axes, in world length; by default those of the world itself."""
+    """Coordinates along three axes, in world length; by default the world's."""
 
-    placed: tuple[Vec3, tuple[Vec3, Vec3, Vec3], tuple[Vec3, Vec3, Vec3]] | None = None
-    """The world point that has coordinates 0; the axes, unit vectors of the world, which may be sheared; and
-    the gradients of the coordinates, which are the axes again where these are orthogonal."""
+    turned: tuple[tuple[Vec3, Vec3, Vec3], tuple[Vec3, Vec3, Vec3]] | None = None
+    """The axes, unit vectors of the world, which may be sheared; and the gradients of the coordinates, which
+    are the axes again where these are orthogonal."""
 
     @classmethod
-    def of(cls, origin: Float[Array, "3"], direction: Float[Array, "3 3"]) -> "Frame":
+    def of(cls, direction: Float[Array, "3 3"]) -> "Frame":
         """`direction`: its columns are the axes."""
         x, y, z = (apart(direction[:, axis]) for axis in range(3))
         across = cross(y, z), cross(z, x), cross(x, y)
         each = 1 / dot(x, across[0])
-        return cls((apart(origin), (x, y, z), tuple(scaled(normal, each) for normal in across)))
+        a, b, c = (scaled(normal, each) for normal in across)
+        return cls(((x, y, z), (a, b, c)))
 
-    def coordinates(self, point: Vec3) -> Vec3:
-        """Coordinates of a world point."""
-        if self.placed is None:
-            return point
-        (x, y, z), ((ox, oy, oz), *_) = point, self.placed
-        return self.components((x - ox, y - oy, z - oz))
-
-    def components(self, direction: Vec3) -> Vec3:
-        """Components of a world direction along the axes."""
-        if self.placed is None:
-            return direction
-        x, y, z = (dot(normal, direction) for normal in self.placed[2])
+    def components(self, vector: Vec3) -> Vec3:
+        """Components of a world vector along the axes."""
+        if self.turned is None:
+            return vector
+        x, y, z = (dot(normal, vector) for normal in self.turned[1])
         return x, y, z
+
+    def vector(self, components: Vec3) -> Vec3:
+        """World vector of these components."""
+        return components if self.turned is None else _combined(self.turned[0], components)
 
     def rises(self, normal: Vec3) -> Vec3:
         """How far one goes in the world direction `normal` by a unit along each axis."""
-        if self.placed is None:
+        if self.turned is None:
             return normal
-        x, y, z = (dot(axis, normal) for axis in self.placed[1])
+        x, y, z = (dot(axis, normal) for axis in self.turned[0])
         return x, y, z
 
     def gradient(self, slopes: Vec3) -> Vec3:
         """The world's gradient of what has these slopes along the axes."""
-        if self.placed is None:
-            return slopes
-        a, b, c = (scaled(normal, slope) for normal, slope in zip(self.placed[2], slopes, strict=True))
-        return plus(plus(a, b), c)
+        return slopes if self.turned is None else _combined(self.turned[1], slopes)
 
     @property
     def stretch(self) -> Scalar | float:
-        """The most that a coordinate changes by a unit of world length, at least 1."""
-        return 1.0 if self.placed is None else greatest(tuple(length(normal) for normal in self.placed[2]))
+        """The most that a component changes by a unit of world length, at least 1."""
+        if self.turned is None:
+            return 1.0
+        x, y, z = map(length, self.turned[1])
+        return greatest((x, y, z))
 
     def diagonal(self, sides: Vec3) -> Scalar:
         """The longest diagonal of a box with these sides along the axes."""
-        if self.placed is None:
+        if self.turned is None:
             return jnp.sqrt(dot(sides, sides))
-        a, b, c = (scaled(axis, side) for axis, side in zip(self.placed[1], sides, strict=True))
-        (x, y, z), (u, v, w) = a, b
-        ends = plus(a, b), (x - u, y - v, z - w)
-        back = (-c[0], -c[1], -c[2])
-        return reduce(jnp.maximum, (length(plus(end, way)) for end in ends for way in (c, back)))
+        a, b, c = (scaled(axis, side) for axis, side in zip(self.turned[0], sides, strict=True))
+        ends = plus(a, b), minus(a, b)
+        return reduce(jnp.maximum, (length(way(end, c)) for end in ends for way in (plus, minus)))
 
-    def point(self, coordinates: Vec3) -> Vec3:
-        """World point of coordinates."""
-        if self.placed is None:
-            return coordinates
-        (a, b, c), (origin, axes, _) = coordinates, self.placed
-        x, y, z = (o + (a * i + b * j + c * k) for o, i, j, k in zip(origin, *axes, strict=True))
-        return x, y, z
+
+def _combined(vectors: tuple[Vec3, Vec3, Vec3], factors: Vec3) -> Vec3:
+    a, b, c = (scaled(vector, factor) for vector, factor in zip(vectors, factors, strict=True))
+    return plus(plus(a, b), c)

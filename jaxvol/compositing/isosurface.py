@@ -98,7 +98,7 @@ class Isosurface(Selection[Crossing]):
 
     def normal(self, sampler: RaySampler, depth: Scalar) -> Float[Array, "3"]:
         assert sampler.gradient is not None
-        slopes = jnp.stack(sampler.gradient(sampler.point(depth)))
+        slopes = jnp.stack(sampler.gradient(sampler.place(depth)))
         square = jnp.sum(slopes * slopes)
         # where values do not change, there is no direction
         return -slopes * jnp.where(square == 0, 0, jax.lax.rsqrt(jnp.where(square == 0, 1, square)))

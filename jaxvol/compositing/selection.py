@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from .._util.vec3 import Scalar, Vec3, along
 from ..lighting.shading import Sample
 from ..scene.occupancy import Blocks
-from ..scene.space import Ray
+from ..scene.space import Ray, Space
 from ..scene.transfer import Classification, Measured, Transfer
 from .blending import Compositing, Fragment, Outputs, State
 
@@ -22,9 +22,10 @@ class RaySampler(NamedTuple):
         ray: on which it samples.
         classification: how samples are measured, classified and shaded.
         depth_scale: 1, with the derivative that depths of a fixed number of steps have by the step.
-        gradient: of the volume's value at a world point, by that point; None during the march.
+        gradient: of the volume's value at a `place`, by that; None during the march.
         chosen: the depth that the march chose, twice: as a number, and as its sample moves; None during the
             march.
+        space: of the volume.
     """
 
     ray: Ray
@@ -32,6 +33,7 @@ class RaySampler(NamedTuple):
     depth_scale: Scalar | int = 1
     gradient: Callable[[Vec3], Vec3] | None = None
     chosen: tuple[Scalar, Scalar] | None = None
+    space: Space = cast(Space, None)
 
     def value(self, depth: Scalar) -> Scalar:
         """The volume's value at this depth."""
@@ -41,9 +43,13 @@ class RaySampler(NamedTuple):
         """The grid coordinate at this depth."""
         return self.ray.path(self.differentiable_depth(depth))
 
+    def place(self, depth: Scalar) -> Vec3:
+        """Where this depth is, from the `anchor` of the space on."""
+        return along(self.ray.entry, self.ray.direction, self.differentiable_depth(depth))
+
     def point(self, depth: Scalar) -> Vec3:
         """The world point at this depth."""
-        return along(self.ray.entry, self.ray.direction, self.differentiable_depth(depth))
+        return self.space.world(self.place(depth))
 
     def differentiable_depth(self, depth: Scalar) -> Scalar:
         """The same depth, which moves with the step, and if it is that of the chosen sample, with the faces
@@ -61,8 +67,9 @@ class RaySampler(NamedTuple):
         color, extinction = classified
         if self.classification.light is None:
             return color
-        point, (direction, pixel) = self.point(depth), (self.ray.direction, self.ray.pixel)
-        sample = Sample(point, direction, measured, color, extinction, transmittance, pixel)
+        place, (direction, pixel) = self.place(depth), (self.ray.direction, self.ray.pixel)
+        point = self.space.world(place)
+        sample = Sample(point, direction, measured, color, extinction, transmittance, pixel, place)
         return self.classification.light(sample)
 
     def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:

@@ -252,13 +252,14 @@ class Replay(SampleVisitor):
             classification = classification_of(transfer, here, integrated=march.integrates)
             classification = classification._replace(search=None)  # what it finds has no gradient
             scene = self.prepared._replace(march=march, volume=here, classification=classification)
+            space = march.locate(here)
             found = []
             for piece in pieces(scene, ray, at, number):
                 depth, measured = march.sample(piece), measure(scene, ray, piece, recorded=True)
-                point = along(ray.entry, ray.direction, depth)
-                place = None if self.shader is None else (point, ray.direction)
+                place = along(ray.entry, ray.direction, depth)
+                lit = None if self.shader is None else (space.world(place), place, ray.direction)
                 at_depth = depth if self.given.depth is not None else None
-                found.append((floats(measured), piece.width, at_depth, place))
+                found.append((floats(measured), piece.width, at_depth, lit))
             return found, fetched
 
         rays = jax.vmap(one, in_axes=(None, None, 0, None, 0, 0, 0, None))

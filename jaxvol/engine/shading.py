@@ -43,7 +43,7 @@ def light_terms(
     volume = around.volume
 
     def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
-        coordinate = around.space.coordinate(_inline_sample(scene, ray, cell).point)
+        coordinate = around.space.local.coordinate(along(ray.entry, ray.direction, scene.march.sample(cell)))
         return volume.fetch.base(volume.data, coordinate)
 
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
@@ -78,8 +78,9 @@ def lit_colors(
 def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
     """Where a sample is. What it shows is not told, which would take time: NaN."""
     depth, unknown = scene.march.sample(cell), jnp.full_like(cell.front, jnp.nan)
-    point, color = along(ray.entry, ray.direction, depth), (unknown, unknown, unknown)
-    return Sample(point, ray.direction, (), color, unknown, jnp.ones_like(unknown), ray.pixel)
+    place, color = along(ray.entry, ray.direction, depth), (unknown, unknown, unknown)
+    point, one = scene.space.world(place), jnp.ones_like(unknown)
+    return Sample(point, ray.direction, (), color, unknown, one, ray.pixel, place)
 
 
 # ---------------------------------------------------------------- visible samples
@@ -120,9 +121,9 @@ def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: 
     entry, direction, pixel = ray
     color, extinction = scene.classification.of_cells(measured)
     transmittance = scene.compositing.transmittance(Composite(opacity))
-    return Sample(
-        along(entry, direction, depth), direction, measured, color, extinction, transmittance, pixel
-    )
+    place = along(entry, direction, depth)
+    point = scene.space.world(place)
+    return Sample(point, direction, measured, color, extinction, transmittance, pixel, place)
 
 
 def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, seen: Seen) -> Sample:

@@ -36,7 +36,7 @@ class ShadingVjp(NamedTuple):
     of_color: Vec3
     of_extinction: Scalar
     of_value: Scalar
-    of_place: tuple[Vec3, Vec3]
+    of_place: tuple[Vec3, Vec3, Vec3]
 
 
 def shading_vjp(
@@ -62,13 +62,13 @@ def shading_vjp(
         some, real = samples_of(chosen, indices, scene, ray, seen), indices < size
         red, green, blue = (jnp.where(real, each, 0) for each in chosen.take(cotangents, indices))
         color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
-        place = of_sample.point, of_sample.direction
+        place = of_sample.point, of_sample.place, of_sample.direction
         vjp = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured[0], place)
         return chosen.put(found, indices, vjp), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     zeros = zero, zero, zero
-    found, total = chosen.fold(one, (ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros)), total))
+    found, total = chosen.fold(one, (ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros, zeros)), total))
     return chosen.split(found, len(weights.weight)), total
 
 

@@ -94,7 +94,10 @@ class Phong(Shading):
     def term(
         self, around: Surroundings, sample: Sample, shared: list[tuple[Vec3, Vec3]], number: Int[Array, ""]
     ) -> tuple[Angles, ...]:
-        gradient = world_gradient(around.volume, around.space, sample.point)
+        space, place = around.space.local, sample.place
+        if place is None:
+            space, place = around.space, sample.point
+        gradient = world_gradient(around.volume, space, place)
         squared, toward_viewer = dot(gradient, gradient), -dot(gradient, sample.direction)
         exists = ~(squared <= 0)  # also of NaN, which is to be seen
         # 0 without a normal, so that it has no derivative

@@ -56,6 +56,8 @@ class Sample(NamedTuple):
         extinction: from the transfer function.
         transmittance: between the sample and the camera.
         pixel: (column, row), which keys random numbers.
+        place: the point, from the `anchor` of its space on, which float32 resolves where the world's zero is
+            far away, too; or None.
     """
 
     point: Vec3
@@ -65,6 +67,7 @@ class Sample(NamedTuple):
     extinction: Scalar
     transmittance: Scalar
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
+    place: Vec3 | None = None
 
 
 class ClassifiedPoint(NamedTuple):

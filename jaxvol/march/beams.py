@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, Vec3, along
+from .._util.vec3 import Scalar, Vec3, along, minus
 from ..scene.occupancy import Index, Occupancy, Sums
 from ..scene.space import Ray
 from ..xla.platform import on_gpu
@@ -78,7 +78,7 @@ class Box(eqx.Module):
         near = jnp.min(jnp.where(hit, rays.t_in, jnp.inf), axis=-1)
         near = jnp.where(jnp.isfinite(near), near, 0)
         far = jnp.max(jnp.where(hit, rays.t_in + rays.length, -jnp.inf), axis=-1)
-        entry = occupancy.frame.coordinates(rays.entry)
+        entry = occupancy.frame.components(rays.entry)
         direction = occupancy.frame.components(rays.direction)
         start = along(entry, direction, near[..., None] - rays.t_in)
         return cls._of(occupancy, start, direction, near, far, hit, jnp.zeros_like(near))
@@ -88,8 +88,11 @@ class Box(eqx.Module):
         """The box of all camera rays between a beam's corner rays, by beam and corner."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
         frame, shape = occupancy.frame, occupancy.occupied.shape
-        spans = tuple(size * n for size, n in zip(occupancy.size, shape, strict=True))
-        center = frame.point(tuple(low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True)))
+        origin = origin if occupancy.anchor is None else minus(origin, occupancy.anchor)
+        x, y, z = (size * n for size, n in zip(occupancy.size, shape, strict=True))
+        spans = x, y, z
+        x, y, z = (low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True))
+        center = frame.vector((x, y, z))
         x, y, z = (c - o for o, c in zip(origin, center, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
         radius = frame.diagonal(spans) / 2
@@ -102,7 +105,7 @@ class Box(eqx.Module):
         nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
         spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
         near, far = jnp.maximum(nearest - radius - spread, 0), farthest + radius + spread
-        start = frame.coordinates(along(origin, direction, near[..., None]))
+        start = frame.components(along(origin, direction, near[..., None]))
         direction, counts = frame.components(direction), jnp.ones(start[0].shape, bool)
         return cls._of(occupancy, start, direction, near, far, counts, bulge * frame.stretch)
 

@@ -119,14 +119,16 @@ class Sums(eqx.Module):
 
 
 class Occupancy(eqx.Module):
-    """A regular grid of cells in the world. Everything visible lies in an occupied cell of it."""
+    """A regular grid of cells. Everything visible lies in an occupied cell of it."""
 
     occupied: Bool[Array, "cx cy cz"]
     origin: Vec3
-    """Corner of the grid, along the axes of `frame`."""
+    """Corner of the grid, along the axes of `frame`, from `anchor` on."""
     size: Vec3
     """Side lengths of a cell."""
     frame: Frame = Frame()
+    anchor: Vec3 | None = None
+    """That of the `Space`."""
 
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
@@ -144,8 +146,8 @@ class Occupancy(eqx.Module):
         return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:
-        """Coordinate of a world point in the grid, in cells."""
-        point = self.frame.coordinates(point)
+        """Coordinate in the grid, in cells, of a place that counts from `anchor`."""
+        point = self.frame.components(point)
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import described
-from .._util.vec3 import Frame, Scalar, Vec3, apart
+from .._util.vec3 import Scalar, Vec3, apart
 from .occupancy import BLOCK, Blocks, Sums
 from .transfer import Classify, Measured, Transfer
 from .volume import Field, Volume
@@ -112,7 +112,7 @@ class GridMap(eqx.Module):
     def between(cls, source: Volume, target: Volume) -> "GridMap":
         # from origin to origin, where numbers are small: many origins are far away
         there = source.origin - target.origin
-        frame = Frame() if target.direction is None else Frame.of(there, target.direction)
+        frame = target.frame
         across = jnp.eye(3, dtype=source.spacing.dtype) if source.direction is None else source.direction
         columns = (frame.components(apart(across[:, axis])) for axis in range(3))
         rates = jnp.stack([jnp.stack(column) for column in columns], axis=1)

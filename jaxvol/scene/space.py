@@ -6,14 +6,14 @@ origin and direction, so that rays are straight in the grid. A space with curved
 
 from abc import abstractmethod
 from functools import partial, reduce
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from .._util.vec3 import Frame, Scalar, Vec3, along, apart
+from .._util.vec3 import Frame, Scalar, Vec3, along, apart, minus, plus, times
 from .occupancy import BLOCK, Occupancy
 from .several import Several
 from .volume import Volume
@@ -38,6 +38,21 @@ class Space(eqx.Module):
     def searches(self) -> bool:
         """Whether `interval` and `gaps` are loops."""
         return False
+
+    @property
+    def anchor(self) -> Vec3 | None:
+        """A world point near the volume, from which `local` and `occupancy` count, so that float32 resolves
+        places where the world's own zero is far away. None: they count from that."""
+        return None
+
+    @property
+    def local(self) -> "Space":
+        """The same space, whose points count from `anchor`."""
+        return self
+
+    def world(self, place: Vec3) -> Vec3:
+        """World point of a place that counts from `anchor`."""
+        return place if self.anchor is None else plus(self.anchor, place)
 
     @property
     def whole(self) -> "Space":
@@ -83,8 +98,8 @@ class Space(eqx.Module):
 
     @abstractmethod
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        """World cells that may hold anything visible, from the visible blocks of the grid, or of a part of it
-        that begins at the node `first`."""
+        """Cells that may hold anything visible, placed from `anchor` on, from the visible blocks of the grid,
+        or of a part of it that begins at the node `first`."""
 
     def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
         """For each face at which rays may enter or leave, whether anything visible may lie there."""
@@ -111,7 +126,7 @@ class Ray(eqx.Module):
     them for far cameras, too."""
 
     entry: Vec3
-    """World point where the ray enters the volume."""
+    """Where the ray enters the volume, from the `anchor` of its space on."""
     direction: Vec3
     """Unit direction in the world."""
     t_in: Scalar
@@ -146,6 +161,8 @@ def enter(
 ) -> Ray:
     """Clip a ray to the volume, to what lies ahead of its origin, and to its first part, up to the distance
     `until`; `invalid` if a number is not finite (or `until` NaN)."""
+    if (anchor := space.anchor) is not None:
+        origin, space = minus(origin, anchor), space.local
     # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
@@ -200,9 +217,10 @@ class Straight(Path):
 class Affine(Space):
     """A grid given by spacing, origin and direction."""
 
-    low: Vec3
-    """The first node, along the axes of `frame`; `high`: the last one."""
+    first: Vec3 | None
+    """The first node; None: points count from there."""
     high: Vec3
+    """The last node, from the first one, along the axes of `frame`."""
     spacing: Vec3
     frame: Frame
     inner: "tuple[Affine, ...]"
@@ -211,40 +229,47 @@ class Affine(Space):
     def __init__(self, volume: Volume):
         field = volume.field
         self.inner = tuple(map(Affine, field.volumes)) if isinstance(field, Several) else ()
-        self.spacing, self.frame = apart(volume.spacing), Frame()
-        if volume.direction is None:
-            self.low, self.high = (apart(end) for end in volume.corners)
-        else:
-            # from the first node, where the numbers are small: many origins are far away
-            self.frame = volume.frame
-            high = (jnp.asarray(volume.shape, volume.spacing.dtype) - 1) * volume.spacing
-            self.low, self.high = apart(jnp.zeros_like(high)), apart(high)
+        self.first, self.spacing, self.frame = apart(volume.origin), apart(volume.spacing), volume.frame
+        x, y, z = (step * (n - 1) for step, n in zip(self.spacing, volume.shape, strict=True))
+        self.high = x, y, z
+
+    @property
+    def anchor(self) -> Vec3 | None:
+        return self.first
+
+    @property
+    def local(self) -> "Affine":
+        if self.first is None:
+            return self
+        away = [minus(cast(Vec3, grid.first), self.first) for grid in self.inner]
+        inner = tuple(eqx.tree_at(lambda g: g.first, *each) for each in zip(self.inner, away, strict=True))
+        return eqx.tree_at(lambda space: (space.first, space.inner), self, (None, inner))
 
     @property
     def diagonal(self) -> Scalar:
-        x, y, z = (high - low for low, high in zip(self.low, self.high, strict=True))
-        return self.frame.diagonal((x, y, z))
+        return self.frame.diagonal(self.high)
 
     @property
     def middle(self) -> Vec3:
-        x, y, z = ((low + high) / 2 for low, high in zip(self.low, self.high, strict=True))
-        return self.frame.point((x, y, z))
+        half = jnp.full_like(self.high[0], 0.5)
+        return self.world(self.frame.vector(times(self.high, (half, half, half))))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        origin, direction = self.frame.coordinates(origin), self.frame.components(direction)
-        return slab_interval(origin, direction, self.low, self.high)
+        zero = jnp.zeros_like(self.high[0])
+        return slab_interval(
+            self._own(origin), self.frame.components(direction), (zero, zero, zero), self.high
+        )
 
     def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
         return tuple(grid.interval(entry, direction) for grid in self.inner)
 
     def coordinate(self, point: Vec3) -> Vec3:
-        point = self.frame.coordinates(point)
         # times the reciprocal: XLA stores quotients that are used more than once
-        x, y, z = ((p - low) * (1 / step) for p, low, step in zip(point, self.low, self.spacing, strict=True))
+        x, y, z = (p * (1 / step) for p, step in zip(self._own(point), self.spacing, strict=True))
         return x, y, z
 
     def point(self, coordinate: Vec3) -> Vec3:
-        return self.frame.point(self._own_point(coordinate))
+        return self.world(self.frame.vector(times(coordinate, self.spacing)))
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
         x, y, z = (step * (1 / self.frame.stretch) for step in self.spacing)
@@ -252,17 +277,18 @@ class Affine(Space):
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         x, y, z = (BLOCK * step for step in self.spacing)
-        low = self.low if first is None else self._own_point(first)
-        return Occupancy(visible, low, (x, y, z), self.frame)
+        zero = jnp.zeros_like(x)
+        low = (zero, zero, zero) if first is None else times(first, self.spacing)
+        return Occupancy(visible, low, (x, y, z), self.frame, self.anchor)
 
     def path(self, entry: Vec3, direction: Vec3) -> Straight:
         direction = self.frame.components(direction)
         dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
         return Straight(self.coordinate(entry), (dx, dy, dz))
 
-    def _own_point(self, coordinate: Vec3) -> Vec3:
-        x, y, z = (low + c * step for c, low, step in zip(coordinate, self.low, self.spacing, strict=True))
-        return x, y, z
+    def _own(self, point: Vec3) -> Vec3:
+        """Components of a point along the axes, from the first node on."""
+        return self.frame.components(point if self.first is None else minus(point, self.first))
 
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:

@@ -131,9 +131,8 @@ class Volume(eqx.Module):
 
     @property
     def frame(self) -> Frame:
-        """Coordinates along the grid's axes, in world length, from the first node on if there is a
-        `direction`; else those of the world."""
-        return Frame() if self.direction is None else Frame.of(self.origin, self.direction)
+        """The grid's axes."""
+        return Frame() if self.direction is None else Frame.of(self.direction)
 
     @property
     def bounds(self) -> Float[Array, "6"]:

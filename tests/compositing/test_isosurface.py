@@ -98,8 +98,8 @@ def at_crossing(volume, value, origin, direction, front, back, rises):
     value, front, back, rises = map(jnp.asarray, (value, front, back, rises))
     space, pixel = Affine(volume), (jnp.int32(0), jnp.int32(0))
     ray = enter(space, apart(jnp.stack(origin)), apart(jnp.stack(direction)), pixel)
-    gradient = partial(world_gradient, volume, space)
-    sampler = RaySampler(ray, classification_of(soft_transfer(), volume), gradient=gradient)
+    gradient = partial(world_gradient, volume, space.local)
+    sampler = RaySampler(ray, classification_of(soft_transfer(), volume), gradient=gradient, space=space)
 
     def depth(value):
         mode = eqx.tree_at(lambda mode: mode.value, jv.Isosurface(0.0), value)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, flag, require, shortened
-from ..._util.vec3 import Scalar, Vec3, apart, dot
+from ..._util.vec3 import Scalar, Vec3, apart, dot, minus
 from ...scene.occupancy import Occupancy
 from ...scene.space import Gap, Path, Space
 from ..march import Transform
@@ -118,11 +118,11 @@ class HalfSpace(NamedTuple):
         a, b, c = map(jnp.abs, grid.frame.rises(self.normal))
         # the greatest coordinate, which rounds most
         ends = jnp.stack([jnp.abs(grid.origin[i]) + grid.size[i] * shape[i] for i in range(3)])
-        if grid.frame.placed is not None:
-            ends = jnp.sum(ends) + jnp.abs(jnp.stack(grid.frame.placed[0]))
+        if grid.frame.turned is not None:
+            ends = jnp.sum(ends)
         reach = 0.51 * dot((a, b, c), grid.size) + 16 * float(jnp.finfo(ends.dtype).eps) * jnp.max(ends)
         middle = x[:, None, None], y[None, :, None], z[None, None]
-        return self.height(grid.frame.point(middle)), reach
+        return self.height(grid.frame.vector(middle)), reach
 
 
 class _Clipped(Space):
@@ -135,6 +135,17 @@ class _Clipped(Space):
     @property
     def searches(self) -> bool:
         return self.inner.searches
+
+    @property
+    def anchor(self) -> Vec3 | None:
+        return self.inner.anchor
+
+    @property
+    def local(self) -> "_Clipped":
+        if self.anchor is None:
+            return self
+        sides = tuple(HalfSpace(minus(point, self.anchor), normal) for point, normal in self.sides)
+        return _Clipped(self.inner.local, sides, self.inside_out)
 
     @property
     def whole(self) -> Space:
@@ -193,7 +204,7 @@ class _Clipped(Space):
 
     def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
         grid = self.inner.occupancy(visible, first)
-        over = [side.over(grid) for side in self.sides]
+        over = [side.over(grid) for side in self.local.sides]
         if self.inside_out:
             seen = reduce(jnp.logical_or, [height <= reach for height, reach in over])
         else:
@@ -202,7 +213,7 @@ class _Clipped(Space):
 
     def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
         grid = self.occupancy(visible)
-        over = [side.over(grid) for side in self.sides]
+        over = [side.over(grid) for side in self.local.sides]
         own = [jnp.any(grid.occupied & (jnp.abs(height) <= reach)) for height, reach in over]
         return *self.inner.visible_at_faces(visible), *own
 
