@@ -35,8 +35,8 @@ def check_captured(what: str, function: Any) -> None:
     captured = jax.tree.leaves([cell.cell_contents for cell in cells])
     if any("LinearizeTracer" in transformations(leaf) for leaf in captured):
         raise ValueError(
-            f"{what} captures a value that is differentiated: hold it as an array of an eqx.Module that has a "
-            "__call__, or of the field or transfer function itself."
+            f"{what} captures a value that is differentiated: hold it as an array of an eqx.Module that has "
+            "a __call__, or of the field or transfer function itself."
         )
 
 
