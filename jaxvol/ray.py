@@ -34,6 +34,7 @@ from .scene.transfer import Classification, Measured, Transfer, TransferFunction
 from .scene.transfer2d import TransferFunction2D
 from .scene.variation import Windows
 from .scene.volume import Volume, without_voxels
+from .xla.differentiation import check_captured
 from .xla.memory import in_memory
 from .xla.trees import PyTree
 
@@ -171,6 +172,9 @@ def check_channels(
     and for what needs a single one."""
     if isinstance(volume.field, Several) and (moved := march.overriding("locate")):
         raise ValueError(f"march.transforms: {type(moved[0]).__name__} places one volume; got several.")
+    for leaf in jax.tree.leaves(volume.field):
+        if callable(leaf):
+            check_captured("a function of the volume's field", leaf)
     channels, reads = volume.channels, transfer.channels
     if reads not in (None, channels):
         raise ValueError(

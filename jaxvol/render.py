@@ -52,8 +52,8 @@ def render(
             volume's face divides counts for the part that lies in it. Without a lighting, by `"over"`,
             `"integral"` or a `Weighting` of one's own.
         transfer: their colours and extinctions; of several volumes, a list of one for each. (Where all of
-            their extinctions are exactly 0, `"direct"` and `"forward"` take the mean of their colours for the
-            derivative by extinction. `"replay"` is exact in reverse mode.)
+            their extinctions are exactly 0, derivatives by extinction take the mean of their colours, except
+            for `jax.grad` under `"replay"`, which is exact: so are not `jax.jacfwd` and second derivatives.)
         camera: makes one ray for each pixel.
         march: step and transforms; or `"auto"`: those of `plan`, which is called for each image, without
             transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call

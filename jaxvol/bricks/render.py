@@ -122,6 +122,10 @@ def render_bricks(
     by which empty bricks are not read. Unlike there, how far bricks overlap follows from the rays of the
     image; `bricks.overlap_of` has their formula. Where it fails: `experiments/stability.py`, "wrong order".
     """
+    if isinstance(source, list | tuple) or isinstance(transfer, list | tuple):
+        raise ValueError(
+            "source and transfer must be of a single volume; got a list. Several are for render."
+        )
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, ("rays", "bricks"))]

@@ -148,6 +148,12 @@ def register(
     images = [finite_array(f"views[{at}]: the image", image, shape) for at, (_, image) in enumerate(read)]
     given = of_pixels("weights", weights, [(*shape, 1)] * len(read))
     counted = [np.ones(shape) if weight is None else weight[..., 0] for weight in given]
+    for number, (image, weight) in enumerate(zip(images, counted, strict=True)):
+        if len(np.unique(np.asarray(image)[weight > 0])) < 2:
+            raise ValueError(
+                f"views[{number}]: the image must not be constant where its weights are positive; got one of "
+                f"{np.count_nonzero(weight > 0)} equal pixels, which say nothing."
+            )
     factors = [integer("levels", level, 1) for level in np.ravel(levels).tolist()]
     if not factors:
         raise ValueError("levels must hold at least one, such as 1; got none.")

@@ -29,6 +29,7 @@ from ..compositing.modes import Mode, compositing_of
 from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera
+from ..scene.several import together
 from ..scene.transfer import Transfer
 from ..xla.trees import PyTree
 from .constraints import Free, FreeVariables, size
@@ -75,8 +76,8 @@ class ImageResidual(eqx.Module):
 
     Args:
         scene: `scene(parameters, camera)` returns what to render for the parameters and a view's camera:
-            `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit. The solver
-            chooses the adjoint.
+            `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit; of several
+            volumes lists, as for `render`. The solver chooses the adjoint.
         views: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
             `background`, or (height, width, 4), as `Rendering.rgba`; or a `PathTraced`, which is put before
             `background`.
@@ -156,7 +157,8 @@ class ImageResidual(eqx.Module):
                 raise ValueError(
                     f"scene must return {order}, the last if it is lit; got {described(result)}."
                 )
-            volume, transfer, camera, march, lighting = cast(Any, (*result, None)[:5])
+            *both, camera, march, lighting = cast(Any, (*result, None)[:5])
+            volume, transfer = together(*both)
             scene = {"volume": volume, "transfer": transfer, "camera": camera, "march": march}
             check_arguments(order, **scene, lighting=lighting)
             if camera.size != of_view.size:

@@ -4,11 +4,13 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import Arrayable, described, not_negative
 from .._util.piecewise_linear import ROUNDING, not_negative as clipped
 from .._util.vec3 import Scalar, Vec3
+from ..xla.differentiation import check_captured
 from .occupancy import Blocks
 from .transfer import Classify, Measured, Transfer
 
@@ -31,7 +33,8 @@ class RadianceField(Transfer):
         color: from a stored channel to linear colour, such as `jax.nn.sigmoid`; by default as it is stored,
             also where that is an integer: of 8 bits, divide by 255, and give `scale` in these units.
 
-    Give functions that exist once: each new `lambda` is compiled anew.
+    Give functions that exist once: each new `lambda` is compiled anew. Parameters of one, which are to have
+    gradients, are arrays of a module (`eqx.Module`, `jax.tree_util.Partial`), not captured by a `lambda`.
 
     Gradients reach all channels (`Volume.data`), in every adjoint; but see `SpaceLeaping` about what is leapt
     over.
@@ -46,8 +49,8 @@ class RadianceField(Transfer):
     """
 
     scale: Float[Array, ""]
-    density: Activation = eqx.field(static=True)
-    color: Activation = eqx.field(static=True)
+    density: Activation
+    color: Activation
 
     def __init__(
         self,
@@ -59,7 +62,8 @@ class RadianceField(Transfer):
         for name, function in (("density", density), ("color", color)):
             if function is not None and not callable(function):
                 raise ValueError(f"{name} must be a function of a channel; got {described(function)}.")
-        self.density, self.color = (_as_stored if f is None else f for f in (density, color))
+            check_captured(name, function)
+        self.density, self.color = map(_activation, (density, color))
 
     @property
     def channels(self) -> int:
@@ -73,11 +77,34 @@ class RadianceField(Transfer):
         return classify
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        bound = jax.lax.stop_gradient(self.scale) * clipped(self.density(blocks.high[3]))
+        bound = jax.lax.stop_gradient(self.scale * clipped(self._greatest(blocks)))
         return (bound * (1 + ROUNDING)).astype(blocks.high.dtype)
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        return self.density(blocks.high[3]) > 0
+        return self._greatest(blocks) > 0
+
+    def _greatest(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
+        """Density of the greatest stored one, in the type of parameters, which may be wider."""
+        return self.density(blocks.high[3].astype(self.scale.dtype))
+
+
+class _Fixed(eqx.Module):
+    """A function without parameters."""
+
+    function: Activation = eqx.field(static=True)
+
+    def __call__(self, channel: Scalar) -> Scalar:
+        return self.function(channel)
+
+
+def _activation(function: Activation | None) -> Activation:
+    """The function as a pytree of its parameters."""
+    found = _as_stored if function is None else function
+    found = found if any(map(eqx.is_array, jax.tree.leaves(found))) else _Fixed(found)
+    like = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    if getattr(answer := eqx.filter_eval_shape(found, like), "shape", None) != ():
+        raise ValueError(f"density and color must return a number for a number; got {answer}.")
+    return found
 
 
 def _as_stored(channel: Scalar) -> Scalar:

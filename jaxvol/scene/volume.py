@@ -31,7 +31,8 @@ FLATTEST = 1e-3
 class Field(eqx.Module):
     """A user-defined field in place of interpolated voxels: `Volume(data, field=...)`.
 
-    Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`. It may hold other
+    Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`; what a function
+    that it holds has captured is no array of its own, and is refused in reverse mode. It may hold other
     volumes, whose voxels have gradients in less time and memory than arrays have; under `adjoint="replay"` it
     must read these outside of `jax.vmap`, loops and branches of its own. `SpaceLeaping` leaps over no part
     of it, since its range is unknown.
@@ -113,7 +114,12 @@ class Volume(eqx.Module):
         if self.field is None:
             return self.data.shape[3] if self.data.ndim > 3 else 1
         at = (jax.ShapeDtypeStruct((), self.spacing.dtype),) * 3
-        return len(jax.tree.leaves(eqx.filter_eval_shape(Volume.value, self, at)))
+        answer = eqx.filter_eval_shape(Volume.value, self, at)
+        numbers = answer if isinstance(answer, tuple) else (answer,)
+        if not numbers or any(getattr(each, "shape", None) != () for each in numbers):
+            kind = type(self.field).__name__
+            raise ValueError(f"{kind}.value must return a number, or a tuple of numbers; got {answer}.")
+        return len(numbers)
 
     @property
     def first(self) -> Vec3 | None:

@@ -28,6 +28,18 @@ def forward_mode(kinds: list[list[str]]) -> bool:
     return any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds)
 
 
+def check_captured(what: str, function: Any) -> None:
+    """Raises `ValueError` for a function that captures a value to be differentiated in reverse mode, which no
+    primitive with a derivative of its own would see."""
+    cells = getattr(function, "__closure__", None) or ()
+    captured = jax.tree.leaves([cell.cell_contents for cell in cells])
+    if any("LinearizeTracer" in transformations(leaf) for leaf in captured):
+        raise ValueError(
+            f"{what} captures a value that is differentiated: hold it as an array of an eqx.Module that has "
+            "a __call__, or of the field or transfer function itself."
+        )
+
+
 def forward_only(tree: PyTree, message: str) -> PyTree:
     """The tree, unchanged. Under reverse mode it raises `ValueError` with this message."""
 

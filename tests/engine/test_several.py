@@ -34,6 +34,10 @@ class Network(jv.Field):
         return jax.nn.softplus(found)
 
 
+def above(least, density):
+    return jnp.where(density > least, (density - least) ** 2, 0)
+
+
 def noise(*shape, seed):
     data = gaussian_filter(np.random.default_rng(seed).normal(size=shape), (1, 1, 1, 0)[: len(shape)])
     return (data - data.min()) / (data.max() - data.min())
@@ -52,7 +56,7 @@ def scene():
     field = jv.Volume(np.zeros((4, 4, 4)), (0.3, 0.3, 0.3), (-0.5, 0.2, 0.1), field=Network(layers, inner))
     tables = [
         jv.TransferFunction([0.5, 0.7, 1], np.eye(3), [0, 2, 5]),
-        jv.RadianceField(3.0),
+        jv.RadianceField(6.0, density=jax.tree_util.Partial(above, jnp.asarray(0.2))),
         jv.TransferFunction([0, 2], [[1, 1, 0], [0, 1, 1]], [0.1, 1]),
     ]
     camera = jv.Camera((2.5, -6.5, 2.5), (0.8, 0.8, 0.8), (0, 0, 1), 20, size=SIZE)
@@ -116,7 +120,8 @@ class Placed:
             value = np.log1p(np.exp(second.weight @ hidden + second.bias))[0]
         elif data.ndim > 3:
             read = [map_coordinates(each, place[:, None], order=1)[0] for each in np.moveaxis(data, -1, 0)]
-            return np.array(read[:3]), table.scale * read[3]
+            (least,) = table.density.args
+            return np.array(read[:3]), table.scale * max(read[3] - least, 0) ** 2
         else:
             value = map_coordinates(data, place[:, None], order=1)[0]
         color = np.array([np.interp(value, table.values, channel) for channel in table.colors.T])

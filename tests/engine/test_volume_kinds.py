@@ -1,5 +1,7 @@
 """Images and gradients of volumes with custom fields, or with 16-bit voxels."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -112,6 +114,15 @@ class Looped(jv.Field):
         return jax.lax.map(lambda c: self.inner.value((c, *coordinate[1:])), jnp.stack([coordinate[0]]))[0]
 
 
+class Of(jv.Field):
+    """A function of the coordinate."""
+
+    function: Any
+
+    def value(self, volume, coordinate):
+        return self.function(coordinate)
+
+
 BOX = np.zeros((5, 5, 5), np.float32)
 
 
@@ -127,9 +138,14 @@ BOX = np.zeros((5, 5, 5), np.float32)
             lambda data: jv.Volume(BOX, field=Looped(jv.Volume(data))),
             "outside of jax.vmap, loops and branches",
         ),
+        (
+            lambda data: jv.Volume(BOX, field=Of(lambda c: c[0] * data[0, 0, 0])),
+            "a function of the volume's field captures a value that is differentiated",
+        ),
+        (lambda data: jv.Volume(BOX, field=Of(jnp.stack)), "Of.value must return a number, or a tuple"),
     ],
 )
-def test_voxels_that_a_field_reads_by_itself_have_no_gradient_by_replay(volume, message):
+def test_what_a_field_reads_by_itself_has_no_gradient_by_replay(volume, message):
     data = jnp.asarray(np.random.default_rng(0).random((5, 5, 5)), jnp.float32)
 
     def loss(data):

@@ -207,8 +207,13 @@ def test_what_a_mask_leaves_counts_as_the_cropped_image_does():
     free, y = Free.of(np.float32(1.2), None, None)
     triangles = eqx.filter_jit(lambda problem, y: problem.condensed(y))
     found = []
-    for of_view, weights in (((view, wrong), [mask]), (part, None)):
-        residual = jv.ImageResidual(thicker, [of_view], noise=0.02, weights=weights)
+
+    def listed(factor, view):
+        volume, transfer, *rest = thicker(factor, view)
+        return [volume], [transfer], *rest
+
+    for scene, of_view, weights in ((thicker, (view, wrong), [mask]), (listed, part, None)):
+        residual = jv.ImageResidual(scene, [of_view], noise=0.02, weights=weights)
         problem = Problem.of(residual, free, y, 2**20, True)
         squares = [np.asarray(factor).T @ np.asarray(factor) for factor in triangles(problem, y)]
         noise = [float(part) for part in jax.tree.leaves(residual.references.noise)[:2]]

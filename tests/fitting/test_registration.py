@@ -68,10 +68,11 @@ def test_the_motion_of_both_cameras_is_found_from_every_start_past_what_a_mask_h
 
 
 BLANK = np.zeros(SIZE[::-1])
+RAMP = BLANK + np.arange(SIZE[0])
 SMALL = jv.Camera(CENTER + 9, CENTER, (0, 0, 1), size=(3, 3))
 
 
-def given(views: Any = ((VIEWS[0], BLANK),), **how: Any):
+def given(views: Any = ((VIEWS[0], RAMP),), **how: Any):
     return lambda: jv.register(VOLUME, TRANSFER, views, **how)
 
 
@@ -83,6 +84,8 @@ BAD = [
     (given(similarity="ssd"), 'similarity must be "gradient_ncc" or "ncc"; got \'ssd\''),
     (given(weights=[-1.0]), r"weights\[0\] must not be negative"),
     (given(levels=()), "levels must hold at least one"),
+    (given([(VIEWS[0], BLANK + 1)]), r"views\[0\]: the image must not be constant"),
+    (given([(VIEWS[0], RAMP)], weights=[0 * BLANK]), "got one of 0 equal pixels"),
     (given(levels=(2, 0.5)), "levels must be an integer of at least 1"),
     (given(starts=3), "starts must be a RigidMotion; got 3"),
     (given(starts=jv.RigidMotion(TURN, SHIFT, CENTER)), r"starts.rotation must have shape \(n, 3\)"),
