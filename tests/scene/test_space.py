@@ -47,8 +47,9 @@ def inside(origin, direction):
     origin and direction."""
 
     def ends(origin, direction):
-        ray = enter(Affine(BOX), apart(origin), apart(direction), (jnp.int32(0), jnp.int32(0)))
-        return jnp.stack([ray.t_in, ray.length]), jnp.stack(ray.entry)
+        space = Affine(BOX)
+        ray = enter(space, apart(origin), apart(direction), (jnp.int32(0), jnp.int32(0)))
+        return jnp.stack([ray.t_in, ray.length]), jnp.stack(space.world(ray.entry))
 
     slopes, _ = jax.jacrev(ends, argnums=(0, 1))(origin, direction)
     return *ends(origin, direction), jnp.concatenate(slopes, axis=-1)
