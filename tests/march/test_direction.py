@@ -278,6 +278,31 @@ def test_a_sheared_grid_shows_what_an_orthogonal_one_does():
         np.testing.assert_allclose(one, other, atol=1e-7)
 
 
+@jax.jit
+def far_off(away):
+    """A lit image, and its derivative by the camera, of a clipped scene that lies so far off in the world."""
+    volume = jv.Volume(STRAIGHT.data, (0.25, 0.25, 0.25), away + jnp.asarray([-1.0, 0.5, 2.0]))
+    clip = jv.Clip(planes=[(away + jnp.asarray([1.0, 3.0, 4.0]), (-0.6, 0.8, -0.3))])
+    march = jv.March(0.2, (clip, jv.SpaceLeaping("beam"), jv.AlphaCorrection()), "midpoint")
+    ends = away + jnp.asarray([10.0, -9.5, 12.0]), away + jnp.asarray([2.0, 3.5, 4.5])
+    camera = jv.Camera(*ends, (0, 0, 1), 30.0, size=SIZE)
+
+    def bright(camera):
+        rgba = jv.render(volume, SPARSE, camera, march, lighting=Phong(), outputs="rgba").rgba
+        return jnp.sum(rgba**2), rgba
+
+    return jax.value_and_grad(bright, has_aux=True)(camera)
+
+
+def test_a_scene_far_from_the_worlds_zero_is_resolved_as_well():
+    """Eastings and northings, where float32 has steps of twice a voxel; all places are multiples of these."""
+    (_, here), by_camera = jax.device_get(far_off(np.zeros(3, np.float32)))
+    (_, there), found = jax.device_get(far_off(np.array([615_840.0, 5_846_926.0, 758.0], np.float32)))
+    assert 0.1 < np.mean(here[..., 3] > 0.1) < 0.9
+    np.testing.assert_allclose(there, here, atol=1e-6)
+    np.testing.assert_allclose(found.position, by_camera.position, rtol=1e-4)
+
+
 def test_a_swept_sector_takes_no_direction():
     probe = jv.ToroidalMap(10.0, 20.0, (1.0, 2.0), (1.0, 2.0), (0.0, 30.0))
     volume = jv.Volume(np.zeros((4, 4, 4), np.float32), direction=R)
