@@ -56,6 +56,9 @@ class Volume(eqx.Module):
             ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`; by
             default the world's axes. Its gradient is exact along changes that keep it orthonormal.
         labels: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
+        label_ids: what the labels stand for where they are numbers 0, 1, 2, … in place of larger ones: label
+            k, or the value k of a volume without labels, has the id `label_ids[k]`. `jv.load` gives them, and
+            `LabelTransferFunction({volume.label_ids.index(997): function})` uses them. Static.
         field: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
     Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
@@ -71,6 +74,7 @@ class Volume(eqx.Module):
     origin: Float[Array, "3"]
     direction: Float[Array, "3 3"] | None
     labels: Integer[Array, "nx ny nz"] | None
+    label_ids: tuple[int, ...] | None = eqx.field(static=True)
     field: Field | None
     fetch: Fetch
     """How voxels are read. Internal."""
@@ -83,6 +87,7 @@ class Volume(eqx.Module):
         labels: Arrayable | None = None,
         *,
         direction: Arrayable | None = None,
+        label_ids: Sequence[int] | None = None,
         field: Field | Any | None = None,
     ):
         data, place = along_xyz(data) if is_named(data) else (data, {})
@@ -94,6 +99,7 @@ class Volume(eqx.Module):
         self.origin = finite_array("origin", origin, (3,))
         self.direction = None if direction is None else _checked_direction(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape[:3])
+        self.label_ids = None if label_ids is None else tuple(map(int, label_ids))
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()
@@ -221,10 +227,14 @@ def corners_of(
 
 def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
     """None for a direction that is known to be the identity."""
+    one, two = [1, 2, 0], [2, 0, 1]
     turn = require(
         finite_array("direction", direction, (3, 3)),
-        lambda d: abs((d[:, :, None] * d[:, None, :]).sum(0) - np.eye(3).astype(d.dtype)) < 1e-4,
-        "direction must be a 3 x 3 matrix of orthogonal columns of length 1; got {got}.",
+        lambda d: (
+            (abs((d * d).sum(0) - 1) < 2e-4).all()
+            & (abs((d[:, 0] * (d[one, 1] * d[two, 2] - d[two, 1] * d[one, 2])).sum()) > 1e-3)
+        ),
+        "direction must be a 3 x 3 matrix of columns of length 1, not all in a plane; got {got}.",
     )
     return None if not is_traced(turn) and np.array_equal(turn, np.eye(3)) else turn
 

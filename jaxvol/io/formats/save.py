@@ -8,6 +8,7 @@ import numpy as np
 
 from ..._util.checks import described, output_file
 from ..._util.files import reason
+from ..._util.npy import VOLUME
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume, check_one_channel
 from .medical import simple_itk
@@ -21,9 +22,9 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 
     | ending | written |
     |---|---|
-    | `.npz` | voxels, spacing, origin, direction, labels; compressed |
+    | `.npz` | voxels, spacing, origin, direction, labels and their ids; compressed |
     | `.nrrd`, `.mha` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
-    | `.nii`, `.nii.gz` | the same; direction is rounded, to about 1e-7 |
+    | `.nii`, `.nii.gz` | the same; spacing and direction are rounded, to about 1e-7 |
 
     Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a
     volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
@@ -59,12 +60,12 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
         raise ValueError(
             f"volume has voxels of {volume.data.dtype}, which {path.name} cannot hold. Convert to float32."
         )
-    if volume.labels is not None and not name.endswith(".npz"):
+    if (volume.labels is not None or volume.label_ids) and not name.endswith(".npz"):
         raise ValueError(
             f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
             "and voxels as two volumes, and read them by load(path, labels=...)."
         )
-    parts = {part: getattr(volume, part) for part in ("data", "spacing", "origin", "direction", "labels")}
+    parts = {part: getattr(volume, part) for part in VOLUME}
     arrays = {part: np.asarray(array) for part, array in parts.items() if array is not None}
     with whole_file(path) as file:
         if name.endswith(".npz"):

@@ -1,0 +1,103 @@
+"""Reads NIfTI-1 and NIfTI-2 images (`.nii`, `.nii.gz`), placed as nibabel, FSL and AFNI place them."""
+
+import gzip
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..._util.files import as_array, decoding, file_size, read_all
+from .medical import check_volume, placed
+
+
+NAMES = "dim datatype pixdim vox_offset slope inter qform_code sform_code qform sform magic"
+LAYOUTS = {
+    348: ("8i2 i2 8f4 f4 f4 f4 i2 i2 6f4 (3,4)f4 S3", (40, 70, 76, 108, 112, 116, 252, 254, 256, 280, 344)),
+    540: ("8i8 i2 8f8 i8 f8 f8 i4 i4 6f8 (3,4)f8 S3", (16, 12, 104, 168, 176, 184, 344, 348, 352, 400, 4)),
+}
+"""Types and places of these fields, by the size of the header, with which it begins."""
+
+CODES = (2, 4, 8, 16, 64, 256, 512, 768, 1024, 1280)
+TYPES = dict(zip(CODES, ("u1", "i2", "i4", "f4", "f8", "i1", "u2", "u4", "i8", "u8"), strict=True))
+COLORS = {128: 3, 2304: 4}
+"""How many bytes the types of colours have."""
+
+TO_LPS = np.array([[-1.0], [-1.0], [1.0]])
+"""NIfTI's world is right, front, head; ours left, back, head."""
+
+
+def read_nifti(path: Path) -> dict[str, Any]:
+    """Reader for `.nii` and `.nii.gz`. The sform places voxels if its code is positive, with its scales and
+    shears; else the qform, if its is; else `pixdim` is their spacing, along axes as in the file."""
+    file_size(path)
+    packed = path.name.lower().endswith(".gz")
+    with decoding(path), gzip.open(path) if packed else path.open("rb") as stream:
+        header = _header(path, stream)
+
+        def check(name: str, holds: Any, expected: str) -> None:
+            if not holds:  # also of NaN
+                raise ValueError(f"path: {path}: {name} must be {expected}; got {header[name].tolist()!r}.")
+
+        kind, pixdim = int(header["datatype"]), header["pixdim"].astype(float)
+        shape, channels = header["dim"][1 : 1 + max(header["dim"][0], 0)].tolist(), COLORS.get(kind, 1)
+        while len(shape) > 3 and shape[-1] == 1:
+            shape.pop()
+        check("magic", header["magic"] in (b"n+1", b"n+2"), "n+1 or n+2, of voxels in the same file")
+        check("datatype", kind in TYPES or kind in COLORS, f"one of {[*TYPES, *COLORS]}")
+        check_volume(path, shape, channels)
+        behind = header["vox_offset"] - stream.tell()
+        check("vox_offset", 0 <= behind < 2**31, "the byte behind the header at which voxels begin")
+        stream.seek(int(behind), 1)
+        stored = np.dtype(TYPES.get(kind, "u1")).newbyteorder(header["dim"].dtype.byteorder)
+        expected = channels * math.prod(shape) * stored.itemsize
+        content = read_all(path, stream, expected, more=True)
+    data = np.moveaxis(as_array(content, (channels, *shape), stored, "F"), 0, -1)
+    slope, inter = float(header["slope"]), float(header["inter"])
+    if channels == 1 and slope and math.isfinite(slope) and (slope, inter) != (1, 0):
+        check("inter", math.isfinite(inter), "finite")
+        data = _scaled(data, slope, inter)
+    axes = {"axes": "xyztc"[: len(shape)] + "s"}
+    if header["sform_code"] > 0:
+        return placed(f"path: {path}: its sform", data, TO_LPS * header["sform"].astype(float)) | axes
+    check("pixdim", np.all(pixdim[1:4] > 0) and np.all(np.isfinite(pixdim[1:4])), "positive lengths")
+    if header["qform_code"] <= 0:
+        return {"data": data, "spacing": pixdim[1:4]} | axes
+    vector = header["qform"][:3].astype(float)
+    real = 1 - vector @ vector
+    check("qform", real > -1e-3, "a quaternion of length 1, and an offset")
+    turn = Rotation.from_quat([*vector, max(real, 0.0) ** 0.5]).as_matrix()
+    turn = turn * pixdim[1:4] * (1, 1, -1 if pixdim[0] < 0 else 1)
+    affine = np.column_stack([turn, header["qform"][3:]])
+    return placed(f"path: {path}: its qform", data, TO_LPS * affine) | axes
+
+
+def _header(path: Path, stream: Any) -> np.void:
+    """The fields of the header, at whose end the stream then stands."""
+    begin = stream.read(4)
+    for order, mark in (("little", "<"), ("big", ">")):
+        size = int.from_bytes(begin, order)
+        rest = stream.read(size - 4) if size in LAYOUTS else b""
+        if len(begin + rest) == size:
+            formats, offsets = LAYOUTS[size]
+            layout = {
+                "names": NAMES.split(),
+                "formats": formats.split(),
+                "offsets": offsets,
+                "itemsize": size,
+            }
+            return np.frombuffer(begin + rest, np.dtype(layout).newbyteorder(mark))[0]
+    raise ValueError(
+        f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; this one "
+        f"with the bytes {begin.hex(' ')}, of {len(begin + rest)}. Fetch or write it again."
+    )
+
+
+def _scaled(data: np.ndarray, slope: float, inter: float) -> np.ndarray:
+    """Scaled in float64, and rounded once, a part at a time."""
+    found = np.empty(data.shape, np.float64 if data.dtype == np.float64 else np.float32)
+    with np.errstate(over="ignore"):  # what is infinite is refused, or replaced, by `load`
+        for plane, into in zip(data, found, strict=True):
+            into[...] = plane * np.float64(slope) + inter
+    return found
