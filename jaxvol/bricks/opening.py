@@ -16,8 +16,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described
-from .._util.files import check_size, file_size
+from .._util.files import MOST_VOXELS, check_size, file_size
+from .._util.memory import memory_of_device
 from .._util.named_axes import along_xyz, is_named
+from ..io.formats import FOLDERS
 from ..io.formats.raw import raw_header
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume, check_one_channel
@@ -105,7 +107,7 @@ def levels_of(
         raise ValueError(f"path: there is no file {path} (working directory {Path.cwd()}).")
     if _is_zarr_array(path):
         return (_zarr_array(path, **place, **options),)
-    if any((path / name).is_file() for name in METADATA):
+    if is_zarr(path):
         return _ome_zarr_levels(path, **place, **options)
     if path.suffix.lower() == ".raw":
         size, stored, own = raw_header(path, options.pop("shape", None), options.pop("dtype", None), 48)
@@ -123,6 +125,34 @@ def levels_of(
         "the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as DICOM slices, as "
         "jv.load(path) or jv.load_ultrasound(path), and of HDF5 the array h5py.File(path)[name]."
     )
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a Zarr array or group."""
+    return any((path / name).is_file() for name in METADATA)
+
+
+def read_zarr(path: Path, *, time: int | None = None, channel: int | None = None) -> dict[str, Any]:
+    """Reader of `jv.load`, for the finest level that takes at most a quarter of the memory."""
+    index = {axis: at for axis, at in (("t", time), ("c", channel)) if at is not None}
+    try:
+        levels = levels_of(path, index=index)
+    except ValueError as fault:
+        hint = " time= gives index['t'], and channel= index['c']." if "index" in str(fault) else ""
+        raise ValueError(f"{fault}{hint}") from fault
+    room = memory_of_device() // 4
+    for level in levels:
+        voxels = math.prod(level.shape)
+        if voxels <= MOST_VOXELS and voxels * level.dtype.itemsize <= room:
+            place = {"spacing": level.spacing, "origin": level.origin}
+            return {"data": level.read((0, 0, 0), level.shape)} | place
+    raise ValueError(
+        f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {levels[-1].shape} "
+        f"voxels of {levels[-1].dtype}. Read it in bricks: jv.render_bricks, --memory."
+    )
+
+
+FOLDERS.append((is_zarr, read_zarr))
 
 
 def _is_zarr_array(path: Path) -> bool:

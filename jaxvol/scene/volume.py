@@ -48,8 +48,9 @@ class Volume(eqx.Module):
             integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are
             enabled. Others become the first of uint8, int8, uint16, int16 and float32 that holds every value
             exactly. Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates,
-            which must be evenly spaced, give spacing and origin. Of an image stack [plane, row, column],
-            pass `stack.T`.
+            which must be evenly spaced, give spacing and origin. Images of nibabel (in its world: x, y to the
+            right and front, here left and back), SimpleITK and VTK (`vtkImageData`, with scalars at points)
+            are taken as they lie. Of an image stack [plane, row, column], pass `stack.T`.
         spacing: distance between neighbouring nodes along x, y, z, world length (mm for CT); by default 1.
         origin: world position of node (0, 0, 0), by default 0.
         direction: 3 x 3 orthonormal matrix whose columns are the world directions of the data's axes, as in
@@ -97,6 +98,7 @@ class Volume(eqx.Module):
         spacing = finite_array("spacing", spacing, (3,))
         self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive; got {got}.")
         self.origin = finite_array("origin", origin, (3,))
+        direction = place.get("direction") if direction is None else direction
         self.direction = None if direction is None else _checked_direction(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape[:3])
         self.label_ids = None if label_ids is None else tuple(map(int, label_ids))

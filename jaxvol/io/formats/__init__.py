@@ -41,6 +41,10 @@ READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
     ".tiff": read_tiff,
 }
 
+FOLDERS: list[tuple[Callable[[Path], bool], Callable[..., dict[str, Any]]]] = []
+"""Readers of other folders, which are given the path, `time` and `channel`, and before each what knows its
+folders: `bricks.opening` adds that of Zarr."""
+
 
 def load(
     path: str | os.PathLike[str] | Any,
@@ -68,6 +72,7 @@ def load(
     | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
+    | a folder that is a Zarr array or OME-Zarr image | its own; by tensorstore (`pip install jaxvol[bricks]`) |
 
     Raw files store x fastest, like those of the Open SciVis datasets. The JSON file has the raw file's name
     with `.json` appended, or in place of `.raw` or `.raw.gz`, and the datasets' keys `size`, `type`,
@@ -78,7 +83,8 @@ def load(
     and the turn that is left is the volume's `direction`, with the shear of a tilted gantry; one below 1e-4,
     which headers' rounding makes, is left out. DICOM slices are sorted by where they lie, and keep their
     values where the lowest is to be shown white (MONOCHROME1). Integers of 32 and 64 bits, from any kind of
-    file, are converted to smaller types, as described in `Volume`.
+    file, are converted to smaller types, as described in `Volume`. Of the levels of an OME-Zarr image, the
+    finest is read that takes at most a quarter of the memory; `render_bricks` takes finer ones.
 
     Ids of segments (labels) that are too large are replaced by 0, 1, 2, … in their order, and kept as
     `volume.label_ids`: those beyond 2**24 in a file whose voxels mostly equal their neighbours, and those of
@@ -132,7 +138,12 @@ def read(
     """What a file or folder holds, as arguments of `Volume`; those of which it says nothing are missing. The
     spacing is that of the volume, if the caller gives it."""
     path = _existing(path)
-    arguments = _one(path, _content(path, shape, dtype, spacing), {"time": time, "channel": channel})
+    index = {"time": time, "channel": channel}
+    read_folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
+    if read_folder is None or shape is not None or dtype is not None:
+        arguments = _one(path, _content(path, shape, dtype, spacing), index)
+    else:
+        arguments = read_folder(path, **index)
     data = arguments["data"]
     if nan is not None and data.dtype.kind == "f":
         arguments["data"] = np.where(np.isfinite(data), data, data.dtype.type(number("nan", nan)))
@@ -157,7 +168,11 @@ def _content(path: Path, shape: Any, dtype: Any, spacing: Any) -> dict[str, Any]
         return read_dicom(path, spacing)  # on discs their names often have no ending
     if path.is_dir() and tiff_files(path):
         return read_tiff_folder(path)
-    fault = "is a directory without DICOM and TIFF files" if path.is_dir() else "has an unknown ending"
+    fault = (
+        "is a directory without DICOM and TIFF files, and no Zarr"
+        if path.is_dir()
+        else "has an unknown ending"
+    )
     raise ValueError(
         f"path: {path} {fault}; expected a folder of these, or a file ending in "
         f"{', '.join(sorted((*RAW, *READERS, '.dcm')))}."

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ..._util.affine import directions
 from ..._util.checks import finite_array
 from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, decoding
-from .medical import directions, simple_itk, toward_axes
+from .medical import simple_itk, toward_axes
 
 
 UID = "1.2.840.10008."

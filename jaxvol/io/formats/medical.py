@@ -12,20 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from ..._util.affine import place_of
 from ..._util.files import MOST_VOXELS, check_size, decoding, file_size
 
 
 ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
-
-ROUNDED, SHEARED = 1e-3, 1e-4
-"""Greatest difference of a direction's length from 1, and greatest cosine between two that counts as a right
-angle: files hold directions of a few decimal places. A smaller shear misplaces no voxel of 1000 by more than
-a tenth; a greater one is kept, whether it was meant or not."""
-
-FLAT = 1e-3
-"""Directions whose determinant is not above this lie in a plane: `Volume` takes none."""
 
 
 def simple_itk(path: Path) -> Any:
@@ -107,29 +100,9 @@ def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, s
         return fields, stream.tell()
 
 
-def directions(what: str, columns: Any) -> np.ndarray:
-    """The directions (columns) that a file holds, of length 1; orthonormal if they are so but for rounding.
-    Raises `ValueError`, which begins with `what`, for other lengths, and for three in a plane."""
-    columns = np.asarray(columns, float)
-    lengths = np.linalg.norm(columns, axis=0)
-    columns = columns / np.where(lengths > 0, lengths, 1)
-    if not (np.all(np.abs(lengths - 1) <= ROUNDED) and abs(np.linalg.det(columns)) > FLAT):  # of NaN, too
-        told = np.round(columns * lengths, 4).T.tolist()
-        raise ValueError(f"{what} must be three directions of length 1, not all in a plane; got {told}.")
-    if np.abs(columns.T @ columns - np.eye(3)).max() > SHEARED:
-        return columns
-    left, _, right = np.linalg.svd(columns)
-    return left @ right
-
-
 def placed(what: str, data: np.ndarray, affine: np.ndarray) -> dict[str, Any]:
-    """Arguments of `Volume` for `data[i, j, k]` at `affine @ (i, j, k, 1)`. `what` begins the error of one
-    that places nothing."""
-    steps = np.linalg.norm(affine[:, :3], axis=0)
-    if not (np.all(steps > 0) and np.all(np.isfinite(affine))):
-        raise ValueError(f"{what} must be finite, with steps longer than 0; got {affine.tolist()}.")
-    turn = directions(what, affine[:, :3] / steps)
-    return toward_axes(data, steps, affine[:, 3], turn)
+    """Arguments of `Volume` for `data[i, j, k]` at `affine @ (i, j, k, 1)`; see `place_of`."""
+    return toward_axes(data, *place_of(what, affine).values())
 
 
 def toward_axes(data: np.ndarray, spacing: Any, origin: Any, direction: Any) -> dict[str, Any]:

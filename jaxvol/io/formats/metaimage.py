@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..._util.affine import directions
 from ..._util.files import as_array, check_size, decoding, file_size
-from .medical import check_volume, directions, text_header, toward_axes
+from .medical import check_volume, text_header, toward_axes
 
 
 NAMES = "CHAR UCHAR SHORT USHORT INT UINT LONG ULONG LONG_LONG ULONG_LONG FLOAT DOUBLE"

@@ -42,7 +42,7 @@ def read_nifti(path: Path) -> dict[str, Any]:
 
         kind, pixdim = int(header["datatype"]), header["pixdim"].astype(float)
         shape, channels = header["dim"][1 : 1 + max(header["dim"][0], 0)].tolist(), COLORS.get(kind, 1)
-        while len(shape) > 3 and shape[-1] == 1:
+        while len(shape) > 5 and shape[-1] == 1:
             shape.pop()
         check("magic", header["magic"] in (b"n+1", b"n+2"), "n+1 or n+2, of voxels in the same file")
         check("datatype", kind in TYPES or kind in COLORS, f"one of {[*TYPES, *COLORS]}")
