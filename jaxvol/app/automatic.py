@@ -184,7 +184,7 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
     dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
     more = np.arange(max(len(kinds) - len(dark_then_light), 0))
-    spread = np.stack([0.618034 * more % 1, 1 - 0.25 * (more % 3), 1 - 0.15 * (more % 4)], axis=-1)
+    spread = np.stack([0.618034 * more % 1, 1 - 0.25 * (more % 3), 1 - 0.2 * (more % 4)], axis=-1)
     colors = np.asarray(from_srgb(np.concatenate([dark_then_light, hsv_to_rgb(spread)])))
     values, opacity = [0, 0.35 * INSIDE, 0.65 * INSIDE], extinction_of([0.0, 0.0, 0.9], unit_of(volume))
     functions = {

@@ -72,7 +72,7 @@ def load(
     | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
-    | a folder that is a Zarr array or OME-Zarr image | its own; by tensorstore (`pip install jaxvol[bricks]`) |
+    | the folder of a Zarr array, or of an OME-Zarr image | its own; by tensorstore (`jaxvol[bricks]`) |
 
     Raw files store x fastest, like those of the Open SciVis datasets. The JSON file has the raw file's name
     with `.json` appended, or in place of `.raw` or `.raw.gz`, and the datasets' keys `size`, `type`,
