@@ -1,4 +1,5 @@
-"""Reads NIfTI-1 and NIfTI-2 images (`.nii`, `.nii.gz`), placed as nibabel, FSL and AFNI place them."""
+"""Reads NIfTI-1 and NIfTI-2 images (`.nii`, `.nii.gz`), placed as nibabel, FSL and AFNI place them. Writes
+NIfTI-1, in whose sform shears are kept, which SimpleITK removes."""
 
 import gzip
 import math
@@ -8,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ..._util.affine import SHEARED
 from ..._util.files import as_array, decoding, file_size, read_all
 from .medical import check_volume, placed
 
@@ -80,18 +82,47 @@ def _header(path: Path, stream: Any) -> np.void:
         size = int.from_bytes(begin, order)
         rest = stream.read(size - 4) if size in LAYOUTS else b""
         if len(begin + rest) == size:
-            formats, offsets = LAYOUTS[size]
-            layout = {
-                "names": NAMES.split(),
-                "formats": formats.split(),
-                "offsets": offsets,
-                "itemsize": size,
-            }
-            return np.frombuffer(begin + rest, np.dtype(layout).newbyteorder(mark))[0]
+            return np.frombuffer(begin + rest, _layout(size, mark))[0]
     raise ValueError(
         f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; this one "
         f"with the bytes {begin.hex(' ')}, of {len(begin + rest)}. Fetch or write it again."
     )
+
+
+def _layout(size: int, order: str) -> np.dtype:
+    formats, offsets = LAYOUTS[size]
+    fields = {"names": NAMES.split(), "formats": formats.split(), "offsets": offsets, "itemsize": size}
+    return np.dtype(fields).newbyteorder(order)
+
+
+def write_nifti(
+    path: Path,
+    data: np.ndarray,
+    spacing: np.ndarray,
+    origin: np.ndarray,
+    direction: np.ndarray,
+    *,
+    packed: bool,
+) -> None:
+    """Write voxels with an sform, and the same as a qform unless it is sheared, which no qform can be."""
+    if max(data.shape) >= 2**15:
+        raise ValueError(f"path: NIfTI-1 holds fewer than 32768 voxels along an axis; got {data.shape}.")
+    fields = np.zeros(1, _layout(348, "<"))
+    header, stored = fields[0], data.dtype.newbyteorder("<")
+    turn, offset = TO_LPS * direction.astype(float), TO_LPS[:, 0] * origin
+    hand = -1.0 if np.linalg.det(turn) < 0 else 1.0
+    header["dim"], header["pixdim"][:4] = (3, *data.shape, 1, 1, 1, 1), (hand, *spacing)
+    header["datatype"] = next(code for code, kind in TYPES.items() if np.dtype(kind) == data.dtype)
+    header["vox_offset"], header["slope"], header["magic"] = 352, 1, b"n+1"
+    header["sform_code"], header["sform"] = 1, np.column_stack([turn * spacing, offset])
+    if np.abs(turn.T @ turn - np.eye(3)).max() <= SHEARED:
+        vector = Rotation.from_matrix(turn * (1, 1, hand)).as_quat(canonical=True)[:3]
+        header["qform_code"], header["qform"] = 1, (*vector, *offset)
+    content = bytearray(fields.tobytes() + bytes(4))
+    content[:4], content[72:74] = (348).to_bytes(4, "little"), (8 * stored.itemsize).to_bytes(2, "little")
+    content[123] = 2  # mm
+    content += data.astype(stored).tobytes(order="F")
+    path.write_bytes(gzip.compress(content, 6) if packed else content)
 
 
 def _scaled(data: np.ndarray, slope: float, inter: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from ..._util.npy import VOLUME
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume, check_one_channel
 from .medical import simple_itk
+from .nifti import write_nifti
 
 
 ENDINGS = (".mha", ".nii", ".nii.gz", ".npz", ".nrrd")
@@ -23,8 +24,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     | ending | written |
     |---|---|
     | `.npz` | voxels, spacing, origin, direction, labels and their ids; compressed |
-    | `.nrrd`, `.mha` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
-    | `.nii`, `.nii.gz` | the same; spacing and direction are rounded, to about 1e-7 |
+    | `.nrrd`, `.mha` | voxels, spacing, origin, direction; by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nii`, `.nii.gz` | the same, rounded to about 1e-7, as sform and, unless sheared, as qform |
 
     Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a
     volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
@@ -71,6 +72,9 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
         if name.endswith(".npz"):
             with file.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
                 np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        elif name.endswith((".nii", ".nii.gz")):
+            place = arrays["spacing"], arrays["origin"], arrays.get("direction", np.eye(3))
+            write_nifti(file, arrays["data"], *place, packed=name.endswith(".gz"))
         else:
             _write_medical(arrays, file)
     return path
@@ -84,6 +88,6 @@ def _write_medical(arrays: dict[str, np.ndarray], path: Path) -> None:
     if "direction" in arrays:
         image.SetDirection(arrays["direction"].astype(float).ravel().tolist())
     try:
-        sitk.WriteImage(image, str(path), not path.name.lower().endswith(".nii"))
+        sitk.WriteImage(image, str(path), True)
     except RuntimeError as fault:
         raise ValueError(f"path: {path.name} cannot be written ({reason(fault)}).") from fault
