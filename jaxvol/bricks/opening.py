@@ -132,11 +132,13 @@ def is_zarr(path: Path) -> bool:
     return any((path / name).is_file() for name in METADATA)
 
 
-def read_zarr(path: Path, *, time: int | None = None, channel: int | None = None) -> dict[str, Any]:
+def read_zarr(
+    path: Path, *, time: int | None = None, channel: int | None = None, nan: float | None = None
+) -> dict[str, Any]:
     """Reader of `jv.load`, for the finest level that takes at most a quarter of the memory."""
     index = {axis: at for axis, at in (("t", time), ("c", channel)) if at is not None}
     try:
-        levels = levels_of(path, index=index)
+        levels = levels_of(path, index=index, nan=nan)
     except ValueError as fault:
         hint = " time= gives index['t'], and channel= index['c']." if "index" in str(fault) else ""
         raise ValueError(f"{fault}{hint}") from fault

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from .._util.axes import XYZ, Axes
-from .._util.checks import Arrayable, described, finite_array, require
+from .._util.checks import Arrayable, described, finite_array, integers, require
 from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
@@ -88,7 +88,7 @@ class Volume(eqx.Module):
         labels: Arrayable | None = None,
         *,
         direction: Arrayable | None = None,
-        label_ids: Sequence[int] | None = None,
+        label_ids: Arrayable | None = None,
         field: Field | Any | None = None,
     ):
         data, place = along_xyz(data) if is_named(data) else (data, {})
@@ -101,7 +101,7 @@ class Volume(eqx.Module):
         direction = place.get("direction") if direction is None else direction
         self.direction = None if direction is None else _checked_direction(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape[:3])
-        self.label_ids = None if label_ids is None else tuple(map(int, label_ids))
+        self.label_ids = None if label_ids is None else integers("label_ids", label_ids)
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()

@@ -42,8 +42,8 @@ READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
 }
 
 FOLDERS: list[tuple[Callable[[Path], bool], Callable[..., dict[str, Any]]]] = []
-"""Readers of other folders, which are given the path, `time` and `channel`, and before each what knows its
-folders: `bricks.opening` adds that of Zarr."""
+"""Readers of other folders, which are given the path, `time`, `channel` and `nan`; and before each, what knows
+its folders. `bricks.opening` adds that of Zarr."""
 
 
 def load(
@@ -143,12 +143,12 @@ def read(
     if read_folder is None or shape is not None or dtype is not None:
         arguments = _one(path, _content(path, shape, dtype, spacing), index)
     else:
-        arguments = read_folder(path, **index)
+        arguments = read_folder(path, **index, nan=nan)
     data = arguments["data"]
     if nan is not None and data.dtype.kind == "f":
         arguments["data"] = np.where(np.isfinite(data), data, data.dtype.type(number("nan", nan)))
     if data.dtype.kind in "iu" and not within(data, WHOLE["float32"]) and is_flat(data):
-        arguments |= _numbered("data", data)
+        arguments |= _numbered(data)
     return arguments
 
 
@@ -202,14 +202,12 @@ def _one(path: Path, arguments: dict[str, Any], given: dict[str, int | None]) ->
 def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
     found = read(path)
-    values = found["data"]
-    if values.dtype.kind == "f":
+    if (values := found["data"]).dtype.kind == "f":
         if not np.array_equal(values, np.rint(values)):
             raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
-        values = values.astype(np.int64)
-    if "label_ids" not in found and not within(values, WHOLE["uint8"]):
-        found |= _numbered("data", values)
-        values = found["data"]
+        found["data"] = values.astype(np.int64)
+    if "label_ids" not in found and not within(found["data"], WHOLE["uint8"]):
+        found |= _numbered(found["data"])
     labels = Volume(**found)
     here, there = map(_corners, (volume, labels))
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
@@ -218,14 +216,15 @@ def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
             f"{there.tolist()}."
         )
     place = volume.spacing, volume.origin
-    return Volume(volume.data, *place, values, direction=volume.direction, label_ids=labels.label_ids)
+    numbers = np.asarray(labels.data)  # float32 of more than 65536 kinds
+    numbers = numbers.astype(np.int32) if numbers.dtype.kind == "f" else numbers
+    return Volume(volume.data, *place, numbers, direction=volume.direction, label_ids=labels.label_ids)
 
 
-def _numbered(name: str, ids: np.ndarray) -> dict[str, Any]:
+def _numbered(ids: np.ndarray) -> dict[str, Any]:
     """Arguments of `Volume`: numbers in the order of the ids, in place of these, and the ids."""
     kinds, numbers = np.unique(ids, return_inverse=True)
-    numbers = numbers.reshape(ids.shape).astype(np.min_scalar_type(len(kinds) - 1))
-    return {name: numbers, "label_ids": kinds.tolist()}
+    return {"data": numbers.reshape(ids.shape), "label_ids": kinds.tolist()}
 
 
 def _corners(volume: Volume) -> np.ndarray:
