@@ -42,8 +42,8 @@ READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
 }
 
 FOLDERS: list[tuple[Callable[[Path], bool], Callable[..., dict[str, Any]]]] = []
-"""Readers of other folders, which are given the path, `time`, `channel` and `nan`; and before each, what knows
-its folders. `bricks.opening` adds that of Zarr."""
+"""What knows a kind of folder, and its reader, which is given the path, `time`, `channel` and `nan`.
+`bricks.opening` adds that of Zarr."""
 
 
 def load(

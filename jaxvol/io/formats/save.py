@@ -68,6 +68,10 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
         )
     parts = {part: getattr(volume, part) for part in VOLUME}
     arrays = {part: np.asarray(array) for part, array in parts.items() if array is not None}
+    if volume.label_ids:
+        arrays["label_ids"] = np.array(
+            volume.label_ids, np.uint64 if min(volume.label_ids) >= 0 else np.int64
+        )
     with whole_file(path) as file:
         if name.endswith(".npz"):
             with file.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
