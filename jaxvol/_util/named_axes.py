@@ -41,7 +41,7 @@ def _nibabel(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 def _simple_itk(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if image.GetDimension() != 3:
         raise ValueError(f"data must be a 3-D image; got one of size {image.GetSize()}. Extract one volume.")
-    data = sys.modules[type(image).__module__].GetArrayFromImage(image)
+    data = sys.modules["SimpleITK"].GetArrayFromImage(image)
     turn = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
     return np.swapaxes(data, 0, 2), place_of("data", np.column_stack([turn, image.GetOrigin()]))
 
@@ -51,7 +51,7 @@ def _vtk(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if scalars is None:
         raise ValueError("data must be an image with scalars at its points; got a vtkImageData without.")
     shape = (scalars.GetNumberOfComponents(), *image.GetDimensions())
-    data = np.moveaxis(np.asarray(memoryview(scalars)).reshape(shape, order="F"), 0, -1)
+    data = np.moveaxis(np.ravel(memoryview(scalars)).reshape(shape, order="F"), 0, -1)
     entries = [matrix.GetElement(i, j) for i in range(3) for j in range(3)]
     turn = np.reshape(entries, (3, 3)) * image.GetSpacing()
     origin = image.GetOrigin() + turn @ image.GetExtent()[::2]

@@ -140,8 +140,8 @@ def read_zarr(
     try:
         levels = levels_of(path, index=index, nan=nan)
     except ValueError as fault:
-        hint = " time= gives index['t'], and channel= index['c']." if "index" in str(fault) else ""
-        raise ValueError(f"{fault}{hint}") from fault
+        hint = f"path: {path}: time= or channel= is needed: " if "index['" in str(fault) else ""
+        raise ValueError(f"{hint}{fault}") from fault
     room = memory_of_device() // 4
     for level in levels:
         voxels = math.prod(level.shape)

@@ -221,6 +221,17 @@ def test_labels_are_shown_in_colours_of_their_own():
     assert opacity_at(jax.tree.map(lambda leaf: leaf[1], transfer.stacked), INSIDE, 0.02 * across) > 0.9
 
 
+def test_a_hundred_labels_have_a_hundred_colours():
+    data = np.zeros((60, 12, 12), np.uint8)
+    for k in range(117):
+        x, y = divmod(k, 9)
+        data[4 * x : 4 * x + 4, y, 1:11] = k + 1
+    shown = labels_shown(jv.Volume(np.repeat(data, 3, axis=0)))
+    assert shown is not None
+    colors = np.asarray(shown[1].stacked.colors)[1:118, 0]
+    assert len(np.unique(colors.round(3), axis=0)) == 117
+
+
 def test_other_volumes_are_not_taken_for_labels():
     for name in ("head", "engine", "colon", "vessels"):
         assert labels_shown(jv.phantom(name, 24)) is None

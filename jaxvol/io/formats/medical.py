@@ -34,6 +34,8 @@ def read_nrrd(path: Path) -> dict[str, Any]:
     """Reader for `.nrrd` and `.nhdr`."""
     file_size(path)
     sitk = simple_itk(path)
+    fields, begin, source = nrrd_header(path)
+    encoding, spacings = fields.get("encoding", "").lower(), fields.get("spacings", "1 1 1")
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO")
     reader.SetFileName(str(path))
@@ -41,14 +43,12 @@ def read_nrrd(path: Path) -> dict[str, Any]:
         reader.ReadImageInformation()
         size, channels = reader.GetSize(), reader.GetNumberOfComponents()
         check_volume(path, size, channels)
+        # axes of no space have NaN; SimpleITK takes 1 for what is wrong
+        lengths = [float(word) for word in spacings.split() if word.lower() != "nan"]
+        if len(lengths) < 3 or not all(0 < each < math.inf for each in lengths):
+            raise ValueError(f"path: {path}: spacings must be positive, for 3 axes; got {spacings[:80]!r}.")
         component = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
         expected = math.prod(size) * channels * component
-        fields, begin, source = nrrd_header(path)
-        encoding, spacings = fields.get("encoding", "").lower(), fields.get("spacings", "1 1 1")
-        # axes of no space have NaN; SimpleITK takes 1 for what is wrong
-        told = [float(word) for word in spacings.split() if word.lower() != "nan"]
-        if len(told) < 3 or not all(0 < each < math.inf for each in told):
-            raise ValueError(f"path: {path}: spacings must be positive, for 3 axes; got {spacings[:80]!r}.")
         if encoding not in ("raw", "gzip", "gz") or not source.is_file():
             raise ValueError(
                 f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
