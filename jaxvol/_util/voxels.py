@@ -42,7 +42,7 @@ def voxel_array(data: Arrayable) -> Array:
         beyond = f" in {stored.dtype}, as they are stored" if np.all(finite(np.asarray(data))) else ""
         raise ValueError(
             f"data must be finite{beyond}; got {np.sum(~finite(stored))} of {stored.size} voxels that are "
-            "NaN or infinite. Replace them, or rescale all, first; of a file, jv.load(path, nan=VALUE) does."
+            "NaN or infinite. Replace them, or rescale all, first: jv.load(path, nan=VALUE), --nan VALUE."
         )
     return _on_device(stored if stored.dtype != data.dtype else data)
 

@@ -146,7 +146,7 @@ def read_zarr(
     for level in levels:
         voxels = math.prod(level.shape)
         if voxels <= MOST_VOXELS and voxels * level.dtype.itemsize <= room:
-            place = {"spacing": level.spacing, "origin": level.origin}
+            place = {} if _is_zarr_array(path) else {"spacing": level.spacing, "origin": level.origin}
             return {"data": level.read((0, 0, 0), level.shape)} | place
     raise ValueError(
         f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {levels[-1].shape} "

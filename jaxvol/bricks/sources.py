@@ -209,7 +209,7 @@ class VoxelSource:
         except Exception as fault:  # of whatever library
             raise ValueError(
                 f"{self.name}: the voxels {where} cannot be read ({fault}). Fetch it again; or, where Zarr "
-                'left out chunks of only the fill value, pass missing="fill".'
+                'left out chunks of only the fill value, pass missing="fill" to jv.bricks.source_of.'
             ) from fault
         expected = tuple(size[axis] for axis in sorted(size))
         if found.shape != expected:

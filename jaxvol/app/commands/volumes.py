@@ -71,6 +71,8 @@ def _info(options: argparse.Namespace) -> None:
     if volume.labels is not None:
         found = np.unique(np.asarray(volume.labels))
         rows["labels"] = f"{found.size}, from {found[0]} to {found[-1]}"
+    if ids := volume.label_ids:
+        rows["ids"] = f"{len(ids)}, from {ids[0]} to {ids[-1]}; voxels hold their numbers"
     for name, text in rows.items():
         print(f"{name:12} {text}")
 
