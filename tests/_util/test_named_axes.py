@@ -66,8 +66,7 @@ def of_nibabel(data):
 def of_vtk(data):
     """Of an image that begins at the point (2, 1, 0) of its grid."""
     vtk = pytest.importorskip("vtk")
-    from vtk.util.numpy_support import numpy_to_vtk
-
+    numpy_to_vtk = pytest.importorskip("vtk.util.numpy_support").numpy_to_vtk
     image = vtk.vtkImageData()
     image.SetExtent(2, 6, 1, 4, 0, 2)
     image.SetSpacing(PLACE[0])

@@ -183,14 +183,14 @@ def _one(path: Path, arguments: dict[str, Any], given: dict[str, int | None]) ->
     """The arguments with the volume that these indices choose, by `axes`, which are left out."""
     data = arguments["data"]
     axes = arguments.pop("axes", "xyzs"[: data.ndim])
-    names = {"t": "time", "c" if "c" in axes else "s": "channel"}
+    letters = {"time": "t", "channel": "c" if "c" in axes else "s"}
     sizes = ", ".join(f"{axis} {n}" for axis, n in zip(axes, data.shape, strict=False))
-    for letter, name in names.items():
+    for name, letter in letters.items():
         if given[name] is not None and letter not in axes:
             raise ValueError(f"{name}: {path} has no such axis; it holds {sizes}.")
     for at in reversed(range(3, len(axes))):
-        name, count = names.get(axes[at], axes[at]), data.shape[at]
-        index = given.get(name)
+        name = "time" if axes[at] == "t" else "channel"
+        index, count = given[name] if letters[name] == axes[at] else None, data.shape[at]
         if index is None and count > 1:
             if axes[at] == "s":
                 continue  # the volume's channels

@@ -21,8 +21,8 @@ LAYOUTS = {
 }
 """Types and places of these fields, by the size of the header, with which it begins."""
 
-CODES = (2, 4, 8, 16, 64, 256, 512, 768, 1024, 1280)
-TYPES = dict(zip(CODES, ("u1", "i2", "i4", "f4", "f8", "i1", "u2", "u4", "i8", "u8"), strict=True))
+TYPES = {2: "u1", 4: "i2", 8: "i4", 16: "f4", 64: "f8", 256: "i1", 512: "u2", 768: "u4", 1024: "i8"}
+TYPES[1280] = "u8"
 COLORS = {128: 3, 2304: 4}
 """How many bytes the types of colours have."""
 
@@ -78,8 +78,8 @@ def read_nifti(path: Path) -> dict[str, Any]:
 def _header(path: Path, stream: Any) -> np.void:
     """The fields of the header, at whose end the stream then stands."""
     begin = stream.read(4)
-    for order, mark in (("little", "<"), ("big", ">")):
-        size = int.from_bytes(begin, order)
+    for mark in "<>":
+        size = int(np.frombuffer(begin, f"{mark}i4")[0]) if len(begin) == 4 else 0
         rest = stream.read(size - 4) if size in LAYOUTS else b""
         if len(begin + rest) == size:
             return np.frombuffer(begin + rest, _layout(size, mark))[0]
@@ -91,8 +91,8 @@ def _header(path: Path, stream: Any) -> np.void:
 
 def _layout(size: int, order: str) -> np.dtype:
     formats, offsets = LAYOUTS[size]
-    fields = {"names": NAMES.split(), "formats": formats.split(), "offsets": offsets, "itemsize": size}
-    return np.dtype(fields).newbyteorder(order)
+    names, kinds = NAMES.split(), [np.dtype(f"{order}{kind}") for kind in formats.split()]
+    return np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": size})
 
 
 def write_nifti(

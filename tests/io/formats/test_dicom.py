@@ -160,7 +160,7 @@ def test_a_tilted_gantry_makes_a_sheared_volume(tmp_path):
     step = np.array([0, 0.5, SPACING[2]])
     expected = np.column_stack([np.eye(3)[:, :2], step / np.linalg.norm(step)])
     np.testing.assert_allclose(np.asarray(volume.direction), expected, atol=1e-6)
-    np.testing.assert_allclose(volume.spacing, (*SPACING[:2], np.linalg.norm(step)), rtol=1e-6)
+    np.testing.assert_allclose(volume.spacing, [*SPACING[:2], float(np.linalg.norm(step))], rtol=1e-6)
     np.testing.assert_allclose(volume.origin, ORIGIN, rtol=1e-6)
 
 

@@ -1,6 +1,7 @@
 """Are NIfTI files read as nibabel reads them, and wrong headers refused by the name of the field?"""
 
 import gzip
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,11 +117,12 @@ def test_one_of_several_volumes_is_chosen_by_its_time_and_channel(tmp_path):
     made.set_data_dtype("uint16")
     path = write(tmp_path / "a.nii", made, data)
     np.testing.assert_array_equal(load(path, time=1, channel=4).data, data[..., 1, 4])
-    for index, message in (
+    wrong: list[tuple[Any, str]] = [
         ({}, r"channel must be given, from 0 to 5: .*a.nii holds x 5, y 4, z 3, t 2, c 6, s 1"),
         ({"channel": 0}, "time must be given, from 0 to 1"),
         ({"channel": 0, "time": 2}, "time must be an integer from 0 to 1; got 2"),
-    ):
+    ]
+    for index, message in wrong:
         with pytest.raises(ValueError, match=message):
             load(path, **index)
     colors = header(datatype=128)
