@@ -80,12 +80,11 @@ def _header(path: Path, stream: Any) -> np.void:
     begin = stream.read(4)
     for mark in "<>":
         size = int(np.frombuffer(begin, f"{mark}i4")[0]) if len(begin) == 4 else 0
-        rest = stream.read(size - 4) if size in LAYOUTS else b""
-        if len(begin + rest) == size:
+        if size in LAYOUTS and len(rest := stream.read(size - 4)) == size - 4:
             return np.frombuffer(begin + rest, _layout(size, mark))[0]
     raise ValueError(
-        f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; this one "
-        f"with the bytes {begin.hex(' ')}, of {len(begin + rest)}. Fetch or write it again."
+        f"path: {path} cannot be read: a NIfTI file begins with a header of 348 or 540 bytes, and these with "
+        f"that number; this one with the bytes {begin.hex(' ')}. Fetch or write it again."
     )
 
 
@@ -95,21 +94,14 @@ def _layout(size: int, order: str) -> np.dtype:
     return np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": size})
 
 
-def write_nifti(
-    path: Path,
-    data: np.ndarray,
-    spacing: np.ndarray,
-    origin: np.ndarray,
-    direction: np.ndarray,
-    *,
-    packed: bool,
-) -> None:
-    """Write voxels with an sform, and the same as a qform unless it is sheared, which no qform can be."""
+def write_nifti(path: Path, arrays: dict[str, np.ndarray], *, packed: bool) -> None:
+    """Write a volume's arrays with an sform, and the same as a qform unless it is sheared, as no qform is."""
+    data, spacing = arrays["data"], arrays["spacing"]
     if max(data.shape) >= 2**15:
         raise ValueError(f"path: NIfTI-1 holds fewer than 32768 voxels along an axis; got {data.shape}.")
     fields = np.zeros(1, _layout(348, "<"))
     header, stored = fields[0], data.dtype.newbyteorder("<")
-    turn, offset = TO_LPS * direction.astype(float), TO_LPS[:, 0] * origin
+    turn, offset = TO_LPS * arrays.get("direction", np.eye(3)), TO_LPS[:, 0] * arrays["origin"]
     hand = -1.0 if np.linalg.det(turn) < 0 else 1.0
     header["dim"], header["pixdim"][:4] = (3, *data.shape, 1, 1, 1, 1), (hand, *spacing)
     header["datatype"] = next(code for code, kind in TYPES.items() if np.dtype(kind) == data.dtype)

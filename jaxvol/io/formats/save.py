@@ -77,8 +77,7 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
             with file.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
                 np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
         elif name.endswith((".nii", ".nii.gz")):
-            place = arrays["spacing"], arrays["origin"], arrays.get("direction", np.eye(3))
-            write_nifti(file, arrays["data"], *place, packed=name.endswith(".gz"))
+            write_nifti(file, arrays, packed=name.endswith(".gz"))
         else:
             _write_medical(arrays, file)
     return path
