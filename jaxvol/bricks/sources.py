@@ -219,6 +219,8 @@ class VoxelSource:
             )
         if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
             raise ValueError(f"{self.name}: voxels {where} are masked. Fill them first.")
+        if self._nan is not None and found.dtype.kind not in "biu":
+            found = np.where(np.isfinite(found), found, found.dtype.type(self._nan))
         if self.dtype == np.float32 and found.dtype.kind in "iu":
             (least, most), (low, high) = WHOLE["float32"], (int(found.min()), int(found.max()))
             if low < least or high > most:
@@ -230,8 +232,6 @@ class VoxelSource:
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
             voxels = np.ascontiguousarray(found.transpose(permuted(rank, axes)), self.dtype)
         if self.dtype.kind not in "iu" and not np.isfinite(voxels).all():
-            if self._nan is not None:
-                return np.where(np.isfinite(voxels), voxels, voxels.dtype.type(self._nan))
             raise ValueError(
                 f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite "
                 f"{where}. Replace them first, or give nan=VALUE."

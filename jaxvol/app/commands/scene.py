@@ -94,6 +94,8 @@ def scene_of(
         volume, transfer = shown
     else:
         header = {name: value for name, value in header_of(options).items() if value is not None}
+        if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
+            header["index"] = index
         try:
             source = levels_of(options.file, **header)[0]
         except TypeError as fault:  # such as a shape of what is no raw file

@@ -113,7 +113,7 @@ def load(
             header says, or without a header; for an image that is not 3-D; where it holds several, and
             `time` or `channel` does not say which; for several DICOM series in a folder, or slices that do
             not fit together; for labels that lie elsewhere; and for anything that `Volume` rejects.
-        ImportError: for a format that needs SimpleITK, tifffile or imagecodecs if it is missing.
+        ImportError: for a format that needs SimpleITK, tifffile, imagecodecs or tensorstore if it is missing.
     """
     arguments = read(path, shape, dtype, spacing=spacing, nan=nan, time=time, channel=channel)
     given = {"spacing": spacing, "origin": origin, "direction": direction}

@@ -126,6 +126,9 @@ def test_ids_of_labels_are_numbered_and_kept(tmp_path):
     assert volume.label_ids == kinds["wide"]
     with pytest.raises(ValueError, match=r"has labels, for which a\.nrrd has no place"):
         jv.save(volume, tmp_path / "a.nrrd")
+    for ids in (5, [0.5, 1.0], [[1, 2]]):
+        with pytest.raises(ValueError, match="label_ids"):
+            jv.Volume(number, label_ids=ids)
     np.save(tmp_path / "counts.npy", ramp("int64") * 2**25)
     with pytest.raises(ValueError, match=r"data must be whole numbers from -2\*\*24"):
         jv.load(tmp_path / "counts.npy")
