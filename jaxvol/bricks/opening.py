@@ -58,7 +58,7 @@ def levels_of(
     | `thing` | read |
     |---|---|
     | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
-    | an xarray `DataArray`; an image of nibabel, SimpleITK, VTK | as by `Volume`; of a lazy one pass `.data` |
+    | an xarray `DataArray`; an image of nibabel, SimpleITK, VTK | as by `Volume`; lazy: pass `.data` |
     | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
     | path of a `.npy` file, data[x, y, z] | by `np.lib.format.open_memmap` |
     | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
@@ -71,8 +71,8 @@ def levels_of(
         **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes`, `index` and `nan`: see
             `VoxelSource`; the axes of Zarr are by default its own (`dimension_names`, or xarray's
             `_ARRAY_DIMENSIONS` in version 2). `missing`: what it means if a chunk of a path's Zarr array is
-            not there: `"error"`, the default, that the data are incomplete; `"fill"`, that all its voxels have
-            the fill value, as where programs leave out such chunks.
+            not there: `"error"`, the default, that the data are incomplete; `"fill"`, that all its voxels
+            have the fill value, as where programs leave out such chunks.
 
     Returns:
         A source for each level.

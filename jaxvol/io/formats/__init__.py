@@ -67,7 +67,7 @@ def load(
     | `.npy` | its own; the array is data[x, y, z] |
     | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
     | `.mha`, `.mhd` | its own |
-    | `.nii`, `.nii.gz` | its own: the sform if its code is positive, else the qform, else `pixdim` |
+    | `.nii`, `.nii.gz` | its own: the sform if its code is positive, else the qform, else `pixdim`; in mm |
     | `.nrrd`, `.nhdr` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
     | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
@@ -147,7 +147,7 @@ def read(
     data = arguments["data"]
     if nan is not None and data.dtype.kind == "f":
         arguments["data"] = np.where(np.isfinite(data), data, data.dtype.type(number("nan", nan)))
-    if data.dtype.kind in "iu" and not within(data, WHOLE["float32"]) and is_flat(data):
+    if data.dtype.kind in "iu" and data.itemsize > 2 and not within(data, WHOLE["float32"]) and is_flat(data):
         arguments |= _numbered(data)
     return arguments
 

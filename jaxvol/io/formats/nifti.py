@@ -14,10 +14,16 @@ from ..._util.files import as_array, decoding, file_size, read_all
 from .medical import check_volume, placed
 
 
-NAMES = "dim datatype pixdim vox_offset slope inter qform_code sform_code qform sform magic"
+NAMES = "dim datatype pixdim vox_offset slope inter qform_code sform_code qform sform magic units"
 LAYOUTS = {
-    348: ("8i2 i2 8f4 f4 f4 f4 i2 i2 6f4 (3,4)f4 S3", (40, 70, 76, 108, 112, 116, 252, 254, 256, 280, 344)),
-    540: ("8i8 i2 8f8 i8 f8 f8 i4 i4 6f8 (3,4)f8 S3", (16, 12, 104, 168, 176, 184, 344, 348, 352, 400, 4)),
+    348: (
+        "8i2 i2 8f4 f4 f4 f4 i2 i2 6f4 (3,4)f4 S3 u1",
+        (40, 70, 76, 108, 112, 116, 252, 254, 256, 280, 344, 123),
+    ),
+    540: (
+        "8i8 i2 8f8 i8 f8 f8 i4 i4 6f8 (3,4)f8 S3 i4",
+        (16, 12, 104, 168, 176, 184, 344, 348, 352, 400, 4, 500),
+    ),
 }
 """Types and places of these fields, by the size of the header, with which it begins."""
 
@@ -32,7 +38,8 @@ TO_LPS = np.array([[-1.0], [-1.0], [1.0]])
 
 def read_nifti(path: Path) -> dict[str, Any]:
     """Reader for `.nii` and `.nii.gz`. The sform places voxels if its code is positive, with its scales and
-    shears; else the qform, if its is; else `pixdim` is their spacing, along axes as in the file."""
+    shears; else the qform, if its is; else `pixdim` is their spacing, along axes as in the file. Lengths in m
+    or µm, which other readers leave so, become mm."""
     file_size(path)
     packed = path.name.lower().endswith(".gz")
     with decoding(path), gzip.open(path) if packed else path.open("rb") as stream:
@@ -60,19 +67,19 @@ def read_nifti(path: Path) -> dict[str, Any]:
     if channels == 1 and slope and math.isfinite(slope) and (slope, inter) != (1, 0):
         check("inter", math.isfinite(inter), "finite")
         data = _scaled(data, slope, inter)
-    axes = {"axes": "xyztc"[: len(shape)] + "s"}
+    axes, unit = {"axes": "xyztc"[: len(shape)] + "s"}, {1: 1e3, 3: 1e-3}.get(int(header["units"]) & 7, 1.0)
     if header["sform_code"] > 0:
-        return placed(f"path: {path}: its sform", data, TO_LPS * header["sform"].astype(float)) | axes
+        return placed(f"path: {path}: its sform", data, unit * TO_LPS * header["sform"]) | axes
     check("pixdim", np.all(pixdim[1:4] > 0) and np.all(np.isfinite(pixdim[1:4])), "positive lengths")
     if header["qform_code"] <= 0:
-        return {"data": data, "spacing": pixdim[1:4]} | axes
+        return {"data": data, "spacing": unit * pixdim[1:4]} | axes
     vector = header["qform"][:3].astype(float)
     real = 1 - vector @ vector
     check("qform", real > -1e-3, "a quaternion of length 1, and an offset")
     turn = Rotation.from_quat([*vector, max(real, 0.0) ** 0.5]).as_matrix()
     turn = turn * pixdim[1:4] * (1, 1, -1 if pixdim[0] < 0 else 1)
     affine = np.column_stack([turn, header["qform"][3:]])
-    return placed(f"path: {path}: its qform", data, TO_LPS * affine) | axes
+    return placed(f"path: {path}: its qform", data, unit * TO_LPS * affine) | axes
 
 
 def _header(path: Path, stream: Any) -> np.void:
@@ -105,14 +112,13 @@ def write_nifti(path: Path, arrays: dict[str, np.ndarray], *, packed: bool) -> N
     hand = -1.0 if np.linalg.det(turn) < 0 else 1.0
     header["dim"], header["pixdim"][:4] = (3, *data.shape, 1, 1, 1, 1), (hand, *spacing)
     header["datatype"] = next(code for code, kind in TYPES.items() if np.dtype(kind) == data.dtype)
-    header["vox_offset"], header["slope"], header["magic"] = 352, 1, b"n+1"
+    header["vox_offset"], header["slope"], header["magic"], header["units"] = 352, 1, b"n+1", 2  # mm
     header["sform_code"], header["sform"] = 1, np.column_stack([turn * spacing, offset])
     if np.abs(turn.T @ turn - np.eye(3)).max() <= SHEARED:
         vector = Rotation.from_matrix(turn * (1, 1, hand)).as_quat(canonical=True)[:3]
         header["qform_code"], header["qform"] = 1, (*vector, *offset)
     content = bytearray(fields.tobytes() + bytes(4))
     content[:4], content[72:74] = (348).to_bytes(4, "little"), (8 * stored.itemsize).to_bytes(2, "little")
-    content[123] = 2  # mm
     content += data.astype(stored).tobytes(order="F")
     path.write_bytes(gzip.compress(content, 6) if packed else content)
 

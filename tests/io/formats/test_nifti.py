@@ -70,14 +70,15 @@ def test_voxels_lie_and_are_scaled_as_nibabel_says(tmp_path_factory, data):
     for row, name in zip(sform, "xyz", strict=True):
         made[f"srow_{name}"] = row
     made["scl_slope"], made["scl_inter"] = draw(st.sampled_from([0, 1, 0.5, -2, np.nan])), draw(numbers)
+    made["xyzt_units"], unit = draw(st.sampled_from([(0, 1), (1, 1e3), (2 + 8, 1), (3, 1e-3)]))
     path = write(tmp_path_factory.mktemp("a") / draw(st.sampled_from(["a.nii", "a.nii.gz"])), made)
 
     volume, image = load(path), nibabel.load(path)
     # where both codes are 0, nibabel turns the first axis, and centres: we leave axes as they are in the file
     affine = image.affine if max(codes) > 0 else np.diag([-1, -1, 1, 1] * np.append(made.get_zooms(), 1))
     found = places(np.asarray(volume.data, float), affine_of(volume))
-    expected = places(image.get_fdata(), np.diag([-1, -1, 1, 1]) @ affine)
-    np.testing.assert_allclose(found[0], expected[0], rtol=1e-4, atol=1e-3)
+    expected = places(image.get_fdata(), unit * np.diag([-1, -1, 1, 1]) @ affine)
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-4, atol=1e-3 * unit)
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-6, atol=1e-6)
 
 
