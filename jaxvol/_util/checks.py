@@ -174,6 +174,13 @@ def integer(name: str, value: Any, least: int, most: int | None = None, *, other
     return whole
 
 
+def integers(name: str, values: Any) -> tuple[int, ...]:
+    """A sequence of integers of at most 64 bits."""
+    if np.ndim(values) != 1:
+        raise ValueError(f"{name} must be a sequence of integers; got {described(values)}.")
+    return tuple(integer(f"{name}[{k}]", each, -(2**63), 2**64 - 1) for k, each in enumerate(values))
+
+
 def is_flag(value: Any) -> bool:
     """Whether a value is Python's or NumPy's True or False."""
     return isinstance(value, bool | np.bool_)

@@ -34,12 +34,13 @@ def file_size(path: Path) -> int:
     return size
 
 
-def read_all(path: Path, stream: Stream, expected: int) -> bytearray:
-    """All bytes of a stream, which must be `expected`; at most one more is read."""
+def read_all(path: Path, stream: Stream, expected: int, *, more: bool = False) -> bytearray:
+    """All bytes of a stream, which must be `expected`; at most one further is read. `more`: others follow."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing
     while chunk := stream.read(min(expected + 1 - len(content), CHUNK)):
         content += chunk
-    check_size(path, len(content), expected)
+    check_size(path, len(content), expected, more=more)
+    del content[expected:]
     return content
 
 
@@ -55,9 +56,12 @@ def check_size(path: Path, size: int, expected: int, *, more: bool = False) -> N
 
 @contextmanager
 def decoding(path: Path) -> Iterator[None]:
-    """Turn any error of a decoder within the context into the `ValueError` of a corrupt file."""
+    """Turn any error of a decoder within the context into a `ValueError` that says what is wrong."""
     try:
         yield
+    except RuntimeError as fault:  # also of whole files
+        told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
+        raise ValueError(f"path: {path} cannot be read: {told}") from fault
     except CORRUPT as fault:
         told = f"corrupt, cut short or incomplete ({reason(fault)})"
         raise ValueError(f"path: {path} cannot be read: {told}.") from fault

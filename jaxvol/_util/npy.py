@@ -9,7 +9,7 @@ import numpy as np
 from .files import CORRUPT, MOST_VOXELS, Stream, as_array, check_size, decoding, file_size, read_all
 
 
-VOLUME = ("data", "spacing", "origin", "direction", "labels")
+VOLUME = ("data", "spacing", "origin", "direction", "labels", "label_ids")
 """Arguments of `Volume` that a `.npz` file may hold."""
 
 

@@ -18,6 +18,9 @@ WHOLE = {name: (int(np.iinfo(name).min), int(np.iinfo(name).max)) for name in DT
 WHOLE["float32"] = -(2**24), 2**24
 """The range of integers that each type holds exactly, smallest type first."""
 
+FLAT = 0.8
+"""The fraction of voxels from which on `is_flat` says so."""
+
 
 def voxel_array(data: Arrayable) -> Array:
     """`data` as an array of JAX of a supported type, which is checked to hold finite voxels."""
@@ -39,7 +42,7 @@ def voxel_array(data: Arrayable) -> Array:
         beyond = f" in {stored.dtype}, as they are stored" if np.all(finite(np.asarray(data))) else ""
         raise ValueError(
             f"data must be finite{beyond}; got {np.sum(~finite(stored))} of {stored.size} voxels that are "
-            "NaN or infinite. Replace them, or rescale all, first."
+            "NaN or infinite. Replace them, or rescale all, first: jv.load(path, nan=VALUE), --nan VALUE."
         )
     return _on_device(stored if stored.dtype != data.dtype else data)
 
@@ -85,6 +88,18 @@ def _narrow(data: Array | np.ndarray) -> np.ndarray:
         "data must be whole numbers from -2**24 to 2**24, which float32 holds exactly; got "
         f"{data.dtype} from {low} to {high}. Subtract an offset, or rescale them to data.astype(np.float32)."
     )
+
+
+def within(integers: np.ndarray, ends: tuple[int, int]) -> bool:
+    """Whether all lie from the first to the last of these."""
+    return ends[0] <= int(integers.min()) and int(integers.max()) <= ends[1]
+
+
+def is_flat(data: np.ndarray) -> bool:
+    """Whether most voxels equal their neighbour, as those of segments do, and grey values do not: of those
+    above the lowest, 0.92 in a segmented frog, 0.46 at most in scans, simulations and phantoms."""
+    above = data[:-1] != data.min()
+    return bool(above.any() and np.mean(data[:-1][above] == data[1:][above]) >= FLAT)
 
 
 def label_array(labels: Arrayable, shape: tuple[int, ...]) -> Array:

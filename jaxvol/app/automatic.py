@@ -9,6 +9,7 @@ from jaxtyping import Float, Shaped
 
 from .._util.checks import described
 from .._util.srgb import from_srgb
+from .._util.voxels import is_flat
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import TransferFunction, extinction_of
 from ..scene.volume import Volume, check_one_channel
@@ -26,9 +27,9 @@ ROUGH, NOISY = 0.7, 0.1
 """Grain has second differences above this fraction of first differences over two steps (0.6 at most in scans,
 0.8 in ultrasound, 1.7 in white noise), and above this fraction of the distance of the thresholds."""
 
-FLAT, MOST_LABELS = 0.8, 64
-"""Whole numbers are labels if this fraction of those above the lowest equal their neighbour (0.92 in a
-segmented frog, 0.46 at most in scans, simulations and phantoms), and no more than so many differ."""
+MOST_LABELS = 256
+"""Whole numbers are labels if most equal their neighbour, and no more than so many differ, the lowest among
+them: a `LabelTransferFunction` has no more."""
 
 INSIDE = 255  # value of what has a label, in the volume that is shown
 
@@ -165,14 +166,11 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     """A volume and a transfer function that show each label but the lowest in its own colour; None if there
     are no labels. The volume is smooth, 255 inside of all labels, and its labels reach two voxels beyond."""
     import matplotlib
-    from matplotlib.colors import ListedColormap
+    from matplotlib.colors import ListedColormap, hsv_to_rgb
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     data = np.asarray(volume.data)
-    if data.dtype.kind not in "iu":
-        return None
-    above = data[:-1] != data.min()
-    if not above.any() or np.mean(data[:-1][above] == data[1:][above]) < FLAT:
+    if data.dtype.kind not in "iu" or not is_flat(data):
         return None
     kinds = np.unique(data)
     if not 2 < len(kinds) <= MOST_LABELS:
@@ -185,10 +183,11 @@ def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
     shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
     tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
     dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
-    colors = np.asarray(from_srgb(dark_then_light))
+    more = np.arange(max(len(kinds) - len(dark_then_light), 0))
+    spread = np.stack([0.618034 * more % 1, 1 - 0.25 * (more % 3), 1 - 0.2 * (more % 4)], axis=-1)
+    colors = np.asarray(from_srgb(np.concatenate([dark_then_light, hsv_to_rgb(spread)])))
     values, opacity = [0, 0.35 * INSIDE, 0.65 * INSIDE], extinction_of([0.0, 0.0, 0.9], unit_of(volume))
     functions = {
-        label: TransferFunction(values, [colors[(label - 1) % len(colors)]] * 3, opacity)
-        for label in range(1, len(kinds))
+        label: TransferFunction(values, [colors[label - 1]] * 3, opacity) for label in range(1, len(kinds))
     }
     return shown, LabelTransferFunction(functions)

@@ -16,8 +16,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described
-from .._util.files import check_size, file_size
+from .._util.files import MOST_VOXELS, check_size, file_size
+from .._util.memory import memory_of_device
 from .._util.named_axes import along_xyz, is_named
+from ..io.formats import FOLDERS
 from ..io.formats.raw import raw_header
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume, check_one_channel
@@ -56,7 +58,7 @@ def levels_of(
     | `thing` | read |
     |---|---|
     | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
-    | an xarray `DataArray` | whole, its axes and coordinates as in `Volume`; of a lazy one pass `.data` |
+    | an xarray `DataArray`; an image of nibabel, SimpleITK, VTK | as by `Volume`; lazy: pass `.data` |
     | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
     | path of a `.npy` file, data[x, y, z] | by `np.lib.format.open_memmap` |
     | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
@@ -66,11 +68,11 @@ def levels_of(
         thing: what holds the voxels.
         spacing: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
         origin: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
-        **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes` and `index`: see `VoxelSource`;
-            the axes of Zarr are by default its own (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in
-            version 2). `missing`: what it means if a chunk of a path's Zarr array is not there: `"error"`,
-            the default, that the data are incomplete; `"fill"`, that all its voxels have the fill value, as
-            where programs leave out such chunks.
+        **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes`, `index` and `nan`: see
+            `VoxelSource`; the axes of Zarr are by default its own (`dimension_names`, or xarray's
+            `_ARRAY_DIMENSIONS` in version 2). `missing`: what it means if a chunk of a path's Zarr array is
+            not there: `"error"`, the default, that the data are incomplete; `"fill"`, that all its voxels
+            have the fill value, as where programs leave out such chunks.
 
     Returns:
         A source for each level.
@@ -105,7 +107,7 @@ def levels_of(
         raise ValueError(f"path: there is no file {path} (working directory {Path.cwd()}).")
     if _is_zarr_array(path):
         return (_zarr_array(path, **place, **options),)
-    if any((path / name).is_file() for name in METADATA):
+    if is_zarr(path):
         return _ome_zarr_levels(path, **place, **options)
     if path.suffix.lower() == ".raw":
         size, stored, own = raw_header(path, options.pop("shape", None), options.pop("dtype", None), 48)
@@ -123,6 +125,36 @@ def levels_of(
         "the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as DICOM slices, as "
         "jv.load(path) or jv.load_ultrasound(path), and of HDF5 the array h5py.File(path)[name]."
     )
+
+
+def is_zarr(path: Path) -> bool:
+    """Whether a folder is a Zarr array or group."""
+    return any((path / name).is_file() for name in METADATA)
+
+
+def read_zarr(
+    path: Path, *, time: int | None = None, channel: int | None = None, nan: float | None = None
+) -> dict[str, Any]:
+    """Reader of `jv.load`, for the finest level that takes at most a quarter of the memory."""
+    index = {axis: at for axis, at in (("t", time), ("c", channel)) if at is not None}
+    try:
+        levels = levels_of(path, index=index, nan=nan)
+    except ValueError as fault:
+        hint = f"path: {path}: time= or channel= is needed: " if "index['" in str(fault) else ""
+        raise ValueError(f"{hint}{fault}") from fault
+    room = memory_of_device() // 4
+    for level in levels:
+        voxels = math.prod(level.shape)
+        if voxels <= MOST_VOXELS and voxels * level.dtype.itemsize <= room:
+            place = {} if _is_zarr_array(path) else {"spacing": level.spacing, "origin": level.origin}
+            return {"data": level.read((0, 0, 0), level.shape)} | place
+    raise ValueError(
+        f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {levels[-1].shape} "
+        f"voxels of {levels[-1].dtype}. Read it in bricks: jv.render_bricks, --memory."
+    )
+
+
+FOLDERS.append((is_zarr, read_zarr))
 
 
 def _is_zarr_array(path: Path) -> bool:

@@ -44,6 +44,7 @@ class VoxelSource:
         axes: the name of each axis, such as "tczyx" or ["z", "y", "x"]; by default "xyz".
         index: the entry of each axis other than x, y and z, such as {"c": 1, "t": 0}; by default the only
             one.
+        nan: the value of voxels that are NaN or infinite; by default they are refused where they are read.
         name: what it is called in errors.
 
     Attributes:
@@ -66,6 +67,7 @@ class VoxelSource:
         direction: Any = None,
         axes: str | Sequence[str] | Any | None = None,
         index: Mapping[str, int] | None = None,
+        nan: float | None = None,
         name: str = "array",
     ):
         if is_traced((array, spacing, origin, direction)):
@@ -89,6 +91,7 @@ class VoxelSource:
         elif hasattr(array, "translate_to"):
             array = array.translate_to[0]  # views of tensorstore count from where they begin in the whole
         self.array, self.name, self.direction = array, name, direction
+        self._nan = None if nan is None else np.float64(finite_array("nan", nan, ()))
         self.spacing = _triple("spacing", (1.0, 1.0, 1.0) if spacing is None else spacing)
         self.origin = _triple("origin", (0.0, 0.0, 0.0) if origin is None else origin)
         if min(self.spacing) <= 0:
@@ -206,7 +209,7 @@ class VoxelSource:
         except Exception as fault:  # of whatever library
             raise ValueError(
                 f"{self.name}: the voxels {where} cannot be read ({fault}). Fetch it again; or, where Zarr "
-                'left out chunks of only the fill value, pass missing="fill".'
+                'left out chunks of only the fill value, pass missing="fill" to jv.bricks.source_of.'
             ) from fault
         expected = tuple(size[axis] for axis in sorted(size))
         if found.shape != expected:
@@ -216,6 +219,8 @@ class VoxelSource:
             )
         if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
             raise ValueError(f"{self.name}: voxels {where} are masked. Fill them first.")
+        if self._nan is not None and found.dtype.kind not in "biu":
+            found = np.where(np.isfinite(found), found, found.dtype.type(self._nan))
         if self.dtype == np.float32 and found.dtype.kind in "iu":
             (least, most), (low, high) = WHOLE["float32"], (int(found.min()), int(found.max()))
             if low < least or high > most:
@@ -229,7 +234,7 @@ class VoxelSource:
         if self.dtype.kind not in "iu" and not np.isfinite(voxels).all():
             raise ValueError(
                 f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite "
-                f"{where}. Replace them first."
+                f"{where}. Replace them first, or give nan=VALUE."
             )
         return voxels
 

@@ -25,7 +25,7 @@ class LabelTransferFunction(Transfer):
     Args:
         functions: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
             label that is not seen, as others without a function are not. Labels are 0 to 255; renumber
-            others, as by `np.unique(labels, return_inverse=True)`.
+            others, as `jv.load(path, labels=...)` and `np.unique(labels, return_inverse=True)` do.
 
     The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
     `AlphaCorrection(labels=True)` cuts cells there, where `"preintegrated"` otherwise takes the label in the

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from .._util.axes import XYZ, Axes
-from .._util.checks import Arrayable, described, finite_array, require
+from .._util.checks import Arrayable, described, finite_array, integers, require
 from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
@@ -53,14 +53,18 @@ class Volume(eqx.Module):
             integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are
             enabled. Others become the first of uint8, int8, uint16, int16 and float32 that holds every value
             exactly. Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates,
-            which must be evenly spaced, give spacing and origin. Of an image stack [plane, row, column],
-            pass `stack.T`.
+            which must be evenly spaced, give spacing and origin. Images of nibabel (in its world: x, y to the
+            right and front, here left and back), SimpleITK and VTK (`vtkImageData`, with scalars at points)
+            are taken as they lie. Of an image stack [plane, row, column], pass `stack.T`.
         spacing: distance between neighbouring nodes along x, y, z, world length (mm for CT); by default 1.
         origin: world position of node (0, 0, 0), by default 0.
         direction: 3 x 3 matrix whose columns, of length 1, are the world directions of the data's axes, as in
             ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`; by
             default the world's axes. Axes need not be orthogonal: a scan with a tilted gantry is sheared.
         labels: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
+        label_ids: what the labels stand for where they are numbers 0, 1, 2, … in place of larger ones: label
+            k, or the value k of a volume without labels, has the id `label_ids[k]`. `jv.load` gives them, and
+            `LabelTransferFunction({volume.label_ids.index(997): function})` uses them. Static.
         field: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
     Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
@@ -76,6 +80,7 @@ class Volume(eqx.Module):
     origin: Float[Array, "3"]
     direction: Float[Array, "3 3"] | None
     labels: Integer[Array, "nx ny nz"] | None
+    label_ids: tuple[int, ...] | None = eqx.field(static=True)
     field: Field | None
     fetch: Fetch
     """How voxels are read. Internal."""
@@ -88,6 +93,7 @@ class Volume(eqx.Module):
         labels: Arrayable | None = None,
         *,
         direction: Arrayable | None = None,
+        label_ids: Arrayable | None = None,
         field: Field | Any | None = None,
     ):
         data, place = along_xyz(data) if is_named(data) else (data, {})
@@ -97,8 +103,10 @@ class Volume(eqx.Module):
         spacing = finite_array("spacing", spacing, (3,))
         self.spacing = require(spacing, lambda s: s > 0, "spacing must be positive; got {got}.")
         self.origin = finite_array("origin", origin, (3,))
+        direction = place.get("direction") if direction is None else direction
         self.direction = None if direction is None else _checked_direction(direction)
         self.labels = None if labels is None else label_array(labels, self.data.shape[:3])
+        self.label_ids = None if label_ids is None else integers("label_ids", label_ids)
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()

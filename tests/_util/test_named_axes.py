@@ -1,9 +1,11 @@
-"""Are arrays of xarray taken with their axes and coordinates?"""
+"""Are images of xarray, nibabel, SimpleITK and VTK taken with their axes and their place?"""
 
 import numpy as np
 import pytest
 
 import jaxvol as jv
+
+from ..io.formats.test_dicom import turned
 
 
 xarray = pytest.importorskip("xarray", reason="xarray is not installed: pip install xarray")
@@ -40,3 +42,47 @@ def test_a_stack_of_scikit_image_is_an_array_like_any_other():
     stack = np.zeros((3, 4, 5), bool)  # plane, row, column
     stack[2, 1, 4] = True
     assert int(jv.Volume(stack.T).data[4, 1, 2]) == 1
+
+
+PLACE = (1.0, 2.0, 3.0), (4.0, 5.0, 6.0), turned(10, -20, 140)
+
+
+def of_simple_itk(data):
+    sitk = pytest.importorskip("SimpleITK")
+    image = sitk.GetImageFromArray(np.swapaxes(data, 0, 2), isVector=data.ndim > 3)
+    image.SetSpacing(PLACE[0])
+    image.SetOrigin(PLACE[1])
+    image.SetDirection(PLACE[2].ravel().tolist())
+    return image
+
+
+def of_nibabel(data):
+    nibabel = pytest.importorskip("nibabel")
+    affine = np.eye(4)
+    affine[:3] = np.diag([-1, -1, 1]) @ np.column_stack([PLACE[2] * PLACE[0], PLACE[1]])
+    return nibabel.Nifti1Image(data, affine)
+
+
+def of_vtk(data):
+    """Of an image that begins at the point (2, 1, 0) of its grid."""
+    vtk = pytest.importorskip("vtk")
+    numpy_to_vtk = pytest.importorskip("vtk.util.numpy_support").numpy_to_vtk
+    image = vtk.vtkImageData()
+    image.SetExtent(2, 6, 1, 4, 0, 2)
+    image.SetSpacing(PLACE[0])
+    image.SetOrigin(PLACE[1] - PLACE[2] @ (2 * 1.0, 1 * 2.0, 0.0))
+    image.SetDirectionMatrix(*PLACE[2].ravel())
+    numbers = np.swapaxes(data, 0, 2).reshape(data.size // data[0, 0, 0].size, -1).copy()
+    image.GetPointData().SetScalars(numpy_to_vtk(numbers, deep=True))
+    return image
+
+
+@pytest.mark.parametrize("made", [of_simple_itk, of_nibabel, of_vtk])
+def test_images_of_other_libraries_are_taken_with_their_place(made):
+    for data in (DATA, np.stack([DATA, DATA + 1, DATA + 2], axis=-1)):
+        volume = jv.Volume(made(data))
+        np.testing.assert_array_equal(volume.data, data)
+        np.testing.assert_allclose(volume.spacing, PLACE[0], rtol=1e-6)
+        np.testing.assert_allclose(volume.origin, PLACE[1], rtol=1e-5)
+        np.testing.assert_allclose(np.asarray(volume.direction), PLACE[2], atol=1e-6)
+    np.testing.assert_array_equal(jv.Volume(made(DATA), (3, 3, 3), direction=np.eye(3)).spacing, (3, 3, 3))

@@ -205,7 +205,11 @@ def labels(n=24):
 
 
 def test_labels_are_shown_in_colours_of_their_own():
-    shown = labels_shown(jv.Volume(labels(), (1, 2, 3), (4, 5, 6)))
+    # a hundred more at one end: 2 x 2 x 3 voxels each
+    more = np.kron(np.arange(144).reshape(12, 12), np.ones((2, 2)))
+    data = labels()
+    data[21:] = np.where(more < 114, 100 + more, 0)
+    shown = labels_shown(jv.Volume(data, (1, 2, 3), (4, 5, 6)))
     assert shown is not None
     volume, transfer = shown
     np.testing.assert_array_equal(volume.spacing, (1, 2, 3))
@@ -215,8 +219,10 @@ def test_labels_are_shown_in_colours_of_their_own():
     assert data[8, 12, 12] == data[16, 12, 12] == INSIDE
     assert 0 < data[3, 12, 12] < data[4, 12, 12] < INSIDE
     assert kinds[[1, 2, 8, 16, 12], 12, [12, 12, 12, 12, 1]].tolist() == [0, 1, 1, 2, 3]
-    colors = np.asarray(transfer.stacked.colors)[1:4, 0]
-    assert np.abs(colors[:, None] - colors[None])[np.triu_indices(3, 1)].max(axis=-1).min() > 0.3
+    colors = np.asarray(transfer.stacked.colors)[1:-1, 0]
+    apart = np.abs(colors[:, None] - colors[None]).max(axis=-1)[np.triu_indices(117, 1)]
+    assert apart[[0, 1, 116]].min() > 0.3  # of the first three labels
+    assert apart.min() > 0.004
     across = float(np.linalg.norm(np.subtract(*map(np.asarray, volume.corners))))
     assert opacity_at(jax.tree.map(lambda leaf: leaf[1], transfer.stacked), INSIDE, 0.02 * across) > 0.9
 

@@ -262,6 +262,10 @@ def test_voxels_that_cannot_be_shown_are_refused_with_their_place(dtype, wrong, 
     source.read((0, 0, 0), (20, 17, 31))
     with pytest.raises(ValueError, match=message):
         source.read((19, 2, 0), SHAPE)
+    if np.isfinite(wrong):
+        return
+    read = source_of(data, nan=-3).read((0, 0, 0), SHAPE)
+    np.testing.assert_array_equal(read, np.where(data == 0, data, np.array(-3, dtype)))
 
 
 # ---- faults ----

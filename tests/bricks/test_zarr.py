@@ -10,8 +10,9 @@ import pytest
 import tensorstore
 import zarr
 
-from jaxvol.bricks import sources
+from jaxvol.bricks import opening, sources
 from jaxvol.bricks.opening import levels_of, source_of
+from jaxvol.io.formats import load
 
 from .test_sources import SHAPE, assert_reads, voxels
 
@@ -234,6 +235,28 @@ def test_metadata_that_do_not_follow_ome_zarr_are_refused(fault, message, tmp_pa
         write_image(tmp_path / version, image | fault, version)
         with pytest.raises(ValueError, match=message):
             source_of(tmp_path / version)
+
+
+def test_load_reads_the_finest_level_that_fits(tmp_path, monkeypatch):
+    levels, path = pyramid(voxels("uint16", (40, 36, 52)), 3), tmp_path / "image.ome.zarr"
+    write_image(path, ome_written(path, levels, "0.5", axes="zyx"), "0.5")
+    for k, room in enumerate((1 << 30, levels[0].nbytes * 4 - 1)):
+        monkeypatch.setattr(opening, "memory_of_device", lambda room=room: room)
+        volume, source = load(path), levels_of(path)[k]
+        np.testing.assert_array_equal(volume.data, levels[k])
+        np.testing.assert_allclose(volume.spacing, source.spacing, rtol=1e-6)
+        np.testing.assert_allclose(volume.origin, source.origin, rtol=1e-6)
+    monkeypatch.setattr(opening, "memory_of_device", lambda: 100)
+    with pytest.raises(ValueError, match=r"must fit into .* Read it in bricks: jv\.render_bricks, --memory"):
+        load(path)
+    with pytest.raises(ValueError, match="shape and dtype are for raw files"):
+        load(path, shape=SHAPE)
+    monkeypatch.undo()
+    data = np.stack([voxels("uint8"), voxels("uint8") // 2])
+    written(tmp_path / "a", data, (1, 8, 8, 16), dimension_names=["c", "x", "y", "z"])
+    np.testing.assert_array_equal(load(tmp_path / "a", channel=1).data, data[1])
+    with pytest.raises(ValueError, match=r"channel= is needed: index\['c'\] must be an integer from 0 to 1"):
+        load(tmp_path / "a")
 
 
 def test_levels_must_become_coarser(tmp_path):

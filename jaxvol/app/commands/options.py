@@ -159,6 +159,10 @@ def add_volume(parser: Parser, **more: Any) -> None:
     add_vector(group, "--shape", "X Y Z", "voxels, x fastest in the file", type=int)
     group.add_argument("--dtype", help="such as uint8 or uint16le")
     add_vector(group, "--spacing", "X Y Z", "world length between voxels")
+    text = "of voxels that are NaN or infinite in the file, such as the value of what is transparent"
+    group.add_argument("--nan", type=float, metavar="VALUE", help=text)
+    for name in ("time", "channel"):
+        group.add_argument(f"--{name}", type=int, metavar="N", help="which one, from 0, of a file of several")
 
 
 def add_sampling(parser: Parser) -> None:

@@ -93,8 +93,9 @@ def scene_of(
         shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
         volume, transfer = shown
     else:
-        header = {name: getattr(options, name) for name in ("shape", "dtype", "spacing")}
-        header = {name: value for name, value in header.items() if value is not None}
+        header = {name: value for name, value in header_of(options).items() if value is not None}
+        if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
+            header["index"] = index
         try:
             source = levels_of(options.file, **header)[0]
         except TypeError as fault:  # such as a shape of what is no raw file
@@ -126,7 +127,12 @@ def with_march(scene: Scene, options: argparse.Namespace, cameras: Sequence[Came
 
 
 def volume_of(options: argparse.Namespace) -> Volume:
-    return load(options.file, shape=options.shape, dtype=options.dtype, spacing=options.spacing)
+    return load(options.file, **header_of(options))
+
+
+def header_of(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say of the file."""
+    return {name: getattr(options, name) for name in ("shape", "dtype", "spacing", "nan", "time", "channel")}
 
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:

@@ -14,7 +14,7 @@ from ...io.formats import read
 from ...scene.volume import Volume
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
-from .scene import is_automatic, transfer_of, volume_of
+from .scene import header_of, is_automatic, transfer_of, volume_of
 
 
 def _datasets(options: argparse.Namespace) -> None:
@@ -41,7 +41,7 @@ def add_datasets(commands: Any) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    arguments = read(options.file, options.shape, options.dtype)
+    arguments = read(options.file, **header_of(options))
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)
@@ -71,6 +71,8 @@ def _info(options: argparse.Namespace) -> None:
     if volume.labels is not None:
         found = np.unique(np.asarray(volume.labels))
         rows["labels"] = f"{found.size}, from {found[0]} to {found[-1]}"
+    if ids := volume.label_ids:
+        rows["ids"] = f"{len(ids)}, from {ids[0]} to {ids[-1]}; voxels hold their numbers"
     for name, text in rows.items():
         print(f"{name:12} {text}")
 

@@ -1,4 +1,4 @@
-"""Reads NIfTI and NRRD images with SimpleITK, and brings medical images along the axes of the world.
+"""Reads NRRD images with SimpleITK, and brings medical images along the axes of the world.
 
 SimpleITK takes memory as headers say, and returns garbage for some files that are cut short. So the size of
 the content is compared with the header before it reads any.
@@ -12,16 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from ..._util.affine import place_of
 from ..._util.files import MOST_VOXELS, check_size, decoding, file_size
 
 
 ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
-
-ROUNDED = 1e-3
-"""Greatest cosine between the directions of two axes that counts as a right angle, and greatest difference of
-a squared length from 1: files hold directions of a few decimal places."""
 
 
 def simple_itk(path: Path) -> Any:
@@ -33,37 +30,25 @@ def simple_itk(path: Path) -> Any:
     return SimpleITK
 
 
-def read_nifti(path: Path) -> dict[str, Any]:
-    """Reader for `.nii` and `.nii.gz`."""
-    file_size(path)
-    reader, packed = simple_itk(path).ImageFileReader(), path.name.lower().endswith(".gz")
-    reader.SetImageIO("NiftiImageIO")
-    with decoding(path), gzip.open(path) if packed else path.open("rb") as stream:
-        begin = stream.read(4)  # of other files, ITK's library prints text of its own
-        if not {int.from_bytes(begin, order) for order in ("little", "big")} & {348, 540}:
-            raise ValueError(
-                f"path: {path} cannot be read: a NIfTI file begins with the size of its header, 348 or 540; "
-                f"this one with the bytes {begin.hex(' ')}. Fetch or write it again."
-            )
-        voxels = _read_header(path, reader)
-        offset = int(float(reader.GetMetaData("vox_offset")))
-        expected = offset + voxels * int(reader.GetMetaData("bitpix")) // 8
-        # only decompressing tells the size; a header may hold any number
-        held = stream.seek(min(expected, 2**62)) if packed else path.stat().st_size
-        check_size(path, held, expected, more=True)
-        return _volume(path, reader)
-
-
 def read_nrrd(path: Path) -> dict[str, Any]:
     """Reader for `.nrrd` and `.nhdr`."""
     file_size(path)
     sitk = simple_itk(path)
+    fields, begin, source = nrrd_header(path)
+    encoding, spacings = fields.get("encoding", "").lower(), fields.get("spacings", "1 1 1")
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO")
+    reader.SetFileName(str(path))
     with decoding(path):
-        voxels = _read_header(path, reader)
-        expected = voxels * sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
-        encoding, begin, source = nrrd_header(path)
+        reader.ReadImageInformation()
+        size, channels = reader.GetSize(), reader.GetNumberOfComponents()
+        check_volume(path, size, channels)
+        # axes of no space have NaN; SimpleITK takes 1 for what is wrong
+        lengths = [float(word) for word in spacings.split() if word.lower() != "nan"]
+        if len(lengths) < 3 or not all(0 < each < math.inf for each in lengths):
+            raise ValueError(f"path: {path}: spacings must be positive, for 3 axes; got {spacings[:80]!r}.")
+        component = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
+        expected = math.prod(size) * channels * component
         if encoding not in ("raw", "gzip", "gz") or not source.is_file():
             raise ValueError(
                 f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
@@ -75,39 +60,30 @@ def read_nrrd(path: Path) -> dict[str, Any]:
                 stream.seek(begin)
                 held = gzip.GzipFile(fileobj=stream).seek(expected)
         check_size(path, held, expected, more=True)
-        return _volume(path, reader)
-
-
-def _read_header(path: Path, reader: Any) -> int:
-    """Read the header of an image, which must be one of a volume. Returns the number of its voxels."""
-    reader.SetFileName(str(path))
-    reader.ReadImageInformation()
-    size, channels = reader.GetSize(), reader.GetNumberOfComponents()
-    check_volume(path, size, channels)
-    return math.prod(size)
+        image = reader.Execute()
+    n = len(size)
+    data = np.moveaxis(sitk.GetArrayFromImage(image).reshape(*size[::-1], channels), range(n), range(n)[::-1])
+    turn = np.reshape(image.GetDirection(), (n, n))[:3, :3]
+    affine = np.column_stack([turn * image.GetSpacing()[:3], image.GetOrigin()[:3]])
+    return placed(f"path: {path}: its place", data, affine) | {"axes": "xyztc"[:n] + "s"}
 
 
 def check_volume(path: Path, size: Any, channels: Any) -> None:
-    """Raises `ValueError` for an image that is no volume of one value per voxel."""
-    if len(size) != 3 or channels != 1 or min(size) < 1 or math.prod(size) > MOST_VOXELS:
+    """Raises `ValueError` for an image that is no volume, or several of them along further axes."""
+    if not 3 <= len(size) <= 5 or channels < 1 or min(size) < 1 or math.prod(size) * channels > MOST_VOXELS:
         raise ValueError(
-            f"path: {path} must be a 3-D image of one value per voxel and fewer than 2**31 voxels; got size "
-            f"{size} and {channels} values per voxel."
+            f"path: {path} must be a 3-D image, or several along further axes, of fewer than 2**31 voxels; "
+            f"got size {tuple(size)} and {channels} values per voxel."
         )
 
 
-def _volume(path: Path, reader: Any) -> dict[str, Any]:
-    image = reader.Execute()
-    data = simple_itk(path).GetArrayFromImage(image).T
-    return toward_axes(data, image.GetSpacing(), image.GetOrigin(), image.GetDirection())
-
-
-def nrrd_header(path: Path) -> tuple[str, int, Path]:
-    """The encoding of an NRRD file; where its voxels begin, and in which file, which may be missing."""
+def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
+    """The fields of an NRRD file, in small letters without blanks; where its voxels begin, and in which file,
+    which may be missing."""
     found, end = text_header(path, ":")
     fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
-    named, encoding = fields.get("datafile"), fields.get("encoding", "").lower()
-    return (encoding, end, path) if named is None else (encoding, 0, path.parent / named)
+    named = fields.get("datafile")
+    return (fields, end, path) if named is None else (fields, 0, path.parent / named)
 
 
 def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, str], int]:
@@ -124,20 +100,13 @@ def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, s
         return fields, stream.tell()
 
 
-def orthonormal(what: str, direction: Any) -> np.ndarray:
-    """The orthonormal directions (columns) nearest to those of a file, which are rounded there. Raises
-    `ValueError`, which begins with `what`, if they are farther from that than by rounding."""
-    columns = np.reshape(np.asarray(direction, float), (3, 3))
-    if not np.allclose(columns.T @ columns, np.eye(3), rtol=0, atol=ROUNDED):
-        raise ValueError(
-            f"{what} must be orthogonal directions of length 1; got {np.round(columns.T, 4).tolist()}."
-        )
-    left, _, right = np.linalg.svd(columns)
-    return left @ right
+def placed(what: str, data: np.ndarray, affine: np.ndarray) -> dict[str, Any]:
+    """Arguments of `Volume` for `data[i, j, k]` at `affine @ (i, j, k, 1)`; see `place_of`."""
+    return toward_axes(data, *place_of(what, affine).values())
 
 
 def toward_axes(data: np.ndarray, spacing: Any, origin: Any, direction: Any) -> dict[str, Any]:
-    """Arguments of `Volume` for `data[i, j, k]` whose axes point along the columns of `direction`.
+    """Arguments of `Volume` for `data[i, j, k, ...]` whose axes point along the columns of `direction`.
 
     Axes are exchanged and reversed so that x, y and z of the result increase along the world's as nearly as
     they can; what is left is its `direction`, which is missing if it is none. No voxel is interpolated.
@@ -147,8 +116,8 @@ def toward_axes(data: np.ndarray, spacing: Any, origin: Any, direction: Any) -> 
     order = max(map(list, itertools.permutations(range(3))), key=lambda p: np.abs(matrix[range(3), p]).sum())
     matrix, steps = matrix[:, order], np.asarray(spacing, float)[order]
     signs = np.where(np.diag(matrix) >= 0, 1, -1)
-    turned = np.transpose(data, order)
-    last = np.where(signs < 0, np.array(turned.shape) - 1, 0)
+    turned = np.transpose(data, (*order, *range(3, data.ndim)))
+    last = np.where(signs < 0, np.array(turned.shape[:3]) - 1, 0)
     arguments: dict[str, Any] = {
         "data": np.ascontiguousarray(turned[tuple(slice(None, None, sign) for sign in signs)]),
         "spacing": steps,

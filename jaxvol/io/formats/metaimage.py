@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..._util.affine import directions
 from ..._util.files import as_array, check_size, decoding, file_size
-from .medical import check_volume, orthonormal, text_header, toward_axes
+from .medical import check_volume, text_header, toward_axes
 
 
 NAMES = "CHAR UCHAR SHORT USHORT INT UINT LONG ULONG LONG_LONG ULONG_LONG FLOAT DOUBLE"
@@ -22,7 +23,8 @@ def read_metaimage(path: Path) -> dict[str, Any]:
     file_size(path)
     fields, begin, source = metaimage_header(path)
     shape = [_natural(size) for size in fields.get("DimSize", "").split()]
-    check_volume(path, shape, _natural(fields.get("ElementNumberOfChannels", "1")))
+    n, channels = len(shape), _natural(fields.get("ElementNumberOfChannels", "1"))
+    check_volume(path, shape, channels)
     kind = fields.get("ElementType", "")
     if kind not in TYPES or not _flag(fields, "BinaryData", "T"):
         raise ValueError(
@@ -31,7 +33,7 @@ def read_metaimage(path: Path) -> dict[str, Any]:
         )
     msb = any(_flag(fields, f"{prefix}ByteOrderMSB") for prefix in ("", "BinaryData", "Element"))
     dtype = np.dtype(TYPES[kind]).newbyteorder(">" if msb else "<")
-    expected = math.prod(shape) * dtype.itemsize
+    expected = channels * math.prod(shape) * dtype.itemsize
     if not source.is_file():
         raise ValueError(f"path: {path} cannot be read: there is no file of its voxels, {str(source)[:80]}.")
     held = source.stat().st_size
@@ -48,12 +50,13 @@ def read_metaimage(path: Path) -> dict[str, Any]:
         else:
             check_size(path, max(held - begin, 0), expected, more=True)
             content = stream.read(expected)
-    spacing = _numbers(path, fields, ("ElementSpacing", "ElementSize"), np.ones(3))
-    origin = _numbers(path, fields, ("Offset", "Position", "Origin"), np.zeros(3))
+    spacing = _numbers(path, fields, ("ElementSpacing", "ElementSize"), np.ones(n))
+    origin = _numbers(path, fields, ("Offset", "Position", "Origin"), np.zeros(n))
     # the axes of the data follow each other; here they are columns
-    turn = _numbers(path, fields, ("TransformMatrix", "Rotation", "Orientation"), np.eye(3)).T
-    direction = orthonormal(f"path: {path}: TransformMatrix", turn)
-    return toward_axes(as_array(content, shape, dtype, "F"), spacing, origin, direction)
+    turn = _numbers(path, fields, ("TransformMatrix", "Rotation", "Orientation"), np.eye(n)).T[:3, :3]
+    turn = directions(f"path: {path}: TransformMatrix", turn)
+    data = np.moveaxis(as_array(content, (channels, *shape), dtype, "F"), 0, -1)
+    return toward_axes(data, spacing[:3], origin[:3], turn) | {"axes": "xyztc"[:n] + "s"}
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:

@@ -8,9 +8,11 @@ import numpy as np
 
 from ..._util.checks import described, output_file
 from ..._util.files import reason
+from ..._util.npy import VOLUME
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume, check_one_channel
 from .medical import simple_itk
+from .nifti import write_nifti
 
 
 ENDINGS = (".mha", ".nii", ".nii.gz", ".npz", ".nrrd")
@@ -21,9 +23,9 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 
     | ending | written |
     |---|---|
-    | `.npz` | voxels, spacing, origin, direction, labels; compressed |
-    | `.nrrd`, `.mha` | voxels, spacing, origin, direction, by SimpleITK (`pip install jaxvol[io]`) |
-    | `.nii`, `.nii.gz` | the same; direction is rounded, to about 1e-7 |
+    | `.npz` | voxels, spacing, origin, direction, labels and their ids; compressed |
+    | `.nrrd`, `.mha` | voxels, spacing, origin, direction; by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nii`, `.nii.gz` | the same, rounded to about 1e-7, as sform and, unless sheared, as qform |
 
     Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a
     volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
@@ -59,17 +61,23 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
         raise ValueError(
             f"volume has voxels of {volume.data.dtype}, which {path.name} cannot hold. Convert to float32."
         )
-    if volume.labels is not None and not name.endswith(".npz"):
+    if (volume.labels is not None or volume.label_ids) and not name.endswith(".npz"):
         raise ValueError(
             f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
             "and voxels as two volumes, and read them by load(path, labels=...)."
         )
-    parts = {part: getattr(volume, part) for part in ("data", "spacing", "origin", "direction", "labels")}
+    parts = {part: getattr(volume, part) for part in VOLUME}
     arrays = {part: np.asarray(array) for part, array in parts.items() if array is not None}
+    if volume.label_ids:
+        arrays["label_ids"] = np.array(
+            volume.label_ids, np.uint64 if min(volume.label_ids) >= 0 else np.int64
+        )
     with whole_file(path) as file:
         if name.endswith(".npz"):
             with file.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
                 np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
+        elif name.endswith((".nii", ".nii.gz")):
+            write_nifti(file, arrays, packed=name.endswith(".gz"))
         else:
             _write_medical(arrays, file)
     return path
@@ -83,6 +91,6 @@ def _write_medical(arrays: dict[str, np.ndarray], path: Path) -> None:
     if "direction" in arrays:
         image.SetDirection(arrays["direction"].astype(float).ravel().tolist())
     try:
-        sitk.WriteImage(image, str(path), not path.name.lower().endswith(".nii"))
+        sitk.WriteImage(image, str(path), True)
     except RuntimeError as fault:
         raise ValueError(f"path: {path.name} cannot be written ({reason(fault)}).") from fault

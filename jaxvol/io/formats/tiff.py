@@ -20,8 +20,10 @@ LENGTHS |= dict.fromkeys(("µm", "um", "micron", "\\u00b5m"), 1e-3)
 
 def read_tiff(path: Path) -> dict[str, Any]:
     """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
-    images, spacing = _images(path)
-    return {"data": images.transpose(2, 1, 0)} | spacing
+    images, axes, spacing = _images(path)
+    order = [axis for axis in "XYZTCS" if axis in axes]
+    data = images.transpose([axes.index(axis) for axis in order])
+    return {"data": data, "axes": "".join(order).lower()} | spacing
 
 
 def tiff_files(folder: Path) -> list[Path]:
@@ -48,10 +50,10 @@ def read_tiff_folder(folder: Path) -> dict[str, Any]:
             f"path: slices are missing in {folder}: {files[i].name} is followed by {files[i + 1].name}."
         )
     for file in files:
-        image, _ = _images(file)
+        image, axes, _ = _images(file)
         slices.append(image)
         first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (slices[0], image))
-        if len(image) != 1 or first != last or len(slices) * image.size > MOST_VOXELS:
+        if axes != "ZYX" or len(image) != 1 or first != last or len(slices) * image.size > MOST_VOXELS:
             raise ValueError(
                 f"path: each file in {folder} must hold one image of the same size and type, fewer than "
                 f"2**31 voxels in all; {files[0].name} has {first}, and {file.name} {len(image)} of {last}."
@@ -59,8 +61,8 @@ def read_tiff_folder(folder: Path) -> dict[str, Any]:
     return {"data": np.concatenate(slices).transpose(2, 1, 0)}
 
 
-def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
-    """The images [z, y, x] in a file, and their spacing where it is known."""
+def _images(path: Path) -> tuple[np.ndarray, str, dict[str, Any]]:
+    """The images in a file, the letters of their axes, with one Z at least, and spacing where it is known."""
     try:
         import tifffile  # pyright: ignore[reportMissingImports]
     except ImportError as fault:
@@ -71,25 +73,37 @@ def _images(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
             _check_last(path, file)
             pages = [page.aspage() for page in file.pages]
             first, kinds = pages[0], {(page.shape, page.dtype) for page in pages}
-            axes, whole = file.series[0].axes, file.is_imagej or len(pages) == 1
-            # ImageJ may hold a stack in its only page
-            shape = file.series[0].shape if whole else (len(pages), *first.shape)
-            several = len(kinds) > 1 or (file.is_ome and (len(file.series) > 1 or set(axes) & set("CT")))
-            several = several or len(shape) not in (2, 3) or first.samplesperpixel != 1
-            if several or first.dtype is None or not 0 < math.prod(shape) <= MOST_VOXELS:
+            series, whole = file.series[0], file.is_imagej or len(pages) == 1
+            told = whole or file.is_ome  # ImageJ may hold a stack in its only page
+            axes, shape = series.axes, series.shape
+            if not told:
+                axes, shape = f"Z{first.axes}", (len(pages), *first.shape)
+            further = axes.translate(str.maketrans("", "", "YXS"))
+            if len(further) == 1 and not file.is_ome:  # ImageJ's stacks may be of times
+                axes = axes.replace(further, "Z")
+            if "Z" not in axes:
+                axes, shape = f"Z{axes}", (1, *shape)
+            strange = (
+                len(kinds) > 1 or (file.is_ome and len(file.series) > 1) or not set(axes) <= set("XYZTCS")
+            )
+            if strange or first.dtype is None or not 0 < math.prod(shape) <= MOST_VOXELS:
                 raise ValueError(
-                    f"path: {path} must hold one stack of images of one size, type and value per pixel, and "
-                    f"fewer than 2**31 voxels; got {len(file.series)} stacks, the first of shape "
-                    f"{file.series[0].shape} ({axes}), and pages of {len(kinds)} kinds."
+                    f"path: {path} must hold one stack of images of one size and type, and fewer than 2**31 "
+                    f"voxels; got {len(file.series)} stacks, the first of shape {series.shape} "
+                    f"({series.axes}), and pages of {len(kinds)} kinds."
                 )
             packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
             held = path.stat().st_size * (MOST_COMPRESSED if packed else 1)
             check_size(path, held, math.prod(shape) * first.dtype.itemsize, more=True)
             images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
-            return images.reshape(-1, *shape[-2:]), _spacing(tifffile, file)
+            return images.reshape(shape), axes, _spacing(tifffile, file)
     except MemoryError:
         raise
     except Exception as fault:
+        if "imagecodecs" in str(fault):
+            raise ImportError(
+                f"reading {path} needs imagecodecs ({fault}): pip install jaxvol[io]"
+            ) from fault
         if isinstance(fault, ValueError) and str(fault).startswith("path:"):
             raise
         raise ValueError(f"path: {path} cannot be read: corrupt, cut short, or {fault}") from fault

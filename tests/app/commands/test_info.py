@@ -58,3 +58,15 @@ def test_info_says_what_is_assumed_of_other_files(tmp_path, capsys):
     for name in ("bare.npz", "told.npz", "bare.tif", "told.tif", "bare"):
         assert main(["info", str(tmp_path / name)]) == 0
         assert ("assumed" in capsys.readouterr().out) == name.startswith("bare")
+
+
+def test_info_says_what_to_do_about_nan_and_several_images(tmp_path, capsys):
+    data = np.full((4, 4, 4, 2), -5, np.float32)
+    data[0] = np.nan
+    np.save(tmp_path / "a.npy", data)
+    assert main(["info", str(tmp_path / "a.npy"), "--channel", "1"]) == 2
+    assert "got 16 of 64 voxels that are NaN or infinite" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "a.npy"), "--channel", "1", "--nan", "-7"]) == 0
+    assert "-7 to -5, mean -5.5" in capsys.readouterr().out
+    assert main(["info", str(tmp_path / "a.npy"), "--time", "0"]) == 2
+    assert "time: " in capsys.readouterr().err

@@ -271,6 +271,8 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
     assert isinstance(asked["lighting"], Phong)
     assert asked["source"].shape == (24, 24, 24)
     assert "3 of 2 x 2 x 1 bricks read, 99 bytes" in capsys.readouterr().out
+    assert render(volume_file, *words, "200K", "--time", "1", "--nan", "0") == 2
+    assert "index must name axes" in capsys.readouterr().err
     jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
     assert render(tmp_path / "v.npz", "--memory", "1M") == 2
     assert "is not of a kind" in capsys.readouterr().err

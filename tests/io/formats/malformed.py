@@ -122,11 +122,11 @@ def in_bricks(path):
 
 
 FILES = [
-    *((kind, loaded) for kind in (raw, packed_raw, npy, npz, series, tiff_folder)),
+    *((kind, loaded) for kind in (raw, packed_raw, npy, npz, series, tiff_folder, ome_zarr)),
     *((image(ending), loaded) for ending in (".nii", ".mha", ".mhd", ".nrrd")),
     *((image(ending, compress=True), loaded) for ending in (".nii.gz", ".mha", ".nrrd")),
     (tiff(), loaded),
-    (tiff(compression="zlib"), loaded),
+    *((tiff(compression=how), loaded) for how in ("zlib", "lzw")),
     (tiff(imagej=True, metadata={"spacing": 2.0}), loaded),
     (ultrasound, lambda path: jv.load_ultrasound(path)[0].data.size),
     *((kind, in_bricks) for kind in (raw, npy, zarr_array(2), zarr_array(3), ome_zarr)),

@@ -217,6 +217,36 @@ def test_bad_paths_and_arguments_are_refused(tmp_path):
             load(tmp_path / file, dtype="uint8")
 
 
+NAN = np.array([1, np.nan, 2, np.inf, 3, -np.inf, 4, 5], "float32").reshape(2, 2, 2)
+WRITERS = {
+    "a.npy": lambda path: np.save(path, NAN),
+    "a.npz": lambda path: np.savez(path, data=NAN),
+    "a_2x2x2_float32.raw": lambda path: path.write_bytes(raw_bytes(NAN)),
+    "a.tif": lambda path: pytest.importorskip("tifffile").imwrite(path, NAN.T, photometric="minisblack"),
+    "a.zarr": lambda path: pytest.importorskip("zarr").create_array(path, data=NAN),
+    **{
+        f"a{ending}": lambda path: written_by_itk(NAN, path)
+        for ending in (".nii", ".nii.gz", ".nrrd", ".mha")
+    },
+}
+
+
+def written_by_itk(data, path):
+    sitk = pytest.importorskip("SimpleITK")
+    sitk.WriteImage(sitk.GetImageFromArray(data.T), str(path))
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_voxels_that_are_nan_or_infinite_are_refused_or_replaced_by_every_reader(tmp_path, name):
+    WRITERS[name](tmp_path / name)
+    with pytest.raises(ValueError, match=r"(data|voxels) must be finite"):
+        load(tmp_path / name)
+    expected = np.where(np.isfinite(NAN), NAN, np.float32(-7))
+    np.testing.assert_array_equal(load(tmp_path / name, nan=-7).data, expected)
+    with pytest.raises(ValueError, match="nan must be finite"):
+        load(tmp_path / name, nan=np.nan)
+
+
 BAD_JSON = [
     ("{", "a.json is not JSON"),
     ("[" * 100_000, "a.json is not JSON"),
@@ -258,7 +288,7 @@ def test_neither_a_file_nor_a_header_takes_memory_that_the_other_does_not_back(t
 
 
 @pytest.mark.parametrize(
-    ("module", "ending"), [("SimpleITK", ".nii"), ("SimpleITK", ".dcm"), ("tifffile", ".tiff")]
+    ("module", "ending"), [("SimpleITK", ".nrrd"), ("SimpleITK", ".dcm"), ("tifffile", ".tiff")]
 )
 def test_a_missing_library_says_how_to_install_it(tmp_path, monkeypatch, module, ending):
     monkeypatch.setitem(sys.modules, module, None)

@@ -5,8 +5,7 @@ import zlib
 import numpy as np
 import pytest
 
-from jaxvol.io.formats import load, save
-from jaxvol.scene.volume import Volume
+from jaxvol.io.formats import load
 
 from .test_formats import ramp, raw_bytes, same, write
 
@@ -51,11 +50,29 @@ def test_an_image_comes_out_as_it_was_written(tmp_path, ending):
     np.testing.assert_allclose(np.array(oblique.direction), turn, atol=1e-6)
 
 
-def test_nifti_values_are_scaled(tmp_path):
-    path = write_itk(tmp_path / "a.nii", ramp("int16"))
-    content = bytearray(path.read_bytes())
-    content[112:120] = np.array([0.5, -100], "float32").tobytes()  # scl_slope, scl_inter
-    assert same(load(write(path, bytes(content))), ramp("float32") / 2 - 100)
+@pytest.mark.parametrize("ending", [".mha", ".mhd", ".nrrd"])
+def test_of_several_values_and_times_one_is_chosen(tmp_path, ending):
+    film = np.arange(60 * 4, dtype="int16").reshape(4, 3, 4, 5)  # t, z, y, x
+    vectors = np.stack(list(film), axis=-1)
+    for name, image in {
+        "film": sitk.JoinSeries([sitk.GetImageFromArray(each) for each in film]),
+        "vectors": sitk.GetImageFromArray(vectors, isVector=True),
+    }.items():
+        image.SetSpacing([1, 2, 3, 4][: image.GetDimension()])
+        sitk.WriteImage(image, str(tmp_path / f"{name}{ending}"))
+    film_path, vectors_path = tmp_path / f"film{ending}", tmp_path / f"vectors{ending}"
+    assert same(load(film_path, time=2), film[2].T, (1, 2, 3))
+    with pytest.raises(ValueError, match=r"time must be given, from 0 to 3: .* holds x 5, y 4, z 3, t 4"):
+        load(film_path)
+    assert same(load(vectors_path), np.moveaxis(film.T, 3, -1), (1, 2, 3))
+    assert same(load(vectors_path, channel=1), film[1].T, (1, 2, 3))
+
+
+@pytest.mark.parametrize("spacings", ["0 1 1", "-1 1 1", "nan nan nan", "inf 1 1"])
+def test_nrrd_spacings_that_are_no_lengths_are_refused(tmp_path, spacings):
+    header = f"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 5 4 3\nencoding: raw\nspacings: {spacings}\n\n"
+    with pytest.raises(ValueError, match="spacing"):
+        load(write(tmp_path / "a.nrrd", header.encode() + raw_bytes(ramp())))
 
 
 WIDE = [
@@ -83,14 +100,10 @@ def test_wide_types_become_those_of_a_volume_where_no_value_is_lost(tmp_path):
 
 
 def test_what_is_no_whole_image_of_a_volume_is_refused_without_text_of_itk(tmp_path, capfd):
-    for name, image in {
-        "flat.mha": sitk.Image([4, 4], sitk.sitkUInt8),
-        "film.nii": sitk.Image([4, 4, 4, 4], sitk.sitkUInt8),
-        "vectors.nrrd": sitk.Image([4, 4, 4], sitk.sitkVectorFloat32, 3),
-    }.items():
-        sitk.WriteImage(image, str(tmp_path / name))
-        with pytest.raises(ValueError, match="must be a 3-D image of one value per voxel"):
-            load(tmp_path / name)
+    for ending in (".mha", ".nrrd", ".nii"):
+        sitk.WriteImage(sitk.Image([4, 4], sitk.sitkUInt8), str(tmp_path / f"flat{ending}"))
+        with pytest.raises(ValueError, match="must be a 3-D image"):
+            load(tmp_path / f"flat{ending}")
     noise = np.random.default_rng(0).integers(0, 250, (20, 20, 20)).astype("uint8")
     for ending in ENDINGS:
         for compress in (False, True):
@@ -106,12 +119,6 @@ def test_what_is_no_whole_image_of_a_volume_is_refused_without_text_of_itk(tmp_p
         assert "\n" not in str(fault.value)
         assert not any(word in str(fault.value) for word in ("ITK", ".cxx", "(0x", "ERROR"))
     assert capfd.readouterr().err == ""
-    path = save(Volume(ramp()), tmp_path / "a.nii")
-    whole = bytearray(path.read_bytes())
-    whole[70:72] = (9999).to_bytes(2, "little")  # the type of the voxels, whose fault only ITK sees
-    path.write_bytes(whole)
-    with pytest.raises(ValueError, match=r"incomplete \(\S*a\.nii is not recognized as a NIFTI file\)\.$"):
-        load(path)
     path = write_itk(tmp_path / "c.mhd", ramp(), compress=True)
     (tmp_path / "c.zraw").unlink()
     with pytest.raises(ValueError, match=r"c\.mhd cannot be read"):
@@ -180,7 +187,7 @@ def test_directions_that_a_file_has_rounded_are_taken_as_meant(tmp_path, digits)
     path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text}")
     np.testing.assert_allclose(np.asarray(load(path).direction), meant, atol=1e-6)
     path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text.replace('0.7', '0.8')}")
-    with pytest.raises(ValueError, match="TransformMatrix must be orthogonal directions of length 1"):
+    with pytest.raises(ValueError, match="TransformMatrix must be three directions of length 1"):
         load(path)
 
 

@@ -1,0 +1,38 @@
+"""Where grids lie: the spacing and directions of an affine map, cleaned of rounding."""
+
+import numpy as np
+
+
+ROUNDED, SHEARED = 1e-3, 1e-4
+"""Greatest difference of a direction's length from 1, and greatest cosine between two that counts as a right
+angle: files hold directions of a few decimal places. A smaller shear misplaces no voxel of 1000 by more than
+a tenth; a greater one is kept, whether it was meant or not."""
+
+FLAT = 1e-3
+"""Directions whose determinant is not above this lie in a plane: `Volume` takes none."""
+
+
+def directions(what: str, columns: np.ndarray) -> np.ndarray:
+    """The directions (columns) that a file holds, of length 1; orthonormal if they are so but for rounding.
+    Raises `ValueError`, which begins with `what`, for other lengths, and for three in a plane."""
+    lengths = np.linalg.norm(columns, axis=0)
+    turn = columns / np.where(lengths > 0, lengths, 1)
+    if not (np.all(np.abs(lengths - 1) <= ROUNDED) and abs(np.linalg.det(turn)) > FLAT):  # of NaN, too
+        told = np.round(columns, 4).T.tolist()
+        raise ValueError(f"{what} must be three directions of length 1, not all in a plane; got {told}.")
+    if np.abs(turn.T @ turn - np.eye(3)).max() > SHEARED:
+        return turn
+    left, _, right = np.linalg.svd(turn)
+    return left @ right
+
+
+def place_of(what: str, affine: np.ndarray) -> dict[str, np.ndarray]:
+    """The `spacing`, `origin` and `direction` of a grid whose node (i, j, k) lies at `affine @ (i, j, k, 1)`.
+    Raises `ValueError`, which begins with `what`, for an affine that places nothing."""
+    columns, origin = np.asarray(affine, float)[:3, :3], np.asarray(affine, float)[:3, 3]
+    steps = np.linalg.norm(columns, axis=0)
+    if not (np.all(steps > 0) and np.all(np.isfinite(affine))):
+        raise ValueError(
+            f"{what} must be finite, with steps longer than 0; got {np.asarray(affine).tolist()}."
+        )
+    return {"spacing": steps, "origin": origin, "direction": directions(what, columns / steps)}
