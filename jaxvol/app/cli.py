@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 
+from .._util.checks import printable
 from .._util.version import __version__
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
@@ -60,15 +61,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (ValueError, OSError, ImportError) as fault:
-        text = " ".join(str(fault).split()).removeprefix("path: ")  # the argument's name in Python
-        print(f"{program}: error: {text}", file=sys.stderr)
-        return 2
+    except (ValueError, OSError, ImportError, OverflowError) as fault:
+        return _told(program, str(fault).removeprefix("path: "))  # the argument's name in Python
     except (MemoryError, jax.errors.JaxRuntimeError) as fault:
         if not isinstance(fault, MemoryError) and "RESOURCE_EXHAUSTED" not in str(fault):
             raise
-        print(f"{program}: error: there is not enough memory ({fault})", file=sys.stderr)
-        return 2
+        return _told(program, f"there is not enough memory ({fault})")
     except KeyboardInterrupt:
         remove_unfinished()
         checkpoint = getattr(options, "checkpoint", None)
@@ -77,6 +75,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         os._exit(130)
     return 0
+
+
+def _told(program: str, fault: str) -> int:
+    """Print a fault in one line, which may hold text of files. Returns the exit code."""
+    print(f"{program}: error: {printable(' '.join(fault.split()))}", file=sys.stderr)
+    return 2
 
 
 def parser_of_all() -> Parser:

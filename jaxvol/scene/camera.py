@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Num
 
-from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require
+from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require, shortened
 from .._util.vec3 import Scalar, Vec3, along, apart
 from ..xla.platform import is_traced
 from .space import Line
@@ -428,8 +428,9 @@ def _image_size(size: Any) -> tuple[int, int]:
     try:
         width, height = (int(n) for n in size)
         whole = (width, height) == tuple(size)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         width = height = whole = 0
-    if not whole or width < 1 or height < 1:
-        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size!r}.")
+    if not whole or min(width, height) < 1 or width * height >= 2**31:
+        expected = "(width, height) in whole pixels, each at least 1, and fewer than 2**31 in all"
+        raise ValueError(f"size must be {expected}; got {shortened(size)}.")
     return width, height

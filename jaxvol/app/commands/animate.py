@@ -25,7 +25,7 @@ FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
 
 
 def _animate(options: argparse.Namespace) -> None:
-    count = integer("--frames", options.frames, 1)
+    count = integer("--frames", options.frames, 1, 2**20)
     path = output_file("--output", options.output)
     kind = path.suffix.lower()
     if kind not in (".gif", ".mp4"):

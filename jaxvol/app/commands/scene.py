@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
 from typing import Any, NamedTuple
 
 import jax
@@ -134,7 +135,7 @@ def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
     for name in names:
         path = getattr(options, name)
-        if path is not None and path.resolve() in [other.resolve() for other in used]:
+        if path is not None and realpath(path) in map(realpath, used):
             raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
         used += [] if path is None else [path]
 

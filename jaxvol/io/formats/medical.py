@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._util.checks import shortened
 from ..._util.files import MOST_VOXELS, check_size, decoding, file_size
 
 
@@ -22,6 +23,11 @@ voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
 ROUNDED = 1e-3
 """Greatest cosine between the directions of two axes that counts as a right angle, and greatest difference of
 a squared length from 1: files hold directions of a few decimal places."""
+
+
+LONGEST = 900
+"""Letters of a field in an NRRD header, at most: a message of ITK's library about longer ones is written beyond
+the end of its memory, and ends the process. Comments and pairs (`key:=value`) may be longer."""
 
 
 def simple_itk(path: Path) -> Any:
@@ -60,15 +66,16 @@ def read_nrrd(path: Path) -> dict[str, Any]:
     sitk = simple_itk(path)
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO")
+    encoding, begin, source = nrrd_header(path)
+    # before ITK opens it, which waits for the other end of a pipe
+    if encoding not in ("raw", "gzip", "gz") or not source.is_file():
+        raise ValueError(
+            f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
+            f"got {shortened(encoding)} and {shortened(str(source))}."
+        )
     with decoding(path):
         voxels = _read_header(path, reader)
         expected = voxels * sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
-        encoding, begin, source = nrrd_header(path)
-        if encoding not in ("raw", "gzip", "gz") or not source.is_file():
-            raise ValueError(
-                f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
-                f"got {encoding!r} and {source}."
-            )
         held = source.stat().st_size - begin
         if encoding != "raw":
             with source.open("rb") as stream:
@@ -104,22 +111,28 @@ def _volume(path: Path, reader: Any) -> dict[str, Any]:
 
 def nrrd_header(path: Path) -> tuple[str, int, Path]:
     """The encoding of an NRRD file; where its voxels begin, and in which file, which may be missing."""
-    found, end = text_header(path, ":")
+    found, end = text_header(path, ":", longest=LONGEST)
     fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
     named, encoding = fields.get("datafile"), fields.get("encoding", "").lower()
     return (encoding, end, path) if named is None else (encoding, 0, path.parent / named)
 
 
-def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, str], int]:
+def text_header(
+    path: Path, separator: str, last: str = "", longest: int = 2**20
+) -> tuple[dict[str, str], int]:
     """The fields of a header in text, and where in the file it ends: at an empty line, or behind the field
-    `last`."""
+    `last`. Raises `ValueError` for more than 1024 fields, and fields of more than so many letters."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
-        while last not in fields and len(fields) < 2**10:  # a file that has more is corrupt
-            line = stream.readline(2**16).decode("latin-1").strip()
+        while last not in fields:
+            line = stream.readline(2**20).decode("latin-1").strip()
             if not line:
                 break
             key, _, value = line.partition(separator)
+            long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
+            if long or len(fields) == 2**10:
+                told = f"the field {shortened(line)}" if long else "more than 1024 fields"
+                raise ValueError(f"path: {path} cannot be read: its header has {told}.")
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 
