@@ -5,6 +5,8 @@ it. A volume gives values, a transfer function maps them to colour and extinctio
 composited front to back into a `Rendering`.
 """
 
+from ._util import interruption as _interruption  # isort: split
+
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
 from ._util.version import __version__ as __version__

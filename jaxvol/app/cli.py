@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 
 from .._util.checks import printable
+from .._util.interruption import end_at_once, raise_again
 from .._util.version import __version__
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
@@ -51,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     program = " ".join(["jaxvol", *words[:1]])
     options = argparse.Namespace()
     try:
+        raise_again()
         options = parsed(parser_of_all(), words)
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
@@ -74,6 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\n{program}: interrupted{hint}", file=sys.stderr, flush=True)
         sys.stdout.flush()
         os._exit(130)
+    finally:
+        end_at_once()
     return 0
 
 

@@ -115,7 +115,8 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     if "transfer" in found:
         settings["recorded_transfer"] = found["transfer"]
     if not named:
-        settings["file"] = volume_of_picture(path, found["file"]["name"], found["file"]["sha256"])
+        file = found["file"]
+        settings["file"] = volume_of_picture(path, file["name"], file.get("bytes"), file["sha256"])
     return settings
 
 
