@@ -1,14 +1,15 @@
 """Ctrl-C ends the command `jaxvol` also while its modules load, and while Python shuts down.
 
-Imported first by `jaxvol`. Python raises `KeyboardInterrupt` in whatever runs; where that is a callback of the
-garbage collector (JAX has one) or of a weak reference, it is reported, lost, and the command goes on. So before
-and after `main`, the signal ends the process as it ends programs that do not handle it.
+Imported first by `jaxvol`. Python raises `KeyboardInterrupt` in whatever runs; where that is a callback of
+the garbage collector (JAX has one) or of a weak reference, it is reported, lost, and the command goes on. So
+before and after `main`, the signal ends the process as it ends programs that do not handle it.
 """
 
 import signal
 import sys
 import threading
 from pathlib import PurePath
+from typing import Any
 
 
 def end_at_once() -> None:
@@ -23,7 +24,7 @@ def raise_again() -> None:
     _replace(signal.SIG_DFL, signal.default_int_handler)
 
 
-def _replace(handler: object, by: signal._HANDLER) -> None:
+def _replace(handler: Any, by: Any) -> None:
     if signal.getsignal(signal.SIGINT) is handler:  # and not where the process was told to ignore it
         signal.signal(signal.SIGINT, by)
 

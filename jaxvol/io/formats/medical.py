@@ -26,8 +26,8 @@ a squared length from 1: files hold directions of a few decimal places."""
 
 
 LONGEST = 900
-"""Letters of a field in an NRRD header, at most: a message of ITK's library about longer ones is written beyond
-the end of its memory, and ends the process. Comments and pairs (`key:=value`) may be longer."""
+"""Letters of a field in an NRRD header, at most: what ITK's library tells of longer ones is written beyond the
+end of its memory, and ends the process. Comments and pairs (`key:=value`) may be longer."""
 
 
 def simple_itk(path: Path) -> Any:
