@@ -26,8 +26,8 @@ a squared length from 1: files hold directions of a few decimal places."""
 
 
 LONGEST = 900
-"""Letters of a field in an NRRD header, at most: what ITK's library tells of longer ones is written beyond the
-end of its memory, and ends the process. Comments and pairs (`key:=value`) may be longer."""
+"""Letters of a field in an NRRD header, at most: what ITK tells of longer ones is written beyond its buffer,
+and ends the process. Comments and pairs (`key:=value`) may be longer."""
 
 
 def simple_itk(path: Path) -> Any:
@@ -67,14 +67,16 @@ def read_nrrd(path: Path) -> dict[str, Any]:
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO")
     encoding, begin, source = nrrd_header(path)
-    # before ITK opens it, which waits for the other end of a pipe
-    if encoding not in ("raw", "gzip", "gz") or not source.is_file():
-        raise ValueError(
-            f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
-            f"got {shortened(encoding)} and {shortened(str(source))}."
-        )
+    wrong = (
+        f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; got "
+        f"{shortened(encoding)} and {shortened(str(source))}."
+    )
+    if not source.is_file():  # ITK opens it, and waits for the other end of a pipe
+        raise ValueError(wrong)
     with decoding(path):
         voxels = _read_header(path, reader)
+        if encoding not in ("raw", "gzip", "gz"):
+            raise ValueError(wrong)
         expected = voxels * sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
         held = source.stat().st_size - begin
         if encoding != "raw":
