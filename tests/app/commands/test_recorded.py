@@ -133,7 +133,9 @@ def test_the_volume_may_lie_beside_the_picture_and_must_be_the_same(picture, vol
     volume_file.unlink()
     assert like("b.png") == 2
     assert "which is not there" in capsys.readouterr().err
+    capsys.readouterr()
     assert options("render", "--like", "there/a.png").file.parent.name == "there"
+    assert f"names the volume 'there/{volume_file.name}'" in capsys.readouterr().out  # which is read then
 
 
 def different(path, file, *contents):
