@@ -183,7 +183,7 @@ def add_transfer(parser: Parser) -> None:
     text = "a transfer function written by jaxvol fit"
     group.add_argument("--transfer", type=Path, metavar="JSON", help=text)
     add_clim(group)
-    text = "length to which opacities refer (default: 1)"
+    text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"
     group.add_argument("--unit-distance", type=float, metavar="LENGTH", help=text)
 
 
