@@ -70,13 +70,17 @@ class Scene(NamedTuple):
 
     @property
     def has_fault(self) -> Bool[Array, ""]:
-        """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
+        """Whether a number on which all pixels depend is NaN, infinite, or out of its range: a step or a
+        spacing that is not positive, a transfer function or a transform that is not `valid`.
 
         All pixels are NaN then. Otherwise comparisons with NaN, which are false, would hide the fault, and a
         fit that diverged would look converged. Given rays are checked one by one; NaN in voxels spreads to
         the pixels that meet it."""
         parts = without_voxels(self.volume), self.march, self.transfer, self.compositing, self.lighting
-        return ~(all_finite(parts) & (self.march.step > 0))
+        valid = all_finite(parts) & (self.march.step > 0) & jnp.all(self.volume.spacing > 0)
+        for part in (self.transfer, *self.march.transforms):
+            valid &= part.valid
+        return ~valid
 
     @property
     def resolves(self) -> bool:

@@ -38,6 +38,7 @@ from .scene.space import Line, Ray, enter, invalid
 from .scene.transfer import Transfer
 from .scene.variation import Windows
 from .scene.volume import Volume
+from .xla.differentiation import nan_derivatives
 from .xla.platform import is_traced
 from .xla.sharding import varying
 
@@ -80,10 +81,12 @@ def render_ray_reference(
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
     scene = Scene(volume, transfer, None, march, compositing_of(compositing), lighting)
     check_channels(volume, transfer, march, scene.compositing, lighting)
-    length, shown = steps_across(volume, march), scene.prepared()
+    length, fault = steps_across(volume, march), scene.has_fault
+    scene = nan_derivatives(scene, fault)
+    shown = scene.prepared()
     column, row = (jnp.asarray(number, jnp.int32) for number in pixel)
     line = Line(apart(_vector("origin", origin)), apart(_vector("direction", direction)), (column, row))
-    ray = invalid(enter(shown.space, *line), scene.has_fault)
+    ray = invalid(enter(shown.space, *line), fault)
     marched = scene.marched.prepared(None if stride_control(march) is None else Windows.of(volume))
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require, shortened
 from .._util.vec3 import Scalar, Vec3, along, apart
@@ -245,17 +245,24 @@ class Camera(eqx.Module):
         window = _zoomed(self.window, factor, finite_array("center", center, (2,)))
         return replace(self, window=window, corner=None)
 
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        """Whether angle, scale and `view_up`, which may be traced, are such as the constructor accepts; else
+        all rays are NaN."""
+        height = self.view_angle if self.parallel_scale is None else self.parallel_scale
+        return _is_valid(height, self.parallel_scale is None, self.view_up, self.focal_point - self.position)
+
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
         x, y = self._column(column + 0.5), self._row(row + 0.5)
         right, up, forward = (apart(axis) for axis in axes_of(self))
-        position = apart(self.position)
-        if self.parallel_scale is not None:
-            scale = self.parallel_scale
+        position, scale = apart(self.position), self.parallel_scale
+        if scale is not None:
+            scale = jnp.where(self.valid, scale, jnp.nan)
             return along(along(position, right, scale * x), up, scale * y), forward
-        scale = jnp.tan(jnp.deg2rad(self.view_angle) / 2)
+        scale = jnp.where(self.valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
         dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return position, (dx / norm, dy / norm, dz / norm)
@@ -407,6 +414,13 @@ def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
     half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
     return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
+
+
+@partial(jax.jit, static_argnums=1)
+def _is_valid(height: Scalar, is_angle: bool, up: Array, forward: Array) -> Bool[Array, ""]:
+    # a margin, since the constructor may round another way
+    beside = _sine(up, forward / jnp.max(jnp.abs(forward))) > 0.5e-6
+    return (height > 0) & ((height < 180) | (not is_angle)) & beside
 
 
 def _sine(a: Any, b: Any) -> Any:

@@ -88,6 +88,12 @@ class Transfer(eqx.Module):
         return ()
 
     @property
+    def valid(self) -> Bool[Array, ""] | bool:
+        """Whether its parameters, which may be traced, are such as its constructor accepts; else the image is
+        NaN. (Whether they are finite is checked of all.)"""
+        return True
+
+    @property
     def reads_more(self) -> bool:
         """Whether `attributes` reads anything. By default, if it is overridden."""
         return type(self).attributes is not Transfer.attributes
@@ -224,6 +230,10 @@ class TransferFunction(Transfer):
     @property
     def channels(self) -> int:
         return 1
+
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        return jnp.all(self.values[..., 1:] >= self.values[..., :-1])
 
     @property
     def _seen(self) -> Float[Array, " n"]:
