@@ -31,6 +31,10 @@ class _Switch(jv.Transform):
     inner: jv.Transform
     on: Bool[Array, ""]
 
+    @property
+    def valid(self):
+        return self.inner.valid
+
 
 class _Index(EmptySpaceIndex):
     """Another index, or one to which nothing is empty."""
@@ -143,7 +147,7 @@ STATIC = "joins", "ends_at_exit"
 @cache
 def _class(kind: type[jv.Transform], part: str) -> type[_Switch]:
     overridden = {name for name in vars(kind) if not name.startswith("_") and hasattr(jv.Transform, name)}
-    assert overridden <= {*SEAMS, *STATIC}, f"{kind.__name__} overrides what cannot be switched"
+    assert overridden <= {*SEAMS, *STATIC, "valid"}, f"{kind.__name__} overrides what cannot be switched"
     members = {
         name: seam for name, seam in SEAMS.items() if getattr(kind, name) is not getattr(jv.Transform, name)
     }
