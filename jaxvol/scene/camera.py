@@ -38,8 +38,8 @@ class Camera(eqx.Module):
             pixels keep their random numbers; by default (0, 0). Set by `crop`.
 
     Raises:
-        ValueError: for a camera at its focal point, a `view_up` along the view direction, and an angle,
-            scale or size out of range.
+        ValueError: for a camera at its focal point, a `view_up` along the view direction, an angle, scale or
+            size out of range, and coordinates from 1e18 on (in float32).
     """
 
     position: Float[Array, "3"]
@@ -65,9 +65,9 @@ class Camera(eqx.Module):
         corner: Arrayable | None = None,
     ):
         self.size = width, height = _image_size(size)
-        self.focal_point = finite_array("focal_point", focal_point, (3,))
+        self.focal_point = _moderate("focal_point", finite_array("focal_point", focal_point, (3,)))
         self.position = require(
-            finite_array("position", position, (3,)),
+            _moderate("position", finite_array("position", position, (3,))),
             lambda here, there: (here != there).any(),
             "position must differ from focal_point; got {got} for both.",
             self.focal_point,
@@ -124,6 +124,7 @@ class Camera(eqx.Module):
         cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
         place, aspect = (volume.origin, volume.spacing, volume.direction, cells), min(1.0, width / height)
         position, center, up, scale = _fitted_view(place, direction, view_up, view_angle, aspect)
+        position = _moderate("volume, as seen from the camera,", position)
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
@@ -438,6 +439,16 @@ def _is_rotation(r: Any) -> Any:
     return sum(each * each for each in off) < 1e-6
 
 
+def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A point to which, from the origin, squares of lengths do not overflow. If it is traced, what overflows
+    makes the image NaN."""
+    if is_traced(point):
+        return point
+    most = float(jnp.finfo(point.dtype).max) ** 0.5 / 16
+    message = f"{name} must have coordinates below {most:.1e}, since squares of greater ones overflow; use a "
+    return require(point, lambda p: abs(p) < most, f"{message}greater unit of length. Got {{got}}.")
+
+
 def _image_size(size: Any) -> tuple[int, int]:
     try:
         width, height = (int(n) for n in size)
@@ -445,6 +456,6 @@ def _image_size(size: Any) -> tuple[int, int]:
     except (TypeError, ValueError, OverflowError):
         width = height = whole = 0
     if not whole or min(width, height) < 1 or width * height >= 2**31:
-        expected = "(width, height) in whole pixels, each at least 1, and fewer than 2**31 in all"
+        expected = "(width, height) in whole pixels, fewer than 2**31 in all and each at least 1"
         raise ValueError(f"size must be {expected}; got {shortened(size)}.")
     return width, height
