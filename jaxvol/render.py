@@ -93,9 +93,12 @@ def render(
 
     Returns:
         A `Rendering` of shape (height, width), in JAX's default float type. If a number on which all pixels
-        depend is NaN or infinite (a transfer function whose fit diverged, say), all of the image and of its
-        gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays meet it, or leave the volume
-        next to it (0 times NaN is NaN).
+        depend is NaN or infinite (a transfer function whose fit diverged, say), or, where it is traced, out
+        of its range (a view angle of 180°, control points that decrease), all of the image and of its
+        gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays sample it, or leave the volume
+        next to it (0 times NaN is NaN), unless what lies in front of it is opaque or decides the pixel, as an
+        isosurface does. An infinite voxel is a value beyond all others, and need not show. (`Volume` refuses
+        both: they come from what replaces its data.)
 
     Raises:
         ValueError: for an argument of another kind (an array for a `Volume`, a camera in the march's place);
