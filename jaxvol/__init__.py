@@ -5,6 +5,8 @@ it. A volume gives values, a transfer function maps them to colour and extinctio
 composited front to back into a `Rendering`.
 """
 
+import jaxvol._util.interruption  # isort: split  # noqa: F401  (before what takes long to load)
+
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
 from ._util.version import __version__ as __version__

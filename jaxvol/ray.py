@@ -25,7 +25,7 @@ from .lighting.shading import Lighting, lit_classification
 from .march import strides
 from .march.march import Cell, March
 from .march.strides import Strides, steps_of
-from .scene.camera import Camera
+from .scene.camera import Camera, without_ends
 from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
 from .scene.several import Several
@@ -71,13 +71,19 @@ class Scene(NamedTuple):
 
     @property
     def has_fault(self) -> Bool[Array, ""]:
-        """Whether a number on which all pixels depend is NaN or infinite, or the step is not positive.
+        """Whether a number on which all pixels depend is NaN, infinite, or out of its range: a step or a
+        spacing that is not positive; a transfer function, a transform or a camera that is not `valid`.
 
         All pixels are NaN then. Otherwise comparisons with NaN, which are false, would hide the fault, and a
         fit that diverged would look converged. Given rays are checked one by one; NaN in voxels spreads to
         the pixels that meet it."""
+        rays = None if self.source is None else without_ends(self.source)
+        camera = [rays] if isinstance(rays, Camera) else []
         parts = without_voxels(self.volume), self.march, self.transfer, self.compositing, self.lighting
-        return ~(all_finite(parts) & (self.march.step > 0))
+        valid = all_finite((parts, camera)) & (self.march.step > 0) & jnp.all(self.volume.spacing > 0)
+        for part in (self.transfer, *self.march.transforms, *camera):
+            valid &= part.valid
+        return ~valid
 
     @property
     def resolves(self) -> bool:

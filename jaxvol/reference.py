@@ -4,9 +4,10 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ._util.checks import Arrayable, finite_array
 from ._util.vec3 import apart
@@ -38,6 +39,7 @@ from .scene.space import Line, Ray, enter, invalid
 from .scene.transfer import Transfer
 from .scene.variation import Windows
 from .scene.volume import Volume
+from .xla.differentiation import nan_derivatives
 from .xla.platform import is_traced
 from .xla.sharding import varying
 
@@ -80,10 +82,13 @@ def render_ray_reference(
     check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
     scene = Scene(volume, transfer, None, march, compositing_of(compositing), lighting)
     check_channels(volume, transfer, march, scene.compositing, lighting)
-    length, shown = steps_across(volume, march), scene.prepared()
+    length = steps_across(volume, march)
     column, row = (jnp.asarray(number, jnp.int32) for number in pixel)
     line = Line(apart(_vector("origin", origin)), apart(_vector("direction", direction)), (column, row))
-    ray = invalid(enter(shown.space, *line), scene.has_fault)
+    fault = _has_fault(scene)
+    scene = nan_derivatives(scene, fault)
+    shown = scene.prepared()
+    ray = invalid(enter(shown.space, *line), fault)
     marched = scene.marched.prepared(None if stride_control(march) is None else Windows.of(volume))
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
@@ -92,6 +97,11 @@ def render_ray_reference(
     at, _ = jax.lax.scan(one, varying(begin(marched, ray), ray), None, length=length)
     rendering = end(marched, ray, at)
     return resolved(shown, line, rendering) if scene.resolves else rendering
+
+
+@eqx.filter_jit  # operations by themselves would be a program each
+def _has_fault(scene: Scene) -> Bool[Array, ""]:
+    return scene.has_fault
 
 
 def step(scene: Scene, ray: Ray, at: Progress) -> Progress:

@@ -5,6 +5,7 @@ import math
 import warnings
 from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -92,9 +93,12 @@ def render(
 
     Returns:
         A `Rendering` of shape (height, width), in JAX's default float type. If a number on which all pixels
-        depend is NaN or infinite (a transfer function whose fit diverged, say), all of the image and of its
-        gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays meet it, or leave the volume
-        next to it (0 times NaN is NaN).
+        depend is NaN or infinite (a transfer function whose fit diverged, say), or, where it is traced, out
+        of its range (a view angle of 180°, control points that decrease), all of the image and of its
+        gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays sample it, or leave the volume
+        next to it (0 times NaN is NaN), unless what lies in front of it is opaque or decides the pixel, as an
+        isosurface does. An infinite voxel is a value beyond all others, and need not show. (`Volume` refuses
+        both: they come from what replaces its data.)
 
     Raises:
         ValueError: for an argument of another kind (an array for a `Volume`, a camera in the march's place);
@@ -183,9 +187,9 @@ def render_rays(
         raise ValueError(
             f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}."
         )
-    message = "directions must not have length 0."
-    directions = require(directions, lambda d: (d != 0).any(axis=-1), message)
-    directions = directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
+    least = float(jnp.finfo(directions.dtype).tiny)
+    message = f"directions must not have length 0, or below {least:.2g}."
+    directions = _unit(require(directions, lambda d: (abs(d) >= least).any(axis=-1), message))
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
     source = GivenRays(origins, directions, _pixels(pixels, origins), first)
@@ -193,6 +197,14 @@ def render_rays(
         source = Ending(source, finite_array("until", until, origins.shape[:-1], infinite=True))
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
     return render_scene(scene, outputs, adjoint, devices=devices)
+
+
+@jax.jit
+def _unit(directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays 3"]:
+    """Directions of length 1; squares of long and short ones would overflow and underflow."""
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(directions), axis=-1, keepdims=True))
+    directions = directions / jnp.where((largest > 1e-9) & (largest < 1e9), 1, largest)
+    return directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 def _pixels(pixels: Arrayable | None, origins: Float[Array, "*rays 3"]) -> Int[Array, "*rays 2"] | None:

@@ -35,6 +35,10 @@ class _Switch(jv.Transform):
     def tested_every(self):
         return self.inner.tested_every
 
+    @property
+    def valid(self):
+        return self.inner.valid
+
 
 class _Index(EmptySpaceIndex):
     """Another index, or one to which nothing is empty."""
@@ -149,7 +153,7 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "ends_at_exit", "tested_every"
+STATIC = "joins", "ends_at_exit", "tested_every", "valid"
 
 
 @cache

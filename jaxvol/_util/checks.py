@@ -54,6 +54,11 @@ def shortened(value: Any) -> str:
     return text if len(text) <= 120 else f"{text[:50]} ... {text[-50:]}"
 
 
+def printable(text: str) -> str:
+    """A text with its control characters escaped: what stands in a file may be meant for a terminal."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
     """Check that `holds(value, *others)` is true everywhere, and return `value`.
 
@@ -207,6 +212,7 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
     try:
         if path.is_dir():
             raise IsADirectoryError("it is a folder")
+        path.resolve()
         nearest = next(folder for folder in path.absolute().parents if folder.exists())
         if not nearest.is_dir():
             raise NotADirectoryError(f"{nearest} is not a folder")
@@ -214,8 +220,9 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
             pass
         if path.exists():
             path.open("ab").close()
-    except OSError as fault:
-        raise ValueError(f"{name}: {path} cannot be written ({fault.strerror or fault}).") from fault
+    except (OSError, RuntimeError) as fault:  # RuntimeError: of links in a circle
+        told = getattr(fault, "strerror", None) or fault
+        raise ValueError(f"{name}: {path} cannot be written ({told}).") from fault
     return path
 
 

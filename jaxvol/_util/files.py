@@ -12,6 +12,8 @@ from typing import IO, Literal, TypeAlias
 
 import numpy as np
 
+from .checks import printable
+
 
 CHUNK = 2**20
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
@@ -71,7 +73,7 @@ def reason(fault: BaseException) -> str:
     """The last line of an error, without the place in ITK's source with which its errors begin."""
     last = str(fault).strip().rpartition("\n")[2]
     told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
-    return "".join(c if c.isprintable() else "?" for c in told).rstrip(".") or type(fault).__name__
+    return printable(told).rstrip(".") or type(fault).__name__
 
 
 def as_array(

@@ -45,6 +45,8 @@ def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dt
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, fortran, dtype = readers[np.lib.format.read_magic(stream)](stream)
+        if not all(type(n) is int for n in shape):  # NumPy lets True through
+            raise TypeError(f"shape {shape}")
     except CORRUPT:
         raise
     except Exception as fault:  # NumPy raises different errors for different faults

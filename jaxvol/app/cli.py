@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import jax
 
+from .._util.checks import printable
+from .._util.interruption import end_at_once, raise_again
 from .._util.version import __version__
 from .._util.whole_files import remove_unfinished
 from ..xla.persistent_cache import SHORTEST, default_programs
@@ -50,6 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     program = " ".join(["jaxvol", *words[:1]])
     options = argparse.Namespace()
     try:
+        raise_again()
         options = parsed(parser_of_all(), words)
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
@@ -60,15 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except (ValueError, OSError, ImportError) as fault:
-        text = " ".join(str(fault).split()).removeprefix("path: ")  # the argument's name in Python
-        print(f"{program}: error: {text}", file=sys.stderr)
-        return 2
+    except (ValueError, OSError, ImportError, OverflowError) as fault:
+        return _told(program, str(fault).removeprefix("path: "))  # the argument's name in Python
     except (MemoryError, jax.errors.JaxRuntimeError) as fault:
         if not isinstance(fault, MemoryError) and "RESOURCE_EXHAUSTED" not in str(fault):
             raise
-        print(f"{program}: error: there is not enough memory ({fault})", file=sys.stderr)
-        return 2
+        return _told(program, f"there is not enough memory ({fault})")
     except KeyboardInterrupt:
         remove_unfinished()
         checkpoint = getattr(options, "checkpoint", None)
@@ -76,7 +76,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\n{program}: interrupted{hint}", file=sys.stderr, flush=True)
         sys.stdout.flush()
         os._exit(130)
+    finally:
+        end_at_once()
     return 0
+
+
+def _told(program: str, fault: str) -> int:
+    """Print a fault in one line, which may hold text of files. Returns the exit code."""
+    print(f"{program}: error: {printable(' '.join(fault.split()))}", file=sys.stderr)
+    return 2
 
 
 def parser_of_all() -> Parser:

@@ -15,9 +15,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from .._util.checks import Arrayable, described
+from .._util.checks import Arrayable, described, shortened
 from .._util.files import MOST_VOXELS, check_size, file_size
-from .._util.memory import memory_of_device
+from .._util.memory import memory_of_device, require_room
 from .._util.named_axes import along_xyz, is_named
 from ..io.formats import FOLDERS
 from ..io.formats.raw import raw_header
@@ -188,10 +188,13 @@ def _zarr_array(path: Path, *, axes: Any = None, missing: Any = "error", **how: 
             f"path: {path} must have chunks that are not much larger than it; got chunks of {tuple(chunk)} "
             f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
         )
+    require_room(of_chunk, f"path: {path}: a chunk of {tuple(chunk)} voxels")  # tensorstore ends the process
     names: Any = list(store.domain.labels)  # Zarr 3
     if (path / ".zattrs").is_file():  # xarray's in Zarr 2
-        names = _read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS")
-    names = [str(name).lower() for name in names] if isinstance(names, list) else []
+        names = _read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"path: {path}: _ARRAY_DIMENSIONS must be names; got {shortened(names)}.")
+    names = [str(name).lower() for name in names]
     if axes is None and {*SPACE} <= {*names}:
         axes = names
     return VoxelSource(store, axes=axes, name=str(path), **how)

@@ -19,7 +19,7 @@ from ..reference import step, steps_across
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..xla.compiling import compiled
-from ..xla.differentiation import forward_only, transformations
+from ..xla.differentiation import forward_only, nan_derivatives, transformations
 from ..xla.linear import differentiable, moving_leaves, recomputed
 from ..xla.platform import is_traced
 from ..xla.sharding import varying
@@ -142,6 +142,7 @@ def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceler
     """The image, by `options.steps` steps of the reference engine along each ray, which JAX can
     differentiate."""
     tiles = RayTiles.of(scene.source, options.tiling, direct=True)
+    scene = nan_derivatives(scene, scene.has_fault)
     prepared = acceleration.prepared(scene)
 
     def scanned(_: Int[Array, ""], rays: Ray) -> tuple[Rendering, None]:
@@ -164,7 +165,7 @@ def _over_tiles(
         return one(each[0], tiles.rays(scene.source, scene.space, each[0], fault))
 
     renderings, more = tiles.map(tile)
-    return jax.tree.map(tiles.assemble, renderings), more
+    return nan_derivatives(jax.tree.map(tiles.assemble, renderings), fault), more
 
 
 def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:

@@ -227,9 +227,11 @@ def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
 
 
 def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Line:
-    """The rays of pixels. If the camera is not finite, or there is a `fault`, all of them are NaN."""
+    """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN."""
     left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
-    found = _rounded(camera, columns, rows, fault)
+    # on a GPU, `in_memory` computes rays also of a fault
+    camera = eqx.tree_at(lambda c: c.position, camera, jnp.where(fault, jnp.nan, camera.position))
+    found = _rounded(camera, columns, rows)
     if camera.parallel_scale is not None:
         origin, direction = found
     else:  # the position need not be stored for each ray
@@ -245,18 +247,18 @@ def _through(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
 
 
 @jax.custom_jvp
-def _rounded(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Any:
+def _rounded(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
     """`_through`, rounded alike in every program.
 
     Otherwise a program that also differentiates it would round it differently, by 1e-4 of a voxel; and a
     sample on the other side of a voxel's face has another slope. So it is computed in a branch of its own,
     without derivatives."""
-    return in_memory(all_finite(camera) & ~fault, partial(_through, camera), columns, rows)
+    return in_memory(all_finite(camera), partial(_through, camera), columns, rows)
 
 
 @_rounded.defjvp
-def _(primals: tuple[Camera, Lanes, Lanes, Any], tangents: tuple[Camera, Any, Any, Any]) -> tuple[Any, Any]:
-    camera, columns, rows, _ = primals
+def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -> tuple[Any, Any]:
+    camera, columns, rows = primals
     _, change = jax.jvp(lambda camera: _through(camera, columns, rows), (camera,), tangents[:1])
     return _rounded(*primals), change
 

@@ -64,6 +64,12 @@ class Transform(eqx.Module):
         number, of which some may have width 0."""
         return (cell,)
 
+    @property
+    def valid(self) -> Bool[Array, ""] | bool:
+        """Whether its parameters, which may be traced, are such as its constructor accepts; else the image is
+        NaN. (Whether they are finite is checked of all.)"""
+        return True
+
     joins: ClassVar[bool] = False
     """Whether pieces touch: each that `cut` returns begins where the one before it ends, also across two
     cells, except past the exit. Pieces that are integrated then share the value where they meet."""

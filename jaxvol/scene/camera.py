@@ -12,9 +12,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Num
+from jaxtyping import Array, Bool, Float, Int, Num
 
-from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require
+from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require, shortened
 from .._util.vec3 import Scalar, Vec3, along, apart
 from ..xla.platform import is_traced
 from .space import Line
@@ -38,8 +38,8 @@ class Camera(eqx.Module):
             pixels keep their random numbers; by default (0, 0). Set by `crop`.
 
     Raises:
-        ValueError: for a camera at its focal point, a `view_up` along the view direction, and an angle,
-            scale or size out of range.
+        ValueError: for a camera at its focal point, a `view_up` along the view direction, an angle, scale or
+            size out of range, and coordinates from 1e18 on (in float32).
     """
 
     position: Float[Array, "3"]
@@ -65,9 +65,9 @@ class Camera(eqx.Module):
         corner: Arrayable | None = None,
     ):
         self.size = width, height = _image_size(size)
-        self.focal_point = finite_array("focal_point", focal_point, (3,))
+        self.focal_point = _moderate("focal_point", finite_array("focal_point", focal_point, (3,)))
         self.position = require(
-            finite_array("position", position, (3,)),
+            _moderate("position", finite_array("position", position, (3,))),
             lambda here, there: (here != there).any(),
             "position must differ from focal_point; got {got} for both.",
             self.focal_point,
@@ -124,6 +124,7 @@ class Camera(eqx.Module):
         cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
         place, aspect = (volume.origin, volume.spacing, volume.direction, cells), min(1.0, width / height)
         position, center, up, scale = _fitted_view(place, direction, view_up, view_angle, aspect)
+        position = _moderate("volume, as seen from the camera,", position)
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
@@ -245,17 +246,24 @@ class Camera(eqx.Module):
         window = _zoomed(self.window, factor, finite_array("center", center, (2,)))
         return replace(self, window=window, corner=None)
 
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        """Whether angle, scale and `view_up`, which may be traced, are such as the constructor accepts; else
+        all rays are NaN."""
+        height = self.view_angle if self.parallel_scale is None else self.parallel_scale
+        return _is_valid(height, self.parallel_scale is None, self.view_up, self.focal_point - self.position)
+
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
         x, y = self._column(column + 0.5), self._row(row + 0.5)
         right, up, forward = (apart(axis) for axis in axes_of(self))
-        position = apart(self.position)
-        if self.parallel_scale is not None:
-            scale = self.parallel_scale
+        position, scale = apart(self.position), self.parallel_scale
+        if scale is not None:
+            scale = jnp.where(self.valid, scale, jnp.nan)
             return along(along(position, right, scale * x), up, scale * y), forward
-        scale = jnp.tan(jnp.deg2rad(self.view_angle) / 2)
+        scale = jnp.where(self.valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
         dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return position, (dx / norm, dy / norm, dz / norm)
@@ -409,6 +417,13 @@ def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
 
 
+@partial(jax.jit, static_argnums=1)
+def _is_valid(height: Scalar, is_angle: bool, up: Array, forward: Array) -> Bool[Array, ""]:
+    # a margin, since the constructor may round another way
+    beside = _sine(up, forward / jnp.max(jnp.abs(forward))) > 0.5e-6
+    return (height > 0) & ((height < 180) | (not is_angle)) & beside
+
+
 def _sine(a: Any, b: Any) -> Any:
     """Sine of the angle between two vectors; 0 if one is zero."""
     across = sum((a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2]) ** 2 for i in range(3))
@@ -424,12 +439,23 @@ def _is_rotation(r: Any) -> Any:
     return sum(each * each for each in off) < 1e-6
 
 
+def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
+    """A point to which, from the origin, squares of lengths do not overflow. If it is traced, what overflows
+    makes the image NaN."""
+    if is_traced(point):
+        return point
+    most = float(jnp.finfo(point.dtype).max) ** 0.5 / 16
+    message = f"{name} must have coordinates below {most:.1e}, since squares of greater ones overflow; use a "
+    return require(point, lambda p: abs(p) < most, f"{message}greater unit of length. Got {{got}}.")
+
+
 def _image_size(size: Any) -> tuple[int, int]:
     try:
         width, height = (int(n) for n in size)
         whole = (width, height) == tuple(size)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         width = height = whole = 0
-    if not whole or width < 1 or height < 1:
-        raise ValueError(f"size must be (width, height) in whole pixels, each at least 1; got {size!r}.")
+    if not whole or min(width, height) < 1 or width * height >= 2**31:
+        expected = "(width, height) in whole pixels, fewer than 2**31 in all and each at least 1"
+        raise ValueError(f"size must be {expected}; got {shortened(size)}.")
     return width, height

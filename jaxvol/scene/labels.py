@@ -99,6 +99,10 @@ class LabelTransferFunction(Transfer):
         return 1
 
     @property
+    def valid(self) -> Bool[Array, ""] | bool:
+        return self.stacked.valid
+
+    @property
     def _seen(self) -> TransferFunction:
         """All functions, with the extinctions that are seen."""
         factor = jnp.where(self.shown, self.opacity, 0)

@@ -136,7 +136,8 @@ def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1
         name: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values.
         clim: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
             Hounsfield units + 1000 needs (0, 4000).
-        unit_distance: world length to which the opacities refer; they are designed for 1 mm.
+        unit_distance: world length to which the opacities refer; they are designed for 1 mm. Or a `Volume`,
+            for the size of its voxels.
 
     Returns:
         The `TransferFunction`, its colours linear.
@@ -187,7 +188,10 @@ def colormap(
         clim: (low, high), the volume's values at which the colormap begins and ends.
         opacity: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
             10; or an array of evenly spaced ones, in [0, 1].
-        unit_distance: thickness, in world length, of a layer that has these opacities.
+        unit_distance: thickness, in world length, of a layer that has these opacities; or a `Volume`, for the
+            size of its voxels (the geometric mean of its spacing). The default, a world length of 1, suits
+            voxels of about that size: little or nothing is seen of a volume that is much smaller, such as one
+            of 0.1 µm voxels in mm.
         n_colors: number of control points, at least 2.
 
     Returns:

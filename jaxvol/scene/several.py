@@ -201,6 +201,10 @@ class Together(Transfer):
         return sum(self.counts)
 
     @property
+    def valid(self) -> Bool[Array, ""]:
+        return jnp.all(jnp.stack([jnp.asarray(each.valid) for each in self.transfers]))
+
+    @property
     def reads_more(self) -> bool:
         return any(each.reads_more for each in self.transfers)
 

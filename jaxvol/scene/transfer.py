@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util import piecewise_linear as linear
@@ -19,6 +20,7 @@ from .._util.checks import Arrayable, finite_array, increasing, number, require,
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, row_sums
+from ..xla.platform import is_traced
 from .occupancy import Blocks
 from .variation import Variation, Windows
 from .volume import Volume
@@ -85,6 +87,12 @@ class Transfer(eqx.Module):
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         """What is read from the volume at a grid coordinate besides the value; by default nothing."""
         return ()
+
+    @property
+    def valid(self) -> Bool[Array, ""] | bool:
+        """Whether its parameters, which may be traced, are such as its constructor accepts; else the image is
+        NaN. (Whether they are finite is checked of all.)"""
+        return True
 
     @property
     def reads_more(self) -> bool:
@@ -199,7 +207,8 @@ class TransferFunction(Transfer):
         Args:
             points: in increasing order of value; two of one value make a step.
             unit_distance: thickness of a layer that has these opacities, world length (VTK's
-                `ScalarOpacityUnitDistance`); extinctions are `-ln(1 - opacity) / unit_distance`.
+                `ScalarOpacityUnitDistance`); extinctions are `-ln(1 - opacity) / unit_distance`. Or a
+                `Volume`, for the size of its voxels.
 
         Raises:
             ValueError: as the class does, and for an opacity outside [0, 1].
@@ -222,6 +231,10 @@ class TransferFunction(Transfer):
     @property
     def channels(self) -> int:
         return 1
+
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        return jnp.all(self.values[..., 1:] >= self.values[..., :-1])
 
     @property
     def _seen(self) -> Float[Array, " n"]:
@@ -339,9 +352,18 @@ def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[linear
     return linear.table_row(rows, index), index
 
 
-def extinction_of(opacity: Arrayable, unit_distance: Arrayable = 1.0) -> Float[Array, " n"]:
-    """The extinction (1/length) under which a layer of thickness `unit_distance` has this opacity, of which
-    more than 1 - 2⁻²⁴, the largest float32 below 1, counts as that."""
+def voxel_size(volume: Any) -> Any:
+    """Geometric mean of the distances between neighbouring nodes along x, y and z."""
+    xp = jnp if is_traced(volume.spacing) else np
+    return xp.exp(xp.mean(xp.log(xp.asarray(volume.spacing))))
+
+
+def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -> Float[Array, " n"]:
+    """The extinction (1/length) under which a layer of thickness `unit_distance` (of a volume, its
+    `voxel_size`) has this opacity, of which more than 1 - 2⁻²⁴, the largest float32 below 1, counts as that.
+    """
+    if hasattr(unit_distance, "spacing"):
+        unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)
     return _extinction(unit_interval("opacity", opacity, (None,)), unit_distance)
 

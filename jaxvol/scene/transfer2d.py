@@ -116,6 +116,10 @@ class TransferFunction2D(Transfer):
         return 1
 
     @property
+    def valid(self) -> Bool[Array, ""]:
+        return jnp.all(jnp.concatenate([jnp.diff(self.values), jnp.diff(self.magnitudes)]) >= 0)
+
+    @property
     def reads_gradient(self) -> bool:
         return True
 

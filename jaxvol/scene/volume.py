@@ -72,7 +72,8 @@ class Volume(eqx.Module):
     Raises:
         ValueError: for data that are not 3-D or 4-D, have an axis of one voxel or an unsupported type, or
             hold NaN, infinity or integers that no type holds exactly; for spacing that is not positive; for a
-            direction whose columns are not of length 1 to 1e-4, or (nearly) lie in a plane; and for labels of another shape, or beyond int32.
+            direction whose columns are not of length 1 to 1e-4, or nearly lie in a plane; and for labels of
+            another shape, or beyond int32.
     """
 
     data: Shaped[Array, "nx ny nz *c"]

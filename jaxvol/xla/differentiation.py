@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
@@ -52,6 +53,23 @@ def forward_only(tree: PyTree, message: str) -> PyTree:
         return primal[0], not_transposed(*tangent, message)
 
     return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def nan_derivatives(tree: PyTree, fault: Array) -> PyTree:
+    """The tree, unchanged; where `fault` is true, its derivatives in either mode are NaN, even if they would
+    be 0."""
+
+    @jax.custom_jvp
+    def same(leaf: Array, factor: Array) -> Array:
+        return leaf
+
+    @same.defjvp
+    def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+        leaf, factor = primals
+        return leaf, tangents[0] * factor.astype(leaf.dtype)
+
+    factor = jnp.where(fault, jnp.nan, 1.0)
+    return jax.tree.map(lambda leaf: same(leaf, factor) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 def not_transposed(tangents: PyTree, message: str) -> PyTree:

@@ -59,7 +59,10 @@ def test_rays_of_ones_own_see_what_the_camera_sees():
     volume = anisotropic_noise()
     camera = around(volume)
     origins, directions = camera.rays()
-    rays = jv.render_rays(volume, soft_transfer(), origins, 3 * directions, MARCH)
+    # of any length, also where squares overflow or underflow
+    lengths = np.geomspace(1e-37, 1e37, origins.size // 3).reshape(*origins.shape[:2], 1)
+    longer = (np.asarray(directions) * lengths).astype(np.float32)
+    rays = jv.render_rays(volume, soft_transfer(), origins, longer, MARCH)
     assert_same(rays, jv.render(volume, soft_transfer(), camera, MARCH), 2e-5)
 
 

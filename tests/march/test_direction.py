@@ -267,7 +267,7 @@ def boxed(volume, camera, box, cut):
 def test_a_sheared_grid_shows_what_an_orthogonal_one_does():
     """In float64. Voxels are a linear function of the world, which both interpolate exactly."""
     with in_float64():
-        camera = jv.Camera(CENTER + (2, -5, 3), CENTER, (0, 0, 1), 30.0, size=(9, 8))
+        camera = jv.Camera(CENTER + np.array([2, -5, 3]), CENTER, (0, 0, 1), 30.0, size=(9, 8))
         cut = CENTER, np.array([-0.2, 0.9, -0.3])
         given = camera, np.stack([CENTER - BOX, CENTER + BOX], axis=-1).ravel(), cut
         expected = jax.device_get(boxed(linear(np.asarray(R, float), (0.3, 0.32, 0.35)), *given))

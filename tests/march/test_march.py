@@ -265,7 +265,7 @@ BAD = {
         lambda: jv.EarlyTermination(0),
         "opacity_left must be greater than 0 and less than 1; got 0",
     ),
-    "interval 0": (lambda: jv.EarlyTermination(interval=0), "interval must be an integer from 1 to 64; got 0"),
+    "interval 0": (lambda: jv.EarlyTermination(interval=0), "interval must be an integer from 1 to 64"),
     "opacity left 1": (lambda: jv.EarlyTermination(1), "opacity_left must be .*; got 1"),
 }
 

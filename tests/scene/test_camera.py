@@ -52,7 +52,11 @@ def test_perspective_rays_lie_where_their_angles_say():
 
 
 def test_parallel_scale_is_half_the_height():
-    origins, directions = jv.Camera((0, 0, 1), (0, 0, 0), size=SIZE, parallel_scale=3).rays()
+    camera = jv.Camera((0, 0, 1), (0, 0, 0), size=SIZE, parallel_scale=3)
+    for wrong in (0.0, -3.0):  # as an optimiser may put in its place
+        broken = eqx.tree_at(lambda c: c.parallel_scale, camera, jax.device_put(np.float32(wrong)))
+        assert np.isnan(broken.rays()[0]).all()
+    origins, directions = camera.rays()
     np.testing.assert_allclose(directions, np.broadcast_to((0, 0, -1), directions.shape), atol=1e-7)
     np.testing.assert_allclose(np.asarray(origins)[0, 0], (-5.85, 2.85, 1), rtol=1e-6)
     np.testing.assert_allclose(np.asarray(origins)[-1, -1], (5.85, -2.85, 1), rtol=1e-6)
@@ -240,6 +244,15 @@ BAD = {
         lambda: jv.Camera((0, 5, 0), (0, 0, 0), (0, 1, 0)),
         "view_up must not be zero or point along",
     ),
+    "lengths whose squares overflow": (
+        lambda: jv.Camera((1.5e20, 0, 0), (0, 0, 0)),
+        r"position must have coordinates below 1.2e\+18, .* greater unit of length. Got \[1.5e\+20",
+    ),
+    "a volume of such lengths": (
+        lambda: jv.Camera.looking_at(jv.Volume(np.zeros((2, 2, 2), np.uint8), (3e19,) * 3)),
+        r"volume, as seen from the camera, must have coordinates below 1.2e\+18",
+    ),
+    "more pixels than counted": (lambda: camera(size=(2**16, 2**15)), "size must be .* fewer than 2\\*\\*31"),
     "size 0": (lambda: camera(size=(0, 5)), r"size must be .* at least 1; got \(0, 5\)"),
     "size of text": (lambda: camera(size="512x512"), "size must be .*got '512x512'"),
     "crop by halves": (

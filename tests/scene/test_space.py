@@ -108,6 +108,7 @@ BAD = {
     "shapes differ": (np.zeros((4, 3)), np.ones((5, 3)), r"agree in shape; got \(4, 3\) and \(5, 3\)"),
     "not triples": (np.zeros((4, 2)), np.ones((4, 2)), r"origins must have shape \(\*rays, 3\)"),
     "no direction": (np.zeros((1, 3)), np.zeros((1, 3)), "directions must not have length 0"),
+    "hardly a direction": (np.zeros((1, 3)), np.full((1, 3), 1e-39), "directions must not have length 0"),
     "NaN": (np.full((1, 3), np.nan), np.ones((1, 3)), "origins must be finite"),
 }
 

@@ -17,6 +17,7 @@ from ..._util.whole_files import whole_file
 from ...io.display import displayed
 from ...scene.camera import Camera
 from .options import add_command, add_output, add_scene, add_vector
+from .render import why_empty
 from .scene import scene_of, with_march
 
 
@@ -25,7 +26,7 @@ FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
 
 
 def _animate(options: argparse.Namespace) -> None:
-    count = integer("--frames", options.frames, 1)
+    count = integer("--frames", options.frames, 1, 2**20)
     path = output_file("--output", options.output)
     kind = path.suffix.lower()
     if kind not in (".gif", ".mp4"):
@@ -43,15 +44,21 @@ def _animate(options: argparse.Namespace) -> None:
     scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))
     begun = time.perf_counter()
     scene = with_march(scene, options, views(scene.camera, PLANNED_VIEWS))
-    images = (
-        displayed(np.asarray(scene.render(camera).image(scene.background), np.float32))
-        for camera in views(scene.camera, count)
-    )
+    empty: list[str | None] = []
+
+    def image_of(camera: Camera) -> UInt8[np.ndarray, "height width 3"]:
+        rendering = scene.render(camera)
+        empty.append(why_empty(scene, rendering))
+        return displayed(np.asarray(rendering.image(scene.background), np.float32))
+
+    images = map(image_of, views(scene.camera, count))
     with whole_file(path) as part:
         write = _write_gif if kind == ".gif" else _write_mp4
         write(part, images, options.fps)
     took = time.perf_counter() - begun
     print(f"{path}: {count} frames of {' x '.join(map(str, options.size))} pixels in {took:.1f} s")
+    if all(empty):
+        print(f"{path}: {empty[0]}")
 
 
 def turned(camera: Camera, degrees: float, axis: Any) -> Camera:

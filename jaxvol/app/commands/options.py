@@ -115,7 +115,8 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     if "transfer" in found:
         settings["recorded_transfer"] = found["transfer"]
     if not named:
-        settings["file"] = volume_of_picture(path, found["file"]["name"], found["file"]["sha256"])
+        file = found["file"]
+        settings["file"] = volume_of_picture(path, file["name"], file.get("bytes"), file["sha256"])
     return settings
 
 
@@ -186,7 +187,7 @@ def add_transfer(parser: Parser) -> None:
     text = "a transfer function written by jaxvol fit"
     group.add_argument("--transfer", type=Path, metavar="JSON", help=text)
     add_clim(group)
-    text = "length to which opacities refer (default: 1)"
+    text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"
     group.add_argument("--unit-distance", type=float, metavar="LENGTH", help=text)
 
 

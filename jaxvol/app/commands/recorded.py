@@ -4,6 +4,7 @@ picture names no file but its volume, whose SHA-256 it holds."""
 import argparse
 import hashlib
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,8 @@ def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
         value = getattr(options, name)
         if value != default and not isinstance(value, Path):
             words += words_of(name, value)
-    file = {"name": str(options.file), "sha256": checksum(options.file)}
+    size = sum(file.stat().st_size for file in _files(options.file))
+    file = {"name": str(options.file), "bytes": size, "sha256": checksum(options.file)}
     content: dict[str, Any] = {"options": words, "file": file}
     from_file = options.transfer is not None or options.recorded_transfer is not None
     if from_file and isinstance(transfer, TransferFunction):
@@ -64,6 +66,7 @@ def recorded_in(path: Path) -> dict[str, Any]:
         known = isinstance(content["options"], list) and isinstance(content["file"]["name"], str)
         known = known and all(isinstance(word, str) for word in content["options"])
         known = known and re.fullmatch("[0-9a-f]{64}", content["file"]["sha256"])
+        known = known and isinstance(content["file"].get("bytes", 0), int)
     except (ValueError, RecursionError, KeyError, TypeError):
         known = False
     if not known:
@@ -73,27 +76,47 @@ def recorded_in(path: Path) -> dict[str, Any]:
     return content
 
 
-def volume_of_picture(picture: Path, name: str, sha256: str) -> Path:
-    """The volume that a picture shows, unchanged: where it was, or in the picture's folder."""
+def volume_of_picture(picture: Path, name: str, size: int | None, sha256: str) -> Path:
+    """The volume that a picture shows, unchanged: where it was, or in the picture's folder. Of what the
+    picture names, only files of as many `size` bytes in all are read, and it is said which."""
+    if size is None:
+        raise ValueError(
+            f"{picture} is of an older jaxvol, and does not hold its volume's size. Name the volume."
+        )
     for path in (Path(name), picture.parent / Path(name).name):
         if path.exists():
-            if checksum(path) == sha256:
+            found = sum(file.stat().st_size for file in _files(path))
+            print(f"{picture} names the volume {shortened(str(path))}, {found} bytes", flush=True)
+            if found == size and checksum(path) == sha256:
                 return path
-            raise ValueError(f"{path} is not the volume that {picture} shows: its SHA-256 differs. Name one.")
+            told = "its SHA-256 differs" if found == size else f"that has {size} bytes"
+            raise ValueError(f"{path} is not the volume that {picture} shows: {told}. Name one.")
     raise ValueError(f"{picture} shows the volume {shortened(name)}, which is not there. Name one.")
 
 
 def checksum(path: Path) -> str:
     """SHA-256 of a volume: of the names and contents of its files."""
-    files = files_of(path)
-    if not files and any((path / name).is_file() for name in METADATA):
-        files = sorted(file for file in path.rglob("*") if file.is_file())  # Zarr
-    if not files:
-        raise ValueError(f"{path} is no volume: a file, or a folder of DICOM slices, TIFF images or Zarr.")
     found = hashlib.sha256()
-    for file in files:
+    for file in _files(path):
         name = file.relative_to(path).as_posix() if path.is_dir() else file.name
         found.update(name.encode() + b"\0")
         with file.open("rb") as content:
             found.update(hashlib.file_digest(content, "sha256").digest())
     return found.hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    """The files of a volume, none of which is a device or one of the kernel's, which may have no end."""
+    files = files_of(path) if _is_ordinary(path) else []
+    if not files and any((path / name).is_file() for name in METADATA):
+        files = sorted(file for file in path.rglob("*") if file.is_file())  # Zarr
+    if not files or not all(map(_is_ordinary, files)):
+        raise ValueError(f"{path} is no volume: a file, or a folder of DICOM slices, TIFF images or Zarr.")
+    return files
+
+
+def _is_ordinary(path: Path) -> bool:
+    """Whether a path is a folder, or a file that holds something, and not of the kernel."""
+    real = Path(os.path.realpath(path))
+    ours = not any(real.is_relative_to(folder) for folder in ("/dev", "/proc", "/sys"))
+    return ours and (real.is_dir() or (real.is_file() and real.stat().st_size > 0))

@@ -14,10 +14,14 @@ from ...compositing.isosurface import Isosurface
 from ...io.display import image_file, save_image
 from ...scene.rendering import Rendering
 from ...scene.space import enter
-from ...scene.transfer import TransferFunction
+from ...scene.transfer import TransferFunction, voxel_size
 from .options import SWITCH, add_command, add_output, add_scene
 from .recorded import text_of
 from .scene import Scene, refuse_to_replace, scene_of, with_march
+
+
+FAINT = 0.01
+"""Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -39,8 +43,8 @@ def _render(options: argparse.Namespace) -> None:
     save_image(options.output, image, text=text_of(options, scene.transfer) if is_png else {})
     if options.depth:
         print(f"{save_image(options.depth, rendering.depth)}: distances, world length")
-    if scene.source is None and (why := why_empty(scene, rendering)):
-        print(f"{options.output}: nothing is visible: {why}")
+    if why := why_empty(scene, rendering):
+        print(f"{options.output}: {why}")
 
 
 def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> None:
@@ -61,13 +65,20 @@ def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> 
 
 
 def why_empty(scene: Scene, rendering: Rendering) -> str | None:
-    """Why an image shows nothing, and what to change; None where 8 bits show a pixel's opacity."""
-    volume, transfer = scene.volume, scene.transfer
-    opacity = float(np.asarray(rendering.rgba)[..., 3].max())
-    if opacity >= 0.5 / 255:
+    """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`."""
+    volume, opacity = scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
+    if opacity > FAINT or np.isnan(opacity):
         return None
     if opacity > 0:
-        return f"the opacity is at most {opacity:.2g}. Use a shorter unit distance, or higher opacities."
+        size = f"voxels have the size {voxel_size(volume):.3g}"
+        change = f"a shorter --unit-distance ({size}) or another --clim"
+        return f"hardly anything is visible: the opacity is at most {opacity:.2g}. Use {change}."
+    return f"nothing is visible: {_why_nothing(scene)}"
+
+
+def _why_nothing(scene: Scene) -> str:
+    """Why all pixels are transparent."""
+    volume, transfer = scene.volume, scene.transfer
     space, zero = scene.march.locate(volume), jnp.zeros((), jnp.int32)
     lengths = jax.jit(jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)).length))
     if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():

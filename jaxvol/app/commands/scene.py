@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
 from typing import Any, NamedTuple
 
 import jax
@@ -101,7 +102,7 @@ def scene_of(
         except TypeError as fault:  # such as a shape of what is no raw file
             raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
         volume = copy_of(source, options.memory)
-        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume)
+        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
 
     size, view = tuple(options.size), (options.view_up, options.view_angle)
     if options.camera:
@@ -140,7 +141,7 @@ def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
     for name in names:
         path = getattr(options, name)
-        if path is not None and path.resolve() in [other.resolve() for other in used]:
+        if path is not None and realpath(path) in map(realpath, used):
             raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
         used += [] if path is None else [path]
 
@@ -163,19 +164,21 @@ def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def transfer_of(options: argparse.Namespace, volume: Volume) -> Transfer:
+def transfer_of(options: argparse.Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
+    """The transfer function that the options ask for. `source`: of which `volume` is a copy with fewer
+    voxels."""
     if is_automatic(options):
         return automatic_transfer(volume)
     if options.recorded_transfer is not None:
         return options.recorded_transfer
     if options.transfer is not None:
         return read_transfer(options.transfer)
-    unit = 1.0 if options.unit_distance is None else options.unit_distance
+    unit = options.unit_distance
     if options.preset is not None:
-        return preset(options.preset, options.clim, unit)
+        return preset(options.preset, options.clim, 1.0 if unit is None else unit)
     clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
-    return colormap(cmap, clim, unit_distance=unit)
+    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 
 
 def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:

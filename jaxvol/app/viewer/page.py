@@ -14,6 +14,7 @@ import viser
 from matplotlib.colors import to_rgb
 from websockets.exceptions import ConnectionClosed
 
+from ..._util.checks import shortened
 from .controls import Control, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Orbit, Scene, State
@@ -55,7 +56,7 @@ class Page:
         self.models: dict[int, Model] = {}
         # browsers open connections in advance, and close those that they do not need
         log = logging.getLogger("websockets.server")
-        log.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+        log.addFilter(_in_one_line)
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self._server = _Server(host=HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
@@ -110,6 +111,16 @@ class Page:
         model = self.models.pop(client.client_id, None)
         if model is not None:
             model.close(wait=False)  # viser's loop must not wait
+
+
+def _in_one_line(record: logging.LogRecord) -> bool:
+    """Whether to log something; what a client's message did to viser, if that knows none such, without the
+    place in viser's code."""
+    told = record.getMessage()
+    if told == "connection handler failed" and record.exc_info:
+        fault = shortened(record.exc_info[1])
+        record.msg, record.exc_info = f"a page was sent away: its message is unknown ({fault})", None
+    return told != "opening handshake failed"
 
 
 class _Panel:

@@ -13,12 +13,18 @@ from typing import Any
 import numpy as np
 
 from ..._util.affine import place_of
+from ..._util.checks import shortened
 from ..._util.files import MOST_VOXELS, check_size, decoding, file_size
 
 
 ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
+
+
+LONGEST = 900
+"""Letters of a field in an NRRD header, at most: what ITK tells of longer ones is written beyond its buffer,
+and ends the process. Comments and pairs (`key:=value`) may be longer."""
 
 
 def simple_itk(path: Path) -> Any:
@@ -38,6 +44,12 @@ def read_nrrd(path: Path) -> dict[str, Any]:
     encoding, spacings = fields.get("encoding", "").lower(), fields.get("spacings", "1 1 1")
     reader = sitk.ImageFileReader()
     reader.SetImageIO("NrrdImageIO")
+    wrong = (
+        f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; got "
+        f"{shortened(encoding)} and {shortened(str(source))}."
+    )
+    if not source.is_file():  # ITK opens it, and waits for the other end of a pipe
+        raise ValueError(wrong)
     reader.SetFileName(str(path))
     with decoding(path):
         reader.ReadImageInformation()
@@ -46,14 +58,13 @@ def read_nrrd(path: Path) -> dict[str, Any]:
         # axes of no space have NaN; SimpleITK takes 1 for what is wrong
         lengths = [float(word) for word in spacings.split() if word.lower() != "nan"]
         if len(lengths) < 3 or not all(0 < each < math.inf for each in lengths):
-            raise ValueError(f"path: {path}: spacings must be positive, for 3 axes; got {spacings[:80]!r}.")
+            raise ValueError(
+                f"path: {path}: spacings must be positive, for 3 axes; got {shortened(spacings)}."
+            )
         component = sitk.Image([1, 1, 1], reader.GetPixelIDValue()).GetSizeOfPixelComponent()
         expected = math.prod(size) * channels * component
-        if encoding not in ("raw", "gzip", "gz") or not source.is_file():
-            raise ValueError(
-                f"path: {path} must hold its voxels, or name one file of them, in the encoding raw or gzip; "
-                f"got {encoding!r} and {source}."
-            )
+        if encoding not in ("raw", "gzip", "gz"):
+            raise ValueError(wrong)
         held = source.stat().st_size - begin
         if encoding != "raw":
             with source.open("rb") as stream:
@@ -80,22 +91,28 @@ def check_volume(path: Path, size: Any, channels: Any) -> None:
 def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
     """The fields of an NRRD file, in small letters without blanks; where its voxels begin, and in which file,
     which may be missing."""
-    found, end = text_header(path, ":")
+    found, end = text_header(path, ":", longest=LONGEST)
     fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
     named = fields.get("datafile")
     return (fields, end, path) if named is None else (fields, 0, path.parent / named)
 
 
-def text_header(path: Path, separator: str, last: str = "") -> tuple[dict[str, str], int]:
+def text_header(
+    path: Path, separator: str, last: str = "", longest: int = 2**20
+) -> tuple[dict[str, str], int]:
     """The fields of a header in text, and where in the file it ends: at an empty line, or behind the field
-    `last`."""
+    `last`. Raises `ValueError` for more than 1024 fields, and fields of more than so many letters."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
-        while last not in fields and len(fields) < 2**10:  # a file that has more is corrupt
-            line = stream.readline(2**16).decode("latin-1").strip()
+        while last not in fields:
+            line = stream.readline(2**20).decode("latin-1").strip()
             if not line:
                 break
             key, _, value = line.partition(separator)
+            long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
+            if long or len(fields) == 2**10:
+                told = f"the field {shortened(line)}" if long else "more than 1024 fields"
+                raise ValueError(f"path: {path} cannot be read: its header has {told}.")
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 

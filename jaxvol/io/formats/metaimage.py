@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..._util.affine import directions
+from ..._util.checks import shortened
 from ..._util.files import as_array, check_size, decoding, file_size
 from .medical import check_volume, text_header, toward_axes
 
@@ -35,7 +36,8 @@ def read_metaimage(path: Path) -> dict[str, Any]:
     dtype = np.dtype(TYPES[kind]).newbyteorder(">" if msb else "<")
     expected = channels * math.prod(shape) * dtype.itemsize
     if not source.is_file():
-        raise ValueError(f"path: {path} cannot be read: there is no file of its voxels, {str(source)[:80]}.")
+        named = shortened(str(source))
+        raise ValueError(f"path: {path} cannot be read: there is no file of its voxels, {named}.")
     held = source.stat().st_size
     if source != path:
         skipped = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file

@@ -69,6 +69,11 @@ class Clip(Transform):
             raise ValueError("Clip must be given a box, planes, or both; got neither.")
         self.inside_out = flag("inside_out", inside_out)
 
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        box = jnp.array([0.0, 1.0] * 3) if self.box is None else self.box
+        return jnp.all(box[0::2] < box[1::2]) & jnp.all(jnp.any(self.normals != 0, axis=1))
+
     def clip(self, space: Space) -> Space:
         origins, normals = [*self.origins], [*self.normals]
         if self.box is not None:

@@ -80,7 +80,7 @@ def test_an_mp4_holds_all_frames(volume_file, tmp_path, drawn):
 
 BAD = {
     "ending": (["-o", "a.avi"], "--output: must end in .gif or .mp4; got a.avi"),
-    "frames": (["--frames", "0"], "--frames must be an integer of at least 1"),
+    "frames": (["--frames", "0"], "--frames must be an integer from 1 to"),
     "fps": (["--fps", "0"], "--fps of a .gif must be above 0"),
     "fps of a gif": (["--fps", "60"], "--fps of a .gif must be above 0, and 50 at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),

@@ -1,5 +1,6 @@
 """The command as a whole: its help, how it tells faults, and how it ends when it is interrupted."""
 
+import json
 import os
 import re
 import signal
@@ -56,6 +57,67 @@ def test_invalid_options_are_named_in_one_line(capsys):
         assert message in printed
         assert printed.count("\n") == 1
         assert "--help lists the options" in printed
+
+
+def zarr(folder, shape, chunks, names=None):
+    header = {"zarr_format": 2, "shape": shape, "chunks": chunks, "dtype": "|u1", "compressor": None}
+    folder.mkdir()
+    (folder / ".zarray").write_text(json.dumps(header | {"fill_value": 0, "order": "F", "filters": None}))
+    (folder / ".zattrs").write_text(json.dumps({"_ARRAY_DIMENSIONS": names}))
+
+
+def written(folder):
+    """Files of which each is bad in a way that once ended in a traceback, a hang or a crash."""
+    nrrd = b"NRRD0004\ntype: uint8\ndimension: 3\nsizes: 2 2 2\nencoding: raw\n"
+    head = b"{'descr': '|u1', 'fortran_order': False, 'shape': (True, 2, 2), }\n"
+    contents = {
+        "escapes.mhd": b"DimSize = 2 2 2\nElementType = MET_UCHAR\nElementDataFile = \x1b[2J\x07\n",
+        "long.nrrd": nrrd + b"comment: " + b"x" * 2000 + b"\n\n" + bytes(8),
+        "many.nrrd": nrrd + b"".join(b"k%d:=1\n" % i for i in range(1100)) + b"\n" + bytes(8),
+        "pipe.nhdr": nrrd + b"data file: pipe\n\n",
+        "bool.npy": b"\x93NUMPY\x01\0" + len(head).to_bytes(2, "little") + head + bytes(4),
+        "good.npy": b"\x93NUMPY\x01\0"
+        + len(head).to_bytes(2, "little")
+        + head.replace(b"True", b"   2")
+        + bytes(8),
+        "digits.toml": b'file = "good.npy"\nsize = [' + b"9" * 400 + b", 16]",
+    }
+    for name, content in contents.items():
+        (folder / name).write_bytes(content)
+    os.mkfifo(folder / "pipe")
+    (folder / "circle_2x2x2_uint8.raw").symlink_to("circle_2x2x2_uint8.raw")
+    zarr(folder / "names", [2, 2, 2], [2, 2, 2], [["x"], 1, None])
+    zarr(folder / "chunks", [2, 2, 2], [30000] * 3)
+    zarr(folder / "large", [30000] * 3, [30000] * 3)
+
+
+BAD_FILES = {
+    "info escapes.mhd": r"there is no file of its voxels, '.*\\x1b\[2J\\x07'",
+    "info long.nrrd": "its header has the field 'comment: x+ ... x+'",
+    "info many.nrrd": "its header has more than 1024 fields",
+    "info pipe.nhdr": "must hold its voxels, or name one file of them",
+    "info bool.npy": r"no valid .npy header \(.*True, 2, 2",
+    "render circle_2x2x2_uint8.raw": "there is no file circle",
+    "render good.npy -o circle_2x2x2_uint8.raw/a.png": "--output: .* cannot be written",
+    "render good.npy --size 99999999999999999999 8": "size must be .* fewer than",
+    "render --config digits.toml": "size must be .* fewer than",
+    "animate good.npy --frames " + "9" * 400: "--frames must be an integer from 1 to",
+    "render names --memory 1M": "_ARRAY_DIMENSIONS must be names",
+    "render chunks --memory 1M": "chunks that are not much larger than it",
+    "render large --memory 1M": "asks for .* GiB of memory",
+}
+
+
+def test_bad_files_are_told_in_one_line(tmp_path, monkeypatch, capsys):
+    for module in ("SimpleITK", "tensorstore"):
+        pytest.importorskip(module)
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path)
+    for words, message in BAD_FILES.items():
+        assert main(words.split()) == 2
+        printed = capsys.readouterr().err
+        assert re.search(message, printed), printed
+        assert printed.removesuffix("\n").isprintable()
 
 
 def test_datasets_are_fetched_by_name(capsys):

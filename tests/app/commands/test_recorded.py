@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import shutil
 import zlib
 
@@ -33,6 +34,10 @@ def picture(volume_file, tmp_path, monkeypatch, drawn):
     return tmp_path / "a.png"
 
 
+def recorded(file):
+    return {"name": file.name, "bytes": file.stat().st_size, "sha256": checksum(file)}
+
+
 def options(*words):
     return parsed(parser_of_all(), words)
 
@@ -43,7 +48,7 @@ def like(name, *words):
 
 def test_a_picture_is_made_again_bit_by_bit(picture, volume_file, tmp_path, drawn):
     said = text_in(picture)
-    assert said["file"] == {"name": volume_file.name, "sha256": checksum(volume_file)}
+    assert said["file"] == recorded(volume_file)
     assert str(tmp_path) not in json.dumps(said)  # nobody gave an absolute path
     flags = [word.partition("=")[0] for word in said["options"] if word.startswith("--")]
     assert sorted(flags) == ["--background", "--direction", "--no-shade", "--preset", "--size", "--step"]
@@ -81,27 +86,26 @@ def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path
 
 def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    file = {"name": volume_file.name, "sha256": checksum(volume_file)}
 
-    def found(recorded, *words):
-        png(tmp_path / "a.png", said(*recorded.split(), file=file))
+    def found(words_of_picture, *words):
+        png(tmp_path / "a.png", said(*words_of_picture.split(), file=recorded(volume_file)))
         return options("render", "--like", "a.png", *words)
 
-    recorded = "--preset=engine --clim 1 2 --unit-distance=3 --step=2 --size 8 8 --clip-plane 1 2 3 0 0 1"
-    assert found(recorded).clim == [1, 2]
-    given = found(recorded, "--transfer", "t.json", "--tolerance", "0.1", "--size", "9", "9")
+    words = "--preset=engine --clim 1 2 --unit-distance=3 --step=2 --size 8 8 --clip-plane 1 2 3 0 0 1"
+    assert found(words).clim == [1, 2]
+    given = found(words, "--transfer", "t.json", "--tolerance", "0.1", "--size", "9", "9")
     assert (given.preset, given.clim, given.unit_distance) == (None, None, None)
     assert (given.step, given.tolerance, given.size) == (None, 0.1, [9, 9])
-    given = found(recorded, "--cmap", "hot", "--clip-plane", *"000100")
+    given = found(words, "--cmap", "hot", "--clip-plane", *"000100")
     assert (given.preset, given.clim, given.clip_plane) == (None, [1, 2], [[0, 0, 0, 1, 0, 0]])
     surface = "--compositing=isosurface --isovalue=5"
     assert found(surface, "--compositing", "maximum").isovalue is None
     assert found(surface, "--compositing", "isosurface").isovalue == 5
     flags = ("parallel", "transparent", "clip_inside_out")
-    recorded = " ".join(f"--{flag.replace('_', '-')}" for flag in flags)
+    words = " ".join(f"--{flag.replace('_', '-')}" for flag in flags)
     off = [f"--no-{flag.replace('_', '-')}" for flag in flags]
-    assert all(getattr(found(recorded), flag) for flag in flags)
-    assert not any(getattr(found(recorded, *off), flag) for flag in flags)
+    assert all(getattr(found(words), flag) for flag in flags)
+    assert not any(getattr(found(words, *off), flag) for flag in flags)
     assert not hasattr(options("plan", "--like", "a.png"), "transparent")
     with pytest.raises(ValueError, match="--cmap and --preset exclude each other"):
         found("--preset=head --cmap=hot")
@@ -129,7 +133,9 @@ def test_the_volume_may_lie_beside_the_picture_and_must_be_the_same(picture, vol
     volume_file.unlink()
     assert like("b.png") == 2
     assert "which is not there" in capsys.readouterr().err
+    capsys.readouterr()
     assert options("render", "--like", "there/a.png").file.parent.name == "there"
+    assert f"names the volume 'there/{volume_file.name}'" in capsys.readouterr().out  # which is read then
 
 
 def different(path, file, *contents):
@@ -195,12 +201,12 @@ def unpacks_to_much(path):
 
 
 def said(*words, **changed):
-    file = {"name": "v.raw", "sha256": "0" * 64}
+    file = {"name": "v.raw", "bytes": 6, "sha256": "0" * 64}
     return json.dumps({"options": words, "file": file} | changed)
 
 
-def volume(name):
-    return said(file={"name": name, "sha256": "0" * 64})
+def volume(name, size=6):
+    return said(file={"name": name, "bytes": size, "sha256": "0" * 64})
 
 
 BAD = {
@@ -226,10 +232,19 @@ BAD = {
     "no words": (said(1), "damaged"),
     "a value of another kind": (said("--step=much"), "argument --step: invalid float value: 'much'"),
     "a long value": (said("--step=" + "9a" * 5000), "argument --step: invalid float value"),
-    "keys": (said(file={"name": "a", "sha256": "0" * 64, "path": "b"}), "which is not there"),
+    "keys": (said(file={"name": "a", "bytes": 6, "sha256": "0" * 64, "path": "b"}), "which is not there"),
+    "no size": (said(file={"name": "a", "sha256": "0" * 64}), "is of an older jaxvol"),
+    "text for a size": (volume("a", "6"), "damaged"),
     "file": (said(file="/etc/passwd"), "damaged"),
     "no file": (said(), "which is not there"),
     "a device": (volume("/dev/zero"), "/dev/zero is no volume"),
+    "a file without an end": (volume("/proc/self/pagemap", 0), "/proc/self/pagemap is no volume"),
+    "what blocks": (volume("/proc/kmsg", 0), "/proc/kmsg is no volume"),
+    "a link to it": (volume("link.raw", 0), "link.raw is no volume"),
+    "a header that names it": (volume("a.mhd", 60), "a.mhd is no volume"),
+    "a pipe": (volume("pipe.raw", 0), "pipe.raw is no volume"),
+    "another size": (volume("six.raw", 5), "is not the volume that a.png shows: that has 5 bytes"),
+    "a file that is another": (volume("six.raw"), "its SHA-256 differs"),
     "a folder": (volume("folder"), "folder is no volume"),
     "transfer": (said(transfer={"values": []}), "the transfer function in it: "),
     "transfer's numbers": (
@@ -243,6 +258,10 @@ BAD = {
 def test_settings_that_others_may_have_made_are_checked(case, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "folder").mkdir()
+    os.mkfifo("pipe.raw")
+    os.symlink("/proc/kmsg", "link.raw")
+    (tmp_path / "six.raw").write_bytes(b"123456")
+    (tmp_path / "a.mhd").write_text("NDims = 3\nElementDataFile = /proc/self/pagemap\n")
     made, message = BAD[case]
     png(tmp_path / "a.png", made) if isinstance(made, str) else made(tmp_path / "a.png")
     assert like("b.png") == 2

@@ -108,6 +108,15 @@ def test_options_of_the_look_make_the_scene(case, volume_file, tmp_path, monkeyp
     np.testing.assert_allclose(np.load("x.npy"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind, atol=1e-6)
 
 
+def test_opacities_of_a_colormap_are_those_of_a_voxel_whatever_its_unit(volume_file, tmp_path, drawn):
+    place = ["--spacing", "1e-4", "1e-4", "8e-4", "-o", tmp_path / "x.npy"]
+    expected = jv.colormap("gray", (-100, 255), unit_distance=2e-4)
+    assert render(volume_file, *GRAY, *place, step="4e-5") == 0
+    assert same(drawn.scenes[0][1], expected)
+    volume = jv.load(volume_file, spacing=(1e-4, 1e-4, 8e-4))
+    assert same(jv.colormap("gray", (-100, 255), unit_distance=volume), expected)
+
+
 def test_a_scene_of_which_nothing_is_told_is_shown_by_its_values(volume_file, tmp_path, drawn):
     volume = jv.load(volume_file)
     assert render(volume_file, "-o", tmp_path / "x.png") == 0
@@ -208,7 +217,7 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
     np.save(tmp_path / "v.npy", np.linspace(20, 90, 1000).reshape(10, 10, 10).astype(np.float32))
     bone = ["--preset", "ct_bone", "-o", str(tmp_path / "x.png")]
     assert render(tmp_path / "v.npy", *bone) == 0
-    assert "nothing" not in capsys.readouterr().out
+    assert "visible" not in capsys.readouterr().out
     drawn.level = 0.0
     assert render(tmp_path / "v.npy", *bone) == 0
     why = "nothing is visible: .* from 20 to 90, .* shows values between 130 and inf. A clim from"
@@ -223,7 +232,9 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
         assert re.search(why, capsys.readouterr().out), why
     drawn.level = 1e-4
     assert render(tmp_path / "v.npy", *bone) == 0
-    assert "nothing is visible: the opacity is at most" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "hardly anything is visible: the opacity is at most" in told
+    assert "a shorter --unit-distance (voxels have the size 1)" in told
 
 
 DARK = np.full((3, 3), 0.5)
@@ -247,7 +258,9 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
     empty = jv.Rendering(jnp.zeros((8, 8, 4), np.float32), jnp.zeros((8, 8), bool))
     said = why_empty(scene, empty)
     assert said is not None
-    assert said.startswith("the volume's values run from 20 to 90, and the transfer function")
+    assert said.startswith(
+        "nothing is visible: the volume's values run from 20 to 90, and the transfer function"
+    )
     assert expected in said
 
 
@@ -273,6 +286,8 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
     assert "3 of 2 x 2 x 1 bricks read, 99 bytes" in capsys.readouterr().out
     assert render(volume_file, *words, "200K", "--time", "1", "--nan", "0") == 2
     assert "index must name axes" in capsys.readouterr().err
+    assert render(volume_file, *GRAY, *words[2:], "9K") == 0
+    assert same(asked["transfer"], jv.colormap("gray", (-100, 255)))  # of voxels, and not of their copy's
     jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
     assert render(tmp_path / "v.npz", "--memory", "1M") == 2
     assert "is not of a kind" in capsys.readouterr().err

@@ -4,7 +4,7 @@ import asyncio
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -84,6 +84,23 @@ def handled(page, origin: str) -> int:
 def test_what_others_send_is_not_handled(page):
     assert handled(page, page.url) == 1
     assert handled(page, "https://example.org") == 0
+
+
+def test_a_message_that_viser_does_not_know_is_told_in_one_line(page, caplog):
+    packed = viser.infra._messages.msgspec.msgpack.encode({"type": "\x1b[2J"})
+    for message in (packed, b"\xc1", "text"):
+        how = {"origin": page.url, "subprotocols": VISER}
+        with client.connect(f"ws://127.0.0.1:{page.port}", **how) as connection:
+            connection.send(message)
+            with suppress(exceptions.ConnectionClosed):
+                while True:
+                    connection.recv(timeout=30)
+    told = [record for record in caplog.records if record.name == "websockets.server"]
+    assert len(told) == 3
+    for record in told:
+        assert record.exc_info is None
+        assert record.getMessage().startswith("a page was sent away: its message is unknown (")
+        assert record.getMessage().isprintable()
 
 
 def test_nobody_else_reaches_it_and_it_serves_no_other_files(page):

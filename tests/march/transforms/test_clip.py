@@ -160,8 +160,10 @@ def test_a_film_between_a_face_and_a_cut_that_coincide_is_not_seen():
 
 def test_nan_in_a_plane_shows():
     clip = jv.Clip(EVERYWHERE, [((0, 0, -9), (0, 0, 1))] * 2)
-    for where in (lambda clip: clip.box, lambda clip: clip.origins, lambda clip: clip.normals):
-        broken = eqx.tree_at(where, clip, where(clip) * jnp.nan)
+    box, normals = (lambda clip: clip.box), (lambda clip: clip.normals)
+    broken = [(where, where(clip) * np.nan) for where in (box, lambda clip: clip.origins, normals)]
+    for where, wrong in (*broken, (box, clip.box[np.array([1, 0, 2, 3, 4, 5])]), (normals, 0 * clip.normals)):
+        broken = eqx.tree_at(where, clip, wrong)
         march = jv.March(0.13, (switch(ALIGNED, True), broken))
         assert np.isnan(jv.render_rays(constant(), uniform_transfer(1.5), *random_rays(0), march).rgba).all()
 
