@@ -93,6 +93,7 @@ def written(folder):
 
 BAD_FILES = {
     "info escapes.mhd": r"there is no file of its voxels, '.*\\x1b\[2J\\x07'",
+    "info \x1b[2J.npy": r"there is no file \\x1b\[2J.npy",
     "info long.nrrd": "its header has the field 'comment: x+ ... x+'",
     "info many.nrrd": "its header has more than 1024 fields",
     "info pipe.nhdr": "must hold its voxels, or name one file of them",
