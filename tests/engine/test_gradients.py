@@ -291,7 +291,7 @@ def test_nan_and_infinity_reach_image_and_gradient():
             image, found = gradient(eqx.tree_at(whole[name], scene, jax.device_put(wrong)))
             assert np.isnan(image).all(), (name, wrong)
             assert not some_finite(found), (name, wrong)
-        volume, transfer, camera, march = scene
+        volume, transfer, _, march = scene
         ray = position, (focal_point - position) / np.linalg.norm(focal_point - position)
         seen = lambda t, v, m: jv.render_ray_reference(v, t, *ray, m).rgba.sum()  # noqa: E731
         lost = eqx.tree_at(lambda t: t.colors, transfer, jax.device_put(np.full((6, 3), np.nan)))

@@ -36,7 +36,7 @@ FAULTS: list[Fault] = [
         "app.commands.recorded:_is_ordinary",
         lambda _: lambda path: path.is_file() or path.is_dir(),
         (
-            "app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[a header that names it]",
+            "app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[such a header]",
         ),
     ),
     Fault(
