@@ -35,9 +35,7 @@ FAULTS: list[Fault] = [
         "like: what a picture names is read whatever it is",
         "app.commands.recorded:_is_ordinary",
         lambda _: lambda path: path.is_file() or path.is_dir(),
-        (
-            "app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[such a header]",
-        ),
+        ("app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[header]",),
     ),
     Fault(
         "DICOM: slices in the order of their names",

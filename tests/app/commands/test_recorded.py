@@ -241,7 +241,7 @@ BAD = {
     "a file without an end": (volume("/proc/self/pagemap", 0), "/proc/self/pagemap is no volume"),
     "what blocks": (volume("/proc/kmsg", 0), "/proc/kmsg is no volume"),
     "a link to it": (volume("link.raw", 0), "link.raw is no volume"),
-    "such a header": (volume("a.mhd", 60), "a.mhd is no volume"),
+    "header": (volume("a.mhd", 60), "a.mhd is no volume"),
     "a pipe": (volume("pipe.raw", 0), "pipe.raw is no volume"),
     "another size": (volume("six.raw", 5), "is not the volume that a.png shows: that has 5 bytes"),
     "a file that is another": (volume("six.raw"), "its SHA-256 differs"),
