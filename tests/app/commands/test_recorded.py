@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import zlib
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -205,7 +206,7 @@ def said(*words, **changed):
     return json.dumps({"options": words, "file": file} | changed)
 
 
-def volume(name, size=6):
+def volume(name, size: Any = 6):
     return said(file={"name": name, "bytes": size, "sha256": "0" * 64})
 
 
