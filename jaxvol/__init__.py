@@ -5,7 +5,8 @@ it. A volume gives values, a transfer function maps them to colour and extinctio
 composited front to back into a `Rendering`.
 """
 
-import jaxvol._util.interruption  # isort: split  # noqa: F401  (before what takes long to load)
+# before what takes long to load
+import jaxvol._util.interruption  # isort: split  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb

@@ -372,7 +372,7 @@ def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
     # are unknown and its ranges infinite, which is not an error.
     ranges = blocks if volume.field is None else None
     valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
-    valid &= all_finite((materials, lights, anisotropy, camera))
+    valid &= all_finite((materials, lights, anisotropy, camera)) & transfer.valid & camera.valid
     paths, pixels = how.paths, how.pixels
     batches, count = -(-width * height // pixels), pixels * paths
 

@@ -10,6 +10,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.engine.image import render_scene
+from jaxvol.engine.rays import lines
 from jaxvol.engine.tiling import GPU, Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
 from jaxvol.ray import Scene
@@ -72,6 +73,16 @@ SCENES = {
 def test_images_are_those_of_the_tiling_for_cpus(name):
     scene = SCENES[name]()
     assert_same(*(render_scene(scene, "all", "replay", tiling) for tiling in (SMALL, Tiling())))
+
+
+def test_a_fault_of_a_scene_makes_all_rays_nan_where_no_branch_computes_them(monkeypatch):
+    monkeypatch.setattr("jaxvol.xla.memory.on_gpu", lambda: True)
+    pixels = np.arange(4, dtype=np.int32).reshape(1, 4)
+    cameras = [jv.Camera((1, 2, 5), (0, 0, 0), parallel_scale=scale, size=(4, 4)) for scale in (None, 2.0)]
+    found = jax.jit(lambda at, fault: [lines(camera, at, at, fault).origin for camera in cameras])
+    for fault in (True, False):
+        for origin in found(pixels, fault):
+            assert np.isnan(origin).all() == fault
 
 
 @pytest.mark.slow

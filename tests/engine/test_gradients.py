@@ -291,6 +291,12 @@ def test_nan_and_infinity_reach_image_and_gradient():
             image, found = gradient(eqx.tree_at(whole[name], scene, jax.device_put(wrong)))
             assert np.isnan(image).all(), (name, wrong)
             assert not some_finite(found), (name, wrong)
+        volume, transfer, _, march = scene
+        ray = position, (focal_point - position) / np.linalg.norm(focal_point - position)
+        seen = lambda t, v, m: jv.render_ray_reference(v, t, *ray, m).rgba.sum()  # noqa: E731
+        lost = eqx.tree_at(lambda t: t.colors, transfer, jax.device_put(np.full((6, 3), np.nan)))
+        of_ray = eqx.filter_jit(eqx.filter_grad(seen))(lost, volume, march)
+        assert np.isnan(of_ray.extinction).all()
         # voxels that are seen, and some in the space that is leapt over: rays that do not meet them keep
         # their pixels
         for place in (np.s_[5:8, 9:13, 7:11], np.s_[2:5, 2:5, 22:27]):

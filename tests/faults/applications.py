@@ -26,6 +26,18 @@ def all_shown(transfer):
 
 FAULTS: list[Fault] = [
     Fault(
+        "command: control characters of a file reach the terminal",
+        "_util.checks:printable",
+        lambda _: lambda text: text,
+        ("app/commands/test_command.py::test_bad_files_are_told_in_one_line",),
+    ),
+    Fault(
+        "like: what a picture names is read whatever it is",
+        "app.commands.recorded:_is_ordinary",
+        lambda _: lambda path: path.is_file() or path.is_dir(),
+        ("app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[header]",),
+    ),
+    Fault(
         "DICOM: slices in the order of their names",
         "io.formats.dicom:_pixels",
         lambda pixels: lambda headers, files: pixels(headers, sorted(files)),

@@ -49,6 +49,18 @@ FAULTS: list[Fault] = [
         ("scene/test_own_transfer.py::test_what_is_read_beside_the_value_has_its_gradient",),
     ),
     Fault(
+        "camera: a view angle of 180 degrees is taken",
+        "scene.camera:_is_valid",
+        lambda _: lambda height, is_angle, up, forward: height == height,
+        ("engine/test_gradients.py::test_nan_and_infinity_reach_image_and_gradient",),
+    ),
+    Fault(
+        "direct: what is NaN has the gradient 0",
+        "xla.differentiation:nan_derivatives",
+        lambda _: lambda tree, fault: tree,
+        ("engine/test_gradients.py::test_nan_and_infinity_reach_image_and_gradient",),
+    ),
+    Fault(
         "selection: a sample stays where a moving face cuts its cell",
         "ray:_movement",
         lambda _: lambda march, ray, volume, depth, scale: depth * (scale - 1),

@@ -316,6 +316,11 @@ def test_nan_and_infinity_make_the_image_nan():
             leaf.flat[-1] = number
             broken = eqx.tree_at(where, SCENE, jax.device_put(leaf))
             assert np.isnan(image_of(broken)).all()
+    for where, wrong in (
+        (lambda scene: scene["camera"].view_angle, np.float32(180)),
+        (lambda scene: scene["transfer"].values, np.array(SCENE["transfer"].values)[::-1]),
+    ):
+        assert np.isnan(image_of(eqx.tree_at(where, SCENE, jax.device_put(wrong)))).all()
 
 
 # ---------------------------------------------------------------- what does not show

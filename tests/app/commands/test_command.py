@@ -1,5 +1,6 @@
 """The command as a whole: its help, how it tells faults, and how it ends when it is interrupted."""
 
+import ast
 import json
 import os
 import re
@@ -12,6 +13,8 @@ from pathlib import Path
 import jax
 import pytest
 
+import jaxvol
+from jaxvol._util.interruption import end_at_once, raise_again
 from jaxvol.app.cli import main
 
 
@@ -93,6 +96,7 @@ def written(folder):
 
 BAD_FILES = {
     "info escapes.mhd": r"there is no file of its voxels, '.*\\x1b\[2J\\x07'",
+    "info \x1b[2J.npy": r"there is no file \\x1b\[2J.npy",
     "info long.nrrd": "its header has the field 'comment: x+ ... x+'",
     "info many.nrrd": "its header has more than 1024 fields",
     "info pipe.nhdr": "must hold its voxels, or name one file of them",
@@ -143,6 +147,30 @@ def test_a_reader_that_ends_early_leaves_no_traceback(monkeypatch, capsys):
         monkeypatch.setattr(sys, "stdout", ended)
         assert main(["datasets", "list"]) == 1
     assert capsys.readouterr().err == ""
+
+
+def test_ctrl_c_ends_the_process_before_and_after_the_command(monkeypatch):
+    """While modules load and Python shuts down, where a `KeyboardInterrupt` may be lost."""
+    tree = ast.parse(Path(jaxvol.__file__).read_text(encoding="utf-8"))
+    first = next(each for each in tree.body if isinstance(each, ast.Import | ast.ImportFrom))
+    assert ast.unparse(first) == "import jaxvol._util.interruption"
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        for words, given, ended in (
+            (["/bin/jaxvol", "info"], signal.default_int_handler, signal.SIG_DFL),
+            (["-m", "jaxvol"], signal.default_int_handler, signal.SIG_DFL),
+            (["/bin/pytest"], signal.default_int_handler, signal.default_int_handler),
+            (["/bin/jaxvol"], signal.SIG_IGN, signal.SIG_IGN),  # as `nohup` and `&` ask for
+        ):
+            monkeypatch.setattr(sys, "argv", words)
+            monkeypatch.setattr(sys, "orig_argv", ["python", *words])
+            signal.signal(signal.SIGINT, given)
+            end_at_once()
+            assert signal.getsignal(signal.SIGINT) is ended
+            raise_again()
+            assert signal.getsignal(signal.SIGINT) is given
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 BUSY = """

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import zlib
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -205,7 +206,7 @@ def said(*words, **changed):
     return json.dumps({"options": words, "file": file} | changed)
 
 
-def volume(name, size=6):
+def volume(name, size: Any = 6):
     return said(file={"name": name, "bytes": size, "sha256": "0" * 64})
 
 
@@ -241,7 +242,7 @@ BAD = {
     "a file without an end": (volume("/proc/self/pagemap", 0), "/proc/self/pagemap is no volume"),
     "what blocks": (volume("/proc/kmsg", 0), "/proc/kmsg is no volume"),
     "a link to it": (volume("link.raw", 0), "link.raw is no volume"),
-    "a header that names it": (volume("a.mhd", 60), "a.mhd is no volume"),
+    "header": (volume("a.mhd", 60), "a.mhd is no volume"),
     "a pipe": (volume("pipe.raw", 0), "pipe.raw is no volume"),
     "another size": (volume("six.raw", 5), "is not the volume that a.png shows: that has 5 bytes"),
     "a file that is another": (volume("six.raw"), "its SHA-256 differs"),

@@ -161,9 +161,11 @@ def test_a_film_between_a_face_and_a_cut_that_coincide_is_not_seen():
 def test_nan_in_a_plane_shows():
     clip = jv.Clip(EVERYWHERE, [((0, 0, -9), (0, 0, 1))] * 2)
     box, normals = (lambda clip: clip.box), (lambda clip: clip.normals)
-    broken = [(where, where(clip) * np.nan) for where in (box, lambda clip: clip.origins, normals)]
-    for where, wrong in (*broken, (box, clip.box[np.array([1, 0, 2, 3, 4, 5])]), (normals, 0 * clip.normals)):
-        broken = eqx.tree_at(where, clip, wrong)
+    parts = [(where, np.asarray(where(clip))) for where in (box, lambda clip: clip.origins, normals)]
+    wrongs = [(where, part * np.float32(np.nan)) for where, part in parts]
+    wrongs += [(box, parts[0][1][[1, 0, 2, 3, 4, 5]]), (normals, 0 * parts[2][1])]
+    for where, wrong in wrongs:
+        broken = eqx.tree_at(where, clip, jax.device_put(wrong))
         march = jv.March(0.13, (switch(ALIGNED, True), broken))
         assert np.isnan(jv.render_rays(constant(), uniform_transfer(1.5), *random_rays(0), march).rgba).all()
 
