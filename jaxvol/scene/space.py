@@ -54,6 +54,10 @@ class Space(eqx.Module):
         """World point of a place that counts from `anchor`."""
         return place if self.anchor is None else plus(self.anchor, place)
 
+    def place(self, point: Vec3) -> Vec3:
+        """A world point, counted from `anchor`."""
+        return point if self.anchor is None else minus(point, self.anchor)
+
     @property
     def whole(self) -> "Space":
         """The space without what is clipped from it: light is that of the whole volume."""
@@ -161,8 +165,7 @@ def enter(
 ) -> Ray:
     """Clip a ray to the volume, to what lies ahead of its origin, and to its first part, up to the distance
     `until`; `invalid` if a number is not finite (or `until` NaN)."""
-    if (anchor := space.anchor) is not None:
-        origin, space = minus(origin, anchor), space.local
+    origin, space = space.place(origin), space.local
     # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
@@ -288,7 +291,7 @@ class Affine(Space):
 
     def _own(self, point: Vec3) -> Vec3:
         """Components of a point along the axes, from the first node on."""
-        return self.frame.components(point if self.first is None else minus(point, self.first))
+        return self.frame.components(self.place(point))
 
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:

@@ -134,6 +134,11 @@ class _Bent(Space):
     def middle(self):
         return self.flat.middle
 
+    @property
+    def low(self):
+        zero = jnp.zeros_like(self.flat.high[0])
+        return self.flat.point((zero, zero, zero))
+
     def _down(self, x):
         return self.bend * (x - self.flat.middle[0]) ** 2
 
@@ -147,7 +152,7 @@ class _Bent(Space):
 
     def least_distances(self, low, high):
         x, y, z = self.flat.spacing
-        aside = [jnp.abs(end[0] * x + self.flat.anchor[0] - self.flat.middle[0]) for end in (low, high)]
+        aside = [jnp.abs(end[0] * x + self.low[0] - self.flat.middle[0]) for end in (low, high)]
         return x, y, z / jnp.sqrt(1 + (2 * self.bend * jnp.maximum(*aside)) ** 2)
 
     def _below(self, origin, direction, level):
@@ -159,7 +164,7 @@ class _Bent(Space):
         return (-b - root) / a, (-b + root) / a
 
     def interval(self, origin, direction):
-        (x0, y0, z0), (x1, y1, z1) = self.flat.anchor, plus(self.flat.anchor, self.flat.high)
+        (x0, y0, z0), (x1, y1, z1) = self.low, plus(self.low, self.flat.high)
         near, far = slab_interval(origin, direction, (x0, y0, z0 - self._down(x0)), (x1, y1, z1))
         first, last = self._below(origin, direction, z1)
         near, far = jnp.maximum(near, first), jnp.minimum(far, last)
@@ -170,7 +175,7 @@ class _Bent(Space):
         )
 
     def gaps(self, entry, direction, length):
-        left, back = self._below(entry, direction, self.flat.anchor[2])
+        left, back = self._below(entry, direction, self.low[2])
         some = (left > 0) & (back < length)
         return ((jnp.where(some, left, jnp.inf), jnp.where(some, back, jnp.inf)),)
 

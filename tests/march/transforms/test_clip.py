@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
-from jaxvol._util.vec3 import apart, minus
+from jaxvol._util.vec3 import apart
 from jaxvol.metrics import boundary_noise
 from jaxvol.scene.occupancy import Blocks
 from jaxvol.scene.space import enter
@@ -238,8 +238,8 @@ def test_no_cell_that_holds_anything_seen_is_taken_as_empty(inside_out):
     @jax.jit
     def occupied_at(clip, x, y, z):
         space = jv.March(1.0, (clip,)).locate(volume)
-        grid, place = space.occupancy(visible), minus((x, y, z), space.anchor)
-        return grid.occupied[tuple(jnp.floor(c).astype(int) for c in grid.cell(place))]
+        grid = space.occupancy(visible)
+        return grid.occupied[tuple(jnp.floor(c).astype(int) for c in grid.cell(space.place((x, y, z))))]
 
     empty = 0
     for _ in range(20):
