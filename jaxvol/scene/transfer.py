@@ -76,8 +76,8 @@ class Transfer(eqx.Module):
     """The interface of all transfer functions. A subclass overrides `classifier`; `attributes` if more than
     the value counts; `majorant`, so that rays leap over what is transparent; `integrator` and `variation` for
     `quadrature="preintegrated"` and `AdaptiveSampling`; `channels`, so that volumes of other numbers of them
-    are refused. `search`, `visible` and `vjp` only save time. Extinctions of one's own are not checked: they
-    must not be negative.
+    are refused; `valid` if parameters must do more than be finite. `search`, `visible` and `vjp` only save
+    time. Extinctions of one's own are not checked: they must not be negative.
     """
 
     @abstractmethod
