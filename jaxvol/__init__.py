@@ -6,8 +6,10 @@ composited front to back into a `Rendering`.
 """
 
 # before what takes long to load
-import jaxvol._util.interruption  # isort: split  # noqa: F401  # pyright: ignore[reportUnusedImport]
+from ._util import interruption as _interruption  # noqa: F401
 
+
+# isort: split
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
 from ._util.version import __version__ as __version__

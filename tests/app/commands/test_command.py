@@ -153,7 +153,7 @@ def test_ctrl_c_ends_the_process_before_and_after_the_command(monkeypatch):
     """While modules load and Python shuts down, where a `KeyboardInterrupt` may be lost."""
     tree = ast.parse(Path(jaxvol.__file__).read_text(encoding="utf-8"))
     first = next(each for each in tree.body if isinstance(each, ast.Import | ast.ImportFrom))
-    assert ast.unparse(first) == "import jaxvol._util.interruption"
+    assert ast.unparse(first) == "from ._util import interruption as _interruption"
     before = signal.getsignal(signal.SIGINT)
     try:
         for words, given, ended in (
