@@ -6,7 +6,7 @@ composited front to back into a `Rendering`.
 """
 
 # before what takes long to load
-from ._util import interruption as _interruption  # noqa: F401
+from ._util import interruption as _interruption  # noqa: F401  # pyright: ignore[reportUnusedImport]
 
 
 # isort: split
