@@ -26,6 +26,10 @@ Chosen: TypeAlias = tuple[Scalar, Scalar]
 """Score and depth of the sample that is chosen."""
 
 
+ROUNDING = 4
+"""Last digits in which interpolated values may differ that are equal."""
+
+
 class Extreme(Selection[Chosen]):
     """A mode that shows the sample of the highest score. `Maximum` says what holds for all of them."""
 
@@ -40,7 +44,9 @@ class Extreme(Selection[Chosen]):
 
     def add(self, state: Chosen, fragment: Fragment) -> Chosen:
         (best, depth), score = state, self.score(fragment.value)
-        higher = fragment.valid & ~(score <= best) & ~jnp.isnan(best)
+        # where values are equal, interpolation rounds them to either side
+        slack = ROUNDING * float(jnp.finfo(best.dtype).eps) * jnp.abs(best)
+        higher = fragment.valid & ~(score <= best + slack) & ~jnp.isnan(best)
         return jnp.where(higher, score, best), jnp.where(higher, fragment.depth, depth)
 
     def depth(self, state: Chosen) -> Scalar:
@@ -56,11 +62,11 @@ class Maximum(Extreme):
     """The greatest value along a ray (maximum intensity projection), looked up in the transfer function.
 
     Values are compared at the samples of the march: at a smooth peak the greatest of them is less than that
-    of the ray by O(step²), and a peak thinner than a step may be missed. Of equal values, the nearest is
-    chosen. NaN is above all numbers, so that a fault of the volume shows. Under
-    `quadrature="preintegrated"`, means of the values at the two ends of cells are compared, and what lies in
-    the middle of the cell is shown. `Rendering.depth` is that of the sample, infinite where it is
-    transparent.
+    of the ray by O(step²), and a peak thinner than a step may be missed. Of values that are equal, up to four
+    units in the last place, the nearest is chosen. NaN is above all numbers, so that a fault of the volume
+    shows. Under `quadrature="preintegrated"`, means of the values at the two ends of cells are compared, and
+    what lies in the middle of the cell is shown. `Rendering.depth` is that of the sample, infinite where it
+    is transparent.
 
     `SpaceLeaping` leaps over blocks in which neither the values nor any that are less are visible: air, under
     most transfer functions. `"min_distance"` is refused.
