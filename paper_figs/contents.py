@@ -179,7 +179,8 @@ ENTRIES = (
         "The table of speed-ups",
         "At 256 x 256 / 512 x 512, ERT + ESS: 2.60 / 3.48 and 3.14 / 4.55 (head), 2.38 / 3.22 and 2.78 / "
         "4.08 (engine). Early termination is tested every 16 slices.",
-        "The first table is shaded, as in the report, the second unshaded; the third gives the speed-up "
+        "The first table is shaded, as in the report, the second too, under transfer functions of value and "
+        "gradient, as the report's are, the third unshaded; the last gives the speed-up "
         "(and the time) by how many samples lie between two tests. The report's numbers are rows of the "
         "tables. The report fetches every sample and skips only the shading of those that are invisible: "
         '"shading skipped", which makes the engine slower here (below 1), since gathering the visible '
