@@ -6,7 +6,16 @@ from typing import Any
 
 from experiments import charts, templates
 from experiments.harness import Main
-from experiments.kisti import BOTH as ERT_AND_ESS, BOTH_SKIPPED, BY_GRADIENT, ERT, ESS, NEITHER, REPORT, SKIPPED
+from experiments.kisti import (
+    BOTH as ERT_AND_ESS,
+    BOTH_SKIPPED,
+    BY_GRADIENT,
+    ERT,
+    ESS,
+    NEITHER,
+    REPORT,
+    SKIPPED,
+)
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
 from experiments.minimum_distance import HIERARCHY, MAP, OF_VOXELS, PROVEN, PUBLISHED, VOXELS, named
 

@@ -12,6 +12,7 @@ from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import DirectionalLight, Material, ScattererTemplates
 from jaxvol.ray import Scene
 
+from .. import oracle
 from ..modes import (
     MODES,
     QUADRATURE,
@@ -59,6 +60,25 @@ def scene_of(name, volume, dtype):
 def march_of(name, *transforms, step=STEP):
     ending = () if name == "over" else (jv.EarlyTermination(0.05),)  # under which other rays never end
     return jv.March(step, (JITTER, jv.AlphaCorrection(), *ending, *transforms), QUADRATURE.get(name, "left"))
+
+
+def test_of_equal_values_the_nearest_is_the_greatest():
+    """In a saturated half of a volume, where interpolation rounds its value to either side."""
+    data = np.zeros((32, 32, 32), np.float32)
+    data[10:] = 0.7
+    volume, step = jv.Volume(data, (0.37, 0.41, 0.53)), 0.1
+    camera = jv.Camera.looking_at(volume, (-1, 0.23, 0.17), size=(24, 24))
+    transfer = jv.TransferFunction([0, 0.7], [[0, 0, 0], [1, 1, 1]], [0, 5.0])
+    found = jv.render(volume, transfer, camera, jv.March(step), compositing="maximum").depth
+    origins, directions = (np.asarray(part, float).reshape(-1, 3) for part in camera.rays())
+    near, far = oracle.box_interval(origins, directions, [0] * 3, 31 * np.array([0.37, 0.41, 0.53]))
+    saturated = (10 * 0.37 - origins[:, 0]) / directions[:, 0]
+    first = near + step * np.ceil((np.maximum(saturated, near) - near) / step)
+    some = (far > near) & (first < far - 0.01)
+    off = np.abs(np.asarray(found).ravel() - first)[some]
+    assert some.sum() > 200
+    assert np.mean(off > 1e-4) < 0.02  # the first sample may be at 255 by rounding alone
+    assert off.max() < 1.01 * step
 
 
 @pytest.mark.parametrize(
