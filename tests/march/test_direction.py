@@ -206,14 +206,16 @@ def test_a_clip_box_is_one_of_the_world():
 
 @pytest.mark.slow
 def test_bricks_and_parts_keep_the_direction():
+    """Of sheared axes."""
+    volume = jv.Volume(STRAIGHT.data, STRAIGHT.spacing, STRAIGHT.origin, direction=SHEARED)
     _, camera = views()
     march = jv.March(0.03, (jv.AlphaCorrection(),), "midpoint")
-    whole = jv.render(TURNED, SPARSE, camera, march)
-    parts = jv.render_bricks(TURNED, SPARSE, camera, march, bricks=(2, 1, 2))
+    whole = jv.render(volume, SPARSE, camera, march)
+    parts = jv.render_bricks(volume, SPARSE, camera, march, bricks=(2, 1, 2))
     np.testing.assert_allclose(parts.rgba, whole.rgba, rtol=0, atol=2e-6)
     # the whole as a part of itself, with its voxels in another order in memory
-    stored = with_voxels(TURNED, [jnp.asarray(TURNED.data).transpose(1, 2, 0)])
-    part = part_of(stored, jnp.zeros(3, jnp.int32), TURNED.shape, (1, 2, 0))
+    stored = with_voxels(volume, [jnp.asarray(volume.data).transpose(1, 2, 0)])
+    part = part_of(stored, jnp.zeros(3, jnp.int32), volume.shape, (1, 2, 0))
     found = jv.render(part, SPARSE, camera, march)
     np.testing.assert_allclose(found.rgba, whole.rgba, rtol=0, atol=2e-6)
 
