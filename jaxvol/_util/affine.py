@@ -9,7 +9,7 @@ angle: files hold directions of a few decimal places. A smaller shear misplaces 
 a tenth; a greater one is kept, whether it was meant or not."""
 
 FLAT = 1e-3
-"""Directions whose determinant is not above this lie in a plane: `Volume` takes none."""
+"""Three directions of length 1 whose determinant is not above this lie in a plane: no grid, but a mistake."""
 
 
 def directions(what: str, columns: np.ndarray) -> np.ndarray:

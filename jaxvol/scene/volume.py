@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Integer, Shaped
 
+from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
 from .._util.checks import Arrayable, described, finite_array, integers, require
 from .._util.named_axes import along_xyz, is_named
@@ -22,10 +23,6 @@ from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
 from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
-
-
-FLATTEST = 1e-3
-"""Least volume that three axes of length 1 span: less is no grid, but a mistake."""
 
 
 class Field(eqx.Module):
@@ -247,7 +244,7 @@ def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
     """None for a direction that is known to be the identity."""
     turn = require(
         finite_array("direction", direction, (3, 3)),
-        lambda d: (abs((d * d).sum(0) - 1) < 2e-4).all() & (abs(_determinant(d)) > FLATTEST),
+        lambda d: (abs((d * d).sum(0) - 1) < 2e-4).all() & (abs(_determinant(d)) > FLAT),
         "direction must be a 3 x 3 matrix of columns of length 1 that do not lie in a plane; got {got}.",
     )
     return None if not is_traced(turn) and np.array_equal(turn, np.eye(3)) else turn

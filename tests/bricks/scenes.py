@@ -180,7 +180,7 @@ class _Bent(Space):
         return ((jnp.where(some, left, jnp.inf), jnp.where(some, back, jnp.inf)),)
 
     def occupancy(self, visible, first=None):
-        raise NotImplementedError("nothing is leapt over here")
+        raise AssertionError("nothing is leapt over here")
 
     def path(self, entry, direction):
         return _BentPath(self, entry, direction)
