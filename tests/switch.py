@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool
 import jaxvol as jv
 from jaxvol.march.march import EmptySpaceIndex
 from jaxvol.march.strides import StrideControl
+from jaxvol.scene.occupancy import BLOCK
 from jaxvol.scene.space import Space
 
 from .scenes import BOX, PLANE
@@ -107,8 +108,8 @@ class _Space(Space):
             either(self.on, gap, (nowhere, nowhere)) for gap in self.clipped.gaps(entry, direction, length)
         )
 
-    def occupancy(self, visible, first=None):
-        return either(self.on, *(s.occupancy(visible, first) for s in (self.clipped, self.inner)))
+    def occupancy(self, visible, first=None, side=BLOCK):
+        return either(self.on, *(s.occupancy(visible, first, side) for s in (self.clipped, self.inner)))
 
     def visible_at_faces(self, visible):
         faces = self.inner.visible_at_faces(visible)
@@ -153,7 +154,7 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "ends_at_exit", "tested_every", "valid"
+STATIC = "joins", "ends_at_exit", "tested_every", "valid", "block_side"
 
 
 @cache

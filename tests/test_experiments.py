@@ -2,18 +2,14 @@
 
 import importlib
 from argparse import Namespace
-from itertools import product
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 from skimage.io import imread
 
-import jaxvol as jv
 from experiments import charts, gradient_errors, record, redraw
 from experiments.harness import experiment, recorded
-from experiments.minimum_distance import distances
 
 
 ROOT = Path(__file__).parent.parent
@@ -89,17 +85,3 @@ def test_every_record_has_a_chart_that_can_be_drawn(tmp_path):
         assert hasattr(importlib.import_module(module), "draw")
     redraw.main(["--only", "overhead", "--output", str(tmp_path)])
     assert min(imread(tmp_path / "overhead.png").shape[:2]) >= 256
-
-
-# -- what experiments compute themselves ------------------------------------------------------------------
-
-
-def test_distances_of_voxels_are_those_to_the_nearest_cell_that_shows_anything():
-    """Two small bright things, one of them at a corner."""
-    data = np.zeros((14, 11, 9), np.float32)
-    data[0, 0, 0], data[9:11, 5, 6] = 1, 0.4
-    grid = distances(jv.Volume(data), jv.TransferFunction([0.1, 1], np.ones((2, 3)), [0, 2]))
-    cells = list(product(*(range(n - 1) for n in data.shape)))
-    shown = [c for c in cells if data[tuple(slice(i, i + 2) for i in c)].max() > 0.1]
-    nearest = [np.abs(np.asarray(c) - shown).max(axis=1).min() for c in cells]
-    np.testing.assert_array_equal(grid.distance(), nearest)

@@ -6,8 +6,9 @@ neighbour along z, and for 8-bit voxels the two next to these along y, which sav
 for each array of them. The slopes of 8-bit voxels take as much again.
 """
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any, cast
 
 import equinox as eqx
@@ -17,20 +18,21 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped, UInt32
 
 from .._util.checks import check_answer
+from ..compositing.blending import Compositing
 from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.beams import EmptySpaceIndex, View
-from ..march.march import March
+from ..march.march import March, Transform
 from ..march.strides import stride_control
 from ..ray import Scene, end
 from ..scene.camera import GivenRays, without_ends
-from ..scene.occupancy import Blocks
+from ..scene.occupancy import BLOCK, Blocks, Occupancy
 from ..scene.several import Several, SeveralBlocks
 from ..scene.transfer import Transfer
 from ..scene.variation import Windows
 from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
-from ..xla.memo import memoized
+from ..xla.memo import memoized, memoized_of
 from ..xla.platform import is_traced
 from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
@@ -43,9 +45,9 @@ LIMIT = 2**30
 
 
 class VolumeAcceleration(eqx.Module):
-    """What depends on the voxels alone: a packed copy for fetching, the slopes of nodes, the ranges of
-    blocks, and how values vary around them; None where the image has no use for it. Made once for each array
-    of voxels."""
+    """What is computed before the image: a packed copy of the voxels for fetching, the slopes of nodes, the
+    ranges of blocks, and how values vary around them; None where the image has no use for it. Made once for
+    each array of voxels."""
 
     words: list[UInt32[Array, " voxels"] | None]
     """Of each of the volume's `grids`."""
@@ -53,21 +55,32 @@ class VolumeAcceleration(eqx.Module):
     blocks: Any
     """`Blocks`, or, of several volumes, `SeveralBlocks`."""
     windows: Windows | None
+    occupancy: Occupancy | None = None
+    """In place of `blocks`, with its distances, where these are of finer blocks and nothing is traced: made
+    once for each volume and transfer function."""
 
     @classmethod
     def of(
-        cls, volume: Volume, transfer: Transfer, march: March, lighting: Lighting | None = None
+        cls,
+        volume: Volume,
+        transfer: Transfer,
+        march: March,
+        lighting: Lighting | None = None,
+        compositing: Compositing[Any] | None = None,
     ) -> "VolumeAcceleration":
+        """What is of use for an image of this kind; `occupancy` only if its `compositing` is given."""
         lit_by_gradient = lighting is not None and lighting.reads_gradient
         slopes = transfer.reads_gradient or lit_by_gradient
         # a brick of a volume is rendered once: packing it takes longer than fetching voxels one by one,
         # unless gradients fetch six cubes of them for each sample
         packs = slopes or volume.first is None
+        seen = None if compositing is None else _kept_occupancy(volume, transfer, march, compositing)
         return cls(
             [words_of(grid) if packs else None for grid in grids(volume)],
             [slopes_of(grid) if slopes else None for grid in grids(volume)],
-            _blocks_of(volume, slopes=transfer.reads_gradient) if march.leaps else None,
+            _blocks_of(volume, transfer, march) if march.leaps and seen is None else None,
             None if stride_control(march) is None else Windows.of(volume),
+            seen,
         )
 
     def packed(self, scene: Scene) -> Scene:
@@ -79,9 +92,57 @@ class VolumeAcceleration(eqx.Module):
         return self.packed(scene).prepared(self.windows)
 
 
-def _blocks_of(volume: Volume, *, slopes: bool) -> Blocks | SeveralBlocks:
-    several = isinstance(volume.field, Several)
-    return SeveralBlocks.of(volume, slopes=slopes) if several else Blocks.of(volume, slopes=slopes)
+def _blocks_of(volume: Volume, transfer: Transfer, march: March) -> Blocks | SeveralBlocks:
+    if not isinstance(volume.field, Several):
+        return Blocks.of(volume, slopes=transfer.reads_gradient, side=march.block_side)
+    if march.block_side != BLOCK:
+        raise ValueError(f"march: distances of several volumes are those of blocks of {BLOCK}³ cells.")
+    return SeveralBlocks.of(volume, slopes=transfer.reads_gradient)
+
+
+def _kept_occupancy(
+    volume: Volume, transfer: Transfer, march: March, compositing: Compositing[Any]
+) -> Occupancy | None:
+    """The occupancy and its distances, where they would take longer than the image."""
+    if march.block_side == BLOCK or isinstance(volume.field, Several) or volume.first is not None:
+        return None
+    seams = march.overriding("locate") + march.overriding("clip")
+    located = tuple(each for each in march.transforms if any(each is one for one in seams))
+    given = volume, transfer, located, compositing
+    leaves = jax.tree.leaves(given)
+    if not all(isinstance(leaf, jax.Array) and not is_traced(leaf) for leaf in leaves):
+        return None
+    return memoized_of(given, _measured(march.block_side, march.may_shift))
+
+
+@cache
+def _measured(side: int, may_shift: bool) -> Callable[..., Occupancy]:
+    @jax.jit
+    def measured(given: tuple[Volume, Transfer, tuple[Transform, ...], Compositing[Any]]) -> Occupancy:
+        volume, transfer, located, compositing = constant(given)
+        # the ranges of so many blocks are not kept: they take eight bytes for each voxel
+        blocks = Blocks.of(volume, slopes=transfer.reads_gradient, side=side)
+        occupancy = _occupancy(volume, transfer, March(1.0, located), compositing, blocks, may_shift)
+        return replace(occupancy, known=occupancy.distance())
+
+    return measured
+
+
+def _occupancy(
+    volume: Volume,
+    transfer: Transfer,
+    march: March,
+    compositing: Compositing[Any],
+    blocks: Any,
+    may_shift: bool,
+) -> Occupancy:
+    """The cells in which anything may be visible. `blocks`: as in `VolumeAcceleration`."""
+    visible = compositing.occupied(transfer, blocks)
+    check_answer(compositing, "occupied", visible, blocks.unordered)
+    visible |= blocks.unordered
+    if may_shift:  # a leap applies the shift, so that it must not cross what `opacity` sees
+        visible |= transfer.visible(blocks)
+    return march.locate(volume).occupancy(visible, volume.first, blocks.side)
 
 
 NO_ACCELERATION = VolumeAcceleration([], [], None, None)
@@ -89,19 +150,14 @@ NO_ACCELERATION = VolumeAcceleration([], [], None, None)
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
     """Where the scene is empty; None where the march does not leap. It carries no gradient."""
+    if acceleration.blocks is None and acceleration.occupancy is None:
+        return None
     scene = constant(scene)
     volume, transfer, march, compositing = scene.volume, scene.transfer, scene.march, scene.compositing
-    blocks = acceleration.blocks
-    if blocks is None:
-        return None
-    space = march.locate(volume)
-    visible = compositing.occupied(transfer, blocks)
-    check_answer(compositing, "occupied", visible, blocks.unordered)
-    visible |= blocks.unordered
-    if march.may_shift:  # a leap applies the shift, so that it must not cross what `opacity` sees
-        visible |= transfer.visible(blocks)
-    corner = volume.first
-    occupancy = space.occupancy(visible) if corner is None else space.occupancy(visible, corner)
+    space, occupancy = march.locate(volume), acceleration.occupancy
+    if occupancy is None:
+        blocks = acceleration.blocks
+        occupancy = _occupancy(volume, transfer, march, compositing, blocks, march.may_shift)
     # ends leave more empty, but would hide from the corners of a cell what the rays between them see
     source = without_ends(scene.source)
     if isinstance(source, GivenRays):

@@ -71,7 +71,7 @@ def render_scene(
     if lighting is not None:
         scene = scene._replace(lighting=with_baked_light(lighting, volume, scene.transfer, march))
     options = RenderOptions(outputs, tiling, adjoint, steps)
-    acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting)
+    acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting, scene.compositing)
     scene, acceleration = on_all(tiling.devices, varying((scene, acceleration)))
     if scene.resolves:
         return _resolved(scene, options, acceleration)

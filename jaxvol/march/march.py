@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._util.checks import check_answer, described, integer, number
 from .._util.vec3 import Scalar
-from ..scene.occupancy import Occupancy
+from ..scene.occupancy import BLOCK, Occupancy
 from ..scene.space import Affine, Ray, Space
 from ..scene.volume import Volume
 from .beams import EmptySpaceIndex, View
@@ -58,6 +58,11 @@ class Transform(eqx.Module):
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
         """Where nothing is visible, asked once an image; None: unknown. `view`: None for `render_rays`."""
         return None
+
+    @property
+    def block_side(self) -> int:
+        """Cells of the voxel grid along the side of the blocks of which `empty_space` is told."""
+        return BLOCK
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
         """The pieces, front to back, into which the cell is divided and each of which is sampled: a static
@@ -167,6 +172,11 @@ class March(eqx.Module):
     @property
     def leaps(self) -> bool:
         return bool(self.overriding("empty_space"))
+
+    @property
+    def block_side(self) -> int:
+        """The least that a transform asks for."""
+        return min((each.block_side for each in self.transforms), default=BLOCK)
 
     @property
     def tested_every(self) -> int | None:

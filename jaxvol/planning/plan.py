@@ -148,7 +148,8 @@ def plan(
     - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule
       takes more than 8 steps of a voxel; it is kept where it is faster, by what a sample costs on CPU.
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
-      0 have no gradient from what is leapt over.
+      0 have no gradient from what is leapt over. `fastest_leaping` measures which of its methods is the
+      fastest.
     - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
       faces, and where a `Clip` cuts.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its

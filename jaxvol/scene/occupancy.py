@@ -7,7 +7,8 @@ gradients.
 
 import itertools
 from collections.abc import Callable
-from functools import partial, reduce
+from functools import cache, partial, reduce
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,13 +19,13 @@ from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
 from ..xla.memory import gather
-from ..xla.platform import on_gpu, while_loop
+from ..xla.platform import on_gpu
 from ..xla.sharding import varying
 from .volume import Volume
 
 
 BLOCK = 4
-"""Cells of the voxel grid along the side of a block."""
+"""Cells of the voxel grid along the side of a block, if nothing else is asked for."""
 
 LAYERS = 8
 """Layers of blocks whose extremes are found at a time, so that they stay in the cache."""
@@ -39,7 +40,7 @@ Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 
 
 class Blocks(eqx.Module):
-    """Ranges of the values in each block of BLOCK³ cells, including the nodes on its faces."""
+    """Ranges of the values in each block of `side`³ cells, including the nodes on its faces."""
 
     low: Float[Array, "*c bx by bz"]
     """Of a volume of several channels, one after the other."""
@@ -48,16 +49,17 @@ class Blocks(eqx.Module):
     """Bit `label % 32` is set for each label of the block's nodes."""
     slopes: tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]] | None = None
     """Least and greatest magnitude of the gradient (`Volume.gradient`); None where they are unknown."""
+    side: int = eqx.field(static=True, default=BLOCK)
 
     @classmethod
-    def of(cls, volume: Volume, *, slopes: bool = False) -> "Blocks":
+    def of(cls, volume: Volume, *, slopes: bool = False, side: int = BLOCK) -> "Blocks":
         """The blocks of a volume, computed once for each array; ranges of `slopes` only where asked for."""
-        labels = None if volume.labels is None else memoized(volume.labels, _label_bits)
-        low, high = map(volume.in_grid_order, memoized(volume.data, _ranges))
+        labels = None if volume.labels is None else memoized(volume.labels, _for(side, _label_bits))
+        low, high = map(volume.in_grid_order, memoized(volume.data, _for(side, _ranges)))
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
-        return cls(low, high, labels, _magnitudes(volume) if known else None)
+        return cls(low, high, labels, _magnitudes(volume, side) if known else None, side)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -129,21 +131,21 @@ class Occupancy(eqx.Module):
     frame: Frame = Frame()
     anchor: Vec3 | None = None
     """That of the `Space`."""
+    known: UInt8[Array, " cells"] | None = None
+    """`distance`, where it has been computed before."""
 
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
-
-        def grow(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            reached, distance, rounds = state
-            distance += (~reached).astype(distance.dtype)
-            return with_neighbours(reached, jnp.logical_or), distance, rounds + 1
-
-        anything = jnp.any(self.occupied)
-        start = self.occupied | ~anything, jnp.zeros(self.occupied.shape, jnp.uint8), jnp.zeros((), jnp.int32)
-        _, distance, _ = while_loop(
-            lambda state: ~jnp.all(state[0]) & (state[2] < FARTHEST - 1), grow, varying(start)
-        )
-        return jnp.where(anything, distance, jnp.uint8(FARTHEST)).reshape(-1)
+        if self.known is not None:
+            return self.known
+        found = jnp.where(self.occupied, 0, FARTHEST - 1).astype(jnp.uint8)
+        for axis in (2, 1, 0):  # exact: a shortest way may take its steps along the later axes last
+            planes = varying(jnp.moveaxis(found, axis, 0))
+            for backwards in (False, True):
+                step = partial(_one_further, range(axis, 2))
+                _, planes = jax.lax.scan(step, planes[-1 if backwards else 0], planes, reverse=backwards)
+            found = jnp.moveaxis(planes, 0, axis)
+        return jnp.where(jnp.any(self.occupied), found, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:
         """Coordinate in the grid, in cells, of a place that counts from `anchor`."""
@@ -152,39 +154,58 @@ class Occupancy(eqx.Module):
         return x, y, z
 
 
+def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Array]:
+    """Distances in a plane, if those of the plane before it are known, from which one step leads here, also
+    a diagonal one along the axes `across`."""
+    for axis in across:
+        before = _with_both_sides(before, axis, jnp.minimum, FARTHEST)
+    plane = jnp.minimum(plane, jnp.minimum(before, FARTHEST - 2) + jnp.uint8(1))
+    return plane, plane
+
+
 def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Array:
     """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
     for axis in range(3):
-        padded = jnp.pad(grid, [(1, 1) if i == axis else (0, 0) for i in range(3)])
-        n = grid.shape[axis]
-        grid = combine(grid, jax.lax.slice_in_dim(padded, 0, n, axis=axis))
-        grid = combine(grid, jax.lax.slice_in_dim(padded, 2, n + 2, axis=axis))
+        grid = _with_both_sides(grid, axis, combine, 0)
     return grid
 
 
-@jax.jit
-def _ranges(data: Shaped[Array, "nx ny nz *c"]) -> tuple[Array, Array]:
-    low, high = widened(*extremes(data))
+def _with_both_sides(grid: Array, axis: int, combine: Callable[[Array, Array], Array], beyond: int) -> Array:
+    """Combines each cell with the two next to it along an axis, with `beyond` where there is none."""
+    around, n = [(1, 1) if i == axis else (0, 0) for i in range(grid.ndim)], grid.shape[axis]
+    padded = jnp.pad(grid, around, constant_values=beyond)
+    before, after = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
+    return combine(combine(grid, before), after)
+
+
+@cache
+def _for(side: int, compute: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of an array for blocks of this side: the same one each time, as `memoized` needs it."""
+    return jax.jit(partial(compute, side=side))
+
+
+def _ranges(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
+    low, high = widened(*extremes(data, side))
     return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
 
 
-@jax.jit
-def extremes(data: Shaped[Array, "nx ny nz *c"]) -> tuple[Array, Array]:
+@partial(jax.jit, static_argnums=1)
+def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Array, Array]:
     """Least and greatest node of each block; NaN where a node is."""
 
     def of(nodes: Array) -> tuple[Array, Array]:
-        return over_blocks(nodes, jnp.minimum), over_blocks(nodes, jnp.maximum)
+        return over_blocks(nodes, jnp.minimum, side=side), over_blocks(nodes, jnp.maximum, side=side)
 
-    whole = (data.shape[0] - 1) // BLOCK
+    whole = (data.shape[0] - 1) // side
     if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
         return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
-    begins = BLOCK * jnp.arange(whole)
+    begins = side * jnp.arange(whole)
     layers = jax.lax.map(
-        lambda x: of(jax.lax.dynamic_slice_in_dim(data, x, BLOCK + 1)), begins, batch_size=LAYERS
+        lambda x: of(jax.lax.dynamic_slice_in_dim(data, x, side + 1)), begins, batch_size=LAYERS
     )
     found = [jax.tree.map(lambda layer: layer[:, 0], layers)]
-    if whole * BLOCK < data.shape[0] - 1:
-        found.append(of(data[whole * BLOCK :]))
+    if whole * side < data.shape[0] - 1:
+        found.append(of(data[whole * side :]))
     low, high = (jnp.concatenate(ends) for ends in zip(*found, strict=True))
     return low, high
 
@@ -197,38 +218,38 @@ def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"
     return low - slack, high + slack
 
 
-@jax.jit
-def _slope_ranges(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array, Array]:
+def _slope_ranges(data: Shaped[Array, "nx ny nz"], side: int) -> tuple[Array, Array, Array]:
     """Least and greatest slopes along the array's axes in each block, in value units per node, and the
     greatest length of a node's three; layer by layer, since all would take several times the volume's memory.
     """
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
-        node = jnp.clip(BLOCK * block + jnp.arange(BLOCK + 1), 0, last)
+        node = jnp.clip(side * block + jnp.arange(side + 1), 0, last)
         # subtracted in their own type: doubles that differ little are the same in single precision
         dtype = data.dtype if data.dtype == jnp.float64 else jnp.float32
-        before, here, after = (data[jnp.clip(node + side, 0, last)].astype(dtype) for side in (-1, 0, 1))
+        before, here, after = (data[jnp.clip(node + step, 0, last)].astype(dtype) for step in (-1, 0, 1))
         border = ((node == 0) | (node == last))[:, None, None]
         along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)
         slopes = jnp.stack([along_x, *jnp.gradient(here, axis=(1, 2))]).astype(jnp.float32)
-        square = over_blocks(jnp.max(jnp.sum(slopes**2, axis=0), axis=0), jnp.maximum)
-        low = jax.vmap(lambda part: over_blocks(part, jnp.minimum))(jnp.min(slopes, axis=1))
-        high = jax.vmap(lambda part: over_blocks(part, jnp.maximum))(jnp.max(slopes, axis=1))
+        blocks = partial(over_blocks, side=side)
+        square = blocks(jnp.max(jnp.sum(slopes**2, axis=0), axis=0), jnp.maximum)
+        low = jax.vmap(lambda part: blocks(part, jnp.minimum))(jnp.min(slopes, axis=1))
+        high = jax.vmap(lambda part: blocks(part, jnp.maximum))(jnp.max(slopes, axis=1))
         # inside loops on CPU, XLA's minima and maxima lose NaN
-        lost = over_blocks(jnp.any(jnp.isnan(slopes), axis=(0, 1)), jnp.logical_or)
+        lost = blocks(jnp.any(jnp.isnan(slopes), axis=(0, 1)), jnp.logical_or)
         slack = ROUNDING * jnp.maximum(jnp.abs(low), jnp.abs(high))
         steepest = jnp.sqrt(square) * (1 + ROUNDING)
         low, high = (jnp.where(lost, jnp.nan, end) for end in (low - slack, high + slack))
         return low, high, steepest
 
-    low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // BLOCK)))
+    low, high, steepest = jax.lax.map(layer, jnp.arange(-(-last // side)))
     return jnp.moveaxis(low, 0, 1), jnp.moveaxis(high, 0, 1), steepest
 
 
-def _magnitudes(volume: Volume) -> tuple[Array, Array]:
+def _magnitudes(volume: Volume, side: int) -> tuple[Array, Array]:
     """Least and greatest magnitude of the gradient in each block, in value units per world length."""
-    low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _slope_ranges))
+    low, high, steepest = map(volume.in_grid_order, memoized(volume.data, _for(side, _slope_ranges)))
     low, high = (jnp.stack([part[axis] for axis in inverse(volume.fetch.axes)]) for part in (low, high))
     place = jax.lax.stop_gradient((volume.spacing, volume.direction))
     return _lengths(low, high, steepest, *jax.tree.map(lambda leaf: leaf.astype(low.dtype), place))
@@ -253,28 +274,29 @@ def _lengths(
     return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
 
 
-@jax.jit
-def _label_bits(labels: Integer[Array, "nx ny nz"]) -> UInt32[Array, "bx by bz"]:
+def _label_bits(labels: Integer[Array, "nx ny nz"], side: int) -> UInt32[Array, "bx by bz"]:
     bits = jnp.uint32(1) << (labels.astype(jnp.int32) % 32).astype(jnp.uint32)
-    return over_blocks(bits, jnp.bitwise_or)
+    return over_blocks(bits, jnp.bitwise_or, side=side)
 
 
-def over_blocks(values: Array, combine: Callable[[Array, Array], Array], margin: int = 0) -> Array:
+def over_blocks(
+    values: Array, combine: Callable[[Array, Array], Array], margin: int = 0, *, side: int = BLOCK
+) -> Array:
     """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
     for axis in range(min(values.ndim, 3)):  # channels stay
         cells = values.shape[axis] - 1
         if margin:
-            missing = -cells % BLOCK
+            missing = -cells % side
             around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
             values, cells = jnp.pad(values, around, mode="edge"), cells + missing
         along = partial(jax.lax.slice_in_dim, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
-        whole, rest = divmod(cells, BLOCK)
+        whole, rest = divmod(cells, side)
         found = []
         if whole:
-            length, nodes = (whole - 1) * BLOCK + 1, range(BLOCK + 1 + 2 * margin)
-            found.append(reduce(combine, [along(i, i + length, BLOCK) for i in nodes]))
+            length, nodes = (whole - 1) * side + 1, range(side + 1 + 2 * margin)
+            found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
         if rest:
-            found.append(reduce(combine, [along(i, i + 1) for i in range(whole * BLOCK, cells + 1)]))
+            found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))
         values = jnp.concatenate(found, axis)
     return values

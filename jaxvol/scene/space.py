@@ -101,9 +101,11 @@ class Space(eqx.Module):
         coordinates that may exceed the grid; 0 where nodes meet."""
 
     @abstractmethod
-    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        """Cells that may hold anything visible, placed from `anchor` on, from the visible blocks of the grid,
-        or of a part of it that begins at the node `first`."""
+    def occupancy(
+        self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None, side: int = BLOCK
+    ) -> Occupancy:
+        """Cells that may hold anything visible, placed from `anchor` on, from the visible blocks of `side`³
+        cells of the grid, or of a part of it that begins at the node `first`."""
 
     def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
         """For each face at which rays may enter or leave, whether anything visible may lie there."""
@@ -278,8 +280,10 @@ class Affine(Space):
         x, y, z = (step * (1 / self.frame.stretch) for step in self.spacing)
         return x, y, z
 
-    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        x, y, z = (BLOCK * step for step in self.spacing)
+    def occupancy(
+        self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None, side: int = BLOCK
+    ) -> Occupancy:
+        x, y, z = (side * step for step in self.spacing)
         zero = jnp.zeros_like(x)
         low = (zero, zero, zero) if first is None else times(first, self.spacing)
         return Occupancy(visible, low, (x, y, z), self.frame, self.anchor)

@@ -1,11 +1,11 @@
-"""Memoizes results computed from an array, for as long as the array lives.
+"""Memoizes results computed from arrays, for as long as these live.
 
 Arrays are immutable: an update of a volume replaces its array, and results for the old one are never
-requested again. So nothing stored here goes stale, and nothing outlives its array.
+requested again. So nothing stored here goes stale, and nothing outlives what it was computed from.
 """
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from functools import cache
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from .compiling import computed_now
 from .platform import is_traced
+from .trees import PyTree
 
 
 T = TypeVar("T")
@@ -34,6 +35,17 @@ def memoized(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
     return _MEMORY[key]
 
 
+def memoized_of(tree: PyTree, compute: Callable[[Any], T]) -> T:
+    """`compute(tree)`, computed once in the lifetime of all of the tree's arrays, which must be concrete."""
+    leaves, structure = jax.tree.flatten(tree)
+    key = tuple(map(id, leaves)), structure, compute
+    if key not in _MEMORY:
+        _MEMORY[key] = computed_now(compute, tree)
+        for leaf in leaves:
+            weakref.finalize(leaf, _MEMORY.pop, key, None)
+    return _MEMORY[key]
+
+
 @cache
 def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """`compute` of one array, with a batching rule that memoizes the results of a batch."""
@@ -47,4 +59,4 @@ def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return one
 
 
-_MEMORY: dict[tuple[int, Callable[..., Any]], Any] = {}
+_MEMORY: dict[Hashable, Any] = {}

@@ -179,7 +179,7 @@ class _Bent(Space):
         some = (left > 0) & (back < length)
         return ((jnp.where(some, left, jnp.inf), jnp.where(some, back, jnp.inf)),)
 
-    def occupancy(self, visible, first=None):
+    def occupancy(self, visible, first=None, side=4):
         raise AssertionError("nothing is leapt over here")
 
     def path(self, entry, direction):

@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from itertools import product
 
 import equinox as eqx
 import jax
@@ -172,6 +173,18 @@ def distance_of(occupied):
 
 def distances(occupied):
     return np.asarray(distance_of(occupied), int)
+
+
+def test_distances_of_voxels_are_those_to_the_nearest_cell_that_shows_anything():
+    """Two small bright things, one of them at a corner."""
+    data = np.zeros((14, 11, 9), np.float32)
+    data[0, 0, 0], data[9:11, 5, 6] = 1, 0.4
+    transfer = jv.TransferFunction(np.array([0.1, 1]), np.ones((2, 3)), np.array([0.0, 2]))
+    found = jax.jit(lambda v: distance_of(transfer.visible(Blocks.of(v, side=1))))(jv.Volume(data))
+    cells = list(product(*(range(n - 1) for n in data.shape)))
+    shown = [c for c in cells if data[tuple(slice(i, i + 2) for i in c)].max() > 0.1]
+    nearest = [np.abs(np.asarray(c) - shown).max(axis=1).min() for c in cells]
+    np.testing.assert_array_equal(found, nearest)
 
 
 def test_distances_are_those_of_a_chessboard():

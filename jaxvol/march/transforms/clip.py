@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, flag, require, shortened
 from ..._util.vec3 import Scalar, Vec3, apart, dot, minus
-from ...scene.occupancy import Occupancy
+from ...scene.occupancy import BLOCK, Occupancy
 from ...scene.space import Gap, Path, Space
 from ..march import Transform
 
@@ -207,8 +207,10 @@ class _Clipped(Space):
     def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
         return self.inner.spans(entry, direction)
 
-    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
-        grid = self.inner.occupancy(visible, first)
+    def occupancy(
+        self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None, side: int = BLOCK
+    ) -> Occupancy:
+        grid = self.inner.occupancy(visible, first, side)
         over = [side.over(grid) for side in self.local.sides]
         if self.inside_out:
             seen = reduce(jnp.logical_or, [height <= reach for height, reach in over])

@@ -178,7 +178,9 @@ class _Sector(Space):
         rho = [probe.a + d * jnp.sin(s) for d in depth for s in angle]
         return jnp.maximum(reduce(jnp.minimum, rho), 0) * beta, depth[0] * sigma, gamma
 
-    def occupancy(self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None) -> Occupancy:
+    def occupancy(
+        self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None, side: int = BLOCK
+    ) -> Occupancy:
         """World cells around the sector, occupied where the sphere around one reaches a visible block."""
         low, high = (apart(corner) for corner in jax.lax.stop_gradient(self.probe).corners)
         x, y, z = size = tuple((b - a) / CUBES for a, b in zip(low, high, strict=True))
@@ -199,9 +201,9 @@ class _Sector(Space):
         for axis, (change, ends, n) in enumerate(zip(changes, ranges, self.shape, strict=True)):
             blocks, c = visible.shape[axis], coordinate[axis] - (0 if first is None else first[axis])
             nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
-            reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, BLOCK * blocks))
+            reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, side * blocks))
             for end, found in ((c - nodes, begin), (c + nodes, stop)):
-                found.append(jnp.clip(jnp.floor(end / BLOCK).astype(jnp.int32), 0, blocks - 1))
+                found.append(jnp.clip(jnp.floor(end / side).astype(jnp.int32), 0, blocks - 1))
         seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
         return Occupancy(reached & seen, low, (x, y, z))
 

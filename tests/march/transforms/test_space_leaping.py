@@ -22,7 +22,8 @@ MOVING = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.EarlyTermination(0.05
 
 def leaping(transforms, method, on=True, cell=4):
     """The transforms, and leaps that share a program with none."""
-    return (*transforms, switch(jv.SpaceLeaping(method, cell), on))
+    leaps = jv.SpaceLeaping("distance", block=1) if method == "voxels" else jv.SpaceLeaping(method, cell)
+    return (*transforms, switch(leaps, on))
 
 
 def assert_same(leapt, whole, tolerance=1e-6):
@@ -90,7 +91,7 @@ KINDS = st.sampled_from(["noise", "sparse", "half", "blobs"])
 SEEDS = st.integers(0, 10**6)
 
 
-@pytest.mark.parametrize("method", ["hierarchy", *slow("beam", "distance")])
+@pytest.mark.parametrize("method", ["hierarchy", "voxels", *slow("beam", "distance")])
 def test_leaping_does_not_show(method):
     """In random scenes, each volume after another one, so that nothing stale is used; and saves samples."""
     transforms = MOVING if method == "hierarchy" else MOVING[:1]
@@ -230,24 +231,33 @@ def test_no_beam_misses_what_is_seen(cell, method):
 # ---- what the published method misses, and invalid arguments ----
 
 
-@pytest.mark.slow
-def test_min_distance_misses_what_is_thin_and_a_beam_does_not():
+def test_what_min_distance_misses_is_seen_when_leaps_are_chosen():
     """A single voxel in front of a wall, between the corners of a cell of 32 x 32 pixels."""
     data = where(Z == 3)
     data[12, 10, 24] = 255
     volume = jv.Volume(data)
     camera = jv.Camera((12.0, 10.0, 90.0), (12.0, 10.0, 3.0), (0, 1, 0), 18.0, size=(100, 100))
 
-    def depth(method, on=True):
-        march = jv.March(0.23, leaping((), method, on, 32))
-        return np.asarray(jv.render(volume, BRIGHT, camera, march).depth)
-
-    whole, published, proven = depth("beam", False), depth("min_distance"), depth("beam")
-    assert whole[49, 49] < 70  # the voxel
-    assert whole[40, 40] > 80  # the wall
-    assert published[49, 49] > 80
-    np.testing.assert_allclose(published[40, 40], whole[40, 40], rtol=1e-5)
-    np.testing.assert_allclose(proven, whole, rtol=1e-5)
+    proven, published = jv.SpaceLeaping("distance"), jv.SpaceLeaping("min_distance", 32)
+    march, leaps = jv.March(0.23), (proven, published)
+    found = jv.fastest_leaping(volume, BRIGHT, camera, march, leaps=leaps, repetitions=1)
+    assert found.leaping is proven
+    assert [part.kept for part in found.parts] == [True, False]
+    seen, missed = (
+        np.asarray(jv.render(volume, BRIGHT, camera, jv.March(0.23, (leap,)), outputs="rgba").rgba)
+        for leap in leaps
+    )
+    wrong = np.argwhere(np.max(np.abs(seen - missed), axis=-1) > 1 / 255)
+    assert f", {len(wrong) / 100**2:.2%} wrong" in str(found)
+    radius = (
+        50 * (1 / 65) / np.tan(np.radians(9))
+    )  # of the sphere around the voxel that interpolation reaches
+    assert np.max(np.linalg.norm(wrong - 49.5, axis=-1)) < radius
+    assert (
+        jv.fastest_leaping(volume, BRIGHT, camera, march, leaps=leaps, tolerance=1, repetitions=1)
+        .parts[1]
+        .kept
+    )
 
 
 @pytest.mark.parametrize("method", ["beam", "min_distance"])
@@ -265,6 +275,20 @@ def test_bad_arguments_are_named():
     }.items():
         with pytest.raises(ValueError, match=message):
             jv.SpaceLeaping(*arguments)
+    for method, block, message in (
+        ("distance", 3, "block must be 1, 2 or 4; got 3"),
+        ("beam", 1, "block is of"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jv.SpaceLeaping(method, block=block)
+    scene = jv.Volume(voxel(3, 3, 3)), BRIGHT, jv.Camera((99.0, 0, 0), (0, 0, 0), (0, 1, 0), size=(4, 4))
+    for march, leaps, message in (
+        (jv.March(1.0, (jv.SpaceLeaping(),)), (jv.SpaceLeaping(),), "march must have no SpaceLeaping"),
+        (jv.March(1.0), (jv.SpaceLeaping("min_distance"),), "leaps must begin"),
+        (jv.March(1.0), (), "leaps must hold"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jv.fastest_leaping(*scene, march, leaps=leaps)
 
 
 # ---- other spaces, other transfer functions ----
