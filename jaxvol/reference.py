@@ -59,7 +59,7 @@ def render_ray_reference(
 
     Computes in the float type of `origin` and `direction`. Differentiable in forward and reverse mode, any
     number of times; the memory of reverse mode grows with the number of samples. `render` agrees to 1e-9 in
-    float64 and to 2e-5 in float32, but where a thin peak of the transfer function magnifies what is rounded,
+    float64 and to 2e-5 in float32, but where a steep transfer function magnifies what is rounded,
     or rounding decides a comparison (docs/features.md, "One reference").
 
     Args:
