@@ -25,7 +25,9 @@ class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
     Args:
-        position: world position. It may lie inside a volume (endoscopy); nothing behind it is visible.
+        position: world position. It may lie inside a volume (endoscopy); nothing behind it is visible. On a
+            face of the volume the image has a kink: the gradient is, pixel by pixel, that of one side, and so
+            it is where rays run along planes of voxels.
         focal_point: world point at the center of the image.
         view_up: direction that points up in the image; not parallel to the view direction.
         view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).
