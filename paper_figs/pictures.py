@@ -95,15 +95,11 @@ def lee_fig5(chosen: Namespace) -> None:
 
 
 PICTURES: dict[str, Main] = {
-    "fig01": pictures(
-        "fig01",
-        "Fig. 1: wood grain, and noise on the cut face",
-        partial(kye.comparison, "head", methods=(PLAIN, JITTER)),
-    ),
-    "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head")),
-    "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart")),
-    "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney")),
-    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left)),
+    "fig01": pictures("fig01", FIG01, partial(kye.comparison, "head", methods=(PLAIN, JITTER)), data=True),
+    "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head"), data=True),
+    "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart"), data=True),
+    "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney"), data=True),
+    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left), data=True),
     "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13),
     "chae_fig6": pictures("chae_fig6", chae_fig6, chae.chae_fig6, resolution=256),
     "kim_fig6": kim_fig6,

@@ -50,7 +50,7 @@ def test_the_page_shows_what_the_records_hold_beside_what_the_papers_report(tmp_
     assert (tmp_path / "fig13.webp").read_bytes() == (common.OUTPUT / "fig13.webp").read_bytes()
     assert imread(tmp_path / "chae_fig5.webp").std() > 10
     row = record.read(record.RESULTS / "overhead.json")["result"]["conditions"]["all samples"]["volumes"]
-    ratio = row["engine"]["512"][BOTH]["ratio"]["median"]
+    ratio = row["bonsai"]["512"][BOTH]["ratio"]["median"]
     assert f"<td>{ratio:.3f} [" in page  # ours
     assert "<td><i>paper: vessels</i></td><td>1024²</td><td>1.192 s</td>" in page
     assert record.read(record.RESULTS / "kisti.json")["commit"] in page
