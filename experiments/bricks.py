@@ -1,14 +1,15 @@
 """What do bricks cost in an ultrasound scan, by how it is split, and does overlap save time?
 
-The scan of Kim, Kwon and Shin 2008 in float32, on disk: a phantom of a fetus, sampled by a probe of the paper's
-proportions. `render_bricks` renders it under the splits of the paper's Table 1 by `"overlap"`, by `"reload"`,
-and in the naive order, which is wrong, all in turn, and in turn with `render` of the whole volume. Beside the
-times stand the loads, and the voxels read over those of the volume, with what is read around each brick. The
-paper's best split is measured from several sides, since a ray's way decides whether it comes back to a brick.
+The scan of Kim, Kwon and Shin 2008 in float32, on disk: a phantom of a fetus, sampled by a probe of the
+paper's proportions. `render_bricks` renders it under the splits of the paper's Table 1 by `"overlap"`, by
+`"reload"`, and in the naive order, which is wrong, all in turn, and in turn with `render` of the whole volume.
+Beside the times stand the loads, and the voxels read over those of the volume, with what is read around each
+brick. The paper's best split is measured from several sides, since a ray's way decides whether it comes back
+to a brick.
 
-Under two conditions: a quarter of the scan along each axis, for which there is memory enough; and the whole
-scan and image of the paper with a quarter of the scan's size for bricks (`memory`). A frame of the latter
-takes about a minute, so that it is rendered once, of some splits, and what XLA takes to compile is subtracted.
+Under two conditions: a quarter of the scan along each axis, for which there is memory enough; and the paper's
+scan and size of the image, with a quarter of the scan's bytes for bricks (`memory`). A frame of that takes a
+minute or more, so that it is rendered once, under some splits, and what JAX takes to compile is subtracted.
 
 Before each frame the file is dropped from the system's page cache, where the system can do that. A split into
 many bricks is timed once.
@@ -141,8 +142,8 @@ MANY = 100
 
 
 class Condition(NamedTuple):
-    """Samples along a beam, the part of the scan's size that bricks may take (None: a quarter of the machine's
-    memory), and the methods. `once`: each frame is the first, without what XLA takes to compile."""
+    """Samples along a beam, the part of the scan's bytes that bricks may take (None: a quarter of the
+    machine's memory), and the methods. `once`: each frame is the first, less what JAX takes to compile."""
 
     resolution: int
     part: float | None = None

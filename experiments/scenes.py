@@ -114,8 +114,8 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
 
 
 def cut(make: Callable[..., Scene], low: Any, high: Any, *zoom: Any) -> Callable[..., Scene]:
-    """Makes the scene with only the part of the volume between two corners (`cropped`), and a part of the image
-    enlarged (`jv.Camera.zoom`)."""
+    """Makes the scene with only the part of the volume between two corners (`cropped`), and a part of the
+    image enlarged (`jv.Camera.zoom`)."""
 
     def made(folder: Path | None, size: int, resolution: int = 0) -> Scene:
         scene = make(folder, size, resolution)
