@@ -2,10 +2,9 @@
 
 The scan of Kim, Kwon and Shin 2008 in float32, on disk: a phantom of a fetus, sampled by a probe of the
 paper's proportions. `render_bricks` renders it under the splits of the paper's Table 1 by `"overlap"`, by
-`"reload"`, and in the naive order, which is wrong, all in turn, and in turn with `render` of the whole volume.
-Beside the times stand the loads, and the voxels read over those of the volume, with what is read around each
-brick. The paper's best split is measured from several sides, since a ray's way decides whether it comes back
-to a brick.
+`"reload"`, and in the naive order, which is wrong, all in turn with `render` of the whole volume. Beside the
+times stand the loads, and the voxels read over those of the volume, with what is read around each brick. The
+best split is measured from several sides, since a ray's way decides whether it comes back to a brick.
 
 Under two conditions: a quarter of the scan along each axis, for which there is memory enough; and the paper's
 scan and size of the image, with a quarter of the scan's bytes for bricks (`memory`). A frame of that takes a

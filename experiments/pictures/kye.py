@@ -110,8 +110,8 @@ REAL = {
         **CHEST,
     ),
 }
-"""CT in place of those that the paper shows: a head whose crown is cut off; and of a chest, all of whose faces
-cut tissue, the heart behind a lung, the liver under a lung, and the vessels of a lung."""
+"""CT in place of that which the paper shows: a head whose crown is cut off; and of a chest, all of whose
+faces cut tissue, the heart behind a lung, the liver under a lung, and the vessels of a lung."""
 CT = {"head": "CT head", "heart": "CT heart", "kidney": "CT liver", "vessels": "CT lung"}
 """In titles."""
 
