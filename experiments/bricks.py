@@ -1,11 +1,14 @@
 """What do bricks cost in an ultrasound scan, by how it is split, and does overlap save time?
 
-The scan of Kim, Kwon and Shin 2008 at a quarter along each axis, in float32, on disk: a phantom of a fetus,
-sampled by a probe of the paper's proportions. `render_bricks` renders it under each split of the paper's
-Table 1 by `"overlap"`, by `"reload"`, and in the naive order, which is wrong, all in turn, and in turn with
-`render` of the whole volume. Beside the times stand the loads, and the voxels read over those of the volume,
-with what is read around each brick. The paper's best split is measured from several sides, since a ray's way
-decides whether it comes back to a brick.
+The scan of Kim, Kwon and Shin 2008 in float32, on disk: a phantom of a fetus, sampled by a probe of the
+paper's proportions. `render_bricks` renders it under the splits of the paper's Table 1 by `"overlap"`, by
+`"reload"`, and in the naive order, which is wrong, all in turn with `render` of the whole volume. Beside the
+times stand the loads, and the voxels read over those of the volume, with what is read around each brick. The
+best split is measured from several sides, since a ray's way decides whether it comes back to a brick.
+
+Under two conditions: a quarter of the scan along each axis, for which there is memory enough; and the paper's
+scan and size of the image, with a quarter of the scan's bytes for bricks (`memory`). A frame of that takes a
+minute or more, so that it is rendered once, under some splits, and what JAX takes to compile is subtracted.
 
 Before each frame the file is dropped from the system's page cache, where the system can do that. A split into
 many bricks is timed once.
@@ -16,7 +19,7 @@ import os
 import tempfile
 from argparse import Namespace
 from collections.abc import Iterable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +31,7 @@ from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of, source_of
 from jaxvol.bricks.traversal import Load, Traversal
 
 from . import timing
-from .harness import experiment
+from .harness import experiment, recorded, show, some_of
 from .scan_conversion import BODY
 
 
@@ -46,8 +49,9 @@ BEST = 2, 4, 2
 
 NEAR, DEEP = 245.0, 349.0
 """Fitted, since the paper does not print the range of depths: distances, from the centre of curvature, of the
-near end of the scan, and from there to its far end. They reproduce the column of overlap, if K in this unit
-counts as a number of voxels. The unit is unexplained: DEEP is 1280 voxels."""
+near end of the scan, and from there to its far end, in a unit that is unexplained: DEEP is 1280 voxels. The
+column of overlap follows from three changes together: K in this unit counts as a number of voxels, a = 0, and
+K is taken at the near face of each brick (`printed_overlap`)."""
 
 
 class Row(NamedTuple):
@@ -134,6 +138,23 @@ SCALE = 0.17
 MANY = 100
 """From so many bricks on, a split is timed once, after a warm frame."""
 
+
+class Condition(NamedTuple):
+    """Samples along a beam, the part of the scan's bytes that bricks may take (None: a quarter of the
+    machine's memory), and the methods. `once`: each frame is the first, less what JAX takes to compile."""
+
+    resolution: int
+    part: float | None = None
+    methods: tuple[str, ...] = tuple(METHODS)
+    once: bool = False
+
+
+FITS, QUARTER = "the scan fits", "a quarter of it fits"
+CONDITIONS = {
+    FITS: Condition(320),
+    QUARTER: Condition(SHAPE[2], 1 / 4, ("overlap", "reload"), once=True),
+}
+
 EYES: dict[str, tuple[float, float, float]] = {
     "across": (0, -290, 40),
     "along": (290, 0, 100),
@@ -193,16 +214,29 @@ def stored(folder: Path, resolution: int) -> Scan:
     return Scan(path, source_of(path), scan, marching(scan, volume))
 
 
-def compared(scan: Scan, view: jv.Camera, split: Split, repetitions: int) -> dict[str, dict[str, Any]]:
-    """Time, reads and error of each method, and time of the volume rendered whole."""
-    programs = {name: partial(scan.render, view, bricks=split, method=how) for name, how in METHODS.items()}
-    seconds = timing.interleaved({**programs, WHOLE: partial(scan.render, view)}, repetitions)
-    truth, voxels = np.asarray(scan.render(view).rgba), np.prod(scan.source.shape) * 4
+def compared(
+    scan: Scan, view: jv.Camera, split: Split, how: Condition, repetitions: int, whole: Any = None
+) -> dict[str, dict[str, Any]]:
+    """Time, reads and error of each method, and time of the volume rendered whole. `whole`: seconds and image
+    of that; then the methods are run once."""
+    voxels = int(np.prod(scan.source.shape)) * 4
+    memory = how.part and int(how.part * voxels)
+    programs: dict[str, Any] = {
+        name: partial(scan.render, view, bricks=split, method=METHODS[name], memory=memory)
+        for name in how.methods
+    }
+    if whole is not None:
+        runs = {name: timing.first(program) for name, program in programs.items()} | {WHOLE: whole}
+        renderings = {name: rendering for name, (_, rendering) in runs.items()}
+        seconds = {name: [taken] for name, (taken, _) in runs.items()}
+    else:
+        programs[WHOLE] = partial(scan.render, view)
+        seconds = timing.interleaved(programs, repetitions)
+        renderings = {name: program() for name, program in programs.items()}
+    truth = np.asarray(renderings[WHOLE].rgba)
     rows: dict[str, dict[str, Any]] = {WHOLE: {"seconds": timing.median(seconds[WHOLE])}}
-    for method, program in programs.items():
-        rendering = program()
-        report = rendering.bricks
-        assert report is not None
+    for method in how.methods:
+        report = renderings[method].bricks
         rows[method] = {
             "seconds": timing.median(seconds[method]),
             "ratio to overlap": timing.ratio(seconds[method], seconds["overlap"]),
@@ -210,7 +244,7 @@ def compared(scan: Scan, view: jv.Camera, split: Split, repetitions: int) -> dic
             "loads": report.loads,
             "read, times the volume": round(float(report.bytes_read / voxels), 4),
             "held, MiB": round(report.bytes_held / 2**20, 3),
-            "largest error": float(np.max(np.abs(np.asarray(rendering.rgba) - truth))),
+            "largest error": float(np.max(np.abs(np.asarray(renderings[method].rgba) - truth))),
         }
     return rows
 
@@ -219,24 +253,26 @@ def named(split: Split) -> str:
     return ",".join(map(str, split))
 
 
-@experiment(
-    repetitions=5,
-    size=64,
-    resolution=320,
-    splits=tuple(TABLE),
-    quick={"size": 16, "resolution": 48, "repetitions": 1, "splits": ((2, 1, 2),)},
-)
-def main(chosen: Namespace) -> dict[str, Any]:
+def measured(chosen: Namespace, how: Condition, size: int, splits: tuple[Split, ...]) -> dict[str, Any]:
+    """The splits from one side, and the best one from the others."""
     rows: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        scan = stored(Path(folder), chosen.resolution)
+        scan = stored(Path(folder), min(how.resolution, chosen.resolution))
+
+        @cache
+        def whole(view: str) -> tuple[float, Any]:
+            return timing.first(partial(scan.render, camera(view, size)))
 
         def measure(split: Split, view: str) -> dict[str, Any]:
-            repetitions = chosen.repetitions if np.prod(split) < MANY else 1
-            found = compared(scan, camera(view, chosen.size), split, repetitions)
+            repetitions = chosen.repetitions if np.prod(split) < MANY and not how.once else 1
+            found = compared(
+                scan, camera(view, size), split, how, repetitions, whole(view) if how.once else None
+            )
+            show(found, named(split), view)
             return {"bricks": int(np.prod(split)), "repetitions": repetitions, **found}
 
-        for split in chosen.splits:
+        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in splits}
+        for split in splits:
             overlap = overlap_of(scan.probe, grid(scan.source.shape, split))
             rows[named(split)] = {
                 "paper": TABLE[split]._asdict(),
@@ -244,6 +280,31 @@ def main(chosen: Namespace) -> dict[str, Any]:
                 "formula, of these voxels": round(share(overlap, scan.source.shape[2]), 3),
                 **measure(split, VIEW),
             }
-        views = {view: measure(BEST, view) for view in EYES if view != VIEW and BEST in chosen.splits}
-        about = {"image": [chosen.size] * 2, "voxels": list(scan.source.shape), "view": VIEW}
+    about: dict[str, Any] = {"image": [size] * 2, "voxels": list(scan.source.shape), "view": VIEW}
+    if how.part:
+        about["memory, MiB"] = round(float(how.part * np.prod(scan.source.shape) * 4 / 2**20), 1)
     return {**about, "splits": rows, f"{named(BEST)} from": views}
+
+
+@experiment(
+    repetitions=5,
+    size=64,
+    resolution={"type": int, "default": SHAPE[2], "help": "samples along a beam, at most"},
+    only=some_of(CONDITIONS, "CONDITION"),
+    splits=tuple(TABLE),
+    large=(375,),
+    large_splits=((2, 1, 2), (2, 2, 2), (2, 4, 2), (2, 2, 4)),
+    quick={
+        "size": 16,
+        "resolution": 48,
+        "repetitions": 1,
+        "splits": ((2, 1, 2),),
+        "large": (16,),
+        "large_splits": ((2, 1, 2),),
+    },
+)
+def main(chosen: Namespace) -> dict[str, Any]:
+    each = {FITS: (chosen.size, chosen.splits), QUARTER: (*chosen.large, chosen.large_splits)}
+    found = recorded(chosen, "conditions", [name for name in CONDITIONS if name not in chosen.only])
+    found |= {name: measured(chosen, CONDITIONS[name], *each[name]) for name in chosen.only}
+    return {"conditions": {name: found[name] for name in CONDITIONS if name in found}}

@@ -181,7 +181,8 @@ def entered(scene: Scene) -> np.ndarray:
 
 
 def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[str, dict[str, Any]]:
-    """Time and error of a scene's frame under every march. Ratios are relative to the first march."""
+    """Time and error of a scene's frame under every march, and the part of its pixels that alignment changes.
+    Ratios are relative to the first march."""
     seconds = timing.interleaved({n: lambda m=m: image(scene, m) for n, m in under.items()}, repetitions)
     truth = frame(scene, marches.converged(scene.step, FINER)).rgba
     rows = {}
@@ -190,6 +191,7 @@ def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[
         assert not np.any(rendering.exhausted)
         rows[name] = row(seconds[name], seconds[next(iter(under))], rmse(rendering.rgba, truth))
         rows[name]["samples"] = int(np.sum(np.asarray(rendering.samples), dtype=np.int64))
+        rows[name]["aligned"] = float(np.mean(np.asarray(rendering.aligned)))
     return rows
 
 

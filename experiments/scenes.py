@@ -113,6 +113,17 @@ def cropped(volume: jv.Volume, low: tuple[float, ...], high: tuple[float, ...]) 
     return jv.Volume(part, volume.spacing, origin)
 
 
+def cut(make: Callable[..., Scene], low: Any, high: Any, *zoom: Any) -> Callable[..., Scene]:
+    """Makes the scene with only the part of the volume between two corners (`cropped`), and a part of the
+    image enlarged (`jv.Camera.zoom`)."""
+
+    def made(folder: Path | None, size: int, resolution: int = 0) -> Scene:
+        scene = make(folder, size, resolution)
+        return scene._replace(volume=cropped(scene.volume, low, high), camera=scene.camera.zoom(*zoom))
+
+    return made
+
+
 def inside(scene: Scene) -> Scene:
     """The scene seen from its widest empty place, towards what is visible."""
     from scipy.ndimage import distance_transform_edt  # not at the top: the first image of a process is timed

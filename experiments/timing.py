@@ -30,6 +30,26 @@ def interleaved(programs: dict[Name, Callable[[], Any]], repetitions: int) -> di
     return seconds
 
 
+def first(program: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds of a program's first run, without those in which JAX traces and compiles, and what it returns.
+    It is for what takes too long to be run twice."""
+    spans: list[tuple[float, float]] = []
+
+    def note(event: str, seconds: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            spans.append((time.perf_counter() - seconds, time.perf_counter()))
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    start = time.perf_counter()
+    found = jax.block_until_ready(program())
+    taken, until = time.perf_counter() - start, start
+    jax.monitoring.unregister_event_duration_listener(note)
+    for begin, end in sorted(spans):  # one may lie within another
+        taken -= max(end - max(begin, until), 0)
+        until = max(until, end)
+    return taken, found
+
+
 def ratio(seconds: list[float], base: list[float], seed: int = 0) -> dict[str, float]:
     """Median of the paired ratios, and its 95 % interval by bootstrap."""
     ratios = np.array(seconds) / np.array(base)

@@ -33,7 +33,7 @@ from .scene.space import Line, Ray, Space, enter, world_gradient
 from .scene.transfer import Classification, Measured, Transfer, TransferFunction
 from .scene.transfer2d import TransferFunction2D
 from .scene.variation import Windows
-from .scene.volume import Volume, without_voxels
+from .scene.volume import Volume, grids, without_voxels
 from .xla.differentiation import check_captured
 from .xla.memory import in_memory
 from .xla.trees import PyTree
@@ -71,8 +71,8 @@ class Scene(NamedTuple):
 
     @property
     def has_fault(self) -> Bool[Array, ""]:
-        """Whether a number on which all pixels depend is NaN, infinite, or out of its range: a step or a
-        spacing that is not positive; a transfer function, a transform or a camera that is not `valid`.
+        """Whether a number on which all pixels depend is NaN, infinite, or out of its range: a step that is
+        not positive; a volume, a transfer function, a transform or a camera that is not `valid`.
 
         All pixels are NaN then. Otherwise comparisons with NaN, which are false, would hide the fault, and a
         fit that diverged would look converged. Given rays are checked one by one; NaN in voxels spreads to
@@ -80,8 +80,8 @@ class Scene(NamedTuple):
         rays = None if self.source is None else without_ends(self.source)
         camera = [rays] if isinstance(rays, Camera) else []
         parts = without_voxels(self.volume), self.march, self.transfer, self.compositing, self.lighting
-        valid = all_finite((parts, camera)) & (self.march.step > 0) & jnp.all(self.volume.spacing > 0)
-        for part in (self.transfer, *self.march.transforms, *camera):
+        valid = all_finite((parts, camera)) & (self.march.step > 0)
+        for part in (*grids(self.volume), self.transfer, *self.march.transforms, *camera):
             valid &= part.valid
         return ~valid
 

@@ -19,11 +19,11 @@ def chae_fig6(chosen: Namespace) -> str:
     return f"Chae and Shin, Fig. 6: part of an image of {size} x {size} pixels"
 
 
-FIG01 = "Fig. 1: wood grain, and noise on the cut face"
-FIG09 = "Fig. 9: the head; boundary noise is that of the cut face"
-FIG10 = "Fig. 10: a cut engine in place of the heart; boundary noise is that of the cut faces"
-FIG11 = "Fig. 11: a colon in soft tissue in place of the kidney; boundary noise is that of the cut face"
-FIG12 = "Fig. 12: vessels; boundary noise is that of the pixels that alignment changes"
+FIG01 = "Fig. 1: wood grain, and noise on the cut face; phantom, and CT of a head"
+FIG09 = "Fig. 9: the head, phantom and CT; boundary noise is that of the cut face"
+FIG10 = "Fig. 10: a cut engine in place of the heart, and CT of a heart; boundary noise: of the cut faces"
+FIG11 = "Fig. 11: a colon, and CT of a liver, in place of the kidney; boundary noise: of the cut faces"
+FIG12 = "Fig. 12: vessels, phantom and CT of a lung; boundary noise: of the pixels that alignment changes"
 KIM = "Kim, Kwon and Shin, Fig. 8: bricks of a scan, in the wrong and the right order"
 KISTI = "KISTI report, Fig. V-1: a head and an engine under two transfer functions"
 STEPS = (
@@ -95,15 +95,11 @@ def lee_fig5(chosen: Namespace) -> None:
 
 
 PICTURES: dict[str, Main] = {
-    "fig01": pictures(
-        "fig01",
-        "Fig. 1: wood grain, and noise on the cut face",
-        partial(kye.comparison, "head", methods=(PLAIN, JITTER)),
-    ),
-    "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head")),
-    "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart")),
-    "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney")),
-    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left)),
+    "fig01": pictures("fig01", FIG01, partial(kye.comparison, "head", methods=(PLAIN, JITTER)), data=True),
+    "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head"), data=True),
+    "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart"), data=True),
+    "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney"), data=True),
+    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left), data=True),
     "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13),
     "chae_fig6": pictures("chae_fig6", chae_fig6, chae.chae_fig6, resolution=256),
     "kim_fig6": kim_fig6,

@@ -36,8 +36,10 @@ KYE = {  # seconds, 1024 x 1024 pixels, in the order of the table's columns
 def table1(result: dict[str, Any]) -> str:
     """The record of `experiments/overhead.py` and the paper's table, as one Markdown table."""
     lines = [
-        f"| volume | pixels | {PLAIN} | " + " | ".join(COLUMNS) + f" | RMSE, {PLAIN} | RMSE, {BOTH} |",
-        "|---|" + "---|" * (len(COLUMNS) + 4),
+        f"| volume | pixels | {PLAIN} | "
+        + " | ".join(COLUMNS)
+        + f" | RMSE, {PLAIN} | RMSE, {BOTH} | pixels aligned |",
+        "|---|" + "---|" * (len(COLUMNS) + 5),
     ]
     each = [
         (f"{name}, {said}", size, condition["volumes"][name][str(size)])
@@ -51,9 +53,10 @@ def table1(result: dict[str, Any]) -> str:
             ratio = rows[column]["ratio"]
             cells.append(f"{ratio['median']:.3f} [{ratio['low']:.3f}, {ratio['high']:.3f}]")
         cells += [f"{rows[march]['rmse']:.5f}" for march in (PLAIN, BOTH)]
+        cells.append(f"{rows[BOTH]['aligned']:.2%}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     for name, (plain, *others) in KYE.items():
-        cells = ["1024²", f"{plain:.3f} s", *(f"{other / plain:.3f}" for other in others), "–", "–"]
+        cells = ["1024²", f"{plain:.3f} s", *(f"{other / plain:.3f}" for other in others), *"–––"]
         lines.append(f"| *paper: {name}* | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
@@ -97,9 +100,10 @@ def chae_fig5(result: dict[str, Any], path: Path) -> None:
 METHODS = ("overlap", "reload", "naive", "whole")
 
 
-def kim_table1(result: dict[str, Any]) -> str:
-    """A row for each split: overlap as printed, by the formula, and for the voxels that are measured; what
-    was read, loads, and rates, of the paper and ours."""
+def kim_rows(result: dict[str, Any], condition: str) -> str:
+    """A row for each split under one condition: overlap as printed, by the formula, and for the voxels that
+    are measured; what was read, loads, the memory that bricks took, and rates, of the paper and ours; and
+    rows of the best split from other sides."""
     head = [
         "β, σ, γ",
         "*paper: overlap %*",
@@ -107,25 +111,33 @@ def kim_table1(result: dict[str, Any]) -> str:
         "formula, these voxels %",
         "read: overlap / reload, times the volume",
         "loads: overlap / reload",
+        "held: overlap / reload, MiB",
         "*paper: fps, proposed / reload*",
         "fps: overlap / reload / naive / whole",
         "time of reload / overlap",
     ]
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for name, row in result["splits"].items():
-        paper, overlap, reload = row["paper"], row["overlap"], row["reload"]
-        read = (method["read, times the volume"] for method in (overlap, reload))
-        rates = (1 / row[method]["seconds"] for method in METHODS)
-        ratio = reload["ratio to overlap"]
+    found = result["conditions"][condition]
+    others = {f"{BEST}, {view}": row for view, row in found[f"{BEST} from"].items()}
+    for name, row in (found["splits"] | others).items():
+        paper, both = row.get("paper"), [row[method] for method in METHODS[:2]]
+        ratio = row["reload"]["ratio to overlap"]
+        printed = ["", "", "", ""]
+        if paper is not None:
+            printed = [
+                f"*{paper['overlap']:.2f}*",
+                f"{row['formula']:.2f}",
+                f"{row['formula, of these voxels']:.2f}",
+                f"*{paper['proposed']:.2f} / {paper['reload']:.2f}*",
+            ]
         cells = [
-            name.replace(",", " × "),
-            f"*{paper['overlap']:.2f}*",
-            f"{row['formula']:.2f}",
-            f"{row['formula, of these voxels']:.2f}",
-            " / ".join(f"{times:.2f}" for times in read),
-            f"{overlap['loads']} / {reload['loads']}",
-            f"*{paper['proposed']:.2f} / {paper['reload']:.2f}*",
-            " / ".join(f"{rate:.2f}" for rate in rates),
+            name.replace(",", " × ", 2),
+            *printed[:3],
+            " / ".join(f"{each['read, times the volume']:.2f}" for each in both),
+            " / ".join(f"{each['loads']}" for each in both),
+            " / ".join(f"{each['held, MiB']:.0f}" for each in both),
+            printed[3],
+            " / ".join(f"{1 / row[m]['seconds']:.3g}" if m in row else "–" for m in METHODS),
             f"{ratio['median']:.2f} [{ratio['low']:.2f}, {ratio['high']:.2f}]"
             if row["repetitions"] > 1
             else f"{ratio['median']:.2f}",
@@ -134,35 +146,47 @@ def kim_table1(result: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def kim_table1(result: dict[str, Any]) -> str:
+    """A table for each condition."""
+    return "\n".join(kim_rows(result, condition) for condition in result["conditions"])
+
+
 BEST = "2,4,2"
 
 
 def kim_fig9(result: dict[str, Any], path: Path) -> None:
     """Above the paper's rates, below ours, from the largest bricks to the smallest."""
-    rows = result["splits"]
+    conditions = result["conditions"]
+    rows = conditions[next(iter(conditions))]["splits"]
     names = sorted(rows, key=lambda name: (rows[name]["bricks"], name))
     at = range(len(names))
-    figure, ((theirs,), (ours,)) = charts.panels(2, 1, 9, 5.6, sharex=True)
+    figure, axes = charts.panels(1 + len(conditions), 1, 9, 2.8 * (1 + len(conditions)), sharex=True)
+    (theirs,), *ours = axes
     theirs.plot(at, [rows[n]["paper"]["proposed"] for n in names], "C0o-", label="proposed (overlap)")
     theirs.plot(at, [rows[n]["paper"]["reload"] for n in names], "C1s-", label="reload")
-    for method, style in (("overlap", "C0o-"), ("reload", "C1s-"), ("naive", "C3x:")):
-        label = "naive, wrong" if method == "naive" else method
-        ours.plot(at, [1 / rows[n][method]["seconds"] for n in names], style, label=label)
-    whole = median(1 / rows[n]["whole"]["seconds"] for n in names)
-    ours.axhline(whole, color="0.5", linestyle="--", label="the whole volume at once")
-    for panel, title in ((theirs, "the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels"), (ours, None)):
-        voxels, image = result["voxels"], result["image"]
-        measured = f"measured: {' x '.join(map(str, voxels[::-1]))} voxels, {image[0]} x {image[1]} pixels"
-        panel.set_title(title or measured, fontsize=9)
+    theirs.set_title("the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels", fontsize=9)
+    for (panel,), (condition, found) in zip(ours, conditions.items(), strict=True):
+        rows, image = found["splits"], found["image"]
+        here = [(x, rows[n]) for x, n in zip(at, names, strict=True) if n in rows]
+        for method, style in (("overlap", "C0o-"), ("reload", "C1s-"), ("naive", "C3x:")):
+            label = "naive, wrong" if method == "naive" else method
+            points = [(x, 1 / row[method]["seconds"]) for x, row in here if method in row]
+            if points:
+                panel.plot(*zip(*points, strict=True), style, label=label)
+        whole = median(1 / row["whole"]["seconds"] for _, row in here)
+        panel.axhline(whole, color="0.5", linestyle="--", label="the whole volume at once")
+        voxels = " x ".join(map(str, found["voxels"][::-1]))
+        panel.set_title(f"{condition}: {voxels} voxels, {image[0]} x {image[1]} pixels", fontsize=9)
+    for (panel,) in axes:
         panel.set_yscale("log")
         panel.set_ylabel("frames per second", fontsize=8)
         panel.legend(fontsize=7)
         panel.tick_params(labelsize=7)
         if BEST in names:
             panel.axvline(names.index(BEST), color="0.8", linewidth=6, zorder=0)
-    labels = [f"{n}\n{rows[n]['bricks']}" for n in names]
-    ours.set_xticks(at, labels, fontsize=7)
-    ours.set_xlabel("split β,σ,γ and number of bricks; grey: the paper's best", fontsize=8)
+    last, bricks = axes[-1][0], conditions[next(iter(conditions))]["splits"]
+    last.set_xticks(at, [f"{n}\n{bricks[n]['bricks']}" for n in names], fontsize=7)
+    last.set_xlabel("split β,σ,γ and number of bricks; grey: the paper's best", fontsize=8)
     charts.save(figure, path)
 
 

@@ -130,6 +130,35 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
     check()
 
 
+@pytest.mark.parametrize("quadrature", ["midpoint", "preintegrated"])
+def test_in_float32_a_thin_peak_magnifies_what_is_rounded_by_its_slope(quadrature):
+    """So do leaps and crops, whose values and rays are rounded anew; other transfer functions are in
+    `test_every_subset...`."""
+
+    @eqx.filter_jit
+    def images(volume, transfer, camera, march):
+        leaping = eqx.tree_at(lambda m: m.transforms, march, (*march.transforms, jv.SpaceLeaping()))
+        crop = jv.render(volume, transfer, camera.crop(7, 3, 9, 10), leaping)
+        return [jv.render(volume, transfer, camera, each).rgba for each in (march, leaping)], crop.rgba
+
+    @settings(max_examples=20)
+    @given(at=st.floats(0.2, 0.8), log_width=st.floats(-5, -1), log_top=st.floats(0, 2), **SCENES)
+    def check(at, log_width, log_top, seed, step, volume, view, left):
+        volume, width, top = VOLUMES[volume](), 10**log_width, 10**log_top
+        values, colors = np.array([at - width, at, at + width], np.float32), np.eye(3, dtype=np.float32)
+        transfer = jv.TransferFunction(values, colors, np.array([0, top, 0], np.float32))
+        camera, transforms = CAMERAS[view](volume), (jv.Jitter(seed), jv.AlphaCorrection())
+        march = jv.March(np.float32(step), transforms, quadrature)
+        (whole, leapt), part = jax.device_get(images(volume, transfer, camera, march))
+        rgba, _ = oracle_image(volume, transfer, camera, march)
+        rounded = {"rtol": 0, "atol": 2e-5 + 1e-5 * top / width * step}
+        np.testing.assert_allclose(whole, rgba, **rounded)
+        np.testing.assert_allclose(leapt, whole, **rounded)
+        np.testing.assert_allclose(part, leapt[3:13, 7:16], **rounded)
+
+    check()
+
+
 @pytest.mark.parametrize(
     ("file", "spacing", "points"),
     [

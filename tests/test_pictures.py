@@ -13,11 +13,11 @@ LEAST = 256
 
 PANELS = {
     "paper_figs/output/chae_fig6.webp": (5, 2),
-    "paper_figs/output/fig01.webp": (2, 2),
-    "paper_figs/output/fig09.webp": (4, 2),
-    "paper_figs/output/fig10.webp": (4, 2),
-    "paper_figs/output/fig11.webp": (4, 2),
-    "paper_figs/output/fig12.webp": (4, 2),
+    "paper_figs/output/fig01.webp": (2, 4),
+    "paper_figs/output/fig09.webp": (4, 4),
+    "paper_figs/output/fig10.webp": (4, 4),
+    "paper_figs/output/fig11.webp": (4, 4),
+    "paper_figs/output/fig12.webp": (4, 4),
     "paper_figs/output/fig13.webp": (2, 1),
     "paper_figs/output/gallery.webp": (4, 5),
     "paper_figs/output/kim_fig8.webp": (3, 2),

@@ -11,7 +11,7 @@ from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
 
 from ..harness import entered, frame
 from ..marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
-from ..scenes import SKIN, Scene, cropped
+from ..scenes import AIRWAY, CT_HEAD, OF_AIRWAY, SKIN, Scene, cropped
 from . import BLACK, Panels, panel
 
 
@@ -37,9 +37,10 @@ CONTRAST = [(60, (0.30, 0.02, 0.02), 0.0), (120, (0.80, 0.20, 0.12), 0.12), (230
 class View(NamedTuple):
     """A phantom, the part of it that is left, its transfer function, the step in voxels, from where it is
     seen, and the zoom; and the part of the image that is zoomed: by how much, and its centre, as fractions of
-    the image's width and height from the top left."""
+    the image's width and height from the top left. Of CT, also what is cut off at the first voxels, what is
+    up, the distances of voxels, mm, and the distance to which opacities refer."""
 
-    phantom: str
+    volume: str
     part: tuple[float, float, float]
     points: list[Any]
     voxels: float
@@ -47,11 +48,20 @@ class View(NamedTuple):
     zoom: tuple[Any, ...]
     factor: float
     middle: tuple[float, float]
+    first: tuple[float, float, float] = (0, 0, 0)
+    up: tuple[float, float, float] = (0, 0, 1)
+    spacing: tuple[float, ...] = ()
+    unit: float = 0.03
 
     def scenes(self, chosen: Namespace) -> dict[str, Scene]:
-        volume = cropped(jv.phantom(self.phantom, chosen.resolution), (0, 0, 0), self.part)
-        camera = jv.Camera.looking_at(volume, self.direction, size=(chosen.size,) * 2).zoom(*self.zoom)
-        transfer = jv.TransferFunction.from_points(self.points, unit_distance=0.03)
+        if self.spacing:
+            volume = jv.load(chosen.data / self.volume, spacing=self.spacing)
+        else:
+            volume = jv.phantom(self.volume, chosen.resolution)
+        volume = cropped(volume, self.first, self.part)
+        camera = jv.Camera.looking_at(volume, self.direction, self.up, size=(chosen.size,) * 2)
+        camera = camera.zoom(*self.zoom)
+        transfer = jv.TransferFunction.from_points(self.points, unit_distance=self.unit)
         whole = Scene(volume, transfer, camera, self.voxels * float(volume.spacing[0]))
         return {"whole": whole, "zoomed": whole._replace(camera=camera.zoom(self.factor, self.middle))}
 
@@ -63,6 +73,47 @@ VIEWS = {
     "vessels": View("vessels", (1, 1, 1), CONTRAST, 2, (0.5, -1, 0.6), (1.5, (0.5, 0.52)), 6, (0.5, 0.84)),
 }
 """A head whose crown is cut off, a cut engine, a colon in soft tissue, and vessels whose root is cut."""
+
+CT_SKIN = [
+    (500, (0.10, 0.04, 0.03), 0.0),
+    (800, (0.85, 0.50, 0.35), 0.7),
+    (1150, (0.75, 0.30, 0.22), 0.9),
+    (1400, (1.00, 0.95, 0.85), 0.95),
+]
+ORGANS = [
+    (-600, (0.10, 0.02, 0.02), 0.0),
+    (-200, (0.70, 0.25, 0.18), 0.5),
+    (60, (0.90, 0.50, 0.40), 0.9),
+    (250, (1.00, 0.95, 0.85), 0.95),
+]
+LUNG = [(-700, (0.30, 0.02, 0.02), 0.0), (-300, (0.80, 0.20, 0.12), 0.04), (200, (1.0, 0.6, 0.45), 0.1)]
+"""Of CT, in Hounsfield units (of the head, 1000 more); the last is translucent."""
+CHEST: dict[str, Any] = {"spacing": OF_AIRWAY, "unit": 1.0}
+REAL = {
+    "head": View(
+        *(CT_HEAD, (1, 1, 1), CT_SKIN, 1.5, (-0.5, -1, -0.75), (1.6,), 3.3, (0.36, 0.3)),
+        *((0, 0, 0.2), (0, 0, -1), (1, 1, 2), 1.0),
+    ),
+    "heart": View(
+        *(AIRWAY, (0.93, 1, 0.6), ORGANS, 2, (1, -0.6, 0.4), (1.4,), 3, (0.32, 0.6)),
+        first=(0.3, 0.1, 0),
+        **CHEST,
+    ),
+    "kidney": View(
+        *(AIRWAY, (0.5, 1, 0.6), ORGANS, 2, (-1, 0.3, 0.5), (1.4,), 3, (0.6, 0.75)),
+        first=(0.07, 0.1, 0),
+        **CHEST,
+    ),
+    "vessels": View(
+        *(AIRWAY, (0.95, 0.9, 0.6), LUNG, 2, (1, -0.8, 0.5), (1.4,), 4, (0.72, 0.72)),
+        first=(0.65, 0.4, 0.15),
+        **CHEST,
+    ),
+}
+"""CT in place of that which the paper shows: a head whose crown is cut off; and of a chest, all of whose
+faces cut tissue, the heart behind a lung, the liver under a lung, and the vessels of a lung."""
+CT = {"head": "CT head", "heart": "CT heart", "kidney": "CT liver", "vessels": "CT lung"}
+"""In titles."""
 
 
 def left(scene: Scene) -> np.ndarray:
@@ -83,12 +134,15 @@ def comparison(
     """The view under every method, whole above and zoomed below, with its measures. `region`: the pixels
     whose boundary noise is measured."""
     rows: Panels = []
-    for name, scene in VIEWS[view].scenes(chosen).items():
-        truth, mask, row = rendered(scene, converged(scene.step)), region(scene), []
-        for method in methods:
-            image = rendered(scene, jv.March(scene.step, transforms(method)))
-            row.append(panel(image, measured(image, truth, mask), method if name == "whole" else ""))
-        rows.append(row)
+    of = {"": VIEWS[view], **({f"{CT[view]}, ": REAL[view]} if chosen.data else {})}
+    for said, each in of.items():
+        for name, scene in each.scenes(chosen).items():
+            truth, mask, row = rendered(scene, converged(scene.step)), region(scene), []
+            for method in methods:
+                image = rendered(scene, jv.March(scene.step, transforms(method)))
+                title = said + method if name == "whole" else ""
+                row.append(panel(image, measured(image, truth, mask), title))
+            rows.append(row)
     return rows
 
 

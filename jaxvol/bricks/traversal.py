@@ -39,7 +39,7 @@ Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
-BEAMS = 32  # of curved rays, searched at a time: it takes as long as the longest of these
+BEAMS = 32  # of curved rays, searched at a time on a GPU: it takes as long as the longest of these
 BATCH = 72  # `Tiling.batch` on a CPU: few rays meet a brick; the last batch lasts as long as its longest ray
 KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
 
@@ -162,7 +162,8 @@ class Traversal:
         mesh, march = self.options.tiling.devices, self.scene.march
         # with their shift still ahead, or a cell that waits for a brick would leave it when its ray shifts
         at = with_fields(self.start, finished=self.at.finished)
-        found = _curved(mesh, self.grid, beyond, march, (self.rays, at, reached), visit)
+        beams = BEAMS if self.options.tiling.turns else 1  # on a CPU
+        found = _curved(mesh, beams, self.grid, beyond, march, (self.rays, at, reached), visit)
         return found if bool(found.any) else None
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
@@ -248,15 +249,21 @@ def _straight(
 
 @compiled
 def _curved(
-    mesh: Mesh | None, grid: BrickGrid, beyond: int, march: March, rays: CurvedRays, visit: Visit
+    mesh: Mesh | None,
+    beams: int,
+    grid: BrickGrid,
+    beyond: int,
+    march: March,
+    rays: CurvedRays,
+    visit: Visit,
 ) -> BrickCells:
-    """By beams of rays, BEAMS of them at a time."""
+    """By beams of rays, so many of them at a time."""
 
     def program(whole: tuple[March, Visit], rays: CurvedRays) -> tuple[None, BrickCells]:
         march, visit = whole
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), rays)
         found: BrickCells = jax.lax.map(
-            lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=BEAMS
+            lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=beams
         )
         shape = rays[0].length.shape
         cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)

@@ -72,7 +72,9 @@ class Maximum(Extreme):
     most transfer functions. `"min_distance"` is refused.
 
     Gradients, also that of the thickness, are those of the sample that is chosen (`Selection`). Where the
-    choice changes, the value is the same on both sides, and the image has a kink; depth and light jump there.
+    choice changes, the value is the same on both sides, and the image has a kink; depth, light, and what a
+    transfer function reads beside the value (a magnitude, a label) jump there, and so by rounding: under two
+    jitters and a `TransferFunction2D`, a pixel may differ by 0.3 between float32 and float64.
 
     Source: VTK's MAXIMUM_INTENSITY_BLEND; Wallis et al. 1989.
 

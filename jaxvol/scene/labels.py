@@ -27,7 +27,8 @@ class LabelTransferFunction(Transfer):
             label that is not seen, as others without a function are not. Labels are 0 to 255; renumber
             others, as `jv.load(path, labels=...)` and `np.unique(labels, return_inverse=True)` do.
 
-    The label is that of the nearest node, so it jumps along a ray, half-way between nodes;
+    The label is that of the nearest node, so it jumps along a ray, half-way between nodes, and a pixel jumps
+    where a sample crosses there: gradients with respect to camera and place do not include these jumps;
     `AlphaCorrection(labels=True)` cuts cells there, where `"preintegrated"` otherwise takes the label in the
     middle of a cell.
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Integer, Shaped
+from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
 
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
@@ -108,6 +108,14 @@ class Volume(eqx.Module):
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()
+
+    @property
+    def valid(self) -> Bool[Array, ""]:
+        """Whether spacing and direction, which may be traced, place the voxels in space, not in a plane."""
+        placed = jnp.all(self.spacing > 0)
+        if self.direction is None:
+            return placed
+        return placed & (jnp.abs(_determinant(self.direction)) > FLAT / 2)
 
     @property
     def shape(self) -> tuple[int, int, int]:

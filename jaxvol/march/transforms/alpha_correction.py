@@ -35,8 +35,9 @@ class AlphaCorrection(Transform):
     Args:
         labels: also cut cells where the volume's label changes, found by bisection, so that the faces of a
             segmentation stay smooth under jitter. A label that lasts less than a quarter of a cell may be
-            missed. Costs a label fetch per bisection, and two more samples per cell. Gradients then take the
-            faces of labels and the ends of gaps as fixed in space; the motion of the exit is included.
+            missed: rounding decides, and a pixel may differ by 0.01 between float32 and float64. Costs a
+            label fetch per bisection, and two more samples per cell. Gradients then take the faces of labels
+            and the ends of gaps as fixed in space; the motion of the exit is included.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
     "jitter at label faces", "gradients at label faces".
