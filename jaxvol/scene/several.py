@@ -161,6 +161,11 @@ class SeveralBlocks(eqx.Module):
         return cls([Blocks.of(each, slopes=slopes) for each in own], _empty(volume), list(map(_empty, own)))
 
     @property
+    def side(self) -> int:
+        """As that of `Blocks`."""
+        return BLOCK
+
+    @property
     def shape(self) -> tuple[int, ...]:
         """Number of blocks along x, y, z, of the grid that holds all."""
         return tuple(-(-(n - 1) // BLOCK) for n in self.grid.shape)
