@@ -27,7 +27,7 @@ from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
 from ..scene.rendering import Details, Rendering
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, part_of
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_mode, transformations
@@ -188,7 +188,7 @@ def scene_of(
     volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
-    return strong(Scene(volume, transfer, camera, march, compositing_of(compositing), lighting))
+    return strong(Scene(volume, sized(transfer, volume), camera, march, compositing_of(compositing), lighting))
 
 
 _begin_rays, _march_brick = compiled(brick_march.begin_rays), compiled(brick_march.march_brick)

@@ -68,7 +68,8 @@ def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
         each = zip(pairwise(rows), pieces, strict=True)
         return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for (a, b), n in each), rows[-1:]])
 
-    return TransferFunction(divided(values), divided(transfer.colors), divided(transfer.extinction))
+    rows = divided(values), divided(transfer.colors), divided(transfer.extinction)
+    return TransferFunction(*rows, per_voxel=transfer.per_voxel)
 
 
 class Candidate(NamedTuple):

@@ -25,7 +25,7 @@ from ..metrics import standardized
 from ..ray import check_arguments
 from ..render import Adjoint, render
 from ..scene.camera import Camera
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel
 from .bijections import rotate
 from .constraints import Free
@@ -135,6 +135,7 @@ def register(
     Raises:
         ValueError: for arguments of another kind, shape or range, and views of several sizes or kinds.
     """
+    transfer = sized(transfer, volume)
     check_arguments("register(volume, transfer, views)", volume=volume, transfer=transfer)
     check_one_channel(volume, "register")
     if similarity not in get_args(Similarity):

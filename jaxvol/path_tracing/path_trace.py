@@ -19,7 +19,7 @@ from ..ray import check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_only
@@ -256,6 +256,7 @@ def path_trace(
             function has a step (if it is traced, the derivative is NaN).
     """
     order = "path_trace(volume, transfer, camera, lights)"
+    transfer = sized(transfer, volume)
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
     check_one_channel(volume, "path_trace")
     lights = lights_of(lights)

@@ -17,7 +17,7 @@ from ..march.transforms import SpaceLeaping
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.rendering import Rendering
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .search import Part
@@ -89,6 +89,7 @@ def fastest_leaping(
         ValueError: for a march that leaps, other `leaps`, a tolerance that is not above 0, no repetition, or
             where the scene is traced; and as `render` does.
     """
+    transfer = sized(transfer, volume)
     check_arguments(
         "fastest_leaping(volume, transfer, camera, march)",
         volume=volume,

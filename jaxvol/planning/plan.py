@@ -23,7 +23,7 @@ from ..scene.occupancy import Blocks
 from ..scene.rendering import BrickReport, Rendering
 from ..scene.several import Several
 from ..scene.space import Space, median_node_distance
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .memory import read_within, with_bricks
@@ -101,6 +101,7 @@ class Plan(NamedTuple):
         how = {"compositing": self.compositing, "lighting": self.lighting, **options}
         if self.bricks is not None:
             return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
+        transfer = sized(transfer, self.volume)
         check_arguments("render(transfer, camera)", transfer=transfer, camera=camera)
         scene = Scene(self.volume, transfer, camera, self.march, self.compositing, self.lighting)
         return render_scene(scene, options.get("outputs", "all"), "replay", devices=options.get("devices"))
@@ -200,6 +201,7 @@ def plan(
     if memory is not None or not isinstance(volume, Volume):
         volume, source, room, stride = read_within(volume, memory)
     check_arguments(order, volume=volume)
+    transfer = sized(transfer, source or volume)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, scene)
     space = March(1.0, given).locate(volume)

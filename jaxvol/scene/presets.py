@@ -177,7 +177,7 @@ def colormap(
     cmap: str | Any,
     clim: Arrayable,
     opacity: str | Arrayable = "linear",
-    unit_distance: Arrayable = 1.0,
+    unit_distance: Arrayable | None = None,
     n_colors: int | Any = 256,
 ) -> TransferFunction:
     """A transfer function from a matplotlib colormap and an opacity ramp, as in PyVista's `add_volume`.
@@ -189,9 +189,8 @@ def colormap(
         opacity: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
             10; or an array of evenly spaced ones, in [0, 1].
         unit_distance: thickness, in world length, of a layer that has these opacities; or a `Volume`, for the
-            size of its voxels (the geometric mean of its spacing). The default, a world length of 1, suits
-            voxels of about that size: little or nothing is seen of a volume that is much smaller, such as one
-            of 0.1 µm voxels in mm.
+            size of its voxels (the geometric mean of its spacing). By default those of whichever volume is
+            rendered (`TransferFunction.per_voxel`).
         n_colors: number of control points, at least 2.
 
     Returns:
@@ -205,8 +204,9 @@ def colormap(
     colors = _display_colors(cmap, np.linspace(0, 1, n_colors))
     low, high = _range(clim)
     linear = from_srgb(jnp.asarray(colors, dtype=float))
-    extinction = extinction_of(_ramp(opacity, n_colors), unit_distance)
-    return TransferFunction(np.linspace(low, high, n_colors), linear, extinction)
+    values, per_voxel = np.linspace(low, high, n_colors), unit_distance is None
+    extinction = extinction_of(_ramp(opacity, n_colors), 1.0 if unit_distance is None else unit_distance)
+    return TransferFunction(values, linear, extinction, per_voxel=per_voxel)
 
 
 def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

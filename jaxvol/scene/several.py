@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from .._util.checks import described
 from .._util.vec3 import Scalar, Vec3, apart
 from .occupancy import BLOCK, Blocks, Sums
-from .transfer import Classify, Measured, Transfer
+from .transfer import Classify, Measured, Transfer, sized
 from .volume import Field, Volume
 from .voxel_fetch import Extent, Fetch
 
@@ -27,14 +27,15 @@ ROUNDING = 1e-3
 
 
 def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
-    """One volume and transfer function for lists of them; anything else as it is.
+    """One volume and transfer function for lists of them; anything else as it is. Transfer functions whose
+    lengths are counted in voxels are those of their volumes.
 
     Raises:
         ValueError: for lists of other things, or of different lengths.
     """
     listed = isinstance(volume, list | tuple), isinstance(transfer, list | tuple)
     if not any(listed):
-        return volume, transfer
+        return volume, sized(transfer, volume)
     kinds = (("volume", volume, Volume), ("transfer", transfer, Transfer))
     for (name, given, kind), is_list in zip(kinds, listed, strict=True):
         expected = f"{name} must be a list of a {kind.__name__} for each volume, where either is a list"
@@ -53,10 +54,11 @@ def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
             raise ValueError(
                 f"transfer[{number}] reads {own.channels} channels; volume[{number}] has {each.channels}."
             )
+    transfer = tuple(sized(own, each) for own, each in zip(transfer, volume, strict=True))
     if len(volume) == 1:
         return volume[0], transfer[0]
     grid = _holding(max(volume, key=lambda each: math.prod(each.shape)), volume)
-    return grid, Together(tuple(transfer), tuple(each.channels for each in volume))
+    return grid, Together(transfer, tuple(each.channels for each in volume))
 
 
 def _holding(largest: Volume, volumes: Sequence[Volume]) -> Volume:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util import piecewise_linear as linear
-from .._util.checks import Arrayable, finite_array, increasing, number, require, unit_interval
+from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, row_sums
@@ -154,6 +154,8 @@ class Transfer(eqx.Module):
 
 def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
     """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
+    if isinstance(transfer, TransferFunction) and transfer.per_voxel:
+        raise ValueError("transfer counts lengths in voxels here; give it a unit_distance, such as the volume.")
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
         name = type(transfer).__name__
@@ -176,6 +178,8 @@ class TransferFunction(Transfer):
         colors: (n, 3) linear RGB at the points. Not premultiplied; usually in [0, 1].
         extinction: (n,) at the points, in 1/length, ≥ 0; a width w has opacity `1 - exp(-extinction w)`.
             Where an optimiser's step leaves it negative, it counts as 0, and has no gradient.
+        per_voxel: whether lengths are counted in voxels (`voxel_size`) of whichever volume is rendered, as
+            those of `colormap` are by default. Static.
 
     VTK interpolates opacity instead; the two differ between points where opacities are high. Put a step
     between values of the data: interpolation may round a value to either side.
@@ -190,8 +194,12 @@ class TransferFunction(Transfer):
     values: Float[Array, " n"]
     colors: Float[Array, "n 3"]
     extinction: Float[Array, " n"]
+    per_voxel: bool = eqx.field(static=True)
 
-    def __init__(self, values: Arrayable, colors: Arrayable, extinction: Arrayable):
+    def __init__(
+        self, values: Arrayable, colors: Arrayable, extinction: Arrayable, *, per_voxel: bool | Any = False
+    ):
+        self.per_voxel = flag("per_voxel", per_voxel)
         self.values = increasing("values", values)
         n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
@@ -350,6 +358,17 @@ def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[linear
     value, *found = measured
     index = jnp.where(value < rows[0, 0], 0, found[0] + 1) if found else span_index(rows, value)
     return linear.table_row(rows, index), index
+
+
+def sized(transfer: Any, volume: Any) -> Any:
+    """The transfer function for a volume: where its lengths are counted in voxels, in world length."""
+    if not isinstance(transfer, TransferFunction) or not transfer.per_voxel:
+        return transfer
+    extinction = transfer.extinction / jnp.asarray(voxel_size(volume), transfer.extinction.dtype)
+    plain = TransferFunction.__new__(TransferFunction)
+    for name, value in {**vars(transfer), "extinction": extinction, "per_voxel": False}.items():
+        object.__setattr__(plain, name, value)
+    return plain
 
 
 def voxel_size(volume: Any) -> Any:

@@ -29,7 +29,7 @@ from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.occupancy import BLOCK
 from ...scene.space import median_node_distance
-from ...scene.transfer import Transfer
+from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, labels_shown
 from ..framing import framed, visible_points
@@ -177,6 +177,7 @@ def initial(
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
         chosen = framed(chosen, visible_points(volume, transfer)) if camera is None else chosen
     given = March(1.0, (), "midpoint") if march is None else march
+    transfer = sized(transfer, volume)
     names = {"volume": volume, "transfer": transfer, "camera": chosen, "march": given, "lighting": lighting}
     check_arguments("view(volume, transfer, camera, march)", **names)
     if chosen.parallel_scale is not None:
