@@ -35,9 +35,9 @@ def first(program: Callable[[], Any]) -> tuple[float, Any]:
     It is for what takes too long to be run twice."""
     spans: list[tuple[float, float]] = []
 
-    def note(event: str, seconds: float, **_: Any) -> None:
+    def note(event: str, duration_secs: float, **_: Any) -> None:
         if event.startswith("/jax/core/compile/"):
-            spans.append((time.perf_counter() - seconds, time.perf_counter()))
+            spans.append((time.perf_counter() - duration_secs, time.perf_counter()))
 
     jax.monitoring.register_event_duration_secs_listener(note)
     start = time.perf_counter()

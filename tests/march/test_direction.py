@@ -109,7 +109,9 @@ def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):
         np.testing.assert_allclose(rendering.rgba, plain.rgba, rtol=0, atol=1e-6)
         # an optimiser passes by the constructor: axes in a plane place nothing
         flat = eqx.tree_at(
-            lambda volume: volume.direction, TURNED, jax.device_put(np.diag(np.float32([1, 1, 0])) @ R)
+            lambda volume: volume.direction,
+            TURNED,
+            jax.device_put(np.diag(np.array([1, 1, 0], np.float32)) @ R),
         )
         assert np.isnan(jv.render(flat, SPARSE, views()[1], march_pair(name)[1]).rgba).all()
 
