@@ -188,7 +188,9 @@ def scene_of(
     volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
-    return strong(Scene(volume, sized(transfer, volume), camera, march, compositing_of(compositing), lighting))
+    return strong(
+        Scene(volume, sized(transfer, volume), camera, march, compositing_of(compositing), lighting)
+    )
 
 
 _begin_rays, _march_brick = compiled(brick_march.begin_rays), compiled(brick_march.march_brick)

@@ -155,7 +155,9 @@ class Transfer(eqx.Module):
 def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = False) -> Classification:
     """A transfer function applied to a volume; where cells are `integrated`, it must have an `integrator`."""
     if isinstance(transfer, TransferFunction) and transfer.per_voxel:
-        raise ValueError("transfer counts lengths in voxels here; give it a unit_distance, such as the volume.")
+        raise ValueError(
+            "transfer counts lengths in voxels here; give it a unit_distance, such as the volume."
+        )
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
         name = type(transfer).__name__
