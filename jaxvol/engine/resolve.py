@@ -4,6 +4,7 @@ For modes that resolve, and for lightings that shade pixels: `ray.resolve` says 
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeAlias
 
 import jax
@@ -15,6 +16,7 @@ from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
 from ..ray import Scene, resolve
 from ..scene.space import Line
+from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import in_front, in_place
 from ..xla.trees import PyTree
 from . import devices
@@ -35,7 +37,11 @@ def resolve_pixels(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
     """Pixels, their depths, and their normals where these are asked for, from what the march found."""
-    prepared, mode = acceleration.packed(scene).prepared(), scene.compositing
+    packed, mode = acceleration.packed(scene), scene.compositing
+    if options.adjoint == "forward":
+        fetches = [replace(fetch, steady=True) for fetch in fetches_of(packed.volume)]
+        packed = packed._replace(volume=with_fetches(packed.volume, fetches))
+    prepared = packed.prepared()
     with_normal = isinstance(mode, Selection) and mode.has_normal and options.outputs == "all"
 
     def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, " numbers"]:

@@ -19,6 +19,7 @@ from .._util import piecewise_linear as linear
 from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
+from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
 from ..xla.platform import is_traced
 from .occupancy import Blocks
@@ -366,11 +367,20 @@ def sized(transfer: Any, volume: Any) -> Any:
     """The transfer function for a volume: where its lengths are counted in voxels, in world length."""
     if not isinstance(transfer, TransferFunction) or not transfer.per_voxel:
         return transfer
-    extinction = transfer.extinction / jnp.asarray(voxel_size(volume), transfer.extinction.dtype)
-    plain = TransferFunction.__new__(TransferFunction)
+    given = transfer.extinction, volume.spacing
+    kept = all(isinstance(each, jax.Array) and not is_traced(each) for each in given)
+    extinction = memoized_of(given, _in_world_length) if kept else _in_world_length(given)
+    plain = TransferFunction.__new__(TransferFunction)  # unchecked: an optimiser may leave numbers negative
     for name, value in {**vars(transfer), "extinction": extinction, "per_voxel": False}.items():
         object.__setattr__(plain, name, value)
     return plain
+
+
+@jax.jit
+def _in_world_length(given: tuple[Any, Any]) -> Float[Array, " n"]:
+    extinction, spacing = given
+    size = jnp.exp(jnp.mean(jnp.log(jnp.asarray(spacing, extinction.dtype))))
+    return extinction / size
 
 
 def voxel_size(volume: Any) -> Any:

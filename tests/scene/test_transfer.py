@@ -191,7 +191,7 @@ def test_opacity_ramps():
 
 
 def test_a_colormaps_opacity_is_that_of_a_voxel_of_what_is_rendered():
-    """0.3 a voxel, whose size is the geometric mean 0.2 of the spacing; also where the program is given it."""
+    """0.3 a voxel, whose size is the geometric mean 0.2 of the spacing, which may be traced."""
     even, march = [0.3, 0.3], jv.March(0.05, (jv.AlphaCorrection(),))
 
     @jax.jit
