@@ -19,7 +19,7 @@ IMAGES = {"path_traced", "tomography", "transport"}
 """Records whose charts show images that no record holds."""
 OTHERS = {
     *("bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),
-    *("out_of_core", "probe_geometry", "shading", "viewer_latency"),
+    *("out_of_core", "probe_geometry", "shading", "viewer_latency", "visible_shading"),
 }
 """Records without a chart."""
 DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]

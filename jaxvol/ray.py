@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import all_finite, check_answer, described
@@ -36,6 +37,7 @@ from .scene.variation import Windows
 from .scene.volume import Volume, grids, without_voxels
 from .xla.differentiation import check_captured
 from .xla.memory import in_memory
+from .xla.platform import is_traced
 from .xla.trees import PyTree
 
 
@@ -132,6 +134,9 @@ EXPECTED: dict[str, tuple[type, str, str]] = {
 }
 """For each argument name: its type, a description, and how to make one."""
 
+COARSE = 1 / 16
+"""How far apart world points may lie, in voxels, for light that is read from them."""
+
 MATCH = 1e-3
 """How near a sample lies to a selected depth to be that one, in steps."""
 
@@ -175,7 +180,7 @@ def check_channels(
     volume: Volume, transfer: Transfer, march: March, compositing: Compositing[Any], lighting: Lighting | None
 ) -> None:
     """Raises `ValueError` for a transfer function that reads another number of channels than the volume has,
-    and for what needs a single one."""
+    for what needs a single one, and for light in a volume so far from 0 that world points are coarse."""
     if isinstance(volume.field, Several) and (moved := march.overriding("locate")):
         raise ValueError(f"march.transforms: {type(moved[0]).__name__} places one volume; got several.")
     for leaf in jax.tree.leaves(volume.field):
@@ -200,6 +205,23 @@ def check_channels(
             if isinstance(field, Several):
                 got = f"{len(field.volumes)} volumes"
             raise ValueError(f"{name}: {given} needs a single volume of one channel; got {got}.")
+    if lighting is not None and lighting.farthest_read != 0:
+        _check_near(volume, lighting)
+
+
+def _check_near(volume: Volume, lighting: Lighting) -> None:
+    """Raises `ValueError` where world points, from which such a lighting reads, are not resolved."""
+    origin, spacing = volume.origin, volume.spacing
+    if is_traced((origin, spacing)):
+        return
+    far = float(np.max(np.abs(np.asarray(origin)) + np.asarray(volume.shape) * np.asarray(spacing)))
+    apart, voxel = far * float(jnp.finfo(spacing.dtype).eps), float(np.min(np.asarray(spacing)))
+    if apart > COARSE * voxel:
+        raise ValueError(
+            f"lighting: {described(lighting)} reads at world points, which lie {apart:.2g} apart at "
+            f"{far:.3g} in {spacing.dtype}, for voxels of {voxel:.2g}. Move the volume (origin), the camera "
+            "and the lights near 0."
+        )
 
 
 class Progress(eqx.Module):

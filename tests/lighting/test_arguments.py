@@ -44,7 +44,15 @@ def lit(materials: Any = HALF, lights: Any = SUN, **how):
 
 AT_VOXELS = lit(interpolation="nearest", occlusion="hard", given=PAIR)
 
+
+def render_far_away():
+    volume = jv.Volume(np.zeros((4, 4, 4), np.float32), 0.05, (615_840.0, 5_846_926.0, 758.0))
+    camera = jv.Camera.looking_at(volume, size=(2, 2))
+    jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=PAIR)())
+
+
 BAD = {
+    "world points of float32": (render_far_away, "reads at world points, which lie 0.7 apart at 5.85e.06"),
     # templates
     "packets": (grown(packets=0), "packets must be an integer of at least 1"),
     "threshold on": (grown(threshold_on="tree"), "threshold_on must be one of photon, level; got 'tree'"),
