@@ -61,7 +61,7 @@ def scan(folder: Path, size: int, resolution: int) -> Scene:
     beta, sigma = (np.deg2rad((90 - half, 90 + half)) for half in (54.45 / 2, 38.55))
     probe = jv.ToroidalMap(22.70 - 52.70, 52.70, beta, sigma, (0, 69.58))
     camera = jv.Camera((100, -180, -60), probe.center, (0, 0, -1), 30.0, size=(size, size))
-    return Scene(volume, probe, jv.colormap("gray", (60, 200), (0.0, 0.5)), camera)
+    return Scene(volume, probe, jv.colormap("gray", (60, 200), (0.0, 0.5), unit_distance=1.0), camera)
 
 
 PHANTOM = "wires phantom"

@@ -37,6 +37,10 @@ class _Switch(jv.Transform):
         return self.inner.tested_every
 
     @property
+    def block_side(self):
+        return self.inner.block_side
+
+    @property
     def valid(self):
         return self.inner.valid
 

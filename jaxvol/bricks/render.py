@@ -145,6 +145,8 @@ def render_bricks(
     if traced and len(levels) > 1:
         raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
     room, chosen = budget(memory), _level(levels, level, camera, march)
+    if len(levels) > 1:
+        transfer = sized(transfer, levels[0])  # so that all levels are equally opaque
     scene = scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
     check_not_sharded(mesh, scene)
     scene = on_all(mesh, scene)

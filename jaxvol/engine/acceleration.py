@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Int, Shaped, UInt32
 
 from .._util.checks import check_answer
+from .._util.vec3 import plus
 from ..compositing.blending import Compositing
 from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
@@ -120,9 +121,12 @@ def _measured(side: int, may_shift: bool) -> Callable[..., Occupancy]:
     @jax.jit
     def measured(given: tuple[Volume, Transfer, tuple[Transform, ...], Compositing[Any]]) -> Occupancy:
         volume, transfer, located, compositing = constant(given)
+        march = March(1.0, located)
+        if compositing.resolves:  # as the march is told, which looks for what the mode resolves
+            transfer, march = compositing.marched(transfer, march, volume)
         # the ranges of so many blocks are not kept: they take eight bytes for each voxel
         blocks = Blocks.of(volume, slopes=transfer.reads_gradient, side=side)
-        occupancy = _occupancy(volume, transfer, March(1.0, located), compositing, blocks, may_shift)
+        occupancy = _occupancy(volume, transfer, march, compositing, blocks, may_shift)
         return replace(occupancy, known=occupancy.distance())
 
     return measured
@@ -172,7 +176,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
             )
         plain = March(march.step, (), march.quadrature, max_samples=march.max_samples)
         seen_by = lines(source, columns.reshape(1, -1), rows.reshape(1, -1), no_fault)
-        own = GivenRays(jnp.stack(seen_by.origin, axis=-1), jnp.stack(seen_by.direction, axis=-1))
+        begins = seen_by.origin if seen_by.beside is None else plus(seen_by.origin, seen_by.beside)
+        own = GivenRays(jnp.stack(begins, axis=-1), jnp.stack(seen_by.direction, axis=-1))
         one_tile = tiling._replace(tile=columns.size, devices=None)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
         seen = Scene(volume, transfer, own, plain, FirstVisible()).prepared()
@@ -181,8 +186,9 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         rendering = vmap_rays(partial(end, seen))(rays, at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)
 
+    ray = partial(source.ray_from, space.anchor)
     no_fault = jnp.zeros((), bool)
-    return march.empty_space(occupancy, View(source.ray, source.size, source.first_pixel, first_hit))
+    return march.empty_space(occupancy, View(ray, source.size, source.first_pixel, first_hit))
 
 
 def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:

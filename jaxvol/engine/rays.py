@@ -153,7 +153,9 @@ class _PixelTiles(RayTiles):
         y, x = jnp.divmod(jnp.arange(4), 2)
         last = self.tiling.beam - 1
         column, row = self._pixels(tile, y * last, x * last)
-        return lambda occupancy: Box.within(occupancy, *vmap_rays(source.ray)(column, row))
+        return lambda occupancy: Box.within(
+            occupancy, *vmap_rays(partial(source.ray_from, occupancy.anchor))(column, row)
+        )
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of the pixels (x, y) of each of a tile's beams."""
@@ -231,19 +233,15 @@ def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -
     left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
     # on a GPU, `in_memory` computes rays also of a fault
     camera = eqx.tree_at(lambda c: c.position, camera, jnp.where(fault, jnp.nan, camera.position))
-    found = _rounded(camera, columns, rows)
-    if camera.parallel_scale is not None:
-        origin, direction = found
-    else:  # the position need not be stored for each ray
-        x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
-        origin, direction = (x, y, z), found
-    return Line(origin, direction, (columns + left, rows + top))
+    beside, direction = _rounded(camera, columns, rows)
+    # the position need not be stored for each ray
+    x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
+    return Line((x, y, z), direction, (columns + left, rows + top), beside=beside)
 
 
 def _through(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
-    """What is computed of the rays of pixels: directions, and origins too in parallel projection."""
-    ends = vmap_rays(camera.ray)(columns, rows)
-    return ends[1] if camera.parallel_scale is None else ends
+    """What is computed of the rays of pixels: directions, and where they begin in parallel projection."""
+    return vmap_rays(camera.beside)(columns, rows)
 
 
 @jax.custom_jvp

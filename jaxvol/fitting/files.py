@@ -73,6 +73,11 @@ def transfer_of_fields(what: str, content: Any) -> TransferFunction:
 
 def transfer_fields(transfer: TransferFunction) -> dict[str, Any]:
     """Its values, colours and extinctions, as JSON holds them."""
+    if transfer.per_voxel:
+        raise ValueError(
+            "transfer counts lengths in voxels, and a file holds world lengths; give it a unit_distance, "
+            "such as the volume."
+        )
     return {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}
 
 

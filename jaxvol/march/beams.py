@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, Vec3, along, minus
+from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import Index, Occupancy, Sums
 from ..scene.space import Ray
 from ..xla.platform import on_gpu
@@ -50,7 +50,7 @@ class View(NamedTuple):
     """The camera's rays, as `Transform.empty_space` may ask for them."""
 
     ray: Callable[[Scalar, Scalar], tuple[Vec3, Vec3]]
-    """Origin and unit direction of the ray through a column and a row."""
+    """Origin, counted from the anchor, and unit direction of the ray through a column and a row."""
     size: tuple[int, int]
     """(width, height)."""
     corner: tuple[Int[Array, ""], Int[Array, ""]]
@@ -85,10 +85,10 @@ class Box(eqx.Module):
 
     @classmethod
     def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
-        """The box of all camera rays between a beam's corner rays, by beam and corner."""
+        """The box of all camera rays between a beam's corner rays, by beam and corner; origins count from the
+        anchor."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
         frame, shape = occupancy.frame, occupancy.occupied.shape
-        origin = origin if occupancy.anchor is None else minus(origin, occupancy.anchor)
         x, y, z = (size * n for size, n in zip(occupancy.size, shape, strict=True))
         spans = x, y, z
         x, y, z = (low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True))

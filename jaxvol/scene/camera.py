@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require, shortened
-from .._util.vec3 import Scalar, Vec3, along, apart
+from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import is_traced
 from .space import Line
 from .volume import Volume, corners_of
@@ -260,18 +260,30 @@ class Camera(eqx.Module):
 
     def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
+        return self.ray_from(None, column, row)
+
+    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any) -> tuple[Vec3, Vec3]:
+        """As `ray`, with an origin that counts from `anchor`."""
+        beside, direction = self.beside(column, row)
+        place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
+        return place if beside is None else plus(place, beside), direction
+
+    def beside(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3 | None, Vec3]:
+        """How far beside the position a pixel's ray begins, if not there, and its unit direction."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
         x, y = self._column(column + 0.5), self._row(row + 0.5)
         right, up, forward = (apart(axis) for axis in axes_of(self))
-        position, scale = apart(self.position), self.parallel_scale
+        scale = self.parallel_scale
         if scale is not None:
             scale = jnp.where(self.valid, scale, jnp.nan)
-            return along(along(position, right, scale * x), up, scale * y), forward
+            x, y = scale * x, scale * y
+            a, b, c = (x * r + y * u for r, u in zip(right, up, strict=True))
+            return (a, b, c), forward
         scale = jnp.where(self.valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
         dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
-        return position, (dx / norm, dy / norm, dz / norm)
+        return None, (dx / norm, dy / norm, dz / norm)
 
     def point(self, column: Any, row: Any, depth: Any) -> Float[Array, "*pixels 3"]:
         """The world point at a distance along a pixel's ray, as when something is picked:

@@ -52,7 +52,7 @@ class LabelTransferFunction(Transfer):
         seen = [function for function in given if function is not None]
         if not seen:
             raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
-        if any(isinstance(function, TransferFunction) and function.per_voxel for function in seen):
+        if any(function.per_voxel for function in seen):
             raise ValueError(
                 "functions must count lengths in world length; got one per voxel. Give it a unit_distance, "
                 "such as the volume: jv.colormap(..., unit_distance=volume)."

@@ -118,13 +118,15 @@ class Space(eqx.Module):
 
 
 class Line(NamedTuple):
-    """A ray before it is cut to the volume: world origin, unit direction, (column, row) of its pixel, and the
-    distance from the origin at which it ends, if not at the volume's exit."""
+    """A ray before it is cut to the volume: world origin, unit direction, (column, row) of its pixel, the
+    distance from the origin at which it ends, if not at the volume's exit, and how far beside the origin it
+    begins: added where places count from near the volume, since world coordinates are coarse far from 0."""
 
     origin: Vec3
     direction: Vec3
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
     until: Scalar | None = None
+    beside: Vec3 | None = None
 
 
 class Ray(eqx.Module):
@@ -164,10 +166,13 @@ def enter(
     direction: Vec3,
     pixel: tuple[Int[Array, ""], Int[Array, ""]],
     until: Scalar | None = None,
+    beside: Vec3 | None = None,
 ) -> Ray:
-    """Clip a ray to the volume, to what lies ahead of its origin, and to its first part, up to the distance
-    `until`; `invalid` if a number is not finite (or `until` NaN)."""
+    """Clip a ray to the volume, to what lies ahead of its origin (and `beside` it), and to its first part, up
+    to the distance `until`; `invalid` if a number is not finite (or `until` NaN)."""
     origin, space = space.place(origin), space.local
+    if beside is not None:
+        origin = plus(origin, beside)
     # distances are measured from a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))

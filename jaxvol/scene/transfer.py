@@ -365,7 +365,7 @@ def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[linear
 
 def sized(transfer: Any, volume: Any) -> Any:
     """The transfer function for a volume: where its lengths are counted in voxels, in world length."""
-    if not isinstance(transfer, TransferFunction) or not transfer.per_voxel:
+    if type(transfer) is not TransferFunction or not transfer.per_voxel or not hasattr(volume, "spacing"):
         return transfer
     given = transfer.extinction, volume.spacing
     kept = all(isinstance(each, jax.Array) and not is_traced(each) for each in given)

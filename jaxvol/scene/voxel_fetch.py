@@ -4,6 +4,7 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from typing import Any, NamedTuple, TypeAlias, TypeVar
@@ -209,7 +210,7 @@ class Packed(Fetch):
     begin: Int[Array, ""] | None = None
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
-        return Packed(self.words, self.nodes, begin, window=self.window)
+        return replace(self, begin=begin)
 
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
         _, ny, nz = data.shape

@@ -30,7 +30,10 @@ from .samples import shaded
 
 
 HALF, FAINT, SUN = Material(0.5, 1.0), Material(0.031, 1.0), DirectionalLight((0, 0, -1.0))
-VOLUME, TRANSFER = jv.Volume(np.zeros((9, 9, 9), np.float32)), jv.colormap("gray", (0.0, 1.0))
+VOLUME, TRANSFER = (
+    jv.Volume(np.zeros((9, 9, 9), np.float32)),
+    jv.colormap("gray", (0.0, 1.0), unit_distance=1.0),
+)
 PAIR = ScattererTemplate(jnp.zeros((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
 
 
@@ -46,9 +49,10 @@ AT_VOXELS = lit(interpolation="nearest", occlusion="hard", given=PAIR)
 
 
 def render_far_away():
-    volume = jv.Volume(np.zeros((4, 4, 4), np.float32), 0.05, (615_840.0, 5_846_926.0, 758.0))
+    volume = jv.Volume(np.zeros((4, 4, 4), np.float32), (0.05,) * 3, (615_840.0, 5_846_926.0, 758.0))
     camera = jv.Camera.looking_at(volume, size=(2, 2))
-    jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=PAIR)())
+    away = ScattererTemplate(jnp.ones((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
+    jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=away)())
 
 
 BAD = {

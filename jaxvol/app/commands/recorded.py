@@ -118,5 +118,6 @@ def _files(path: Path) -> list[Path]:
 def _is_ordinary(path: Path) -> bool:
     """Whether a path is a folder, or a file that holds something, and not of the kernel."""
     real = Path(os.path.realpath(path))
-    ours = not any(real.is_relative_to(folder) for folder in ("/dev", "/proc", "/sys"))
+    # of /dev only its devices, which are no files: in /dev/shm are ordinary ones
+    ours = not any(real.is_relative_to(folder) for folder in ("/proc", "/sys"))
     return ours and (real.is_dir() or (real.is_file() and real.stat().st_size > 0))

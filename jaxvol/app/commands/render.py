@@ -66,7 +66,7 @@ def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> 
 
 def why_empty(scene: Scene, rendering: Rendering) -> str | None:
     """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`."""
-    volume, opacity = scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
+    volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
     if opacity > FAINT or np.isnan(opacity):
         return None
     if opacity > 0:

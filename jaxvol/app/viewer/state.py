@@ -177,13 +177,13 @@ def initial(
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
         chosen = framed(chosen, visible_points(volume, transfer)) if camera is None else chosen
     given = March(1.0, (), "midpoint") if march is None else march
-    transfer = sized(transfer, volume)
-    names = {"volume": volume, "transfer": transfer, "camera": chosen, "march": given, "lighting": lighting}
+    shown: Any = sized(transfer, volume)
+    names = {"volume": volume, "transfer": shown, "camera": chosen, "march": given, "lighting": lighting}
     check_arguments("view(volume, transfer, camera, march)", **names)
     if chosen.parallel_scale is not None:
         raise ValueError("the viewer's camera must be perspective; got one with a parallel_scale.")
     mode = compositing_of(compositing)
-    mode.marched(transfer, given, volume)  # refuses what it cannot show
+    mode.marched(shown, given, volume)  # refuses what it cannot show
     can_be_lit = mode.can_be_lit
     if lighting is not None and not can_be_lit:
         raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
@@ -205,4 +205,4 @@ def initial(
     scene = Scene(volume, (*given.transforms, *others), given, light, voxel, mode, (r, g, b))
     enabled = frozenset(type(t).__name__ for t in (default if march is None else given.transforms))
     orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, float(chosen.view_angle))
-    return scene, State(orbit, whole.size, transfer, step, enabled, lit and can_be_lit)
+    return scene, State(orbit, whole.size, shown, step, enabled, lit and can_be_lit)
