@@ -25,7 +25,8 @@ class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
     Args:
-        position: world position. It may lie inside a volume (endoscopy); nothing behind it is visible. On a
+        position: world position, rounded as all numbers here to the type of the others (float32 has steps of
+            half a metre at 5 846 925 m). It may lie inside a volume (endoscopy); nothing behind it is visible. On a
             face of the volume the image has a kink: the gradient is, pixel by pixel, that of one side, and so
             it is where rays run along planes of voxels.
         focal_point: world point at the center of the image.

@@ -59,8 +59,9 @@ class SpaceLeaping(Transform):
     "occupancy under steep transfer functions", "gradients of what is leapt over".
 
     Raises:
-        ValueError: for another method, a smaller cell, another block or one with another method, and, with
-            the last two methods, when rendering rays of one's own (`render_rays`).
+        ValueError: for another method, a smaller cell, another block or one with another method. When
+            rendering several volumes with another block than 4, and, with the last two methods, rays of
+            one's own (`render_rays`).
 
     Source: Chae and Shin for `"distance"` and `"min_distance"`, with blocks of 1; `"hierarchy"` stands for
     the octree of the KISTI report 2005; `"beam"` is unpublished.
