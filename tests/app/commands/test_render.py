@@ -82,9 +82,27 @@ SCENES = {
         jv.colormap("gray", (-100, 255), unit_distance=20),
         *("maximum", None, 0),
     ),
-    "of all values": (["--compositing", "average"], jv.colormap("gray", RANGE), "average", None, 0),
-    "an isosurface": (SURFACE, jv.colormap("white", RANGE), jv.Isosurface(30.0), Phong(), 1),
-    "a red one": ([*SURFACE, "--cmap", "red"], jv.colormap("red", RANGE), jv.Isosurface(30.0), Phong(), 1),
+    "of all values": (
+        ["--compositing", "average"],
+        jv.colormap("gray", RANGE, unit_distance=1.0),
+        "average",
+        None,
+        0,
+    ),
+    "an isosurface": (
+        SURFACE,
+        jv.colormap("white", RANGE, unit_distance=1.0),
+        jv.Isosurface(30.0),
+        Phong(),
+        1,
+    ),
+    "a red one": (
+        [*SURFACE, "--cmap", "red"],
+        jv.colormap("red", RANGE, unit_distance=1.0),
+        jv.Isosurface(30.0),
+        Phong(),
+        1,
+    ),
     "a file": (["--transfer", "t.json"], jv.preset("head"), "over", None, 1),
 }
 """Options, and the transfer function, the mode, the light and the background that they mean."""
@@ -287,7 +305,9 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
     assert render(volume_file, *words, "200K", "--time", "1", "--nan", "0") == 2
     assert "index must name axes" in capsys.readouterr().err
     assert render(volume_file, *GRAY, *words[2:], "9K") == 0
-    assert same(asked["transfer"], jv.colormap("gray", (-100, 255)))  # of voxels, and not of their copy's
+    assert same(
+        asked["transfer"], jv.colormap("gray", (-100, 255), unit_distance=1.0)
+    )  # of voxels, and not of their copy's
     jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
     assert render(tmp_path / "v.npz", "--memory", "1M") == 2
     assert "is not of a kind" in capsys.readouterr().err
