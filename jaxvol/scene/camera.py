@@ -26,9 +26,9 @@ class Camera(eqx.Module):
 
     Args:
         position: world position, rounded as all numbers here to the type of the others (float32 has steps of
-            half a metre at 5 846 925 m). It may lie inside a volume (endoscopy); nothing behind it is visible. On a
-            face of the volume the image has a kink: the gradient is, pixel by pixel, that of one side, and so
-            it is where rays run along planes of voxels.
+            half a metre at 5 846 925 m). It may lie inside a volume (endoscopy); nothing behind it is
+            visible. On a face of the volume the image has a kink: the gradient is, pixel by pixel, that of
+            one side, and so it is where rays run along planes of voxels.
         focal_point: world point at the center of the image.
         view_up: direction that points up in the image; not parallel to the view direction.
         view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).

@@ -87,9 +87,9 @@ def load(
     finest is read that takes at most a quarter of the memory; `render_bricks` takes finer ones.
 
     Ids of segments (labels) that are too large are replaced by 0, 1, 2, … in their order, and kept as
-    `volume.label_ids`: those beyond 2**24 in a file whose voxels mostly equal their neighbours along an axis, and
-    those of `labels` that do not lie from 0 to 255, as `LabelTransferFunction` wants them. (Of Zarr, ids beyond
-    2**24 are refused.)
+    `volume.label_ids`: those beyond 2**24 in a file whose voxels mostly equal their neighbours along an
+    axis, and those of `labels` that do not lie from 0 to 255, as `LabelTransferFunction` wants them. (Of
+    Zarr, ids beyond 2**24 are refused.)
 
     Args:
         path: the file.
@@ -148,12 +148,14 @@ def read(
     data = arguments["data"]
     if nan is not None and data.dtype.kind == "f":
         arguments["data"] = np.where(np.isfinite(data), data, data.dtype.type(number("nan", nan)))
-    if data.dtype.kind in "iu" and data.itemsize > 2 and not within(data, WHOLE["float32"]):
-        if any(
-            is_flat(np.moveaxis(data, axis, 0)) for axis in range(3)
-        ):  # segments may be thin along an axis
-            arguments |= _numbered(data)
+    if data.dtype.kind in "iu" and data.itemsize > 2 and not within(data, WHOLE["float32"]) and _is_ids(data):
+        arguments |= _numbered(data)
     return arguments
+
+
+def _is_ids(data: np.ndarray) -> bool:
+    """Whether voxels are ids of segments, which may be thin along an axis."""
+    return any(is_flat(np.moveaxis(data, axis, 0)) for axis in range(3))
 
 
 def _content(path: Path, shape: Any, dtype: Any, spacing: Any) -> dict[str, Any]:

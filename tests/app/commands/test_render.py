@@ -22,6 +22,13 @@ from jaxvol.scene.rendering import BrickReport
 
 ENGINE = np.asarray(jv.phantom("engine", 24).data)
 RANGE = float(ENGINE.min()), float(ENGINE.max())
+
+
+def of_voxel(cmap, clim=RANGE):
+    """The command's own: opacities are those of a voxel, whose size is 1 here."""
+    return jv.colormap(cmap, clim, unit_distance=1.0)
+
+
 FAST = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()
 
 
@@ -84,21 +91,21 @@ SCENES = {
     ),
     "of all values": (
         ["--compositing", "average"],
-        jv.colormap("gray", RANGE, unit_distance=1.0),
+        of_voxel("gray"),
         "average",
         None,
         0,
     ),
     "an isosurface": (
         SURFACE,
-        jv.colormap("white", RANGE, unit_distance=1.0),
+        of_voxel("white"),
         jv.Isosurface(30.0),
         Phong(),
         1,
     ),
     "a red one": (
         [*SURFACE, "--cmap", "red"],
-        jv.colormap("red", RANGE, unit_distance=1.0),
+        of_voxel("red"),
         jv.Isosurface(30.0),
         Phong(),
         1,
