@@ -26,6 +26,7 @@ from ..march.transforms import SpaceLeaping, ToroidalMap
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
+from ..scene.occupancy import BLOCK
 from ..scene.rendering import Details, Rendering
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, part_of
@@ -73,7 +74,8 @@ def render_bricks(
             `bricks.VoxelSource` keeps them for the next: open it once, by `bricks.source_of`.
         transfer: as for `render`.
         camera: as for `render`.
-        march: as for `render`; all transforms but `SpaceLeaping("min_distance")`.
+        march: as for `render`; all transforms but `SpaceLeaping("min_distance")`, and with the default
+            `block`.
         spacing: as in `Volume`; by default what the source says.
         origin: as in `Volume`; by default what the source says.
         memory: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
@@ -183,6 +185,10 @@ def scene_of(
         raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
         raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
+    if march.block_side != BLOCK:
+        raise ValueError(
+            f"march: SpaceLeaping(block={march.block_side}) needs the whole volume; use {BLOCK}."
+        )
     if lighting is not None and lighting.farthest_read is None:
         needs = f"{type(lighting).__name__}, which needs the whole volume"
         raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); got {needs}.")

@@ -236,7 +236,7 @@ class TransferFunction(Transfer):
         return self.classifier()(measured if search is None else (*measured, *search(measured)))
 
     def opacity(self, unit_distance: float = 1.0) -> Float[Array, " n"]:
-        """Opacity at the control points of a layer of thickness `unit_distance`."""
+        """Opacity at the control points of a layer of thickness `unit_distance`, in voxels if `per_voxel`."""
         return -jnp.expm1(-self._seen * number("unit_distance", unit_distance, above=0))
 
     @property

@@ -41,8 +41,14 @@ def memoized_of(tree: PyTree, compute: Callable[[Any], T]) -> T:
     key = tuple(map(id, leaves)), structure, compute
     if key not in _MEMORY:
         _MEMORY[key] = computed_now(compute, tree)
-        for leaf in leaves:
-            weakref.finalize(leaf, _MEMORY.pop, key, None)
+        watched: list[Any] = []
+
+        def forget() -> None:  # once: arrays that live on are watched no longer
+            _MEMORY.pop(key, None)
+            for other in watched:
+                other.detach()
+
+        watched += [weakref.finalize(leaf, forget) for leaf in leaves]
     return _MEMORY[key]
 
 

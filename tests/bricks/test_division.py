@@ -190,7 +190,7 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
         visit = jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
-        return _curved(None, grid, 11, scene.march, (underway.rays, underway.at, reached), visit)
+        return _curved(None, 1, grid, 11, scene.march, (underway.rays, underway.at, reached), visit)
 
     with in_float64():
         found = eqx.filter_eval_shape(cells_of, to_float64(scene))
@@ -201,10 +201,11 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
 # ---- the paper's overlap ----
 
 
-def test_the_printed_overlap_is_that_of_the_formula_up_to_its_unit():
+def test_the_printed_overlap_is_that_of_the_formula_with_three_changes():
     """The paper does not print the range of depths. With the one that is fitted, `overlap_of` gives 12 rows
     of Table 1 to 0.1 points if K, found in a unit of which the scan is 349 deep, counts as voxels, of which
-    it has 1280: a factor of 3.7 that nothing explains. In voxels, the overlap is larger."""
+    it has 1280 (a factor of 3.7 that nothing explains), both planes count from one centre (a = 0), and K is
+    that of the near face of each brick. In voxels, the overlap is larger."""
     off = [abs(paper.printed_overlap(split) - row.overlap) for split, row in paper.TABLE.items()]
     assert len(off) == 17
     assert max(off) <= 0.4

@@ -217,6 +217,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"transfer": 3}, "transfer must be a transfer function"),
     ({"transfer": jv.LabelTransferFunction({1: TRANSFER})}, "bricks have no labels"),
     ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
+    ({"march": jv.March(1.0, (jv.SpaceLeaping("distance", block=1),))}, "block=1. needs the whole volume"),
     (
         {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), DirectionalLight((1, 0, 0)), baked=True)},
         "farthest_read",
