@@ -205,7 +205,7 @@ def check_channels(
             if isinstance(field, Several):
                 got = f"{len(field.volumes)} volumes"
             raise ValueError(f"{name}: {given} needs a single volume of one channel; got {got}.")
-    if lighting is not None and lighting.farthest_read != 0:
+    if lighting is not None and not lighting.reads_gradient:  # as `Phong` does, where samples are placed
         _check_near(volume, lighting)
 
 

@@ -190,13 +190,16 @@ def test_opacity_ramps():
     np.testing.assert_allclose(opacity([0.0, 0.8, 0.2])[::25], [0, 0.4, 0.8, 0.5, 0.2], atol=1e-6)
 
 
+POINTS = np.array([0.0, 1]), np.ones((2, 3)), np.ones(2)
+
+
 def test_a_colormaps_opacity_is_that_of_a_voxel_of_what_is_rendered():
     """0.3 a voxel, whose size is the geometric mean 0.2 of the spacing, which may be traced."""
-    even, march = [0.3, 0.3], jv.March(0.05, (jv.AlphaCorrection(),))
+    march = jv.March(0.05, (jv.AlphaCorrection(),))
 
     @jax.jit
     def opacity(spacing):
-        shown = jv.colormap("gray", (0, 2), even, n_colors=2)
+        shown = jv.colormap("gray", (0, 2), [0.3, 0.3], n_colors=2)
         volume = jv.Volume(np.ones((3, 4, 5), np.float32), spacing)
         ray = np.array([[-1.0, 0.1, 0.1]]), np.array([[1.0, 0.0, 0.0]])
         return jv.render_rays(volume, shown, *ray, march).rgba[0, 3]
@@ -205,7 +208,7 @@ def test_a_colormaps_opacity_is_that_of_a_voxel_of_what_is_rendered():
         voxels = 2 * spacing[0] / np.prod(spacing) ** (1 / 3)
         np.testing.assert_allclose(opacity(spacing.astype(np.float32)), 1 - 0.7**voxels, rtol=1e-5)
     with pytest.raises(ValueError, match="functions must count lengths in world length"):
-        jv.LabelTransferFunction({1: jv.colormap("gray", (0, 2), even)})
+        jv.LabelTransferFunction({1: jv.TransferFunction(*POINTS, per_voxel=True)})
 
 
 def test_colormaps_and_presets_can_be_made_inside_a_program():
