@@ -82,8 +82,8 @@ def test_of_equal_values_the_nearest_is_the_greatest():
 
 
 PLAIN = [name for name in MODES if name not in SIMILAR]
-MAPS = {"average": "voxels", "isosurface": "voxels"}
-"""Modes whose march is told another transfer function, by maps that are made before the image."""
+MAPS = {"average": "voxels"}
+"""A mode whose march is told another transfer function, by a map that is made before the image."""
 
 
 @pytest.mark.parametrize(
