@@ -130,7 +130,7 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
     check()
 
 
-@pytest.mark.parametrize("quadrature", ["midpoint", pytest.param("preintegrated", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("quadrature", ["midpoint", "preintegrated"])
 def test_in_float32_a_thin_peak_magnifies_what_is_rounded_by_its_slope(quadrature):
     """So do leaps and crops, whose values and rays are rounded anew; other transfer functions are in
     `test_every_subset...`."""

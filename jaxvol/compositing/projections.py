@@ -73,8 +73,8 @@ class Maximum(Extreme):
 
     Gradients, also that of the thickness, are those of the sample that is chosen (`Selection`). Where the
     choice changes, the value is the same on both sides, and the image has a kink; depth, light, and what a
-    transfer function reads beside the value (a magnitude, a label) jump there, and so by rounding: under two
-    jitters and a `TransferFunction2D`, a pixel may differ by 0.3 between float32 and float64.
+    transfer function reads beside the value (a magnitude, a label) jump there, and rounding may decide it:
+    such a pixel differs between float32 and float64.
 
     Source: VTK's MAXIMUM_INTENSITY_BLEND; Wallis et al. 1989.
 

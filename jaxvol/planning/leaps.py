@@ -26,11 +26,11 @@ from .search import Part
 
 LEAPS = (
     SpaceLeaping(),
-    SpaceLeaping("distance", block=2),
-    *(SpaceLeaping("min_distance", cell, block=2) for cell in (4, 8, 16)),
+    SpaceLeaping("distance", block=1),
+    *(SpaceLeaping("min_distance", cell, block=1) for cell in (4, 8, 16)),
 )
 """What is tried if nothing else is given: outside of a body, the first is as a rule the fastest; in a cavity,
-one of the others."""
+one of the others (`experiments/minimum_distance.py`)."""
 
 
 class FastestLeaping(NamedTuple):
@@ -79,9 +79,9 @@ def fastest_leaping(
         march: without `SpaceLeaping`.
         compositing: as for `render`.
         lighting: as for `render`.
-        leaps: what is tried; by default `"hierarchy"`, and with maps of blocks of 2³, `"distance"` and, where
-            the compositing mode allows it, `"min_distance"` with cells of 4, 8 and 16 pixels. The first gives
-            the image that is right, and is not by `"min_distance"`.
+        leaps: what is tried; by default `"hierarchy"`, and with maps of voxels (`block=1`), `"distance"` and,
+            where the compositing mode allows it, `"min_distance"` with cells of 4, 8 and 16 pixels. The first
+            gives the image that is right, and is not by `"min_distance"`.
         tolerance: largest difference of a colour or an opacity from that image.
         repetitions: images by each, after one that is not counted.
 
@@ -116,8 +116,11 @@ def fastest_leaping(
     if leaps[0].method == "min_distance":
         raise ValueError('leaps must begin with a method that misses nothing; got "min_distance".')
 
-    step, given, rest = march.step, march.transforms, (march.quadrature, march.max_samples)
-    marches = [March(step, (*given, each), rest[0], max_samples=rest[1]) for each in leaps]
+    def leaping(leap: SpaceLeaping) -> March:
+        every = (*march.transforms, leap)
+        return March(march.step, every, march.quadrature, max_samples=march.max_samples)
+
+    marches = [leaping(each) for each in leaps]
 
     def image(march: March) -> Rendering:
         scene = Scene(volume, transfer, camera, march, mode, lighting)

@@ -37,7 +37,7 @@ class SpaceLeaping(Transform):
             bounding box holds no visible block of 4³ voxels. Blocks have one level; a table of their sums
             tells of a box of any size whether it is empty, as coarser levels would.
             `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
-            proves empty. Leaps are short where a ray runs along a surface. In a cavity, with small blocks, it
+            proves empty. Leaps are short where a ray runs along a surface. In a cavity, with blocks of 1, it
             is the fastest that misses nothing; elsewhere `"hierarchy"` is (`fastest_leaping` measures it).
             `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
             the first hits of their four corner rays. **It is not a bound**: what is thinner than these
@@ -46,9 +46,10 @@ class SpaceLeaping(Transform):
         cell: side of the square of pixels of the last two methods; at least 2.
         block: cells of the voxel grid along the side of a block of the map of distances (of `"distance"` and
             `"min_distance"`): 1, as published, 2 or 4. The map of single cells leaps farther along
-            surfaces, but takes about a second for 256³ voxels and nine bytes for each. It is made once for
-            a volume, a transfer function and cuts that are held, and in each image where one of them is
-            traced (`jax.jit`, `jax.grad`) or made anew.
+            surfaces, but takes a tenth of a second for 256³ voxels (two cores; blocks of 2: a hundredth),
+            and some ten bytes for each while it is made, two from then on. It is made once for a volume, a
+            transfer function and cuts that are held, and in each image where one of them is traced
+            (`jax.jit`, `jax.grad`) or made anew.
 
     What is leapt over has extinction 0, but the derivative of the image with respect to it is not 0. Only
     `adjoint="direct"`, which does not leap, includes it; `"forward"` takes it as 0 where rays leap,
