@@ -163,13 +163,6 @@ def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Arr
     return plane, plane
 
 
-def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Array:
-    """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
-    for axis in range(3):
-        grid = _with_both_sides(grid, axis, combine, 0)
-    return grid
-
-
 def _with_both_sides(grid: Array, axis: int, combine: Callable[[Array, Array], Array], beyond: int) -> Array:
     """Combines each cell with the two next to it along an axis, with `beyond` where there is none."""
     around, n = [(1, 1) if i == axis else (0, 0) for i in range(grid.ndim)], grid.shape[axis]
@@ -279,22 +272,16 @@ def _label_bits(labels: Integer[Array, "nx ny nz"], side: int) -> UInt32[Array, 
     return over_blocks(bits, jnp.bitwise_or, side=side)
 
 
-def over_blocks(
-    values: Array, combine: Callable[[Array, Array], Array], margin: int = 0, *, side: int = BLOCK
-) -> Array:
-    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
+def over_blocks(values: Array, combine: Callable[[Array, Array], Array], *, side: int) -> Array:
+    """Combines all nodes of each block, axis by axis."""
     for axis in range(min(values.ndim, 3)):  # channels stay
         cells = values.shape[axis] - 1
-        if margin:
-            missing = -cells % side
-            around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
-            values, cells = jnp.pad(values, around, mode="edge"), cells + missing
         along = partial(jax.lax.slice_in_dim, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, side)
         found = []
         if whole:
-            length, nodes = (whole - 1) * side + 1, range(side + 1 + 2 * margin)
+            length, nodes = (whole - 1) * side + 1, range(side + 1)
             found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
         if rest:
             found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))

@@ -24,8 +24,8 @@ from ..scenes import CAMERAS, RESOLUTION, anisotropic_noise, around, soft_transf
 
 SIZE = (65, 43)  # 9 x 6 beams, the last ones cut
 MOVING = (jv.Jitter(5), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-3))
-SHIFTED = (jv.EmptySpaceJitter(4), jv.AdaptiveSampling(0.02), jv.SpaceLeaping(), jv.AlphaCorrection())
-FIELDS = ("rgba", "depth", "samples", "aligned", "exhausted", "normal", "error")
+SHIFTED = (jv.EmptySpaceJitter(4), jv.SpaceLeaping(), jv.AlphaCorrection())
+FIELDS = ("rgba", "depth", "samples", "aligned", "exhausted", "normal")
 
 
 def all_devices() -> list[Any]:
