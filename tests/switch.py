@@ -8,7 +8,6 @@ for costs nothing is for static tests to show.
 
 from functools import cache, partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from hypothesis import strategies as st
