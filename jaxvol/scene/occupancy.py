@@ -158,17 +158,17 @@ def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Arr
     """Distances in a plane, if those of the plane before it are known, from which one step leads here, also
     a diagonal one along the axes `across`."""
     for axis in across:
-        before = _with_both_sides(before, axis, jnp.minimum, FARTHEST)
+        before = _with_both_sides(before, axis)
     plane = jnp.minimum(plane, jnp.minimum(before, FARTHEST - 2) + jnp.uint8(1))
     return plane, plane
 
 
-def _with_both_sides(grid: Array, axis: int, combine: Callable[[Array, Array], Array], beyond: int) -> Array:
-    """Combines each cell with the two next to it along an axis, with `beyond` where there is none."""
-    around, n = [(1, 1) if i == axis else (0, 0) for i in range(grid.ndim)], grid.shape[axis]
-    padded = jnp.pad(grid, around, constant_values=beyond)
+def _with_both_sides(plane: Array, axis: int) -> Array:
+    """The least distance of each cell and the two next to it along an axis."""
+    around, n = [(1, 1) if i == axis else (0, 0) for i in range(plane.ndim)], plane.shape[axis]
+    padded = jnp.pad(plane, around, constant_values=FARTHEST)
     before, after = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
-    return combine(combine(grid, before), after)
+    return jnp.minimum(jnp.minimum(plane, before), after)
 
 
 @cache
