@@ -1,8 +1,7 @@
 """What does accuracy cost? Time against error, for steps and quadratures, compared with VTK and Dr.Jit.
 
-Five scenes, steps of a quarter of a voxel to four, three quadratures, and adaptive sampling at five
-tolerances. Ours skips empty space, cuts the last cell at the exit, and ends rays early. Error is the RMSE
-over white against one converged image of ours.
+Five scenes, steps of a quarter of a voxel to four, three quadratures. Ours skips empty space, cuts the last
+cell at the exit, and ends rays early. Error is the RMSE over white against one converged image of ours.
 
 A second part looks at a transfer function whose peak is 1 % as wide as the range of values: the error of both
 second-order quadratures, by step.
@@ -16,17 +15,15 @@ from jaxvol.metrics import rmse
 
 from . import charts, programs
 from .harness import chosen_scenes, experiment, some_of
-from .programs import DRJIT, FINEST_OF, QUADRATURES, VTK, Case, Program, is_here
+from .programs import DRJIT, QUADRATURES, VTK, Case, Program, is_here
 from .scenes import PHANTOM, SCENES, Scene, peaked
 
 
 STEPS = (0.5, 1.0, 2.0, 4.0)
 FINEST = 0.25
-ADAPTIVE = "adaptive"
 FINER = 16
 OF_DRJIT = f"{DRJIT}, left", f"{DRJIT}, midpoint"
 STYLES = {
-    ADAPTIVE: "C4*-",
     "left": "C0o-",
     "midpoint": "C2s-",
     "preintegrated": "C3D-",
@@ -37,12 +34,11 @@ STYLES = {
 BASE = "midpoint", 1.0
 
 Rows = dict[str, dict[str, dict[str, Any]]]
-"""By program and step, in voxels, or tolerance: time and error."""
+"""By program and step, in voxels: time and error."""
 
 
 def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
     made: dict[Any, Any] = {BASE: programs.ours()}  # the base first
-    made |= {(ADAPTIVE, tolerance): programs.adaptive(tolerance) for tolerance in FINEST_OF}
     made |= {
         (q, step): programs.ours(step=step, quadrature=q) for step in (FINEST, *STEPS) for q in QUADRATURES
     }

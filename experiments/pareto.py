@@ -1,9 +1,9 @@
 """What does accuracy cost, for every setting of every method? Time against error, with the Pareto fronts.
 
 Each scene of `pareto_scenes` is rendered under each setting of `pareto_points`: steps and quadratures,
-adaptive sampling, jitter, alignment, leaping, termination, tables, types of voxels, and the light of lit
-scenes, beside VTK and Dr.Jit. Settings are timed in turn with the scene's base; a point's time is its median
-ratio to the base, times the base's median time over the whole scene. Errors are those of linear RGB over
+jitter, alignment, leaping, termination, tables, types of voxels, and the light of lit scenes, beside VTK and
+Dr.Jit. Settings are timed in turn with the scene's base; a point's time is its median ratio to the base,
+times the base's median time over the whole scene. Errors are those of linear RGB over
 white against a converged image, whose own error is estimated (`pareto_measure`).
 
 `--scene` measures some scenes again and keeps what the record says of the others, with the commit that they

@@ -22,7 +22,7 @@ from jaxvol.lighting import Lighting
 
 from . import peer_vtk, programs
 from .pareto_scenes import Kind, Row
-from .programs import DRJIT, FINEST_OF, LEFT, QUADRATURES, VTK, Case, Program, deferred, lighting_of, ours
+from .programs import DRJIT, LEFT, QUADRATURES, VTK, Case, Program, deferred, lighting_of, ours
 
 
 STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -129,8 +129,6 @@ def unlit() -> Settings:
     found = {BASE: Setting("midpoint", ours(), True)}
     for quadrature in QUADRATURES:
         found |= sweep(quadrature, quadrature, STEPS, quadrature=quadrature)
-    for tolerance in FINEST_OF:
-        found[f"adaptive, tolerance {tolerance:g}"] = Setting("adaptive", programs.adaptive(tolerance), True)
     for name, (jitter, toroidal) in JITTERS.items():
         found |= sweep("jitter", name, (1.0, 2.0), jitter, toroidal=toroidal)
     found |= sweep("alignment", "not aligned", (0.5, 1.0, 2.0), **NOT_ALIGNED)

@@ -5,8 +5,8 @@ some with narrow peaks; random cameras, a quarter of them inside. (What a sample
 other scenes.) Each is planned for three tolerances. The image under the plan is compared with a converged
 one, over black or white, whichever differs more.
 
-Of some scenes, a table of marches is searched: three quadratures and adaptive sampling, at steps from a
-thirty-second of a voxel to four, with leaps and without. Of each kind, the two with the longest steps within
+Of some scenes, a table of marches is searched: three quadratures, at steps from a thirty-second of a voxel to
+four, with leaps and without. Of each kind, the two with the longest steps within
 the tolerance are timed; the fastest of all, in turn with the planned one. Last, what planning itself takes,
 programs being compiled, in images of 512 x 512 pixels under the plan.
 """
@@ -28,6 +28,7 @@ from jaxvol.metrics import rmse
 
 from . import charts, timing
 from .harness import data, experiment
+from .programs import QUADRATURES
 from .scenes import CT_HEAD
 
 
@@ -48,8 +49,6 @@ STEPS = tuple(2.0 ** (k / 2) for k in range(4, -11, -1))
 """Voxels."""
 POINTS = 8
 """Most points of a transfer function."""
-OWN = tuple(10.0 ** (k / 2) for k in range(-2, -7, -1))
-"""Tolerances of adaptive sampling."""
 
 
 class Scene(NamedTuple):
@@ -153,18 +152,13 @@ def searched(
     """How much longer the planned image takes than the fastest of the table within the tolerance: of each
     kind the first two, with leaps and without, which render the same image."""
     leaps, transforms = jv.SpaceLeaping(), (jv.AlphaCorrection(), jv.EarlyTermination(tolerance / 8))
-    table: dict[str, list[tuple[float, tuple[jv.Transform, ...], Any]]] = {
-        rule: [(step, transforms, rule) for step in STEPS] for rule in ("left", "midpoint", "preintegrated")
-    }
-    for step in (1 / 8, 1 / 4, 1 / 2):
-        adaptive = [(jv.AdaptiveSampling(own, 8), *transforms) for own in OWN]
-        table[f"adaptive, shortest step {step:g}"] = [(step, each, "midpoint") for each in adaptive]
     programs: dict[str, Any] = {}
-    for kind, rows in table.items():
-        marches = ((s, [jv.March(s * scene.voxel, t, q) for t in ((*t, leaps), t)]) for s, t, q in rows)
+    for kind in QUADRATURES:
+        both = (*transforms, leaps), transforms
+        marches = ((s, [jv.March(s * scene.voxel, each, kind) for each in both]) for s in STEPS)
         accurate = (each for each in marches if distance(image(scene, each[1][0]), truth) <= tolerance)
-        for number, (step, both) in enumerate(islice(accurate, 2)):
-            for march, words in zip(both, ("leaps", "no leaps"), strict=True):
+        for number, (step, pair) in enumerate(islice(accurate, 2)):
+            for march, words in zip(pair, ("leaps", "no leaps"), strict=True):
                 programs[f"{kind}, step {step:.3g}, {number}, {words}"] = partial(image, scene, march)
     if not programs:
         return {"fastest": None}

@@ -28,9 +28,6 @@ THREADS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 
 LEFT = 1e-4
 """Transmittance at which rays end: 1/255 would be the error of the most accurate images."""
 QUADRATURES = ("left", "midpoint", "preintegrated")
-LONGEST = 4
-FINEST_OF = {1e-1: 4, 3e-2: 4, 1e-2: 4, 3e-3: 4, 1e-3: 8}
-"""Of adaptive sampling, by tolerance: into how many parts of a voxel the shortest cells divide it."""
 
 Image: TypeAlias = Float[np.ndarray, "height width 3"]
 Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
@@ -95,12 +92,6 @@ def ours(
         return program(case, march, None if lighting is None else lighting(case))
 
     return make
-
-
-def adaptive(tolerance: float) -> Callable[[Case], Program]:
-    """The base by adaptive sampling."""
-    finest = FINEST_OF[tolerance]
-    return ours(jv.AdaptiveSampling(tolerance, LONGEST * finest), step=1 / finest)
 
 
 def converged(scene: Scene, finer: int) -> Image:

@@ -18,7 +18,7 @@ NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 IMAGES = {"path_traced", "tomography", "transport"}
 """Records whose charts show images that no record holds."""
 OTHERS = {
-    *("bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),
+    *("adaptive_error", "bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),
     *("out_of_core", "probe_geometry", "shading", "viewer_latency", "visible_shading"),
 }
 """Records without a chart."""

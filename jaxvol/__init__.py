@@ -58,7 +58,6 @@ from .io.scan_conversion import scan_convert as scan_convert
 from .lighting import Material as Material, scatterer_template as scatterer_template
 from .march.march import March as March, Transform as Transform
 from .march.transforms import (
-    AdaptiveSampling as AdaptiveSampling,
     AlphaCorrection as AlphaCorrection,
     Clip as Clip,
     EarlyTermination as EarlyTermination,

@@ -23,9 +23,7 @@ from .compositing.blending import Compositing, Fragment, Outputs, Over, Weightin
 from .compositing.selection import RaySampler, Selection
 from .lighting.deferred import Deferred
 from .lighting.shading import Lighting, lit_classification
-from .march import strides
 from .march.march import Cell, March
-from .march.strides import Strides, steps_of
 from .scene.camera import Camera, without_ends
 from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
@@ -33,7 +31,6 @@ from .scene.several import Several
 from .scene.space import Line, Ray, Space, enter, world_gradient
 from .scene.transfer import Classification, Measured, Transfer, TransferFunction
 from .scene.transfer2d import TransferFunction2D
-from .scene.variation import Windows
 from .scene.volume import Volume, grids, without_voxels
 from .xla.differentiation import check_captured
 from .xla.memory import in_memory
@@ -59,17 +56,13 @@ class Scene(NamedTuple):
     space: Space = cast(Space, None)
     classification: Classification = cast(Classification, None)
 
-    def prepared(self, windows: Windows | None = None) -> "Scene":
-        """The scene with what is computed once for each image. `windows`: those of the volume, which a
-        `StrideControl` needs."""
-        space, march = self.march.locate(self.volume), self.march
+    def prepared(self) -> "Scene":
+        """The scene with what is computed once for each image."""
+        space = self.march.locate(self.volume)
         lit = lit_classification(
-            self.volume, self.transfer, space, self.lighting, integrated=march.integrates
+            self.volume, self.transfer, space, self.lighting, integrated=self.march.integrates
         )
-        if windows is not None:
-            variation = partial(self.compositing.variation, self.transfer)
-            march = strides.predicted(march, space, windows, variation)
-        return self._replace(march=march, space=space, classification=lit)
+        return self._replace(space=space, classification=lit)
 
     @property
     def has_fault(self) -> Bool[Array, ""]:
@@ -192,11 +185,9 @@ def check_channels(
             f"volume must have as many channels as {type(transfer).__name__} reads, {reads}; got {channels}. "
             "Several volumes are given as lists: render([a, b], [of_a, of_b], ...)."
         )
-    adaptive = strides.stride_control(march)
     single = {
         "compositing": described(compositing) if compositing.reads_value else None,
         "lighting": None if lighting is None else described(lighting),
-        "march.transforms": None if adaptive is None else described(adaptive),
         "march.quadrature": '"preintegrated"' if march.integrates else None,
     }
     for name, given in single.items():
@@ -230,8 +221,8 @@ class Progress(eqx.Module):
     The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
     ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
     the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
-    first transparent cell, and is 0 from then on. Three are None where they are not needed: `stats` unless
-    all outputs are asked for, `shift` unless a transform shifts, `strides` unless there is a `StrideControl`.
+    first transparent cell, and is 0 from then on. Two are None where they are not needed: `stats` unless
+    all outputs are asked for, `shift` unless a transform shifts.
     """
 
     index: Int[Array, ""]
@@ -240,7 +231,6 @@ class Progress(eqx.Module):
     stats: "SampleStats | None"
     finished: Bool[Array, ""]
     shift: Scalar | None
-    strides: Strides | None = None
 
 
 class SampleStats(eqx.Module):
@@ -262,33 +252,13 @@ def begin(scene: Scene, ray: Ray, outputs: Outputs | None = "all") -> Progress:
         stats=SampleStats(count, no) if outputs == "all" else None,
         finished=no,
         shift=march.shift(ray) if march.may_shift else None,
-        strides=strides.begin(march, ray, estimate=outputs == "all"),
     )
-
-
-def with_stride(
-    scene: Scene, ray: Ray, at: Progress, ahead: Int[Array, ""] | int = 0
-) -> tuple[Progress, Int[Array, ""] | int]:
-    """Chooses the stride of the run that holds the step `ahead` of this one; all cells before it must be
-    transparent. Returns the progress, and the steps to that run (`ahead` itself without a
-    `StrideControl`)."""
-    if at.strides is None:
-        return at, ahead
-    march, transmittance = scene.march, scene.compositing.transmittance(at.composite)
-    leaves = (ahead > 0) & (front(march, at, ahead) >= ray.length)
-    finished = at.finished | (ray.length <= 0) | (at.index >= march.most_samples)
-    chosen, ahead = at.strides.next(
-        march, ray, at.index, ahead, transmittance, leaves=leaves, finished=finished
-    )
-    return replace(at, strides=chosen), ahead
 
 
 def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
-    """The pieces of the ray's next cell, or of the `number`-th one after it, which is as long."""
-    march, steps = scene.march, steps_of(at.strides)
-    width = jnp.asarray(steps, march.step.dtype) * march.step
-    begin = front(march, at, number * steps)
-    return march.cut(Cell(begin, width, jnp.zeros(begin.shape, bool)), ray, scene.volume)
+    """The pieces of the ray's next cell, or of the `number`-th one after it."""
+    march, begin = scene.march, front(scene.march, at, number)
+    return march.cut(Cell(begin, march.step, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
 def read(scene: Scene, ray: Ray, piece: Cell) -> Measured:
@@ -413,8 +383,6 @@ def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
     if at.stats is not None:
         details = details._replace(samples=at.stats.samples, aligned=at.stats.aligned)
-    if at.strides is not None and at.strides.error is not None:
-        details = details._replace(error=jnp.where(valid, jnp.sqrt(at.strides.error), jnp.nan))
     if isinstance(scene.compositing, Selection):
         details = details._replace(selected=at.composite)
     return Rendering(rgba, ~at.finished, details)
@@ -472,8 +440,7 @@ def _selected(
 
 def _movement(march: March, ray: Ray, volume: Volume, depth: Scalar, scale: Scalar) -> Scalar:
     """0, with the derivatives of a sample that the march found at this depth: those of the sample in the cell
-    that begins a fixed number of steps past the entry, and is cut; or, where the march has longer cells, of
-    the number of steps."""
+    that begins a fixed number of steps past the entry, and is cut."""
     start = march.start(ray)
     starts = [start, start + march.shift(ray)] if march.may_shift else [start]
     step = jax.lax.stop_gradient(march.step)

@@ -16,7 +16,6 @@ from .compositing.modes import Mode, compositing_of
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting
 from .march.march import March
-from .march.strides import steps_of, stride_control
 from .ray import (
     Progress,
     Scene,
@@ -31,13 +30,11 @@ from .ray import (
     pieces,
     resolve,
     stop,
-    with_stride,
 )
 from .scene.rendering import Rendering
 from .scene.several import together
 from .scene.space import Line, Ray, enter, invalid
 from .scene.transfer import Transfer
-from .scene.variation import Windows
 from .scene.volume import Volume
 from .xla.differentiation import nan_derivatives
 from .xla.platform import is_traced
@@ -91,7 +88,7 @@ def render_ray_reference(
     scene = nan_derivatives(scene, fault)
     shown = scene.prepared()
     ray = invalid(enter(shown.space, *line), fault)
-    marched = scene.marched.prepared(None if stride_control(march) is None else Windows.of(volume))
+    marched = scene.marched.prepared()
 
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(marched, ray, at), None
@@ -109,7 +106,6 @@ def _has_fault(scene: Scene) -> Bool[Array, ""]:
 def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
     """Samples one cell, composites it, and moves on."""
     march, compositing = scene.march, scene.compositing
-    at, _ = with_stride(scene, ray, at)
     sampler = RaySampler(ray, scene.classification, space=scene.space)
     after, alphas, color = at, [], None
     cut = pieces(scene, ray, at)
@@ -122,10 +118,7 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
         after = add(scene, ray, after, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    after = move(march, ray, stop(scene, after), transparent, steps_of(at.strides))
-    if at.strides is None:  # each cell is one step, and the scan is no longer than `most_samples`
-        return after
-    return jax.tree.map(lambda a, b: jnp.where(at.index < march.most_samples, a, b), after, at)
+    return move(march, ray, stop(scene, after), transparent, 1)
 
 
 def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:

@@ -8,7 +8,6 @@ for costs nothing is for static tests to show.
 
 from functools import cache, partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from hypothesis import strategies as st
@@ -16,7 +15,6 @@ from jaxtyping import Array, Bool
 
 import jaxvol as jv
 from jaxvol.march.march import EmptySpaceIndex
-from jaxvol.march.strides import StrideControl
 from jaxvol.scene.occupancy import BLOCK
 from jaxvol.scene.space import Space
 
@@ -178,9 +176,6 @@ def switch(transform: jv.Transform, on, part: str = "") -> jv.Transform:
     takes each class of transforms once."""
     if type(transform).locate is not jv.Transform.locate:
         raise ValueError("a space is static: compare marches with and without it.")
-    if isinstance(transform, StrideControl):  # no error is tolerated, so that cells are one step long
-        off = jnp.full_like(transform.tolerance, -1)
-        return eqx.tree_at(lambda of: of.tolerance, transform, either(on, transform.tolerance, off))
     return _class(type(transform), part)(transform, jnp.asarray(on, bool))
 
 
@@ -201,7 +196,7 @@ OTHERS = frozenset({"residual", "shift", "hollow", "alignment", "leaping"})
 
 
 def transforms(seed=3, left=0.05, box=BOX, planes=(PLANE,)) -> dict[str, jv.Transform]:
-    """Every transform but those with a space of their own, and those that change the length of cells."""
+    """Every transform but those with a space of their own."""
     return {
         "jitter": jv.Jitter(seed),
         "residual": jv.Jitter(seed, "blue", front_residual=True),

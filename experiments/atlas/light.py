@@ -1,8 +1,7 @@
 """Where does light fail? Templates of printed energy, of few packets, of long and short mean free paths;
-shading of noise; adaptive strides."""
+shading of noise."""
 
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,11 +15,10 @@ from jaxvol.lighting import (
     ScattererTemplates,
     scatterer_templates,
 )
-from jaxvol.metrics import rmse
 
 from ..printed_templates import printed_templates
 from ..scenes import grid, on_cube
-from .entry import colors, cube, entry, rms, uniform
+from .entry import colors, entry, rms
 
 
 @entry(
@@ -200,42 +198,3 @@ def normals_in_noise(noise: float, size: int) -> dict[str, float]:
     found = np.asarray(gradient(points), np.float64)
     cosine = np.abs(np.sum(found * outward, axis=-1)) / np.linalg.norm(found, axis=-1)
     return {"angle": float(np.rad2deg(np.mean(np.arccos(np.minimum(cosine, 1)))))}
-
-
-def lit_image(size: int, transforms: tuple[jv.Transform, ...], lit: bool, finer: int = 1) -> np.ndarray:
-    """A translucent cube of one value, lit from the side; a mean free path is a tenth of its side."""
-    sun = DirectionalLight((1.0, 0.3, 0.2), (3.0, 3.0, 3.0))
-    how: Any = {"templates": 1, "packets": 2, "photons": 6, "levels": 3}
-    lighting = ScattererTemplates(jv.Material(0.3, 0.2), sun, **how) if lit else None
-    camera = jv.Camera.looking_at(cube(32), (0.4, -1.0, 0.5), size=(size, size)).zoom(1.3)
-    march = jv.March(1 / 32 / finer, (jv.AlphaCorrection(), *transforms), "midpoint")
-    return colors(cube(32), uniform(1.5, (0.9, 0.8, 0.7)), camera, march, lighting=lighting)
-
-
-@cache
-def _light_error(size: int, lit: bool, tolerance: float | None) -> float:
-    """RMSE of the cube, by adaptive strides or by cells of one step."""
-    transforms = () if tolerance is None else (jv.AdaptiveSampling(tolerance, 16),)
-    return rmse(lit_image(size, transforms, lit), lit_image(size, (), lit, finer=4))
-
-
-@entry(
-    "jaxvol.AdaptiveSampling",
-    "tolerance",
-    (0.1, 0.03, 0.01, 0.005, 0.002, 1e-3, 3e-4, 1e-4),
-    "RMSE of the image / tolerance",
-    "lit",
-    limit=1.0,
-    size=24,
-)
-def adaptive_strides_under_light(tolerance: float, size: int) -> dict[str, float]:
-    """What does adaptive sampling miss where light varies and values do not?
-
-    Strides follow from values and transfer function alone, so that in a cube of one value all cells are as
-    long as allowed, whatever the tolerance: without light that is exact, with light it is not.
-    Rendering.error does not count it."""
-    return {
-        "lit": _light_error(size, True, tolerance) / tolerance,
-        "lit, cells of one step": _light_error(size, True, None) / tolerance,
-        "unlit": _light_error(size, False, tolerance) / tolerance,
-    }

@@ -1,5 +1,4 @@
-"""Where do jitters and steps fail? Rays without an empty sample, thin sheets, offsets near 1, and
-tolerances finer than the finest cell of adaptive sampling."""
+"""Where do jitters and steps fail? Rays without an empty sample, thin sheets, offsets near 1."""
 
 from collections.abc import Callable
 from functools import cache
@@ -11,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import jaxvol as jv
-from jaxvol.metrics import rmse, wood_grain_energy
+from jaxvol.metrics import wood_grain_energy
 
 from .entry import along_z, colors, cube, entry, grey, of_field, opacities, shift_of, signed, uniform
 
@@ -190,50 +189,3 @@ def jitter_offsets_near_1(left: float, size: int) -> dict[str, float]:
     Random numbers have 24 bits, so that ξ is at most 1 - 2⁻²⁴. The front residual and the cells behind it
     always cover the whole ray. Without it, Jitter lacks the first ξ d, here up to e⁻² ξ d."""
     return {name: float(np.abs(offset_error(left, size, each)).max()) for name, each in BLUE.items()}
-
-
-@cache
-def _waves() -> jv.Volume:
-    """Values that rise and fall within eight voxels, in all directions."""
-    line = np.arange(33, dtype=np.float32)
-    x, y, z = np.meshgrid(line, line, line, indexing="ij")
-    data = 0.5 + 0.16 * (np.sin(0.8 * x) + np.sin(0.7 * y + 1) + np.sin(0.75 * z + 2))
-    return jv.Volume(data, [2 / 32] * 3, [-1.0] * 3)
-
-
-def waves_image(size: int, transforms: tuple[jv.Transform, ...], finer: int = 1) -> np.ndarray:
-    points = [(0.5, (0.2, 0.4, 0.9), 0.0), (0.7, (0.9, 0.7, 0.2), 0.5), (1.0, (0.9, 0.2, 0.2), 0.9)]
-    transfer = jv.TransferFunction.from_points(points, unit_distance=0.1)
-    camera = jv.Camera.looking_at(_waves(), (0.5, -0.9, 0.4), size=(size, size)).zoom(1.6)
-    return colors(_waves(), transfer, camera, jv.March(2 / 32 / finer, (ALIGNED, *transforms), "midpoint"))
-
-
-@cache
-def _waves_truth(size: int) -> np.ndarray:
-    return waves_image(size, (), 32)
-
-
-@entry(
-    "jaxvol.AdaptiveSampling",
-    "tolerance",
-    (0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, 3e-5),
-    "RMSE of the image / tolerance",
-    "finest=1",
-    limit=1.0,
-    picture=lambda tolerance, size: signed(
-        waves_image(size, (jv.AdaptiveSampling(tolerance, 8),)) - _waves_truth(size), 0.05
-    ),
-    shows="error of the image with finest=1, ± 0.05 from blue to red",
-    pictured=(0.1, 1e-3),
-    size=32,
-)
-def tolerances_finer_than_the_finest_cell(tolerance: float, size: int) -> dict[str, float]:
-    """Down to which tolerance does adaptive sampling keep its promise?
-
-    No cell is shorter than a step, here a voxel / finest: below the error of an image of such cells the
-    tolerance means nothing. A shorter step moves the edge."""
-    found = {}
-    for finest in (1, 8):
-        image = waves_image(size, (jv.AdaptiveSampling(tolerance, 8 * finest),), finest)
-        found[f"finest={finest}"] = rmse(image, _waves_truth(size)) / tolerance
-    return found

@@ -198,14 +198,6 @@ def flag(name: str, value: Any) -> bool:
     return bool(value)
 
 
-def power_of_two(name: str, value: Any, most: int) -> int:
-    """A power of two from 1 to `most`."""
-    found = integer(name, value, 1, most)
-    if found & (found - 1):
-        raise ValueError(f"{name} must be a power of two; got {value!r}.")
-    return found
-
-
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
     """The path of a file that can be written, else a `ValueError`. `whole_file` makes its folder."""
     path = Path(path)

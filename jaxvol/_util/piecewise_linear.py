@@ -134,61 +134,6 @@ def upper_bound_between(
     return jnp.maximum(ends, inside) + ROUNDING * extinction.max()
 
 
-def variation_between(
-    values: Float[Array, " n"],
-    colors: Float[Array, "n 3"],
-    extinction: Float[Array, " n"],
-    low: Float[Array, "*blocks"],
-    high: Float[Array, "*blocks"],
-) -> tuple[Float[Array, "*blocks"], ...]:
-    """What `variation.Variation` holds, for values from `low` to `high`: upper bounds, but for rounding."""
-    gap, rise, shifts = jnp.diff(values), jnp.diff(extinction), jnp.diff(colors, axis=0)
-    brightness = jnp.maximum(jnp.max(jnp.abs(colors), axis=1), 1)
-    brighter, densest = (jnp.maximum(each[1:], each[:-1]) for each in (brightness, extinction))
-    shift = jnp.max(jnp.abs(shifts), axis=1)
-    colored = densest * shift
-    total = jnp.abs(rise) * brighter + colored
-    # steps, the sum of whose slopes would swallow all others, are counted instead
-    steps = gap <= 1e-4 * (values[-1] - values[0])
-    inverse = jnp.where(steps, 0, 1 / jnp.where(steps, 1, gap))
-    # emission, a product of two linear functions, bends between points, too
-    bends = 2 * jnp.abs(rise) * shift * inverse
-    slopes = jnp.concatenate([rise[:, None], shifts], axis=1) * inverse[:, None]
-    turns = jnp.abs(jnp.diff(jnp.pad(slopes, ((1, 1), (0, 0))), axis=0))
-    turns = turns[:, 0] * brightness + extinction * jnp.max(turns[:, 1:], axis=1)
-    low, high = low.astype(values.dtype), high.astype(values.dtype)
-    passed, reached = points_below(values, low), points_below(values, high)
-    ends = [_interval(values, end, below) for end, below in ((low, passed), (high, reached))]
-
-    def between(changes: Array) -> Array:
-        """Sum of what changes along the intervals, in proportion where only a fraction of one lies within."""
-        whole = jnp.cumsum(changes) - changes
-        first, last = (gather(whole, i) + t * gather(changes, i) for i, t in ends)
-        return jnp.maximum(last - first, 0)
-
-    def inside(at_points: Array, end: Array) -> Array:
-        """Sum over the points above `low`, up to so many."""
-        whole = jnp.pad(jnp.cumsum(at_points), (1, 0))
-        return jnp.maximum(gather(whole, end) - gather(whole, passed), 0)
-
-    # what lies at a step is above it; a slope that changes at `high` has not been passed
-    stepped = inside(jnp.pad(steps, (0, 1)).astype(jnp.int32), reached) > 0
-    turned = inside(turns, points_below(values, high, strictly=True)) + between(bends)
-    turned = jnp.where(stepped, jnp.inf, turned)
-    return between(total), turned, between(colored), between(densest * colored)
-
-
-def _interval(
-    values: Float[Array, " n"], value: Float[Array, "*batch"], below: Int[Array, "*batch"]
-) -> tuple[Int[Array, "*batch"], Float[Array, "*batch"]]:
-    """In which interval a value lies that has so many points at or below it, and the fraction of it below."""
-    i = jnp.clip(below - 1, 0, values.shape[0] - 2)
-    start, end = gather(values, i), gather(values, i + 1)
-    gap = end - start
-    fraction = jnp.clip((value - start) / jnp.where(gap > 0, gap, 1), 0, 1)
-    return i, jnp.where(gap > 0, fraction, (value >= start).astype(fraction.dtype))
-
-
 def _maximum_of_range(
     entries: Float[Array, " n"], first: Int[Array, "*batch"], end: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:

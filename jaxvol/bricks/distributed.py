@@ -23,7 +23,6 @@ from ..engine.brick_march import RayStates, begin_rays, finish_image, join_segme
 from ..engine.devices import AXIS, REPLICATED, SHARDED
 from ..engine.tiling import RenderOptions
 from ..engine.wavefront import CellRange
-from ..march.strides import stride_control
 from ..ray import Scene
 from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
@@ -59,7 +58,6 @@ def check_joins(scene: Scene, method: Any) -> None:
             mode, Over
         ),
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
-        "AdaptiveSampling, whose strides depend on what lies in front": stride_control(march) is not None,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
         "gradients": is_traced(scene),
     }

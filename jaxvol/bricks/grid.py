@@ -13,9 +13,7 @@ from .._util.checks import integer, shortened
 from .._util.files import MOST_VOXELS
 from .._util.vec3 import Vec3, apart
 from ..march.march import March
-from ..march.strides import longest_run, stride_control
 from ..march.transforms import ToroidalMap
-from ..march.transforms.adaptive_sampling import FARTHEST
 from ..ray import Scene
 from ..scene.camera import Camera, axes_of
 from ..scene.occupancy import BLOCK
@@ -149,7 +147,7 @@ class Margin:
     steps: int  # how far cells that begin in the brick may reach along a ray
     length: float  # and in the world
     light: float  # world length around a sample within which light is looked for
-    around: int  # nodes more, for interpolation, slopes, and the windows of `AdaptiveSampling`
+    around: int  # nodes more, for interpolation and slopes
     slopes: bool
     straight: bool = True  # whether rays are straight in the grid
     probe: ToroidalMap | None = None  # whose bricks overlap, if they do
@@ -159,15 +157,11 @@ class Margin:
         """That of a march in a grid of this shape, which takes `segment` cells of a ray at a time. `shown`:
         what is measured and lit there."""
         transfer, lighting, straight = shown.transfer, shown.lighting, is_straight(space)
-        steps = SLACK + max(segment, longest_run(march))
+        steps = SLACK + segment
         # where rays are curved, a brick's own cells are found by points that may lie four steps apart
         length = (steps + (0 if straight else 4)) * float(march.step)
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
         around = 2 if slopes else 1
-        if stride_control(march) is not None:  # blocks around a run's own, and the windows of these
-            shortest = min(_distances(space, np.zeros(3), np.asarray(shape) + BLOCK))
-            rounds = longest_run(march) * float(march.step) / max(2 * BLOCK * shortest, 1e-30)
-            around += BLOCK * (math.ceil(min(rounds, FARTHEST)) + 2)  # runs that touch more are not made
         light = 0.0 if lighting is None else lighting.farthest_read
         assert light is not None
         probe = next((t for t in march.transforms if isinstance(t, ToroidalMap)), None)

@@ -100,10 +100,10 @@ def render_bricks(
             is read once and copied to all. `"bricks"`: each device reads its own bricks, marches all rays
             through them, and the partial images are combined front to back: where reading takes longest, and
             for several processes. Rays must be straight in the grid, and what a ray shows must not depend on
-            what lies in front but by its transmittance (no `EmptySpaceJitter` or `AdaptiveSampling`;
-            compositing by `"over"`). An `EarlyTermination` sees only what is in front on the same device: up
-            to `opacity_left` of the colours behind are added, and depth changes with them; without it, depth
-            agrees to 1e-5 of itself. No gradients.
+            what lies in front but by its transmittance (no `EmptySpaceJitter`; compositing by `"over"`). An
+            `EarlyTermination` sees only what is in front on the same device: up to `opacity_left` of the
+            colours behind are added, and depth changes with them; without it, depth agrees to 1e-5 of itself.
+            No gradients.
         **options: for the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
 
     Returns:

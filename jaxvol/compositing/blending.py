@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float
 from .._util.vec3 import Scalar, Vec3
 from ..march.march import Cell, March
 from ..scene.transfer import Classification, Measured, Transfer
-from ..scene.variation import Variation, Windows
 from ..scene.volume import Volume
 
 
@@ -101,11 +100,6 @@ class Compositing(eqx.Module, Generic[State]):
         """Which blocks of a volume may change a pixel, from the ranges of their values, `Blocks` (of several
         volumes, `SeveralBlocks`); rays leap over the others. `transfer`: that of `marched`."""
         return transfer.visible(blocks)
-
-    def variation(self, transfer: Transfer, windows: Windows) -> Variation:
-        """How much extinction and emission change within the range of each window, for `AdaptiveSampling`. By
-        default nothing is known."""
-        return Variation.unknown(windows)
 
 
 class Composite(eqx.Module):
@@ -224,9 +218,6 @@ class Over(Weighting):
 
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
-
-    def variation(self, transfer: Transfer, windows: Windows) -> Variation:
-        return transfer.variation(windows)
 
 
 class OpticalDepths(Weighting):

@@ -85,9 +85,8 @@ class Selection(Compositing[State]):
 
     Gradients are those of `pixel`, also of parameters: the chosen sample stays that of the same cell, while
     the ray, the step, the faces that cut the cell, and what the ray meets change. They miss the jumps of a
-    pixel where the choice changes, and under `AdaptiveSampling` that a cut cell moves with a face. The
-    gradient of voxels takes an array of their size for each fetch of `pixel`, for each chunk of 2048 pixels:
-    slow for large volumes.
+    pixel where the choice changes. The gradient of voxels takes an array of their size for each fetch of
+    `pixel`, for each chunk of 2048 pixels: slow for large volumes.
     """
 
     @abstractmethod

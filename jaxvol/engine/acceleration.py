@@ -24,13 +24,11 @@ from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.beams import EmptySpaceIndex, View
 from ..march.march import March, Transform
-from ..march.strides import stride_control
 from ..ray import Scene, end
 from ..scene.camera import GivenRays, without_ends
 from ..scene.occupancy import BLOCK, Blocks, Occupancy
 from ..scene.several import Several, SeveralBlocks
 from ..scene.transfer import Transfer
-from ..scene.variation import Windows
 from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
 from ..xla.memo import memoized, memoized_of
@@ -46,16 +44,14 @@ LIMIT = 2**30
 
 
 class VolumeAcceleration(eqx.Module):
-    """What is computed before the image: a packed copy of the voxels for fetching, the slopes of nodes, the
-    ranges of blocks, and how values vary around them; None where the image has no use for it. Made once for
-    each array of voxels."""
+    """What is computed before the image: a packed copy of the voxels for fetching, the slopes of nodes, and
+    the ranges of blocks; None where the image has no use for it. Made once for each array of voxels."""
 
     words: list[UInt32[Array, " voxels"] | None]
     """Of each of the volume's `grids`."""
     slopes: list[UInt32[Array, " voxels"] | None]
     blocks: Any
     """`Blocks`, or, of several volumes, `SeveralBlocks`."""
-    windows: Windows | None
     occupancy: Occupancy | None = None
     """In place of `blocks`, with its distances, where these are of finer blocks and nothing is traced: made
     once for each volume and transfer function."""
@@ -80,7 +76,6 @@ class VolumeAcceleration(eqx.Module):
             [words_of(grid) if packs else None for grid in grids(volume)],
             [slopes_of(grid) if slopes else None for grid in grids(volume)],
             _blocks_of(volume, transfer, march) if march.leaps and seen is None else None,
-            None if stride_control(march) is None else Windows.of(volume),
             seen,
         )
 
@@ -90,7 +85,7 @@ class VolumeAcceleration(eqx.Module):
 
     def prepared(self, scene: Scene) -> Scene:
         """The scene, packed, and with what is computed once for each image."""
-        return self.packed(scene).prepared(self.windows)
+        return self.packed(scene).prepared()
 
 
 def _blocks_of(volume: Volume, transfer: Transfer, march: March) -> Blocks | SeveralBlocks:
@@ -149,7 +144,7 @@ def _occupancy(
     return march.locate(volume).occupancy(visible, volume.first, blocks.side)
 
 
-NO_ACCELERATION = VolumeAcceleration([], [], None, None)
+NO_ACCELERATION = VolumeAcceleration([], [], None)
 
 
 def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:

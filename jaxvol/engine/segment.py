@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Int
 from .._util.vec3 import Scalar, Vec3
 from ..compositing.selection import Selection
 from ..march.march import Cell, March
-from ..march.strides import RUN, steps_of
 from ..ray import Progress, Scene, add, move, opacity, pieces, read, stop
 from ..scene.several import Together
 from ..scene.space import Ray
@@ -29,12 +28,6 @@ from ..xla.memory import in_memory
 from ..xla.trees import PyTree
 from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
-
-
-def begins(at: Progress, cells: int) -> Int[Array, "cells *rays"]:
-    """Steps to where the next cells of rays begin: (cells,), or (cells, rays) where strides differ."""
-    number = jnp.arange(cells, dtype=at.index.dtype)
-    return number if at.strides is None else number[:, None] * at.strides.steps[None]
 
 
 class Samples(NamedTuple):
@@ -95,14 +88,13 @@ def march_segment(
     until: Int[Array, " rays"] | None = None,
 ) -> tuple[Progress, Samples]:
     """Marches rays by a segment of cells; by fewer, where a ray is finished, where a shift puts its next
-    samples elsewhere than those that were fetched, at the end of a run, or at `until`. `regular`: no ray has
-    a shift, a limit of samples or `until` ahead of it, which is then not tested."""
-    march, classification = scene.march, scene.classification
-    number = tiling.cells if at.strides is None else min(tiling.cells, RUN)
+    samples elsewhere than those that were fetched, or at `until`. `regular`: no ray has a shift, a limit of
+    samples or `until` ahead of it, which is then not tested."""
+    march, classification, number = scene.march, scene.classification, tiling.cells
     every = samples = _sampled(scene, number, ray, at)
     kept: Int[Array, " rays"] | None = None
     shifts = None
-    if not regular or (at.strides is not None and at.strides.ends_within(number)):
+    if not regular:
         fewer = in_memory(always(at), partial(_kept, march), at, every.opacity, until)
         (kept, shifts), samples = fewer, _truncated(every, fewer[0], ray)
     colors: list[Vec3] | list[None]
@@ -137,7 +129,7 @@ def march_segment(
     order = jnp.arange(number, dtype=at.index.dtype)
     after, _ = jax.lax.scan(next_, at, (order, cells), unroll=number)
     steps = jnp.full_like(at.index, number) if kept is None else kept
-    return jax.vmap(partial(move, march))(ray, after, shifts, steps * steps_of(at.strides)), samples
+    return jax.vmap(partial(move, march))(ray, after, shifts, steps), samples
 
 
 def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
@@ -179,8 +171,8 @@ def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
 def always(at: Progress) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
     # An index cannot overflow: in a pass there are at most some `most_samples` / cells segments, and it grows
-    # by at most cells times the longest stride, finished or not: with 2**24 samples and strides of 64 it
-    # stays below 2**31. Whether any ray is alive would take 1 % of a frame to find out.
+    # by at most cells, finished or not: with 2**24 samples it stays below 2**31. Whether any ray is alive
+    # would take 1 % of a frame to find out.
     return at.index[0] >= 0
 
 
@@ -244,8 +236,6 @@ def _kept(
     left = march.most_samples - at.index
     if until is not None:
         left = jnp.clip(until - at.index, 0, left)
-    if at.strides is not None:
-        left = at.strides.cells_left(at.index, left)
     cells = opacity[0].shape[0]
     # cell by cell, back to front: a reduction over all of them would be a loop of its own
     first = jnp.full_like(left, cells + 1)

@@ -91,6 +91,5 @@ Chosen on an H200: the head phantom of 512³ voxels, 1024 × 1024 pixels, steps 
 early termination. An image with the gradient of its transfer function took 9.3 ms; in segments of 8 cells
 11.0 ms, and in these by batches of 2¹³ groups and 16 turns 14.3 ms. (Of the lanes of a batch of 2¹² groups,
 41 % take samples of this image, of one of 2¹³ 24 %.) In the view of `experiments/scenes.py`, the host waits
-13 times. Loops of unknown length remain in `AdaptiveSampling`, once a frame, and in shading with many terms
-(`ScattererTemplates`), in each segment.
+13 times. Loops of unknown length remain in shading with many terms (`ScattererTemplates`), in each segment.
 """

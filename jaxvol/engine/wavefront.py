@@ -24,16 +24,15 @@ from jaxtyping import Array, Bool, Int
 from ..compositing.blending import Outputs, Weighting
 from ..march.beams import Box, EmptySpaceIndex
 from ..march.march import March
-from ..march.strides import steps_of
-from ..ray import Progress, Scene, begin, front, is_sample, measure, move, opacity, pieces, with_stride
+from ..ray import Progress, Scene, begin, front, is_sample, measure, move, opacity, pieces
 from ..scene.occupancy import Occupancy
 from ..scene.space import Ray
 from ..xla.compaction import in_front
-from ..xla.memory import gather, in_memory
+from ..xla.memory import gather
 from ..xla.sharding import varying
 from ..xla.trees import PyTree
 from .rays import RayTiles, vmap_rays
-from .segment import Samples, SampleVisitor, always, begins, march_segment, regular_from_here
+from .segment import Samples, SampleVisitor, march_segment, regular_from_here
 from .tiling import Tiling
 
 
@@ -63,7 +62,7 @@ class VisibleRangeRecorder(SampleVisitor):
     def visit(
         self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
     ) -> tuple[CellRange, None, None]:
-        begin = at.index[None] + begins(at, samples.number).reshape(samples.number, -1)
+        begin = at.index[None] + jnp.arange(samples.number, dtype=at.index.dtype)[:, None]
         visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
         first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
         until = jnp.max(jnp.where(visible, begin + 1, carry.until[None]), axis=0)
@@ -163,7 +162,7 @@ def march_rays(
             first = jnp.where(visible, first, until)
         # `first` is not a valid index for rays that see nothing: these are finished before, and so not moved.
         at = finished_after(beams.range, at)
-        at = vmap_rays(partial(_over_transparent, scene))(rays, at, jnp.maximum(first - at.index, 0))
+        at = vmap_rays(partial(_moved, march))(rays, at, jnp.maximum(first - at.index, 0))
         at = finished_after(beams.range, at)
     visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
     state: State = varying((at, visited), rays)
@@ -282,7 +281,7 @@ def finished_after(range_: CellRange | None, at: Progress) -> Progress:
 
 def _staying(here: Progress, after: Progress) -> Progress:
     """`after`, but rays that were finished before keep their position."""
-    names = "index", "offset", "shift", "strides"
+    names = "index", "offset", "shift"
     there, moved = ({n: getattr(at, n) for n in names if getattr(at, n) is not None} for at in (here, after))
     return with_fields(after, **jax.tree.map(partial(jnp.where, here.finished), there, moved))
 
@@ -290,11 +289,10 @@ def _staying(here: Progress, after: Progress) -> Progress:
 def _past_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
     """Moves a ray past its first cell if that is transparent. Most rays begin in empty space and would shift
     there, and so use one cell of their first segment only."""
-    march, (begun, _) = scene.march, with_stride(scene, ray, at)
-    cut = pieces(scene, ray, begun)
+    march, cut = scene.march, pieces(scene, ray, at)
     alphas = [opacity(scene, ray, piece, measure(scene, ray, piece)) for piece in cut]
     moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
-    moved = move(march, ray, begun, jnp.ones((), bool), steps_of(begun.strides))
+    moved = move(march, ray, at, jnp.ones((), bool), 1)
     if moved.stats is not None:
         count = jnp.sum(jnp.stack([is_sample(march, ray, piece, divided=len(cut) > 1) for piece in cut]))
         samples = moved.stats.samples + count.astype(moved.stats.samples.dtype)
@@ -302,13 +300,8 @@ def _past_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
     return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
 
 
-def _over_transparent(scene: Scene, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
-    """Moves a ray on by so many steps, whose cells are all transparent; with strides, to the beginning of the
-    run that holds that step."""
-    return _moved(scene.march, ray, *with_stride(scene, ray, at, steps))
-
-
-def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""] | int) -> Progress:
+def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
+    """Moves a ray on by so many steps, whose cells are all transparent."""
     moved = move(march, ray, at, jnp.ones((), bool), steps)
     return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
@@ -316,16 +309,13 @@ def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""] | int) ->
 def _to_next_cell(
     job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress, range_: CellRange | None
 ) -> Progress:
-    """Moves rays to their next cell that is not proven empty, and decides its stride."""
-    steps = None if job.skip_to is None else _leap(job.scene.march, partial(job.skip_to, beam), rays, at)
-    if steps is not None and range_ is not None:  # behind it, nothing is known
+    """Moves rays to their next cell that is not proven empty."""
+    if job.skip_to is None:
+        return at
+    steps = _leap(job.scene.march, partial(job.skip_to, beam), rays, at)
+    if range_ is not None:  # behind it, nothing is known
         steps = jnp.minimum(steps, jnp.maximum(range_.until - at.index, 0))
-    if at.strides is not None:
-        ahead = jnp.zeros_like(at.index) if steps is None else steps
-        # in memory, since all that computes with cells would decide it again
-        at, found = in_memory(always(at), jax.vmap(partial(with_stride, job.scene)), rays, at, ahead)
-        steps = None if steps is None else found
-    return at if steps is None else jax.vmap(partial(_moved, job.scene.march))(rays, at, steps)
+    return jax.vmap(partial(_moved, job.scene.march))(rays, at, steps)
 
 
 def _leap(march: March, skip_to: Callable[..., Array], rays: Ray, at: Progress) -> Int[Array, " rays"]:

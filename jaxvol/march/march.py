@@ -4,8 +4,6 @@ A march is a step length d and a tuple of transforms. Without transforms it is L
 depths 0, d, 2d, … from the entry to the exit, each of which stands for the cell of width d that begins there;
 the last may reach past the exit. A transform is one idea of one paper: it overrides one or two methods of
 `Transform`, the seams. At each seam the answers of all transforms are combined, so that they compose.
-
-How many steps long each cell is, one by default, is decided in `strides.py`.
 """
 
 from typing import Any, ClassVar, Literal, TypeAlias, get_args

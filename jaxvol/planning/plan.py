@@ -16,7 +16,7 @@ from ..compositing.modes import Mode, compositing_of
 from ..engine.image import render_scene
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
-from ..march.transforms import AdaptiveSampling, AlphaCorrection, EarlyTermination, SpaceLeaping
+from ..march.transforms import AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
@@ -264,7 +264,7 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     number("tolerance", tolerance, above=0, below=1)
     given = March(1.0, transforms).transforms  # checks them
     for each in given:
-        decided = isinstance(each, AdaptiveSampling | EarlyTermination | SpaceLeaping)
+        decided = isinstance(each, EarlyTermination | SpaceLeaping)
         if decided or (isinstance(each, AlphaCorrection) and not each.labels):
             name = type(each).__name__
             raise ValueError(f"transforms must be those of the scene; got {name}, on which the plan decides.")

@@ -158,24 +158,17 @@ def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Arr
     """Distances in a plane, if those of the plane before it are known, from which one step leads here, also
     a diagonal one along the axes `across`."""
     for axis in across:
-        before = _with_both_sides(before, axis, jnp.minimum, FARTHEST)
+        before = _with_both_sides(before, axis)
     plane = jnp.minimum(plane, jnp.minimum(before, FARTHEST - 2) + jnp.uint8(1))
     return plane, plane
 
 
-def with_neighbours(grid: Array, combine: Callable[[Array, Array], Array]) -> Array:
-    """Combines each cell with its 26 neighbours. 0 must not change what it is combined with."""
-    for axis in range(3):
-        grid = _with_both_sides(grid, axis, combine, 0)
-    return grid
-
-
-def _with_both_sides(grid: Array, axis: int, combine: Callable[[Array, Array], Array], beyond: int) -> Array:
-    """Combines each cell with the two next to it along an axis, with `beyond` where there is none."""
-    around, n = [(1, 1) if i == axis else (0, 0) for i in range(grid.ndim)], grid.shape[axis]
-    padded = jnp.pad(grid, around, constant_values=beyond)
+def _with_both_sides(plane: Array, axis: int) -> Array:
+    """The least distance of each cell and the two next to it along an axis."""
+    around, n = [(1, 1) if i == axis else (0, 0) for i in range(plane.ndim)], plane.shape[axis]
+    padded = jnp.pad(plane, around, constant_values=FARTHEST)
     before, after = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
-    return combine(combine(grid, before), after)
+    return jnp.minimum(jnp.minimum(plane, before), after)
 
 
 @cache
@@ -279,22 +272,16 @@ def _label_bits(labels: Integer[Array, "nx ny nz"], side: int) -> UInt32[Array, 
     return over_blocks(bits, jnp.bitwise_or, side=side)
 
 
-def over_blocks(
-    values: Array, combine: Callable[[Array, Array], Array], margin: int = 0, *, side: int = BLOCK
-) -> Array:
-    """Combines all nodes of each block, and those up to `margin` beyond its faces, axis by axis."""
+def over_blocks(values: Array, combine: Callable[[Array, Array], Array], *, side: int) -> Array:
+    """Combines all nodes of each block, axis by axis."""
     for axis in range(min(values.ndim, 3)):  # channels stay
         cells = values.shape[axis] - 1
-        if margin:
-            missing = -cells % side
-            around = [(margin, missing + margin) if i == axis else (0, 0) for i in range(values.ndim)]
-            values, cells = jnp.pad(values, around, mode="edge"), cells + missing
         along = partial(jax.lax.slice_in_dim, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, side)
         found = []
         if whole:
-            length, nodes = (whole - 1) * side + 1, range(side + 1 + 2 * margin)
+            length, nodes = (whole - 1) * side + 1, range(side + 1)
             found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
         if rest:
             found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))

@@ -37,7 +37,6 @@ class Details(NamedTuple):
 
     depth: Float[Array, "*rays"] | None = None
     samples: Int[Array, "*rays"] | None = None
-    error: Float[Array, "*rays"] | None = None
     aligned: Bool[Array, "*rays"] | None = None
     normal: Float[Array, "*rays 3"] | None = None
     selected: PyTree = None
@@ -56,13 +55,11 @@ class Rendering(eqx.Module):
             opacity, world length; infinite where nothing is visible.
         samples: number of samples evaluated, one for each piece of a cell.
         aligned: whether a last cell that is not transparent was cut at the exit (Kye 2013, Fig. 13).
-        error: under `AdaptiveSampling`, a cautious estimate of the error of a pixel's colour, mostly several
-            times the true one (`experiments.adaptive_error`); without a gradient, infinite where unknown.
         normal: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
         bricks: the `BrickReport` of `render_bricks`.
 
-    With `antialias`, a pixel has the mean of its rays' `rgba` and `error`, that of `depth` and `normal`
-    weighted by opacity, and the sum of `samples`; it is `exhausted` or `aligned` where any of them is.
+    With `antialias`, a pixel has the mean of its rays' `rgba`, that of `depth` and `normal` weighted by
+    opacity, and the sum of `samples`; it is `exhausted` or `aligned` where any of them is.
 
     All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
     other than `"over"` say what their depth is.
@@ -83,10 +80,6 @@ class Rendering(eqx.Module):
     @property
     def aligned(self) -> Bool[Array, "*rays"]:
         return self._detail("aligned")
-
-    @property
-    def error(self) -> Float[Array, "*rays"]:
-        return self._detail("error", "give the march AdaptiveSampling, and ")
 
     @property
     def normal(self) -> Float[Array, "*rays 3"]:
@@ -140,7 +133,7 @@ def pooled(rendering: Rendering, n: int) -> Rendering:
     if samples is not None:
         samples = of_pixels(partial(jnp.sum, dtype=samples.dtype), samples)
     exhausted, aligned = of_pixels(jnp.any, (rendering.exhausted, details.aligned))
-    details = Details(depth, samples, mean(details.error), aligned, normal)
+    details = Details(depth, samples, aligned, normal)
     return Rendering(mean(rendering.rgba), exhausted, details)
 
 

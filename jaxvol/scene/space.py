@@ -309,25 +309,17 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
     return reduce(jnp.maximum, nears), reduce(jnp.minimum, fars)
 
 
-def node_distance(space: Space, shape: tuple[int, ...], first: Array | None = None) -> Array:
-    """The least world distance between neighbouring nodes in the middle of each block, from `first` on."""
-    begins = jnp.zeros(3, jnp.int32) if first is None else first
-    blocks = [
-        (jnp.arange(n) + begin).astype(space.middle[0].dtype) for n, begin in zip(shape, begins, strict=True)
-    ]
-    middle = [BLOCK * (block + 0.5) for block in blocks]
+@partial(jax.jit, static_argnums=1)  # operations by themselves take seconds to compile
+def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
+    """The size of a voxel: the median, over so many blocks, of the least world distance between neighbouring
+    nodes in the middle of each."""
+    middle = [BLOCK * (jnp.arange(n).astype(space.middle[0].dtype) + 0.5) for n in shape]
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
         return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))
 
-    return jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij"))
-
-
-@partial(jax.jit, static_argnums=1)  # operations by themselves take seconds to compile
-def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
-    """The median of `node_distance` over all blocks: the size of a voxel."""
-    return jnp.median(node_distance(space, shape))
+    return jnp.median(jnp.vectorize(least)(*jnp.meshgrid(*middle, indexing="ij")))
 
 
 def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:

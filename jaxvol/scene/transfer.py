@@ -23,7 +23,6 @@ from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
 from ..xla.platform import is_traced
 from .occupancy import Blocks
-from .variation import Variation, Windows
 from .volume import Volume
 
 
@@ -75,8 +74,8 @@ class Classification(NamedTuple):
 
 class Transfer(eqx.Module):
     """The interface of all transfer functions. A subclass overrides `classifier`; `attributes` if more than
-    the value counts; `majorant`, so that rays leap over what is transparent; `integrator` and `variation` for
-    `quadrature="preintegrated"` and `AdaptiveSampling`; `channels`, so that volumes of other numbers of them
+    the value counts; `majorant`, so that rays leap over what is transparent; `integrator` for
+    `quadrature="preintegrated"`; `channels`, so that volumes of other numbers of them
     are refused; `valid` if parameters must do more than be finite. `search`, `visible` and `vjp` only save
     time. Extinctions of one's own are not checked: they must not be negative.
     """
@@ -121,10 +120,6 @@ class Transfer(eqx.Module):
         extinction × colour divided by that, as if the value were linear between its ends; None, the default,
         where they are unknown: `quadrature="preintegrated"` is refused."""
         return None
-
-    def variation(self, windows: Windows) -> Variation:
-        """How much extinction and emission change within the range of each window, without a gradient."""
-        return Variation.unknown(windows)
 
     def search(self) -> Callable[[Measured], Measured] | None:
         """A function from `Measured` to what is appended to it (such as the interval of the value), so that
@@ -256,10 +251,6 @@ class TransferFunction(Transfer):
         values, extinction = jax.lax.stop_gradient((self.values, self._seen))
         bound = linear.upper_bound_between(values, extinction, blocks.low, blocks.high)
         return jnp.where(self.visible(blocks), bound, 0)
-
-    def variation(self, windows: Windows) -> Variation:
-        points = jax.lax.stop_gradient((self.values, self.colors, self._seen))
-        return Variation(*linear.variation_between(*points, windows.low, windows.high))
 
     def visible(self, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         values, extinction = jax.lax.stop_gradient((self.values, self._seen))

@@ -32,8 +32,7 @@ class TransferFunction2D(Transfer):
 
     The magnitude is that of the value's gradient in the volume's own grid, also under a `ToroidalMap`, which
     bends the grid: choose a spacing for which that has a meaning. Where the gradient is 0, the derivative of
-    its magnitude is taken as 0. `quadrature="preintegrated"` and `"average"` are refused; `AdaptiveSampling`
-    takes its shortest steps.
+    its magnitude is taken as 0. `quadrature="preintegrated"` and `"average"` are refused.
 
     Raises:
         ValueError: for fewer than two lines, lines that do not increase or of which three are equal,

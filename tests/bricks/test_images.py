@@ -271,8 +271,8 @@ WAYS: dict[str, tuple[jv.March, dict[str, Any]]] = {
         jv.March(2.5, (jv.Jitter(0, front_residual=True), jv.Clip(planes=[OBLIQUE])), "midpoint"),
         {},
     ),
-    "adaptive, by beams": (
-        jv.March(0.5, (jv.Jitter(1), jv.AdaptiveSampling(0.01), jv.SpaceLeaping("beam")), "preintegrated"),
+    "jittered, by beams": (
+        jv.March(0.5, (jv.Jitter(1), jv.SpaceLeaping("beam")), "preintegrated"),
         {},
     ),
     "templates": (

@@ -24,8 +24,8 @@ from ..scenes import CAMERAS, RESOLUTION, anisotropic_noise, around, soft_transf
 
 SIZE = (65, 43)  # 9 x 6 beams, the last ones cut
 MOVING = (jv.Jitter(5), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-3))
-SHIFTED = (jv.EmptySpaceJitter(4), jv.AdaptiveSampling(0.02), jv.SpaceLeaping(), jv.AlphaCorrection())
-FIELDS = ("rgba", "depth", "samples", "aligned", "exhausted", "normal", "error")
+SHIFTED = (jv.EmptySpaceJitter(4), jv.SpaceLeaping(), jv.AlphaCorrection())
+FIELDS = ("rgba", "depth", "samples", "aligned", "exhausted", "normal")
 
 
 def all_devices() -> list[Any]:
@@ -206,8 +206,8 @@ def rays(_: Any):
 
 
 def bricks(_: Any):
-    """Owned by more and by fewer devices than there are, lit and clipped. And with rays dealt out: with cells
-    that depend on what lies in front, and with curved rays."""
+    """Owned by more and by fewer devices than there are, lit and clipped. And with rays dealt out: with
+    shifts that depend on what lies in front, and with curved rays."""
     volume, every = blocks(), all_devices()
     clipped: tuple[jv.Transform, ...] = (jv.Jitter(2), jv.Clip((-0.2, 0.9, -0.9, 0.3, 0, 1.9)))
     given = volume, thin(), CAMERAS["orthographic"](volume, SIZE), jv.March(0.05, clipped)

@@ -144,7 +144,6 @@ PROBE = jv.ToroidalMap(20.0, 10.0, (1.1, 2.0), (1.1, 2.0), (5.0, 30.0))
 UNOWNED: list[tuple[tuple[jv.Transform, ...], dict[str, Any], str]] = [
     ((PROBE,), {}, "ToroidalMap, where a ray may come back"),
     ((jv.EmptySpaceJitter(1),), {}, "EmptySpaceJitter, which shifts"),
-    ((jv.AdaptiveSampling(0.1),), {}, "AdaptiveSampling, whose strides"),
     ((), {"compositing": "maximum"}, "compositing by Maximum, which"),
     ((), {"compositing": "average"}, "compositing by Average, which"),
     ((), {"method": "reload"}, "method='reload'"),

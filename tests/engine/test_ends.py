@@ -134,7 +134,7 @@ def test_a_pixel_of_several_rays_has_what_these_have():
     normal = np.zeros((2, 4, 3), np.float32)
     normal[0, 0, 0] = normal[1, 0, 1] = normal[1, 1, 2] = 1
     some, samples = opacity > 0.3, np.arange(8, dtype=np.int32).reshape(2, 4)
-    given: Any = jax.device_put((rgba, some, (depth, samples, depth, some, normal)))
+    given: Any = jax.device_put((rgba, some, (depth, samples, some, normal)))
     found = jax.device_get(pooled(jv.Rendering(given[0], given[1], Details(*given[2])), 2))
     np.testing.assert_allclose(found.rgba[..., 3], [[0.25, 0]])
     np.testing.assert_allclose(found.details.depth, [[(0.5 + 0.5 + 1) / 1, np.inf]])
@@ -144,4 +144,3 @@ def test_a_pixel_of_several_rays_has_what_these_have():
     np.testing.assert_array_equal(found.details.samples, [[0 + 1 + 4 + 5, 2 + 3 + 6 + 7]])
     np.testing.assert_array_equal(found.exhausted, [[True, False]])
     np.testing.assert_array_equal(found.details.aligned, [[True, False]])
-    assert np.isinf(found.details.error[0, 0])

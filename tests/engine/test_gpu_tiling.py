@@ -59,11 +59,11 @@ def toroidal() -> Scene:
 
 LIGHT = DirectionalLight((0.4, 0.8, 0.6), (2.0, 2.0, 2.0))
 SCATTERERS = ScattererTemplates(Material(0.8, 0.1, 1.4), LIGHT, templates=1, photons=2)
-ADAPTIVE = jv.AdaptiveSampling(0.02), jv.Jitter(3), jv.AlphaCorrection(), jv.SpaceLeaping()
+JITTERED = jv.Jitter(3), jv.AlphaCorrection(), jv.SpaceLeaping()
 
 SCENES = {
     "defaults": engine,
-    "adaptive": lambda: engine(transforms=ADAPTIVE, quadrature="preintegrated"),
+    "jittered": lambda: engine(transforms=JITTERED, quadrature="preintegrated"),
     "toroidal": toroidal,
     "scatterers": lambda: engine(lighting=SCATTERERS),
 }
@@ -87,7 +87,7 @@ def test_a_fault_of_a_scene_makes_all_rays_nan_where_no_branch_computes_them(mon
 
 @pytest.mark.slow
 def test_images_and_gradients_are_those_of_the_tiling_for_cpus():
-    scene = SCENES["adaptive"]()
+    scene = SCENES["jittered"]()
     weights = np.random.default_rng(0).normal(size=(38, 45, 4)).astype(np.float32)
 
     def differentiated(tiling):

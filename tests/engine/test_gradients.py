@@ -457,12 +457,12 @@ def test_forward_and_replay_gradients_agree_under_every_method(method):
 @pytest.mark.parametrize(
     ("quadrature", "more"),
     [
-        ("preintegrated", (jv.AdaptiveSampling(0.03),)),
+        ("preintegrated", ()),
         ("midpoint", (jv.Clip(BOX, [PLANE], inside_out=True),)),
     ],
-    ids=["adaptive", "hollowed"],
+    ids=["preintegrated", "hollowed"],
 )
-def test_other_quadratures_long_cells_and_gaps(quadrature, more):
+def test_other_quadratures_and_gaps(quadrature, more):
     both = with_and_without_leaps(jv.EmptySpaceJitter(4), jv.AlphaCorrection(), *more)
     leapt, whole = (gradient(scene_of(transforms, quadrature=quadrature))[1] for transforms in both)
     assert_same(leapt, whole, 1e-4)

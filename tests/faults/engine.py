@@ -82,20 +82,6 @@ FAULTS: list[Fault] = [
         (f"{MARCH}test_early_termination_stops_where_little_is_left",),
     ),
     Fault(
-        "stride: what lies in front does not count",
-        "march.strides:Strides.next",
-        lambda f: lambda self, *to, **more: f(self, *to[:4], jnp.ones_like(to[4]), **more),
-        ("march/transforms/test_adaptive_sampling.py::test_runs_are_the_same_however_a_ray_comes_to_them",),
-    ),
-    Fault(
-        "adaptive sampling: looked up where a run begins, not in its middle",
-        "march.strides:Run.middle",
-        lambda _: property(lambda run: run.front),
-        (
-            "march/transforms/test_adaptive_sampling.py::test_the_error_of_a_run_is_that_of_a_window_that_holds_it",
-        ),
-    ),
-    Fault(
         "cut: the last cell reaches past the exit",
         "march.transforms.alpha_correction:AlphaCorrection.cut",
         lambda _: lambda self, cell, ray, volume: (cell,),

@@ -232,7 +232,7 @@ LEAPING = jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ea
         *slow(
             ((jv.Jitter(3, "blue", front_residual=True), jv.AlphaCorrection()), "float32", "sun", "left"),
             ((jv.Clip(BOX, [PLANE]), jv.AlphaCorrection()), "uint8", "all", "preintegrated"),
-            ((*LEAPING, jv.AdaptiveSampling(0.01, longest=4)), "int16", "all", "left"),
+            (LEAPING, "int16", "all", "left"),
         ),
     ],
 )

@@ -68,7 +68,7 @@ MARCHES = {
         *(jv.Clip(planes=[cut], inside_out=True), jv.SpaceLeaping()),
         jv.AlphaCorrection(),
     ),
-    "beam": lambda cut, leaps: (jv.SpaceLeaping("beam"), jv.AdaptiveSampling(0.01), jv.AlphaCorrection()),
+    "beam": lambda cut, leaps: (jv.SpaceLeaping("beam"), jv.AlphaCorrection()),
 }
 
 

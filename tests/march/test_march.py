@@ -10,10 +10,9 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.march.march import Cell
-from jaxvol.march.strides import StrideControl
 from jaxvol.scene.space import Affine
 
-from ..scenes import around, scaled_phantom, slow, soft_transfer, uniform_transfer
+from ..scenes import around, scaled_phantom, soft_transfer, uniform_transfer
 from ..switch import switch
 
 
@@ -44,24 +43,6 @@ class Halves(jv.Transform):
         return Cell(cell.front, half, cell.cut), Cell(cell.front + half, half, cell.cut)
 
 
-class Long(StrideControl):
-    """Cells of so many steps in runs that begin at the grid coordinate x = `beyond` or behind it."""
-
-    steps: jax.Array = eqx.field(converter=jnp.asarray)  # arrays, so that all values share one program
-    beyond: jax.Array = eqx.field(converter=jnp.asarray, default=0.0)
-
-    tolerance: jax.Array = eqx.field(converter=jnp.asarray, default=1.0)
-    longest: int = eqx.field(static=True, default=4)
-
-    def prepared(self, march, space, windows, variation):
-        return self
-
-    def error(self, ray, run):
-        x, _, _ = ray.path(run.front)
-        allowed = (x >= self.beyond) & (run.stride <= self.steps)
-        return jnp.where(allowed, 0, jnp.inf).astype(x.dtype)
-
-
 class Moved(jv.Transform):
     """Places the volume elsewhere in the world."""
 
@@ -87,7 +68,6 @@ def opacity(quadrature="left", step=0.3, *, most=80, **on):
         "shift": Shift(),
         "late": Late(on.get("late", 0.0)),
         "halves": Halves(),
-        "long": Long(steps=on.get("long", 1.0), beyond=on.get("beyond", 0.0)),
         "aligned": jv.AlphaCorrection(),
         "ended": jv.EarlyTermination(on.get("ended", 0.5)),
     }
@@ -140,52 +120,6 @@ def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, 
     # at 0, and on from 0.3 (1 + by), limited to between 0 and 0.3
     assert int(rendering.samples[0]) == samples
     assert opacity(late=by)[1] == 7, "where nothing is transparent"
-
-
-@pytest.mark.parametrize(
-    ("on", "length", "samples"),
-    [
-        ({"long": 1.0}, 2.04, 34),
-        ({"long": 2.0}, 2.04, 18),  # four runs of eight steps; two more would reach past the exit
-        ({"long": 3.0}, 2.04, 18),  # no power of two
-        ({"long": 4.0}, 2.04, 10),  # two runs of sixteen steps
-        ({"long": 50.0}, 2.04, 10),  # no longer than the longest stride
-        ({"long": 0.1}, 2.04, 34),  # one step is always allowed
-        (
-            {"long": 4.0, "beyond": 1.7},
-            2.04,
-            22,
-        ),  # the second run of sixteen begins behind 1.7, but only that
-        ({"shift": True, "long": 4.0}, 1.98, 9),  # half a step later
-        ({"halves": True, "long": 4.0}, 2.01, 19),  # half cells
-    ],
-)
-def test_stride_lengthens_cells(on, length, samples):
-    """On a ray of 33.3 steps."""
-    assert opacity(step=0.06, **on)[:2] == (seen(length), samples)
-
-
-def test_a_run_may_reach_past_the_exit_where_cells_are_cut_there():
-    origin, direction = (jnp.asarray(end[0]) for end in RAY)
-    march = jv.March(0.06, (jv.AlphaCorrection(), Long(steps=4.0)))
-    found = jv.render_ray_reference(BOX, uniform_transfer(1.0), origin, direction, march)
-    assert float(found.rgba[3]) == seen(2)
-    assert int(found.samples) == 9
-
-
-@pytest.mark.parametrize(("limit", "cells"), [(5, 2), *slow((1, 1), (33, 9))])
-def test_cells_of_several_steps_begin_within_the_limit(limit, cells):
-    """Eight cells of four steps, and two of one, in all engines."""
-    march, box = jv.March(0.06, (Long(steps=4),), max_samples=limit), (BOX, uniform_transfer(1.0))
-    found = [jv.render_rays(*box, *RAY, march, adjoint=adjoint) for adjoint in ("replay", "direct")]
-    found.append(
-        jv.render_rays(*box, *RAY, jv.March(0.06, (*march.transforms, jv.SpaceLeaping()), max_samples=limit))
-    )
-    alone = jv.render_ray_reference(*box, jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march)
-    for rendering in (*(jax.tree.map(lambda leaf: leaf[0], each) for each in found), alone):
-        assert float(rendering.rgba[3]) == seen(0.24 * min(cells, 8) + 0.06 * max(cells - 8, 0))
-        assert int(rendering.samples) == cells
-        assert bool(rendering.exhausted) == (cells < 10)
 
 
 def test_locate_replaces_the_space():

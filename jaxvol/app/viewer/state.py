@@ -18,7 +18,6 @@ from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
 from ...march.transforms import (
-    AdaptiveSampling,
     AlphaCorrection,
     EarlyTermination,
     EmptySpaceJitter,
@@ -197,7 +196,7 @@ def initial(
             f"{MAX_STEP:g} voxels, to be shown; got one of {float(given.step):.4g}, {step:.4g} voxels."
         )
     # not a constant: their arrays are made on a device, and none may be in use before `jax.distributed`
-    offered = EmptySpaceJitter(seed=0), Jitter(seed=0), AdaptiveSampling(0.005)
+    offered = EmptySpaceJitter(seed=0), Jitter(seed=0)
     default = AlphaCorrection(), SpaceLeaping(), EarlyTermination(1 / 256)
     own = {type(transform) for transform in given.transforms}
     others = (each for each in (*offered, *default) if type(each) not in own)

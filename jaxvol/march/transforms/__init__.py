@@ -1,6 +1,5 @@
 """The transforms of a march: each is one idea from one paper."""
 
-from .adaptive_sampling import AdaptiveSampling as AdaptiveSampling
 from .alpha_correction import AlphaCorrection as AlphaCorrection
 from .clip import Clip as Clip
 from .early_termination import EarlyTermination as EarlyTermination

@@ -335,7 +335,7 @@ def test_without_a_march_the_defaults_are_on_and_all_others_are_offered():
     scene, state = begun(transfer=None, march=None, lit=True)
     assert state.enabled == {"AlphaCorrection", "SpaceLeaping", "EarlyTermination"}
     assert state.lit
-    assert {jv.Jitter, jv.EmptySpaceJitter, jv.AdaptiveSampling} <= set(map(type, scene.transforms))
+    assert {jv.Jitter, jv.EmptySpaceJitter} <= set(map(type, scene.transforms))
     clip = jv.Clip(box=(0, 5, 0, 5, 0, 5))
     scene, state = begun(march=jv.March(0.2, (clip,)))
     assert isinstance(scene.transforms[0], jv.Clip)
