@@ -171,7 +171,7 @@ def march_rays(
 
 def _march_all(job: Job, state: State) -> State:
     """Marches groups for as long as any of their rays is alive, in rounds of batches."""
-    size = min(job.tiling.batch, job.beams.groups)
+    size = job.tiling.batch_of(job.beams.groups)
     enough = int(job.tiling.min_alive * size)
 
     def round_(state: tuple[State, Bool[Array, " groups"]]) -> tuple[State, Bool[Array, " groups"]]:
