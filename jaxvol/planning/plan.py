@@ -142,8 +142,9 @@ def plan(
 ) -> Plan:
     """Finds the cheapest way to render a scene within a tolerance, by rendering patches of it.
 
-    At most 128 patches of 8 x 8 pixels are rendered by the midpoint rule, with steps of two voxels, one, a
-    half, and so on, until some are within the tolerance, compared with steps of a quarter of theirs. Then:
+    At most 128 patches of 8 x 8 pixels (32 of small images) are rendered by the midpoint rule, with steps of
+    two voxels, one, a half, and so on, until some are within the tolerance, compared with steps of half of
+    theirs. Then:
 
     - **step**: the longest within the tolerance, between two of these.
     - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule
@@ -216,16 +217,18 @@ def plan(
     over = isinstance(scene.compositing, Over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
 
-    def search(ends: float, goal: float) -> Search:
+    def search(ends: float, goal: float, images: Any) -> Search:
         own = (EarlyTermination(ends),) if over else ()
-        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own))
+        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own), images)
 
     # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
     # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
-    seen = search(ends, tolerance).image(COARSEST, "midpoint")
+    first = search(ends, tolerance, {})
+    seen = first.image(COARSEST, "midpoint")
     opaque = probe.mean(seen.rgba[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
-    within = search(ends / brightest_of(seen), MARGIN * tolerance - share)
+    brightest = brightest_of(seen)
+    within = search(ends / brightest, MARGIN * tolerance - share, first.images if brightest == 1 else {})
     chosen, truth, tried = within.cheapest(once=once)
     ending = EarlyTermination(ends / brightest_of(truth.image))
     kept = (*given, *proven, *((ending,) if share else ()))

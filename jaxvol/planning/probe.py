@@ -20,8 +20,9 @@ from ..scene.space import Space
 SIDE = 8
 """Pixels along the side of a patch, as of the engine's beams, so that its samples are those of the image."""
 
-PATCHES = 128
-"""Patches that are rendered: a thirty-second of 512 x 512 pixels."""
+PATCHES, FEW = (128, 512), 32
+"""Patches that are rendered, a thirty-second of 512 x 512 pixels; and in images of fewer than 512 patches, which
+would else take less time than their plan."""
 
 LIKELY = 7 / 8
 """Fraction of the patches that are chosen where visible blocks lie on or near their middle ray; the others,
@@ -70,15 +71,16 @@ class Probe(NamedTuple):
         likely = hit & np.asarray(_passes(camera, space, near)).reshape(-1)
         hit[0] |= not hit.any()
         groups = np.flatnonzero(likely), np.flatnonzero(hit & ~likely)
-        reserved = min(groups[1].size, round(PATCHES * (1 - LIKELY)))
-        first = min(groups[0].size, PATCHES - reserved)
+        patches = PATCHES[0] if hit.size >= PATCHES[1] else FEW
+        reserved = min(groups[1].size, round(patches * (1 - LIKELY)))
+        first = min(groups[0].size, patches - reserved)
         random, chosen, strata = np.random.default_rng(seed), [], []
-        for group, count in zip(groups, (first, min(groups[1].size, PATCHES - first)), strict=True):
+        for group, count in zip(groups, (first, min(groups[1].size, patches - first)), strict=True):
             edges = np.linspace(0, group.size, count + 1).astype(int)
             chosen.append(group[random.integers(edges[:-1], edges[1:])])
             strata.append(np.diff(edges))
         chosen, strata = np.concatenate(chosen), np.concatenate(strata).astype(float)
-        more = PATCHES - chosen.size  # a fixed number of rays, so that images of all sizes share a program
+        more = patches - chosen.size  # one of two numbers of rays, so that images of all sizes share programs
         chosen, strata = np.pad(chosen, (0, more), mode="edge"), np.pad(strata, (0, more))
         y, x = np.divmod(np.arange(SIDE**2), SIDE)
         column, row = (chosen % across)[:, None] * SIDE + x, (chosen // across)[:, None] * SIDE + y
@@ -88,7 +90,7 @@ class Probe(NamedTuple):
             for part, last in ((column, width - 1), (row, height - 1))
         )
         rays = _rays(camera, column, row)
-        return cls(rays, strata, np.arange(PATCHES) < first, inside, width * height)
+        return cls(rays, strata, np.arange(patches) < first, inside, width * height)
 
     def mean(self, of_pixels: Any) -> float:
         """Of a number of each pixel, over the whole image; 0 where nothing can be seen."""

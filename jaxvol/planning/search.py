@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import equinox as eqx
@@ -66,7 +67,8 @@ class Search:
     voxel: float
     """World length that steps are counted in."""
     transforms: tuple[Transform, ...]
-    _images: dict[tuple[float, Quadrature], Rendering] = field(default_factory=dict, init=False)
+    images: dict[tuple[float, Quadrature], Rendering] = field(default_factory=dict)
+    """What has been rendered, by step in voxels and quadrature."""
 
     def cheapest(self, *, once: bool) -> tuple[Trial, Truth, list[Part]]:
         """The cheapest march within the goal, what images were compared with, and what was tried. `once`: as
@@ -75,7 +77,7 @@ class Search:
         if found.error > self.goal and self._integrable and math.isfinite(found.error):
             found, truth = self._longest("preintegrated", FINEST)
             # the truth may be known better now: good enough for cheaper steps by the midpoint rule
-            steps = [step for step, quadrature in self._images if quadrature == "midpoint"]
+            steps = [step for step, quadrature in self.images if quadrature == "midpoint"]
             trials = (found, *(self._trial(step, "midpoint", truth) for step in steps))
             within = [trial for trial in trials if trial.error <= self.goal]
             found = min(within, key=lambda trial: trial.cost, default=found)
@@ -109,12 +111,12 @@ class Search:
 
     def image(self, step: float, quadrature: Quadrature) -> Rendering:
         """Of steps of this length, in voxels."""
-        if (step, quadrature) not in self._images:
+        if (step, quadrature) not in self.images:
             march = March(step * self.voxel, self.transforms, quadrature)
-            self._images[step, quadrature] = self.probe.render(self.scene, march)
-        return self._images[step, quadrature]
+            self.images[step, quadrature] = self.probe.render(self.scene, march)
+        return self.images[step, quadrature]
 
-    @property
+    @cached_property
     def _integrable(self) -> bool:
         """Whether cells can be integrated between their ends."""
         # as shapes: its tables take seconds to compile, operation by operation
@@ -125,13 +127,15 @@ class Search:
         return known[0] and isinstance(self.scene.compositing, Over)
 
     def _longest(self, quadrature: Quadrature, finest: float) -> tuple[Trial, Truth]:
-        """The longest steps within the goal, compared with steps of a quarter of them or less. If there are
-        none, the finest, whose error is not known: just `beyond`, or more."""
+        """The longest steps within the goal, compared with steps of half of them or less, and with what these
+        still err by. If there are none, the finest, whose error is not known: just `beyond`, or more."""
         steps = [COARSEST, COARSEST / 2, COARSEST / 4]
         while True:
             truth = Truth.of(self.probe, [self.image(step, quadrature) for step in steps])
-            step = steps[-3]
-            found = self._trial(step, quadrature, truth)
+            for step in steps[-3:-1]:
+                found = self._trial(step, quadrature, truth)
+                if found.error <= self.goal:
+                    break
             if found.error <= self.goal or steps[-1] <= finest or not math.isfinite(found.error):
                 break
             steps.append(steps[-1] / 2)
