@@ -4,6 +4,7 @@ import math
 import time
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool
@@ -209,7 +210,7 @@ def plan(
     shown, mode = transfer, scene.compositing
     if mode.resolves:
         shown, _ = mode.marched(transfer, March(1.0, given), volume)
-    visible = mode.occupied(shown, Blocks.of(volume, slopes=shown.reads_gradient))
+    visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
     probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
     proven, parts = proven_transforms(visible, space, given, copy=stride > 1)
     voxel = float(median_node_distance(space, visible.shape))
@@ -225,7 +226,7 @@ def plan(
     # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
     first = search(ends, tolerance, {})
     seen = first.image(COARSEST, "midpoint")
-    opaque = probe.mean(seen.rgba[:, 3] >= 1 - ends) if over else 0.0
+    opaque = probe.mean(np.asarray(seen.rgba)[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     brightest = brightest_of(seen)
     within = search(ends / brightest, MARGIN * tolerance - share, first.images if brightest == 1 else {})
@@ -279,7 +280,7 @@ def proven_transforms(
 ) -> tuple[tuple[Transform, ...], list[Part]]:
     """Transforms that proofs decide on, from the blocks that may hold anything visible. `copy`: these are of
     a copy, which does not prove that there is nothing in between."""
-    faces = [bool(each) for each in space.visible_at_faces(visible)]
+    faces = [bool(each) for each in _visible_at_faces(space, visible)]
     aligned = any(isinstance(each, AlphaCorrection) for each in given)
     added = () if aligned or not (any(faces) or copy) else (AlphaCorrection(),)
     if aligned:
@@ -294,6 +295,16 @@ def proven_transforms(
     leaps = (SpaceLeaping(),) if empty >= EMPTY or copy else ()
     proof = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
     return (*added, *leaps), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
+
+
+@eqx.filter_jit  # operations by themselves take seconds to compile
+def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+    return mode.occupied(transfer, blocks)
+
+
+@eqx.filter_jit
+def _visible_at_faces(space: Space, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
+    return space.visible_at_faces(visible)
 
 
 def brightest_of(image: Rendering) -> float:

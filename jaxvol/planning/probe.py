@@ -21,8 +21,8 @@ SIDE = 8
 """Pixels along the side of a patch, as of the engine's beams, so that its samples are those of the image."""
 
 PATCHES, FEW = (128, 512), 32
-"""Patches that are rendered, a thirty-second of 512 x 512 pixels; and in images of fewer than 512 patches, which
-would else take less time than their plan."""
+"""Patches that are rendered, a thirty-second of 512 x 512 pixels; and of images of fewer than 512 patches,
+whose plan would else take longer than ten of them."""
 
 LIKELY = 7 / 8
 """Fraction of the patches that are chosen where visible blocks lie on or near their middle ray; the others,
@@ -148,7 +148,7 @@ class Truth(NamedTuple):
     def error(self, image: Rendering) -> float:
         """Of another image; infinite if either is not finite, or rays used up their samples."""
         found = self.probe.distance(image, self.image) + self.own
-        ended = any(bool(np.any(each.exhausted)) for each in (image, self.image))
+        ended = any(bool(np.asarray(each.exhausted).any()) for each in (image, self.image))
         return found if np.isfinite(found) and not ended else np.inf
 
 

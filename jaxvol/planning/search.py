@@ -132,10 +132,8 @@ class Search:
         steps = [COARSEST, COARSEST / 2, COARSEST / 4]
         while True:
             truth = Truth.of(self.probe, [self.image(step, quadrature) for step in steps])
-            for step in steps[-3:-1]:
-                found = self._trial(step, quadrature, truth)
-                if found.error <= self.goal:
-                    break
+            tried = [(self._trial(step, quadrature, truth), step) for step in steps[-3:-1]]
+            found, step = next((each for each in tried if each[0].error <= self.goal), tried[-1])
             if found.error <= self.goal or steps[-1] <= finest or not math.isfinite(found.error):
                 break
             steps.append(steps[-1] / 2)
