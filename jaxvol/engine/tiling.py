@@ -27,8 +27,8 @@ class Tiling(NamedTuple):
     Attributes:
         cells: cells of a segment, whose samples are all fetched before any is composited.
         group: rays compacted as one unit, a square number.
-        batch: groups marched at a time, as many as fit into the cache (`batch_of` takes fewer of a small
-            image).
+        batch: groups marched at a time, as many as fit into the cache; where `turns` is 0, no more than a
+            sixteenth of a tile's, or LEAST_BATCH (`batch_of`).
         min_alive: share of a batch's groups that must be alive for it to go on; below it, batches are
             refilled.
         turns: if not 0, the segments by which a batch is marched before it is refilled, in place of

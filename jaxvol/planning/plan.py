@@ -143,9 +143,9 @@ def plan(
 ) -> Plan:
     """Finds the cheapest way to render a scene within a tolerance, by rendering patches of it.
 
-    At most 128 patches of 8 x 8 pixels (32 of small images) are rendered by the midpoint rule, with steps of
-    two voxels, one, a half, and so on, until some are within the tolerance, compared with steps of half of
-    theirs. Then:
+    At most 128 patches of 8 x 8 pixels (32 of images of fewer than 512) are rendered by the midpoint rule,
+    with steps of two voxels, one, a half, and so on, until some are within the tolerance, compared with steps
+    of half of theirs. Then:
 
     - **step**: the longest within the tolerance, between two of these.
     - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule

@@ -22,7 +22,7 @@ SIDE = 8
 
 PATCHES, SMALL, FEW = 128, 512, 32
 """Patches that are rendered, a thirty-second of 512 x 512 pixels; of images of fewer than SMALL patches FEW,
-or their plan would take longer than ten of them."""
+since their plan takes as long as several of them."""
 
 LIKELY = 7 / 8
 """Fraction of the patches that are chosen where visible blocks lie on or near their middle ray; the others,

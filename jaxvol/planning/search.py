@@ -21,7 +21,7 @@ RAY = 22.0
 """Cost of a pixel without its samples, in samples by the midpoint rule. Fitted, like `SAMPLE`, to the times
 of `experiments.accuracy` (two CPU cores), whose ratios they predict within 9 % in the mean, 28 % at most."""
 
-COARSEST, FINE, FINEST = 2.0, 1 / 32, 1 / 256
+COARSEST, FINE, FINEST = 2.0, 1 / 16, 1 / 128
 """Voxels of the longest step that is tried, and of the shortest: by the midpoint rule where cells can be
 integrated, too; and otherwise."""
 

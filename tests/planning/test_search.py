@@ -137,3 +137,10 @@ def test_what_is_cheapest_within_the_goal_is_taken(case):
 def test_brightness_counts_where_anything_is_seen():
     rgba = jnp.asarray(np.asarray([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]], np.float32))
     assert brightest_of(jv.Rendering(rgba, jnp.zeros(3, bool))) == pytest.approx(2)
+
+
+@pytest.mark.parametrize("once", [False, True])
+def test_cells_are_integrated_rather_than_taken_in_more_than_eight_steps_of_a_voxel(once):
+    """Also for a single image: a program is compiled in less time than such steps take."""
+    chosen, _ = marched(Known(square(1.3), square(1e-9), samples=20.0), once=once)
+    assert chosen.march.quadrature == "preintegrated"
