@@ -8,7 +8,8 @@ import contextlib
 import operator
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from types import EllipsisType
 from typing import Any, TypeAlias, TypeVar
@@ -52,6 +53,13 @@ def shortened(value: Any) -> str:
     except ValueError:  # Python does not write integers of more than 4300 digits
         return f"a {type(value).__name__} with a very long integer"
     return text if len(text) <= 120 else f"{text[:50]} ... {text[-50:]}"
+
+
+def near(given: str, names: Iterable[str]) -> str:
+    """A sentence that asks whether one of up to three names like this one is meant; empty without any."""
+    by_case = {name.lower(): name for name in names}
+    found = [by_case[name] for name in get_close_matches(given.lower(), by_case, 3)]
+    return f" Did you mean {' or '.join(found)}?" if found else ""
 
 
 def printable(text: str) -> str:

@@ -1,10 +1,14 @@
 """The sRGB curve: linear colour to display values, and back."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, UInt8
 
-from .checks import Arrayable
+from ..xla.platform import is_traced
+from .checks import Arrayable, described, finite_array
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
@@ -33,6 +37,33 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
     Source: IEC 61966-2-1.
     """
     return _from_srgb(jnp.asarray(display))
+
+
+def linear_color(name: str, color: Any, shape: Any = (3,)) -> Any:
+    """Linear RGB of this shape; or a name that matplotlib knows: "white", "#336699"."""
+    if isinstance(color, str):
+        from matplotlib.colors import to_rgb
+
+        try:
+            display = np.array(to_rgb(color))
+        except ValueError as fault:
+            expected = 'a colour\'s name, such as "white", or linear RGB'
+            raise ValueError(f"{name} must be {expected}; got {described(color)}.") from fault
+        with jax.ensure_compile_time_eval():
+            return from_srgb(display)
+    # a traced one may be NaN, which then shows in the image
+    return color if is_traced(color) else finite_array(name, color, shape)
+
+
+def displayed(
+    image: Float[np.ndarray, "height width channels"],
+) -> UInt8[np.ndarray, "height width channels"]:
+    """Linear RGB, or premultiplied RGBA, as 8-bit sRGB with straight alpha."""
+    color, opacity = image[..., :3], image[..., 3:]
+    # straight alpha: viewers multiply by the opacity
+    color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
+    display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
+    return np.asarray(jnp.round(display * 255)).astype(np.uint8)
 
 
 # Jitted: one program for each shape, rather than one for each operation.

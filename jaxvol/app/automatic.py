@@ -10,6 +10,7 @@ from jaxtyping import Float, Shaped
 from .._util.checks import described
 from .._util.srgb import from_srgb
 from .._util.voxels import is_flat
+from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import TransferFunction, extinction_of
 from ..scene.volume import Volume, check_one_channel
@@ -46,10 +47,10 @@ def stride_of(shape: tuple[int, ...], most: int = SAMPLED) -> int:
     return stride
 
 
-def sampled(volume: Volume) -> Shaped[np.ndarray, "nx ny nz"]:
-    """Every n-th voxel along each axis."""
+def sampled(volume: Volume, data: Any = None) -> Shaped[np.ndarray, "nx ny nz *c"]:
+    """Every n-th voxel along each axis, or what `data` hold there."""
     stride = stride_of(volume.shape)
-    return np.asarray(volume.data)[::stride, ::stride, ::stride]
+    return np.asarray(volume.data if data is None else data)[::stride, ::stride, ::stride]
 
 
 def unit_of(volume: Volume) -> float:
@@ -162,32 +163,59 @@ def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -
     return bool(inside.sum() >= BODY * middle.sum()) and not is_grain
 
 
-def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
-    """A volume and a transfer function that show each label but the lowest in its own colour; None if there
-    are no labels. The volume is smooth, 255 inside of all labels, and its labels reach two voxels beyond."""
+def labels_shown(
+    volume: Volume | Any, around: TransferFunction | Any | None = None
+) -> tuple[Volume, LabelTransferFunction] | None:
+    """A volume and a transfer function that show labels, each in a colour of its own and lit: those that the
+    volume has, or its values, if they seem to be labels.
+
+    In and near labels the volume that is returned is smooth, from its least value to, inside of them, its
+    greatest; and labels reach two voxels beyond.
+
+    Args:
+        volume: the `Volume`.
+        around: what is shown of a volume with labels where these are 0; by default what `automatic_transfer`
+            shows.
+
+    Returns:
+        The two, or None if there are no labels: none of its own, or more than 256; and values that are not
+        whole numbers of 3 to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
+
+    Raises:
+        ValueError: for what is no volume.
+    """
     import matplotlib
     from matplotlib.colors import ListedColormap, hsv_to_rgb
     from scipy.ndimage import gaussian_filter, maximum_filter
 
-    data = np.asarray(volume.data)
-    if data.dtype.kind not in "iu" or not is_flat(data):
+    check_arguments("labels_shown(volume)", volume=volume)
+    own, data = volume.labels is not None, np.asarray(volume.data)
+    given = np.asarray(volume.labels) if own else data
+    if not own and (given.dtype.kind not in "iu" or not is_flat(given)):
         return None
-    kinds = np.unique(data)
-    if not 2 < len(kinds) <= MOST_LABELS:
+    kinds = np.unique(np.append(given, 0) if own else given)
+    if len(kinds) > MOST_LABELS or not (own or len(kinds) > 2):
         return None
-    labels = np.searchsorted(kinds, data).astype(np.uint8)
+    labels = np.searchsorted(kinds, given).astype(np.uint8)
     # smoothed, so that the border of what has a label has a gradient
-    inside = gaussian_filter(np.where(labels > 0, np.float32(INSIDE), np.float32(0)), 0.8)
+    inside = gaussian_filter(np.where(labels > 0, np.float32(1), np.float32(0)), 0.8)
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
+    low, high, kind = (data.min(), data.max(), data.dtype) if own else (0, INSIDE, np.dtype(np.uint8))
+    low, high = float(low), float(high)
+    smooth = low + (high - low) * inside
+    smooth = (smooth if kind.kind == "f" else np.round(smooth)).astype(kind)
+    shown = np.where(beyond > 0, smooth, data if own else kind.type(0))
     place = volume.spacing, volume.origin
-    shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
     tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
     dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
     more = np.arange(max(len(kinds) - len(dark_then_light), 0))
     spread = np.stack([0.618034 * more % 1, 1 - 0.25 * (more % 3), 1 - 0.2 * (more % 4)], axis=-1)
     colors = np.asarray(from_srgb(np.concatenate([dark_then_light, hsv_to_rgb(spread)])))
-    values, opacity = [0, 0.35 * INSIDE, 0.65 * INSIDE], extinction_of([0.0, 0.0, 0.9], unit_of(volume))
-    functions = {
+    values = low + (high - low) * np.array([0, 0.35, 0.65])
+    opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
+    functions: dict[int, Any] = {
         label: TransferFunction(values, [colors[label - 1]] * 3, opacity) for label in range(1, len(kinds))
     }
-    return shown, LabelTransferFunction(functions)
+    if own:
+        functions[0] = automatic_transfer(volume) if around is None else around
+    return Volume(shown, *place, beyond, direction=volume.direction), LabelTransferFunction(functions)

@@ -14,7 +14,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require, shortened
+from .._util.checks import (
+    Arrayable,
+    described,
+    finite_array,
+    flag,
+    integer,
+    is_flag,
+    number,
+    require,
+    shortened,
+)
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import is_traced
 from .space import Line
@@ -34,7 +44,7 @@ class Camera(eqx.Module):
         view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).
         parallel_scale: half the height of the view, in world length. Makes the camera orthographic, with ray
             origins in the plane through `position`.
-        size: (width, height) of the image in pixels.
+        size: (width, height) of the image in pixels; one number is a square.
         window: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
             half heights of the whole view; by default all of it. Set by `crop` and `zoom`.
         corner: (column, row) of the first pixel in the image that this one was cropped from, so that its
@@ -468,6 +478,7 @@ def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _image_size(size: Any) -> tuple[int, int]:
+    size = (size, size) if isinstance(size, int) and not is_flag(size) else size
     try:
         width, height = (int(n) for n in size)
         whole = (width, height) == tuple(size)

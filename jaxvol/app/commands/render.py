@@ -32,6 +32,7 @@ def _render(options: argparse.Namespace) -> None:
         image_file("--depth", options.depth, 0)
     scene = scene_of(options)
     scene = with_march(scene, options, [scene.camera])
+    print(*scene.notes, sep="\n", end="\n" * bool(scene.notes))
     ready = time.perf_counter()
     rendering = scene.render(scene.camera)
     ended = time.perf_counter()
