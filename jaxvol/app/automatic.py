@@ -24,6 +24,10 @@ BODY = 0.15
 """Least fraction of the voxels between the thresholds whose six neighbours lie between them, too, if they are
 a body: 0.25 to 0.92 in scans and simulations, 0.09 at most in angiograms, where only rims of vessels do."""
 
+IN_FRONT, THROUGH, THIN = 0.3, 1.2, 0.15
+"""Optical depth of the object in front of what is dense, and all through it, at most, in the median of rays
+along the axes; and opacity from which on it is thin."""
+
 ROUGH, NOISY = 0.7, 0.1
 """Grain has second differences above this fraction of first differences over two steps (0.6 at most in scans,
 0.8 in ultrasound, 1.7 in white noise), and above this fraction of the distance of the thresholds."""
@@ -105,14 +109,36 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
         data = np.asarray(copy.data)
         outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
         if np.mean(outer > first) < CUT and is_body(part, first, second):
+            depth, usual = depth_of_object(copy, first, second)
             w = min(first - low, second - first) / 3
-            border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, 0.07)]
-            points = [*border, (second - d, TISSUE, 0.04), *points]
+            border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, max(0.07, depth))]
+            if depth > THIN:  # leaves, say: no border, which noise also crosses
+                border = [(first, EDGE, 0.0), (min(usual, second - 2 * d), SKIN, depth)]
+            points = [*border, (second - d, TISSUE, depth), *points]
         else:
             points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
     return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
+
+
+def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float, float]:
+    """Opacity that the object, values between two thresholds, may have along `unit_of` a volume: so that what
+    is dense is seen through it, and so that it has some itself, if it is thin. And its usual value."""
+    data, unit = sampled(volume), unit_of(volume)
+    middle, dense = (data > first) & (data <= second), data > second
+    in_front, whole = [], []
+    for axis, step in enumerate(np.asarray(volume.spacing) * (stride_of(volume.shape) / unit)):
+        whole.append(step * middle.sum(axis)[middle.any(axis)])
+        for side in (slice(None), slice(None, None, -1)):
+            object_, stop = (np.moveaxis(each, axis, 0)[side] for each in (middle, dense))
+            seen = stop.any(0)
+            ends = stop.argmax(0)[None]
+            counts = np.take_along_axis(np.cumsum(object_, 0, np.int32), ends, 0)[0]
+            in_front.append(step * counts[seen])
+    depths = zip((IN_FRONT, THROUGH), (in_front, whole), strict=True)
+    found = min(most / max(float(np.median(np.concatenate(each))), most) for most, each in depths)
+    return -math.expm1(-found), float(data[middle].mean(dtype=np.float64))
 
 
 def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:

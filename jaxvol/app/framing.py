@@ -17,6 +17,7 @@ from .automatic import sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
+FAINT = 0.01  # the same where it is asked on which face an object stands
 SPECK = 0.02  # pieces smaller than this fraction of the largest one need not be in the picture
 REACH = 3  # voxels of the cube around each visible one that connects it to others, as the leaves of a tree
 NEAREST = 0.1  # least distance of the camera from what is visible, as a fraction of the diagonal of that
@@ -51,8 +52,8 @@ def automatic_camera(
         transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts.
         direction: from the volume to the camera; by default to the right, in front, and higher.
         view_up: as in `Camera`. By default z; of a volume that does not say where it lies (its origin is 0,
-            its axes are the world's, as of raw files), -z where the object stands on the upper face of z,
-            which alone cuts through it.
+            its axes are the world's, as of raw files), away from the face that cuts through most of what is
+            visible, if the opposite one does not: the neck, or the pot of a plant, is below.
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
@@ -73,19 +74,28 @@ def upright(
     volume: Volume, transfer: Transfer, direction: Arrayable | None, view_up: Arrayable | None
 ) -> tuple[Any, Any]:
     """Direction and view up, where they are None as `automatic_camera` has them."""
+    axis, sign = (2, 1.0) if view_up is not None else _up(volume, transfer)
     if view_up is None:
-        view_up = _up(volume, transfer)
+        view_up = sign * np.eye(3)[axis]
     if direction is None:
-        direction = (*FRONT[:2], FRONT[2] * (-1 if np.allclose(view_up, (0, 0, -1)) else 1))
+        right, front, above = FRONT
+        direction = np.array(
+            [[sign * above, front, right], [right, sign * above, -sign * front], FRONT][axis]
+        )
+        direction = direction * (1, 1, sign) if axis == 2 else direction
     return direction, view_up
 
 
-def _up(volume: Volume, transfer: Transfer) -> tuple[float, float, float]:
-    visible = _visible(volume, transfer)
+def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
+    """The axis that points up, and whether it does so forward or backward."""
     known = volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
-    low, high = float(visible[..., 0].mean()), float(visible[..., -1].mean())
-    stands_on_top = not known and high >= CUT_FACE and low <= OTHER_FACE * high
-    return 0.0, 0.0, -1.0 if stands_on_top else 1.0
+    visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
+    for axis in () if known else (2, 1, 0):
+        low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))
+        cut, other, sign = (low, high, 1.0) if low >= high else (high, low, -1.0)
+        if cut > most and other <= OTHER_FACE * cut:
+            found, most = (axis, sign), cut
+    return found
 
 
 def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3"]:
@@ -113,8 +123,8 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     return np.asarray(volume.origin, np.float64) + (grid * np.asarray(volume.spacing, np.float64)) @ turn.T
 
 
-def _visible(volume: Volume, transfer: Transfer) -> Bool[np.ndarray, "nx ny nz"]:
-    """Which of the volume's `sampled` voxels a transfer function shows."""
+def _visible(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Bool[np.ndarray, "nx ny nz"]:
+    """Which of the volume's `sampled` voxels a transfer function shows with at least this opacity."""
     data, shown = sampled(volume), sized(transfer, volume)
     if isinstance(shown, TransferFunction):
         extinction = np.interp(data, np.asarray(shown.values), np.asarray(shown.extinction))
@@ -130,7 +140,7 @@ def _visible(volume: Volume, transfer: Transfer) -> Bool[np.ndarray, "nx ny nz"]
                 extinction[where] = factor * np.interp(data[where], values, own)
     else:
         return np.ones(data.shape[:3], bool)
-    return -np.expm1(-extinction * unit_of(volume)) > VISIBLE
+    return -np.expm1(-extinction * unit_of(volume)) > least
 
 
 def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:

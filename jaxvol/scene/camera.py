@@ -22,6 +22,7 @@ from .._util.checks import (
     integer,
     is_flag,
     number,
+    pasted,
     require,
     shortened,
 )
@@ -99,6 +100,20 @@ class Camera(eqx.Module):
         whole = (-width / height, width / height, -1.0, 1.0)
         self.window = finite_array("window", whole if window is None else window, (4,))
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
+
+    def __repr__(self) -> str:
+        whole = np.array((-self.size[0] / self.size[1], self.size[0] / self.size[1], -1.0, 1.0))
+        usual: dict[str, Any] = {"parallel_scale": None, "window": whole, "corner": np.zeros(2)}
+        texts = {}
+        for name in ("position", "focal_point", "view_up", "view_angle", *usual):
+            value = getattr(self, name)
+            if value is None and name in usual:
+                continue
+            if (text := pasted(value)) is None or value.ndim > 1:
+                return eqx.tree_pformat(self)
+            if usual.get(name) is None or not np.allclose(value, usual[name]):
+                texts[name] = text
+        return f"Camera({', '.join(f'{name}={text}' for name, text in texts.items())}, size={self.size})"
 
     @classmethod
     def looking_at(

@@ -5,12 +5,13 @@ import argparse
 import re
 import tomllib
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ..._util.checks import near, shortened
 from ..._util.srgb import linear_color
-from ...compositing.modes import MODES
+from ...compositing.modes import ELSEWHERE, MODES
 from ...scene.presets import PRESETS, SLICER
 from .recorded import recorded_in, volume_of_picture, words_of
 
@@ -43,7 +44,9 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
-            message += near(wrong[1], re.split("[', ]+", wrong[2]))
+            message += "." + near(ELSEWHERE.get(wrong[1].lower(), wrong[1]), re.split("[', ]+", wrong[2]))
+        if wrong := re.search("unrecognized arguments: (--[a-z-]+)", message):
+            message += "." + near(wrong[1], self._option_string_actions)
         raise ValueError(f"{message} ({self.prog} --help lists the options)")
 
     def defaults(self) -> dict[str, Any]:
@@ -85,7 +88,7 @@ def in_full(words: Sequence[str]) -> list[str]:
     for word in words:
         name, is_joined, value = word.partition("=")
         found += [name, value] if is_joined and name in ("--size", "--background") else [word]
-    for number, (name, value) in reversed([*enumerate(zip(found, found[1:], strict=False))]):
+    for number, (name, value) in reversed([*enumerate(pairwise(found))]):
         if name == "--size" and not "".join(found[number + 2 : number + 3]).isdecimal():
             found.insert(number + 1, value)
         elif name == "--background" and not re.match(r"[-+.\d]", value):
@@ -235,8 +238,8 @@ def add_scene(parser: Parser) -> None:
     text = "labels of the voxels (a segmentation), each shown in a colour, and around them what is shown else"
     parser.add_argument("--labels", type=Path, metavar="FILE", help=text)
     text = (
-        "one more volume in the same image, such as PET in CT; by a colormap (default: hot) over LOW and HIGH "
-        "(default: what stands out); may be given several times; without shading"
+        "one more volume in the same image, such as PET in CT; by a colormap (default: hot) over LOW and "
+        "HIGH (default: what stands out); may be given several times; without shading"
     )
     names = {"dest": "others", "nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
     parser.add_argument("--with", default=[], help=text, **names)
@@ -269,7 +272,7 @@ def add_scene(parser: Parser) -> None:
     add_vector(group, "--camera", "X Y Z FX FY FZ", text)
     text = "without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)"
     add_vector(group, "--direction", "X Y Z", text)
-    text = "what is up in the image (default: 0 0 1; or, of a raw file, 0 0 -1 if its content stands on top)"
+    text = "what is up (default: 0 0 1; of a raw file, away from the face that its content stands on)"
     add_vector(group, "--view-up", "X Y Z", text)
     text = "degrees from the lower to the upper edge of the image (default: 30)"
     group.add_argument("--view-angle", type=float, default=30.0, metavar="DEGREES", help=text)
