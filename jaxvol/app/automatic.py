@@ -128,7 +128,8 @@ def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float,
     data, unit = sampled(volume), unit_of(volume)
     middle, dense = (data > first) & (data <= second), data > second
     in_front, whole = [], []
-    for axis, step in enumerate(np.asarray(volume.spacing) * (stride_of(volume.shape) / unit)):
+    extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
+    for axis, step in enumerate(extent / (np.maximum(np.array(data.shape) - 1, 1) * unit)):
         whole.append(step * middle.sum(axis)[middle.any(axis)])
         for side in (slice(None), slice(None, None, -1)):
             object_, stop = (np.moveaxis(each, axis, 0)[side] for each in (middle, dense))

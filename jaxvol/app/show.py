@@ -59,7 +59,7 @@ def show(
     add_scene(parser)
     known = {name: value for name, value in parser.defaults().items() if name not in OF_FILES}
     for name in options:
-        if name not in known or name == "others":
+        if name not in known or name == "with":
             raise ValueError(
                 f"show has no option {name!r}.{near(name, known)} jaxvol render --help has them."
             )
@@ -70,10 +70,8 @@ def show(
     try:
         check_exclusive({name: value for name, value in options.items() if value is not None})
         given = argparse.Namespace(**known | options, recorded_transfer=None, file=volumes[0])
-        given.others = [
-            (each, *(() if own is None else (own,)))
-            for each, own in zip(volumes[1:], transfers[1:], strict=True)
-        ]
+        more = zip(volumes[1:], transfers[1:], strict=True)
+        vars(given)["with"] = [(each, *(() if own is None else (own,))) for each, own in more]
         if isinstance(given.file, Volume):
             if of_file := [name for name, value in header_of(given).items() if value is not None]:
                 raise ValueError(f"{of_file[0]} is of files; volume is a Volume.")

@@ -106,7 +106,7 @@ class Camera(eqx.Module):
         usual: dict[str, Any] = {"parallel_scale": None, "window": whole, "corner": np.zeros(2)}
         texts = {}
         for name in ("position", "focal_point", "view_up", "view_angle", *usual):
-            value = getattr(self, name)
+            value: Any = getattr(self, name)
             if value is None and name in usual:
                 continue
             if (text := pasted(value)) is None or value.ndim > 1:

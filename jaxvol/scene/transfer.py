@@ -216,7 +216,7 @@ class TransferFunction(Transfer):
         self.colors = finite_array("colors", colors, (n, 3))
         if not is_traced(self.colors) and (most := float(np.max(self.colors))) > BRIGHTEST:
             told = f"colors reach {most:g}; in linear RGB, white is 1"
-            warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb(colors / 255).", stacklevel=2)
+            warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb(colors / 255).", stacklevel=3)
         extinction = finite_array("extinction", extinction, (n,))
         self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
 

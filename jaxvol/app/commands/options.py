@@ -132,7 +132,8 @@ def _of_toml(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
 def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
     found = recorded_in(path)
-    known = [action for action in command._actions if action.type is not Path and action.dest != "help"]
+    own = [action for action in command._actions if action.type is not Path]
+    known = [action for action in own if action.dest not in ("help", "with")]
     flags = {flag for action in known for flag in action.option_strings}
     words = [word for word in found["options"] if word != "--transparent" or word in flags]
     for word in words:
@@ -241,8 +242,8 @@ def add_scene(parser: Parser) -> None:
         "one more volume in the same image, such as PET in CT; by a colormap (default: hot) over LOW and "
         "HIGH (default: what stands out); may be given several times; without shading"
     )
-    names = {"dest": "others", "nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
-    parser.add_argument("--with", default=[], help=text, **names)
+    how: dict[str, Any] = {"nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
+    parser.add_argument("--with", default=[], help=text, **how)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
     text = "options by their names, such as size = [640, 480]; those of the command line override them"

@@ -57,8 +57,8 @@ class Scene(NamedTuple):
     transforms: tuple[Transform, ...]
     source: VoxelSource | None = None
     memory: int | None = None
-    others: tuple[tuple[Volume, Transfer], ...] = ()
     march: Any = None
+    others: tuple[tuple[Volume, Transfer], ...] = ()
     notes: tuple[str, ...] = ()
 
     def render(self, camera: Camera) -> Rendering:
@@ -90,7 +90,7 @@ def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Cam
 
     Args:
         options: of a command that has those of `add_scene`. `file` may be a `Volume`, `transfer` a
-            `Transfer`, and entries of `others` volumes with their transfer functions.
+            `Transfer`, and entries of `with` volumes with their transfer functions.
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
     is_surface, background = options.compositing == "isosurface", background_of(options)
@@ -105,7 +105,7 @@ def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Cam
     elif options.clip_inside_out:
         raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
 
-    automatic, source, note = is_automatic(options), None, None
+    automatic, source, note, more = is_automatic(options), None, None, vars(options)["with"]
     if options.memory is None:
         volume = volume_of(options)
         transfer, note = (None, None) if automatic else transfer_of(options, volume)
@@ -113,7 +113,7 @@ def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Cam
             volume, transfer = labels_shown(volume, transfer) or (volume, transfer)
         transfer = automatic_transfer(volume) if transfer is None else transfer
     else:
-        if options.labels is not None or options.others:
+        if options.labels is not None or more:
             raise ValueError("--memory reads one volume, without --labels and --with.")
         header = {name: value for name, value in header_of(options).items() if value is not None}
         if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
@@ -128,23 +128,11 @@ def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Cam
         else:
             transfer, note = transfer_of(options, volume, source)
 
-    others = tuple(_other(*each) for each in options.others)
+    others = tuple(_other(*each) for each in more)
     lighting = _lighting(options, mode, alone=not others)
     camera = _camera(options, volume, transfer, orbit, automatic=automatic).zoom(options.zoom)
-    notes = () if note is None else (note,)
-    return Scene(
-        volume,
-        transfer,
-        camera,
-        mode,
-        lighting,
-        background,
-        transforms,
-        source,
-        options.memory,
-        others,
-        notes=notes,
-    )
+    scene = Scene(volume, transfer, camera, mode, lighting, background, transforms, source, options.memory)
+    return scene._replace(others=others, notes=() if note is None else (note,))
 
 
 def _camera(
@@ -238,11 +226,12 @@ def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
     if options.background is None:
         level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
-    red, green, blue = np.asarray(linear_color("--background", options.background)).tolist()
-    if not 0 <= min(red, green, blue) <= max(red, green, blue) <= 1:
+    given = options.background
+    red, green, blue = map(float, linear_color("--background", given) if isinstance(given, str) else given)
+    if not all(0 <= each <= 1 for each in (red, green, blue)):
         got = f"{red:g} {green:g} {blue:g}"
-        hint = "; of 8-bit colours, give a name such as '#336699'" if max(red, green, blue) > 1 else ""
-        raise ValueError(f"--background must be three numbers from 0 to 1 (linear RGB); got {got}{hint}.")
+        hint = " 8-bit colours are written '#336699'." if max(red, green, blue) > 1 else ""
+        raise ValueError(f"--background must be three numbers from 0 to 1 (linear RGB); got {got}.{hint}")
     return red, green, blue
 
 

@@ -107,7 +107,7 @@ def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, prog
 
     It is looked for in the folder that the environment variable `JAXVOL_DATA` names, as `.raw` or as
     `.raw.gz`, then in the cache. If it is in neither, it is downloaded (`pip install "jaxvol[datasets]"`),
-    and     kept if its SHA-512 is the published one.
+    and kept if its SHA-512 is the published one.
 
     Args:
         name: one of `names()`; case is ignored. `info(name).nbytes` tells how much will be fetched.
