@@ -62,8 +62,7 @@ def displayed(
     color, opacity = image[..., :3], image[..., 3:]
     # straight alpha: viewers multiply by the opacity
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
-    display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
-    return np.asarray(jnp.round(display * 255)).astype(np.uint8)
+    return np.asarray(_in_8_bits(color, opacity)).astype(np.uint8)
 
 
 # Jitted: one program for each shape, rather than one for each operation.
@@ -80,3 +79,8 @@ def _to_srgb(linear: Array) -> Float[Array, "*image"]:
 def _from_srgb(display: Array) -> Float[Array, "*image"]:
     display = jnp.clip(display, 0, 1)
     return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+
+
+@jax.jit
+def _in_8_bits(color: Any, opacity: Any) -> Float[Array, "height width channels"]:
+    return jnp.round(jnp.concatenate([_to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1) * 255)

@@ -20,6 +20,7 @@ from .._util.checks import (
     finite_array,
     flag,
     integer,
+    is_concrete,
     is_flag,
     number,
     pasted,
@@ -104,16 +105,16 @@ class Camera(eqx.Module):
     def __repr__(self) -> str:
         whole = np.array((-self.size[0] / self.size[1], self.size[0] / self.size[1], -1.0, 1.0))
         usual: dict[str, Any] = {"parallel_scale": None, "window": whole, "corner": np.zeros(2)}
-        texts = {}
-        for name in ("position", "focal_point", "view_up", "view_angle", *usual):
-            value: Any = getattr(self, name)
-            if value is None and name in usual:
-                continue
-            if (text := pasted(value)) is None or value.ndim > 1:
-                return eqx.tree_pformat(self)
-            if usual.get(name) is None or not np.allclose(value, usual[name]):
-                texts[name] = text
-        return f"Camera({', '.join(f'{name}={text}' for name, text in texts.items())}, size={self.size})"
+        given: dict[str, Any] = {
+            name: getattr(self, name) for name in ("position", "focal_point", "view_up", "view_angle", *usual)
+        }
+        given = {name: value for name, value in given.items() if value is not None or name not in usual}
+        if not all(is_concrete(each) and each.ndim < 2 for each in given.values()):
+            return eqx.tree_pformat(self)
+        told = [
+            name for name in given if usual.get(name) is None or not np.allclose(given[name], usual[name])
+        ]
+        return f"Camera({', '.join(f'{name}={pasted(given[name])}' for name in told)}, size={self.size})"
 
     @classmethod
     def looking_at(

@@ -214,7 +214,7 @@ class TransferFunction(Transfer):
         self.values = increasing("values", values)
         n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
-        if not is_traced(self.colors) and (most := float(np.max(self.colors))) > BRIGHTEST:
+        if not is_traced(self.colors) and (most := float(np.asarray(self.colors).max())) > BRIGHTEST:
             told = f"colors reach {most:g}; in linear RGB, white is 1"
             warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb(colors / 255).", stacklevel=3)
         extinction = finite_array("extinction", extinction, (n,))
@@ -246,7 +246,7 @@ class TransferFunction(Transfer):
         if None in texts or self.values.ndim > 1:
             return eqx.tree_pformat(self)
         if (n := self.values.shape[0]) > MOST_WRITTEN:
-            low, high, most = self.values[0], self.values[-1], np.max(self.extinction)
+            low, high, most = self.values[0], self.values[-1], np.asarray(self.extinction).max()
             return f"<TransferFunction of {n} points from {low:g} to {high:g}, extinction up to {most:g}>"
         values, colors, extinction = texts
         more = ", per_voxel=True" if self.per_voxel else ""

@@ -129,7 +129,7 @@ class Volume(eqx.Module):
             return eqx.tree_pformat(self)
         data = np.asarray(self.data)
         more = [f"{name}={text}" for name, text in texts.items()]
-        more += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
+        more += [] if self.labels is None else [f"labels to {np.asarray(self.labels).max()}"]
         more += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
         return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(more)}>"
 

@@ -85,7 +85,8 @@ def _why_nothing(scene: Scene) -> str:
     if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():
         bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
         return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
-    low, high = float(volume.data.min()), float(volume.data.max())
+    data = np.asarray(volume.data)
+    low, high = float(data.min()), float(data.max())
     where = f"the volume's values run from {low:g} to {high:g}"
     if isinstance(scene.compositing, Isosurface):
         return f"{where}, and no ray crosses the isosurface's value, {float(scene.compositing.value):g}."

@@ -227,7 +227,8 @@ def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
         level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
     given = options.background
-    red, green, blue = map(float, linear_color("--background", given) if isinstance(given, str) else given)
+    given = linear_color("--background", given) if isinstance(given, str) else given
+    red, green, blue = np.asarray(given, np.float64).tolist()
     if not all(0 <= each <= 1 for each in (red, green, blue)):
         got = f"{red:g} {green:g} {blue:g}"
         hint = " 8-bit colours are written '#336699'." if max(red, green, blue) > 1 else ""
@@ -252,7 +253,8 @@ def transfer_of(
             values = sampled(volume)
             clim, note = fitted_range(name, float(values.min()), float(np.percentile(values, 99.9)))
         return preset(name, clim, 1.0 if unit is None else unit), note
-    clim = clim or (float(volume.data.min()), float(volume.data.max()))
+    data = np.asarray(volume.data)
+    clim = clim or (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit), None
 
