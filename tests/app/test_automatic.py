@@ -234,3 +234,40 @@ def test_other_volumes_are_not_taken_for_labels():
     many = np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4)
     for data in (floats, two, many):
         assert labels_shown(jv.Volume(data)) is None
+
+
+def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows():
+    data = np.asarray(ball(0.5, 0.2).data)
+    transfer = jv.automatic_transfer(jv.Volume(data))
+    for axis in range(3):
+        for sign in (1, -1):
+            stand = np.array(data)  # a slab on one face
+            stand[(slice(None),) * axis + (slice(31, None) if sign < 0 else slice(0, 1),)] = 200
+            camera = jv.automatic_camera(volume := jv.Volume(stand), transfer, size=(32, 32))
+            np.testing.assert_array_equal(camera.view_up, sign * np.eye(3)[axis])
+            away = np.asarray(camera.position - camera.focal_point)
+            assert away @ np.asarray(camera.view_up) > 0.3 * np.linalg.norm(away)  # from above
+            seen = in_picture(camera, visible_points(volume, transfer))
+            assert np.abs(seen).max() == pytest.approx(1 / MARGIN, abs=1e-4)
+    placed = jv.Volume(
+        stand, origin=(0, 0, 1)
+    )  # a file that says where it lies, and a user who says what is up
+    for volume, up in ((placed, None), (jv.Volume(stand), (0, 0, 1))):
+        camera = jv.automatic_camera(volume, transfer, (1, 2, 0.5), up, size=(32, 32))
+        np.testing.assert_array_equal(camera.view_up, (0, 0, 1))
+        away = np.asarray(camera.position - camera.focal_point)
+        np.testing.assert_allclose(away / away[2], (2, 4, 1), rtol=1e-3)
+
+
+def test_what_is_thin_is_dense_and_what_hides_is_not():
+    """Leaves around a trunk, and a body around bones; both of value 100 around 200."""
+    leaves = np.full((32, 32, 32), 10, np.uint8)
+    for at in (3, 9, 19, 25):
+        leaves[at : at + 3, 4:28, 4:28] = 100
+    leaves[14:16, 14:16, 2:30] = 200
+    body = np.asarray(ball(0.8, 0.35).data)
+    thin, thick = (
+        opacity_at(transfer, 100, unit)
+        for transfer, unit in ((jv.automatic_transfer(jv.Volume(each)), 0.5) for each in (leaves, body))
+    )
+    assert thin > 3 * thick
