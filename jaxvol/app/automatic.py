@@ -127,7 +127,9 @@ def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float,
     is dense is seen through it, and so that it has some itself, if it is thin. And its usual value."""
     data, unit = sampled(volume), unit_of(volume)
     middle, dense = (data > first) & (data <= second), data > second
-    in_front, whole = [], []
+    in_front, whole = [np.zeros(1)], []
+    if not middle.any():
+        return THIN, (first + second) / 2
     extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
     for axis, step in enumerate(extent / (np.maximum(np.array(data.shape) - 1, 1) * unit)):
         whole.append(step * middle.sum(axis)[middle.any(axis)])

@@ -246,7 +246,7 @@ class TransferFunction(Transfer):
         if None in texts or self.values.ndim > 1:
             return eqx.tree_pformat(self)
         if (n := self.values.shape[0]) > MOST_WRITTEN:
-            low, high, most = self.values[0], self.values[-1], np.asarray(self.extinction).max()
+            (low, *_, high), most = np.asarray(self.values), np.asarray(self.extinction).max()
             return f"<TransferFunction of {n} points from {low:g} to {high:g}, extinction up to {most:g}>"
         values, colors, extinction = texts
         more = ", per_voxel=True" if self.per_voxel else ""

@@ -148,13 +148,17 @@ class Volume(eqx.Module):
         ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)]
         if any(len(each) < 2 or each.step < 1 for each in ranges) or self.fetch.window is not None:
             raise ValueError(f"{expected}; got {shortened(part)} of {self.shape}.")
-        shift = self.spacing * np.array([each.start for each in ranges], self.spacing.dtype)
-        if self.direction is not None:
-            shift = jnp.sum(self.direction * shift[None, :], axis=1)
-        spacing = self.spacing * np.array([each.step for each in ranges], self.spacing.dtype)
-        labels = None if self.labels is None else self.labels[slices]
-        how: Any = {"direction": self.direction, "label_ids": self.label_ids}
-        return Volume(self.data[slices], spacing, self.origin + shift, labels, **how)
+        # in NumPy where numbers are known, which compiles nothing
+        given = self.data, self.spacing, self.origin, self.direction, self.labels
+        known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in given]
+        data, spacing, origin, direction, labels = known
+        shift = spacing * np.array([each.start for each in ranges], spacing.dtype)
+        if direction is not None:
+            shift = (direction * shift[None, :]).sum(axis=1)
+        spacing = spacing * np.array([each.step for each in ranges], spacing.dtype)
+        labels = None if labels is None else labels[slices]
+        how: Any = {"direction": direction, "label_ids": self.label_ids}
+        return Volume(data[slices], spacing, origin + shift, labels, **how)
 
     def crop(self, box: Arrayable) -> "Volume":
         """The part of it that just holds a box, at its place in the world; in axes that are turned, the box

@@ -5,6 +5,7 @@ import math
 import jax
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
 from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_shown, thresholds
@@ -260,14 +261,14 @@ def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows()
 
 
 def test_what_is_thin_is_dense_and_what_hides_is_not():
-    """Leaves around a trunk, and a body around bones; both of value 100 around 200."""
-    leaves = np.full((32, 32, 32), 10, np.uint8)
-    for at in (3, 9, 19, 25):
-        leaves[at : at + 3, 4:28, 4:28] = 100
-    leaves[14:16, 14:16, 2:30] = 200
-    body = np.asarray(ball(0.8, 0.35).data)
-    thin, thick = (
-        opacity_at(transfer, 100, unit)
-        for transfer, unit in ((jv.automatic_transfer(jv.Volume(each)), 0.5) for each in (leaves, body))
-    )
-    assert thin > 3 * thick
+    """Leaves beside a trunk, and a body around bones; both of value 100, and of 200 what is dense."""
+    leaves = np.full((64, 64, 64), 10, np.float32)
+    for at in range(8):
+        x, y, z = (8 * (at * step % 8) for step in (1, 3, 5))
+        leaves[x : x + 6, y : y + 6, z : z + 6] = 100
+    leaves[28:36, 60:64, 2:62] = 200
+    leaves = jv.Volume(gaussian_filter(leaves, 0.7).astype(np.uint8))
+    thin, thick = map(jv.automatic_transfer, (leaves, ball(0.8, 0.35)))
+    assert opacity_at(thin, 90, 64 * 3**0.5 / 100) > 3 * opacity_at(thick, 100, 32 * 3**0.5 / 100)
+    assert opacity_at(thin, 45, 64 * 3**0.5 / 100) < 0.05  # noise above the threshold
+    assert opacity_at(thin, 39, 64 * 3**0.5) == 0
