@@ -239,7 +239,7 @@ def test_other_volumes_are_not_taken_for_labels():
 
 def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows():
     data = np.asarray(ball(0.5, 0.2).data)
-    transfer = jv.automatic_transfer(jv.Volume(data))
+    transfer, stand = jv.automatic_transfer(jv.Volume(data)), data
     for axis in range(3):
         for sign in (1, -1):
             stand = np.array(data)  # a slab on one face

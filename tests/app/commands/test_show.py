@@ -91,7 +91,7 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
             jv.show(what, step=0.4, **options)
     drawn.level = 0.0
     with pytest.warns(UserWarning, match="nothing is visible: the volume's values run .* A clim from"):
-        jv.show(volume, jv.preset("engine", (500, 900)), size=16, step=0.4)
+        jv.show(volume, jv.preset("engine", (500, 900)), size=8, step=0.4)
 
 
 def test_presets_of_slicer_are_found_by_any_spelling_and_have_its_values():
