@@ -3,6 +3,7 @@ is interrupted."""
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -81,8 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+ARGUMENT = re.compile(r'\b(shape|dtype|spacing|nan|time|channel)=(?:\(([\w, ]+)\)|"?(\w+)"?)')
+"""Of `jv.load`, as messages quote it, such as `shape=(nx, ny, nz)`: an option of the command, too."""
+
+
 def _told(program: str, fault: str) -> int:
     """Print a fault in one line, which may hold text of files. Returns the exit code."""
+    fault = ARGUMENT.sub(lambda found: f"--{found[1]} {(found[2] or found[3]).replace(',', '')}", fault)
     print(f"{program}: error: {printable(' '.join(fault.split()))}", file=sys.stderr)
     return 2
 

@@ -16,13 +16,26 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
 
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
-from .._util.checks import Arrayable, described, finite_array, integers, require
+from .._util.checks import (
+    Arrayable,
+    described,
+    finite_array,
+    integers,
+    is_concrete,
+    pasted,
+    require,
+    shortened,
+)
 from .._util.named_axes import along_xyz, is_named
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
 from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
+
+
+PLACE = 1e-4
+"""Voxels by which a box may miss a node through rounding."""
 
 
 class Field(eqx.Module):
@@ -108,6 +121,69 @@ class Volume(eqx.Module):
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()
+
+    def __repr__(self) -> str:
+        place = {"spacing": self.spacing, "origin": self.origin, "direction": self.direction}
+        texts = {name: pasted(value) for name, value in place.items() if value is not None}
+        if not texts or None in texts.values() or not is_concrete(self.data):
+            return eqx.tree_pformat(self)
+        data = np.asarray(self.data)
+        more = [f"{name}={text}" for name, text in texts.items()]
+        more += [] if self.labels is None else [f"labels to {np.asarray(self.labels).max()}"]
+        more += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
+        return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(more)}>"
+
+    def __getitem__(self, part: Any) -> "Volume":
+        """The part of it with these voxels, such as `volume[10:90, :, ::2]`, at its place in the world.
+
+        Raises:
+            ValueError: for what is no slice with a step above 0, fewer than two voxels along an axis, and a
+                volume with a `field`.
+        """
+        part = part if isinstance(part, tuple) else (part,)
+        expected = "volume[a:b, c:d, e:f] takes up to three slices that leave 2 voxels along each axis"
+        if len(part) > 3 or not all(isinstance(each, slice) for each in part) or self.field is not None:
+            raise ValueError(f"{expected}, of a volume without a field; got {shortened(part)}.")
+        slices = (*part, *[slice(None)] * (3 - len(part)))
+        ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)]
+        if any(len(each) < 2 or each.step < 1 for each in ranges) or self.fetch.window is not None:
+            raise ValueError(f"{expected}; got {shortened(part)} of {self.shape}.")
+        # in NumPy where numbers are known, which compiles nothing
+        given = self.data, self.spacing, self.origin, self.direction, self.labels
+        known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in given]
+        data, spacing, origin, direction, labels = known
+        shift = spacing * np.array([each.start for each in ranges], spacing.dtype)
+        if direction is not None:
+            shift = (direction * shift[None, :]).sum(axis=1)
+        spacing = spacing * np.array([each.step for each in ranges], spacing.dtype)
+        labels = None if labels is None else labels[slices]
+        how: Any = {"direction": direction, "label_ids": self.label_ids}
+        return Volume(data[slices], spacing, origin + shift, labels, **how)
+
+    def crop(self, box: Arrayable) -> "Volume":
+        """The part of it that just holds a box, at its place in the world; in axes that are turned, the box
+        around that one.
+
+        Args:
+            box: (x_min, x_max, y_min, y_max, z_min, z_max) in the world, as `bounds`.
+
+        Returns:
+            The `Volume`, of whole voxels.
+
+        Raises:
+            ValueError: for a box outside of it, and as slices are.
+        """
+        ends = np.asarray(finite_array("box", box, (6,)), np.float64).reshape(3, 2)
+        turn = np.eye(3) if self.direction is None else np.asarray(self.direction, np.float64)
+        corners = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 3)
+        at = np.linalg.solve(turn, (corners - np.asarray(self.origin, np.float64)).T).T
+        at, last = at / np.asarray(self.spacing, np.float64), np.array(self.shape) - 1
+        first = np.clip(np.floor(at.min(0) + PLACE), 0, last - 1).astype(int).tolist()
+        end = np.clip(np.ceil(at.max(0) - PLACE), 1, last).astype(int).tolist()
+        if (at.max(0) < 0).any() or (at.min(0) > last).any() or (ends[:, 0] >= ends[:, 1]).any():
+            bounds = pasted(self.bounds)
+            raise ValueError(f"box must be one that meets the volume, {bounds}; got {pasted(ends.ravel())}.")
+        return self[tuple(slice(low, max(high, low + 1) + 1) for low, high in zip(first, end, strict=True))]
 
     @property
     def valid(self) -> Bool[Array, ""]:

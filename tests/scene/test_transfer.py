@@ -155,10 +155,11 @@ def test_presets_are_stretched_to_a_range(name):
 def test_presets_show_something_and_hide_something():
     for name, (_, (low, high), points) in jv.PRESETS.items():
         values, _, opacities = zip(*points, strict=True)
+        own = not name.startswith(("CT", "MR", "DTI"))  # 3D Slicer's are fainter, and may reach beyond
         assert opacities[0] == 0, name
-        assert max(opacities) > 0.25, name
-        assert low <= min(values), name
-        assert max(values) <= high, name
+        assert max(opacities) > (0.25 if own else 0.1), name
+        assert not own or low <= min(values), name
+        assert not own or max(values) <= high, name
 
 
 def test_colormaps_have_the_colours_of_matplotlib_in_linear_light():
@@ -245,7 +246,7 @@ BAD = [
     (lambda: jv.colormap([(255, 0, 0)], (0, 1)), r"cmap must be .* in \[0, 1\]; got \[\("),
     (lambda: jv.colormap("gray", (0, 1), n_colors=1), "n_colors must be an integer of at least 2"),
     (lambda: jv.colormap("gray", (0, 1), "cubic"), "opacity must be"),
-    (lambda: jv.preset("ct-bone"), "preset must be one of ct_bone.*got 'ct-bone'"),
+    (lambda: jv.preset("ct-bnoe"), "preset must be one of ct_bone.*got 'ct-bnoe'"),
     (lambda: jv.preset("engine", clim=(5, 5)), "clim must be .*low < high"),
 ]
 

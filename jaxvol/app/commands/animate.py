@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..._util.checks import integer, output_file
+from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
-from ...io.display import displayed
 from ...scene.camera import Camera
 from .options import add_command, add_output, add_scene, add_vector
 from .render import why_empty
@@ -38,12 +38,13 @@ def _animate(options: argparse.Namespace) -> None:
         raise ImportError('--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]".')
 
     def views(camera: Camera, count: int) -> list[Camera]:
-        axis = options.axis or options.view_up
+        axis = camera.view_up if options.axis is None else options.axis
         return [turned(camera, angle, axis) for angle in angles_of(options.degrees, count)]
 
     scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))
     begun = time.perf_counter()
     scene = with_march(scene, options, views(scene.camera, PLANNED_VIEWS))
+    print(*scene.notes, sep="\n", end="\n" * bool(scene.notes))
     empty: list[str | None] = []
 
     def image_of(camera: Camera) -> UInt8[np.ndarray, "height width 3"]:

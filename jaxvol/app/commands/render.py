@@ -32,6 +32,7 @@ def _render(options: argparse.Namespace) -> None:
         image_file("--depth", options.depth, 0)
     scene = scene_of(options)
     scene = with_march(scene, options, [scene.camera])
+    print(*scene.notes, sep="\n", end="\n" * bool(scene.notes))
     ready = time.perf_counter()
     rendering = scene.render(scene.camera)
     ended = time.perf_counter()
@@ -84,7 +85,8 @@ def _why_nothing(scene: Scene) -> str:
     if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():
         bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
         return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
-    low, high = float(volume.data.min()), float(volume.data.max())
+    data = np.asarray(volume.data)
+    low, high = float(data.min()), float(data.max())
     where = f"the volume's values run from {low:g} to {high:g}"
     if isinstance(scene.compositing, Isosurface):
         return f"{where}, and no ray crosses the isosurface's value, {float(scene.compositing.value):g}."

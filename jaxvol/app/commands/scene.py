@@ -3,11 +3,13 @@
 import argparse
 from collections.abc import Callable, Sequence
 from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from ..._util.srgb import linear_color
 from ...bricks import VoxelSource, levels_of, render_bricks
 from ...compositing.blending import Compositing, Over
 from ...compositing.isosurface import Isosurface
@@ -16,17 +18,25 @@ from ...fitting import read_transfer
 from ...io.formats import files_of, load
 from ...lighting import Lighting, Phong
 from ...march.march import March, Transform
-from ...march.transforms import AlphaCorrection, Clip, EarlyTermination, SpaceLeaping
+from ...march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
 from ...planning import Plan, plan
 from ...planning.memory import IN_MEMORY
 from ...render import PLANNED, render
 from ...scene.camera import Camera
-from ...scene.presets import SHADED, colormap, preset
+from ...scene.presets import SHADED, colormap, fitted_range, preset, preset_name
 from ...scene.rendering import Rendering
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from ..automatic import SAMPLED, automatic_transfer, labels_shown, stride_of, transfer_by_copy
-from ..framing import FRONT, framed, visible_points
+from ..automatic import (
+    SAMPLED,
+    automatic_transfer,
+    labels_shown,
+    sampled,
+    stride_of,
+    thresholds,
+    transfer_by_copy,
+)
+from ..framing import automatic_camera, framed, upright, visible_points
 
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
@@ -34,7 +44,9 @@ FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose
 
 class Scene(NamedTuple):
     """What is looked at, and how. Of a volume that is read in bricks from `source`, with so many bytes of
-    memory, `volume` is a copy of every n-th voxel in the same place. `march`: a `March`, once it is known."""
+    memory, `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image,
+    with their transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it
+    is known. `notes`: what the user should know."""
 
     volume: Volume
     transfer: Transfer
@@ -42,15 +54,20 @@ class Scene(NamedTuple):
     compositing: Compositing[Any]
     lighting: Lighting | None
     background: tuple[float, float, float]
-    clip: tuple[Transform, ...]
-    source: VoxelSource | None
-    memory: int | None
+    transforms: tuple[Transform, ...]
+    source: VoxelSource | None = None
+    memory: int | None = None
     march: Any = None
+    others: tuple[tuple[Volume, Transfer], ...] = ()
+    notes: tuple[str, ...] = ()
 
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
         how = {"compositing": self.compositing, "lighting": self.lighting}
-        if self.source is None:
+        if self.others:
+            volumes, transfers = zip((self.volume, self.transfer), *self.others, strict=True)
+            found = render(volumes, transfers, camera, self.march, **how)
+        elif self.source is None:
             found = render(self.volume, self.transfer, camera, self.march, **how)
         else:
             how["memory"] = self.memory
@@ -60,7 +77,7 @@ class Scene(NamedTuple):
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
         """The cheapest way to render the scene within a tolerance, for each camera."""
         what: Any = self.volume if self.source is None else self.source
-        how: dict[str, Any] = {"transforms": self.clip, "once": len(cameras) == 1}
+        how: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
         how |= {"compositing": self.compositing, "lighting": self.lighting}
         if self.source is not None:
             how["memory"] = self.memory
@@ -68,32 +85,36 @@ class Scene(NamedTuple):
         return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
 
 
-def scene_of(
-    options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Camera]] = lambda camera: [camera]
-) -> Scene:
+def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
     """The scene that the options describe, without a march.
 
     Args:
-        options: of a command that has those of `add_scene`.
+        options: of a command that has those of `add_scene`. `file` may be a `Volume`, `transfer` a
+            `Transfer`, and entries of `with` volumes with their transfer functions.
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
     is_surface, background = options.compositing == "isosurface", background_of(options)
     if is_surface == (options.isovalue is None):
         raise ValueError("--compositing isosurface and --isovalue VALUE go together; one is missing.")
     mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
-    clip: tuple[Transform, ...] = ()
+    # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
+    transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
     planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
     if options.clip_box is not None or planes:
-        clip = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out),)
+        transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
     elif options.clip_inside_out:
         raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
 
-    automatic, source = is_automatic(options), None
+    automatic, source, note, more = is_automatic(options), None, None, vars(options)["with"]
     if options.memory is None:
         volume = volume_of(options)
-        shown = (labels_shown(volume) if automatic else None) or (volume, transfer_of(options, volume))
-        volume, transfer = shown
+        transfer, note = (None, None) if automatic else transfer_of(options, volume)
+        if automatic or options.labels is not None:
+            volume, transfer = labels_shown(volume, transfer) or (volume, transfer)
+        transfer = automatic_transfer(volume) if transfer is None else transfer
     else:
+        if options.labels is not None or more:
+            raise ValueError("--memory reads one volume, without --labels and --with.")
         header = {name: value for name, value in header_of(options).items() if value is not None}
         if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
             header["index"] = index
@@ -102,33 +123,81 @@ def scene_of(
         except TypeError as fault:  # such as a shape of what is no raw file
             raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
         volume = copy_of(source, options.memory)
-        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
-
-    size, view = tuple(options.size), (options.view_up, options.view_angle)
-    if options.camera:
-        camera = Camera(options.camera[:3], options.camera[3:], *view, size=size)
-    else:
-        side = options.direction or FRONT
-        camera = Camera.looking_at(volume, side, *view, parallel=options.parallel, size=size)
         if automatic:
-            camera = framed(camera, visible_points(volume, transfer), orbit(camera))
-    camera, lighting = camera.zoom(options.zoom), _lighting(options, mode)
-    return Scene(volume, transfer, camera, mode, lighting, background, clip, source, options.memory)
+            transfer = _transfer_of_bricks(volume, source)
+        else:
+            transfer, note = transfer_of(options, volume, source)
+
+    others = tuple(_other(*each) for each in more)
+    lighting = _lighting(options, mode, alone=not others)
+    camera = _camera(options, volume, transfer, orbit, automatic=automatic).zoom(options.zoom)
+    scene = Scene(volume, transfer, camera, mode, lighting, background, transforms, source, options.memory)
+    return scene._replace(others=others, notes=() if note is None else (note,))
+
+
+def _camera(
+    options: argparse.Namespace,
+    volume: Volume,
+    transfer: Transfer,
+    orbit: Callable[[Camera], Sequence[Camera]] | None,
+    *,
+    automatic: bool,
+) -> Camera:
+    """That of the options; or else, `automatic`, one as near as what is visible allows, or of all."""
+    given = {"view_angle": options.view_angle, "size": options.size}
+    if options.camera:
+        up = options.view_up or (0.0, 0.0, 1.0)
+        return Camera(options.camera[:3], options.camera[3:], up, **given)
+    given["parallel"] = options.parallel
+    if not automatic:
+        side = upright(volume, transfer, options.direction, options.view_up)
+        return Camera.looking_at(volume, *side, **given)
+    camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
+    return framed(camera, visible_points(volume, transfer), orbit(camera)) if orbit else camera
+
+
+def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
+    """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
+    and HIGH, or over what stands out of the background."""
+    volume = file if isinstance(file, Volume) else load(file)
+    if look and isinstance(look[0], Transfer):
+        return volume, look[0]
+    cmap, *clim = look or ("hot",)
+    if len(clim) not in (0, 2):
+        raise ValueError(
+            f"--with takes FILE, FILE CMAP or FILE CMAP LOW HIGH; got {' '.join(map(str, look))}."
+        )
+    if not clim:
+        values = sampled(volume).ravel().astype(np.float32)
+        clim = thresholds(values)[0], float(np.percentile(values, 99.9))
+    try:
+        low, high = map(float, clim)
+    except ValueError as fault:
+        raise ValueError(f"--with: LOW and HIGH must be numbers; got {' '.join(map(str, clim))}.") from fault
+    return volume, colormap(cmap, (low, max(high, float(np.nextafter(np.float32(low), np.inf)))))
 
 
 def with_march(scene: Scene, options: argparse.Namespace, cameras: Sequence[Camera]) -> Scene:
-    """The scene with the given step; without one, with the shortest of those planned for the cameras."""
-    if options.step is not None:
-        return scene._replace(march=March(options.step, (*scene.clip, *FAST), "midpoint"))
+    """The scene with the given step; without one, with the shortest of those planned for the cameras (of
+    several volumes, with half of their shortest spacing)."""
+    step = options.step
+    if step is None and scene.others:
+        step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
+    if step is not None:
+        return scene._replace(march=March(step, (*scene.transforms, *FAST), "midpoint"))
     found = min(scene.plans(cameras, options.tolerance), key=lambda plan: float(plan.march.step))
-    if not found.within:
-        print(f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more")
     source = None if found.bricks is None else found.source
-    return scene._replace(volume=found.volume, march=found.march, source=source)
+    scene = scene._replace(volume=found.volume, march=found.march, source=source)
+    if found.within:
+        return scene
+    told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
+    return scene._replace(notes=(*scene.notes, told))
 
 
 def volume_of(options: argparse.Namespace) -> Volume:
-    return load(options.file, **header_of(options))
+    if isinstance(options.file, Volume):
+        return options.file
+    return load(options.file, labels=vars(options).get("labels"), **header_of(options))
 
 
 def header_of(options: argparse.Namespace) -> dict[str, Any]:
@@ -148,7 +217,7 @@ def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
 
 def is_automatic(options: argparse.Namespace) -> bool:
     """Whether nothing is said of the transfer function."""
-    names = ("preset", "cmap", "transfer", "recorded_transfer", "clim", "unit_distance")
+    names = ("preset", "cmap", "transfer", "recorded_transfer", "clim", "window", "level", "unit_distance")
     return options.compositing == "over" and all(getattr(options, name) is None for name in names)
 
 
@@ -157,28 +226,46 @@ def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
     if options.background is None:
         level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
-    red, green, blue = options.background
-    if not all(0 <= each <= 1 for each in options.background):
+    given = options.background
+    given = linear_color("--background", given) if isinstance(given, str) else given
+    red, green, blue = np.asarray(given, np.float64).tolist()
+    if not all(0 <= each <= 1 for each in (red, green, blue)):
         got = f"{red:g} {green:g} {blue:g}"
-        raise ValueError(f"--background must be three numbers from 0 to 1 (linear RGB); got {got}.")
+        hint = " 8-bit colours are written '#336699'." if max(red, green, blue) > 1 else ""
+        raise ValueError(f"--background must be three numbers from 0 to 1 (linear RGB); got {got}.{hint}")
     return red, green, blue
 
 
-def transfer_of(options: argparse.Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
-    """The transfer function that the options ask for. `source`: of which `volume` is a copy with fewer
-    voxels."""
-    if is_automatic(options):
-        return automatic_transfer(volume)
+def transfer_of(
+    options: argparse.Namespace, volume: Volume, source: VoxelSource | None = None
+) -> tuple[Transfer, str | None]:
+    """The transfer function that the options ask for, and a word where a preset does not fit. `source`: of
+    which `volume` is a copy with fewer voxels."""
     if options.recorded_transfer is not None:
-        return options.recorded_transfer
+        return options.recorded_transfer, None
     if options.transfer is not None:
-        return read_transfer(options.transfer)
-    unit = options.unit_distance
+        given = options.transfer
+        return (read_transfer(given) if isinstance(given, str | Path) else given), None
+    unit, clim = options.unit_distance, _clim_of(options)
     if options.preset is not None:
-        return preset(options.preset, options.clim, 1.0 if unit is None else unit)
-    clim = options.clim or (float(volume.data.min()), float(volume.data.max()))
+        name, note = preset_name(options.preset), None
+        if clim is None:
+            values = sampled(volume)
+            clim, note = fitted_range(name, float(values.min()), float(np.percentile(values, 99.9)))
+        return preset(name, clim, 1.0 if unit is None else unit), note
+    data = np.asarray(volume.data)
+    clim = clim or (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
-    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
+    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit), None
+
+
+def _clim_of(options: argparse.Namespace) -> Any:
+    """--clim, or what --window and --level say instead."""
+    if (options.window is None) != (options.level is None):
+        raise ValueError("--window and --level go together; one is missing.")
+    if options.window is None:
+        return options.clim
+    return options.level - options.window / 2, options.level + options.window / 2
 
 
 def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
@@ -188,12 +275,12 @@ def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
     return transfer_by_copy(copy, np.asarray(source.read(low, high)))
 
 
-def _lighting(options: argparse.Namespace, mode: Compositing[Any]) -> Lighting | None:
-    """The light that the options ask for, or that is usual for what they show."""
+def _lighting(options: argparse.Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
+    """The light that the options ask for, or that is usual for what they show; none of several volumes."""
     shade = options.shade
     if shade is None:
-        shows_surfaces = options.preset in SHADED or is_automatic(options)
-        shade = (shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface)
+        shows_surfaces = is_automatic(options) or (options.preset and preset_name(options.preset) in SHADED)
+        shade = alone and ((shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface))
     return Phong() if shade else None
 
 

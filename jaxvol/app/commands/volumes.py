@@ -88,7 +88,7 @@ def add_info(commands: Any) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     volume = volume_of(options)
-    transfer = None if is_automatic(options) else transfer_of(options, volume)
+    transfer = None if is_automatic(options) else transfer_of(options, volume)[0]
     page = serve(volume, transfer, lit=options.shade, port=options.port, title=options.file.name)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:

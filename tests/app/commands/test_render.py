@@ -29,7 +29,7 @@ def of_voxel(cmap, clim=RANGE):
     return jv.colormap(cmap, clim, unit_distance=1.0)
 
 
-FAST = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()
+FAST = jv.EmptySpaceJitter(seed=0), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()
 
 
 def render(file, *words, step: str | None = "0.4"):
@@ -205,7 +205,7 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
     assert "step 0.7, left, Clip" in capsys.readouterr().out
     assert [tolerance for *_, tolerance, _ in plans] == [1 / 255, 0.01, 0.01]
     for *_, how in plans:
-        assert same(how["transforms"], (jv.Clip(CLIP, PLANES, inside_out=True),))
+        assert same(how["transforms"], (jv.Clip(CLIP, PLANES, inside_out=True), FAST[0]))
         assert isinstance(how["lighting"], Phong)
         assert how["once"]
     for bad in (["--tolerance", "0.1", "--step", "1"], ["--step", "1"]):
@@ -351,6 +351,16 @@ BAD = {
         ["nowhere.raw", "--background", "200", "0", "nan"],
         "--background must be three numbers from 0 to 1 (linear RGB); got 200 0 nan.",
     ),
+    "a colour's name": (
+        ["nowhere.raw", "--background", "whit"],
+        "--background must be a colour's name, such",
+    ),
+    "level": (["FILE", "--window", "3"], "--window and --level go together; one is missing"),
+    "window": (["FILE", "--window", "3", "--clim", "0", "1"], "--clim and --window exclude each other"),
+    "preset": (["FILE", "--preset", "CT-Bnes"], "got 'CT-Bnes'. Did you mean CT-Bones"),
+    "raw": (["DIR/headless.raw"], "not both known. Give --shape nx ny nz and --dtype uint8, or name it"),
+    "with": (["FILE", "--with", "FILE", "hot", "1"], "--with takes FILE, FILE CMAP or FILE CMAP LOW HIGH"),
+    "labels and memory": (["FILE", "--with", "FILE", "--memory", "1M"], "--memory reads one volume, without"),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
     "size": (["FILE", "--size", "0", "5"], "size must be"),
     "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
@@ -366,7 +376,8 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
     arguments, message = BAD[case]
-    arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
+    arguments = [a.replace("FILE", str(volume_file)).replace("DIR", str(tmp_path)) for a in arguments]
+    (tmp_path / "headless.raw").write_bytes(bytes(8))
     monkeypatch.setattr("jaxvol.app.commands.scene.render", None)  # fails if it is called
     assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
     printed = capsys.readouterr()

@@ -1,0 +1,118 @@
+"""Is the picture of one line that of the command, and what is said where it shows nothing?"""
+
+import io
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+from skimage.io import imread
+
+import jaxvol as jv
+from jaxvol.app.cli import main
+from jaxvol.scene.presets import SHADED, fitted_range, preset_name
+
+from .test_render import render, same
+
+
+def label_file(folder):
+    """Two boxes of labels in the volume of `volume_file`."""
+    labels = np.zeros((24, 24, 24), np.uint8)
+    labels[4:12, 4:-4, 4:-4], labels[12:-4, 4:-4, 4:-4] = 2, 5
+    np.save(folder / "labels.npy", labels)
+    return folder / "labels.npy"
+
+
+CASES = {
+    "nothing is said": ({}, []),
+    "a preset": ({"preset": "ct aaa", "shade": False}, ["--preset", "CT_AAA", "--no-shade"]),
+    "window and level": ({"window": 100, "level": 80}, ["--clim", 30, 130]),
+    "a view": ({"direction": (0, 0, 1), "zoom": 2}, ["--direction", 0, 0, 1, "--zoom", 2]),
+    "a projection": ({"compositing": "maximum"}, ["--compositing", "maximum"]),
+    "names of colours": ({"background": "#336699"}, ["--background", "#336699"]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_line_makes_the_picture_of_the_command(case, volume_file, tmp_path, drawn):
+    options, words = CASES[case]
+    with pytest.warns() if case == "a preset" else nullcontext():
+        rendering = jv.show(volume_file, size=16, step=0.4, **options)
+    assert render(volume_file, *words, "-o", tmp_path / "x.png") == 0
+    here, there = drawn.scenes
+    assert same(here, there)
+    assert same(drawn.how[0], drawn.how[1])
+    assert len(here[3].transforms) == 4  # with jitter and alignment
+    expected = imread(tmp_path / "x.png")
+    png = rendering._repr_png_()
+    assert png is not None
+    np.testing.assert_array_equal(imread(io.BytesIO(png), extension=".png"), expected)
+
+
+def test_labels_are_shown_in_what_is_around_them(volume_file, tmp_path, drawn):
+    file = label_file(tmp_path)
+    assert render(volume_file, "--labels", file, "-o", tmp_path / "x.png") == 0
+    volume, transfer, _, _ = drawn.scenes[0]
+    given = jv.load(volume_file, labels=file)
+    assert isinstance(transfer, jv.LabelTransferFunction)
+    automatic = jv.automatic_transfer(given)
+    around = np.asarray(transfer.stacked.extinction)[0, : automatic.values.shape[0]]
+    np.testing.assert_allclose(around, automatic.extinction, rtol=1e-5)
+    data, kinds = np.asarray(volume.data), np.asarray(volume.labels)
+    assert data[8, 12, 12] == data[16, 12, 12] == np.max(given.data)
+    assert kinds[[8, 16], 12, 12].tolist() == [1, 2]
+    np.testing.assert_array_equal(data[kinds == 0], np.asarray(given.data)[kinds == 0])
+    assert main(["render", "--like", str(tmp_path / "x.png")]) == 2  # it may name no other file
+
+
+def test_several_volumes_are_in_one_picture(volume_file, tmp_path, drawn):
+    pair = ["--with", volume_file, "viridis", 20, 90, "--with", volume_file]
+    assert render(volume_file, *pair, "-o", tmp_path / "x.npy", step=None) == 0
+    volumes, transfers, _, march = drawn.scenes[0]
+    assert len(volumes) == len(transfers) == 3
+    assert drawn.how[0]["lighting"] is None
+    assert float(march.step) == 0.5
+    assert same(transfers[1], jv.colormap("viridis", (20, 90)))
+    jv.show([volume_file, jv.load(volume_file)], [None, transfers[1]], size=16)
+    assert same(drawn.scenes[1][1], transfers[:2])
+
+
+def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
+    volume = jv.load(volume_file)
+    for what, options, message in (
+        (volume_file, {"presets": "engine"}, "show has no option 'presets'. Did you mean preset"),
+        (volume_file, {"clim": (0, 1), "window": 3, "level": 2}, "^clim and (window|level) exclude"),
+        (volume_file, {"isovalue": 3}, "^compositing isosurface and isovalue VALUE go together"),
+        (volume, {"dtype": "uint8"}, "dtype is of files; volume is a Volume"),
+        (5, {}, "volume must be a jaxvol Volume or a path; got 5"),
+        ([volume], {"transfer": [None, None]}, "must be lists of as many entries"),
+        (volume, {"transfer": "hot"}, "transfer must be a transfer function or None; got 'hot'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jv.show(what, step=0.4, **options)
+    drawn.level = 0.0
+    with pytest.warns(UserWarning, match="nothing is visible: the volume's values run .* A clim from"):
+        jv.show(volume, jv.preset("engine", (500, 900)), size=8, step=0.4)
+
+
+def test_presets_of_slicer_are_found_by_any_spelling_and_have_its_values():
+    for name in ("CT-Bones", "ct_bones", "ct bones", "CTBONES"):
+        assert preset_name(name) == "CT-Bones"
+    assert preset_name("ct_bone") == "ct_bone"  # ours
+    assert preset_name("CT-Bone") == "CT-Bone"
+    assert {"CT-AAA", "MR-Default"} <= SHADED
+    assert not {"MR-MIP", "CT-Fat"} & SHADED
+    found = jv.preset("CT-Bone")  # of presets.xml
+    assert np.asarray(found.values).tolist() == pytest.approx([-3024, -16.4458, 641.385, 3071])
+    display = np.array([[0.729412, 0.254902, 0.301961], [0.905882, 0.815686, 0.552941]])
+    np.testing.assert_allclose(np.asarray(found.colors)[1:3], ((display + 0.055) / 1.055) ** 2.4, rtol=1e-3)
+    np.testing.assert_allclose(
+        -np.expm1(-np.asarray(found.extinction)), [0, 0, 0.715686, 0.705882], atol=1e-6
+    )
+    # MR has no unit, and is stretched; CT is not, and it is said that it does not fit
+    assert fitted_range("MR-Default", 0, 250) == (None, None)
+    clim, told = fitted_range("mr default", 0, 900)
+    assert clim == (0, 900)
+    assert told is not None
+    assert np.asarray(jv.preset("MR-Default", clim).values)[4] == pytest.approx(900)
+    assert fitted_range("CT-Bone", -1000, 2000) == (None, None)
+    assert "Hounsfield" in str(fitted_range("CT-Bone", 0, 255)[1])
