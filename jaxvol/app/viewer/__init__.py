@@ -4,6 +4,7 @@ One `model`, whose `state` a thread draws in `tiles`, and one list of its `contr
 `notebook` and `page`.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..._util.checks import integer
@@ -88,6 +89,9 @@ def serve(
     *,
     port: int | Any = 8080,
     title: str = "jaxvol",
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    file: Callable[[], dict[str, Any]] = dict,
     **how: Any,
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
@@ -118,4 +122,5 @@ def serve(
         raise ImportError(f"serve needs {fault.name}: pip install jaxvol[view]") from fault
     port = integer("port", port, 1, 65535)
     keep_programs_by_default()
-    return Page(*initial(volume, transfer, camera, march, **how), port=port, title=title)
+    served = {"port": port, "title": title, "host": host, "token": token, "file": file}
+    return Page(*initial(volume, transfer, camera, march, **how), **served)

@@ -4,24 +4,29 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import anywidget
 import ipywidgets
 import numpy as np
+import traitlets
 from rendercanvas.anywidget import RenderCanvas
 
+from ...compositing.blending import Compositing
 from ...lighting.shading import Lighting
 from ...march.march import March
 from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from .controls import Control, controls_of
+from .control import PRESSED, Control, Press
+from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Scene, State
 from .tiles import Pixels
 
 
-WIDE = {"width": "330px"}  # layout of what stands in a line of its own
+WIDE = {"width": "310px"}  # layout of what stands in a line of its own
 
 
 class NotebookView(ipywidgets.HBox):
@@ -46,15 +51,24 @@ class NotebookView(ipywidgets.HBox):
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
         self._status = ipywidgets.HTML(layout=WIDE)
-        self.model = Model(scene, state, self._show, self._set_status)
-        self._first = state
+        self.model = Model(scene, state, self._show, self._set_status, self._deliver)
         self._pointer: tuple[float, float] | None = None
+        self._pressed: tuple[float, float] | None = None
         self._widgets: list[tuple[Any, Control]] = []
         self._updating = False
         shown: list[ipywidgets.Widget] = [self._status]
         for heading, controls in controls_of(self.model).items():
-            shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
-        self.children = (self.canvas, ipywidgets.VBox(shown, layout={"margin": "0 0 0 12px"}))
+            group = ipywidgets.Accordion([ipywidgets.VBox([*map(self._widget, controls)])], titles=[heading])
+            group.selected_index = None if heading in FOLDED else 0
+            shown.append(group)
+        height = f"{max(state.size[1], 480)}px"
+        panel = {"margin": "0 0 0 8px", "width": "350px", "height": height, "overflow": "hidden auto"}
+        self.children = (
+            self.canvas,
+            ipywidgets.VBox(shown, layout=panel | {"flex": "0 0 auto", "display": "block"}),
+        )
+        self.layout.flex_flow = "row wrap"
+        self.model.marked = self._update
         self.model.ask(state)
 
     @property
@@ -65,7 +79,7 @@ class NotebookView(ipywidgets.HBox):
     @property
     def camera(self) -> Camera:
         """The camera, with the size of the image."""
-        return self.model.state.orbit.camera(self.model.state.size)
+        return self.model.state.camera(self.model.state.size)
 
     @property
     def transfer(self) -> Transfer:
@@ -82,12 +96,24 @@ class NotebookView(ipywidgets.HBox):
         """The light, None if it is off."""
         return self.model.scene.light(self.model.state)
 
+    @property
+    def compositing(self) -> Compositing[Any]:
+        """How cells become a pixel."""
+        return self.model.scene.compositing(self.model.state)
+
     def close(self) -> None:
         """Remove the widget, and end its thread. A cell that shows another viewer does not end it."""
         self.model.close()
         self.canvas._is_closed = True  # its scheduler ends; in rendercanvas 2.7, its `close` calls itself
         ipywidgets.Widget.close(self.canvas)
         super().close()
+
+    def _deliver(self, name: str, content: bytes) -> None:
+        path, number = Path(name), 1
+        while path.exists():
+            path, number = Path(f"{Path(name).stem}-{number}.png"), number + 1
+        path.write_bytes(content)
+        self._set_status(f"saved {path}\nin the folder of the notebook")
 
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
@@ -109,9 +135,12 @@ class NotebookView(ipywidgets.HBox):
             notches = -float(event["dy"]) / 100  # of a mouse's wheel, as browsers report it
             self.model.change(orbit=self.model.state.orbit.zoomed(1.2**notches))
         elif kind == "pointer_down":
-            self._pointer = at
+            self._pointer = self._pressed = at
         elif kind == "pointer_up":
-            self._pointer = None
+            if self._pressed is not None and math.dist(at, self._pressed) < 3:
+                ratio, size = self.canvas.get_pixel_ratio(), self.model.state.size
+                self.model.pick(at[0] * ratio / size[0], at[1] * ratio / size[1])
+            self._pointer = self._pressed = None
         elif self._pointer is not None and event["buttons"]:
             # a move without a button may come late, after the button went down
             scale = self.canvas.get_pixel_ratio() / self.model.state.size[1]
@@ -125,26 +154,32 @@ class NotebookView(ipywidgets.HBox):
         self.model.resize(event["width"] * ratio, event["height"] * ratio)
 
     def _reset(self, _: Any = None) -> None:
-        self.model.change(orbit=self._first.orbit)
+        self.model.change(orbit=self.model.first.orbit)
 
     def _widget(self, control: Control) -> ipywidgets.Widget:
         """A widget that shows what a control describes, and changes the model."""
         if control.kind == "buttons":
-            buttons = [ipywidgets.Button(description=text) for text in control.choices()]
+            narrow = {"width": "auto", "min_width": "38px", "padding": "0 5px"}
+            buttons = [ipywidgets.Button(description=text, layout=narrow) for text in control.choices()]
             for button in buttons:
                 button.on_click(lambda pressed: self._change(control.set, pressed.description))
             return ipywidgets.HBox(buttons)
         widget = _widget_of_value(control)
-        if control.kind != "html":
+        if control.kind == "pad":
+            widget.observe(lambda event: self._change(control.set, Press.of(event["new"])), "sent")
+        elif control.kind != "html":
             widget.observe(lambda event: self._change(control.set, event["new"]), "value")
         self._widgets.append((widget, control))
         return widget
 
     def _change(self, change: Callable[[Any], None], value: Any) -> None:
         """Change the model, and let all controls show it; not while they are being made to."""
-        if self._updating:
+        if self._updating or value is None:
             return
         change(value)
+        self._update()
+
+    def _update(self) -> None:
         self._updating = True
         try:
             for widget, control in self._widgets:
@@ -159,6 +194,8 @@ def _widget_of_value(control: Control) -> Any:
     how: dict[str, Any] = {"value": control.get(), "layout": WIDE}
     if control.kind == "html":
         return ipywidgets.HTML(**how)
+    if control.kind == "pad":
+        return Pad(**how)
     how["description"] = control.label
     if control.kind == "checkbox":
         return ipywidgets.Checkbox(indent=False, **how)
@@ -166,11 +203,30 @@ def _widget_of_value(control: Control) -> Any:
     low, high, step = control.limits
     if control.kind == "dropdown":
         return ipywidgets.Dropdown(options=control.choices(), **how)
+    if control.kind == "range":
+        return ipywidgets.FloatRangeSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     if control.kind == "log slider":
         return ipywidgets.FloatLogSlider(base=2, min=math.log2(low), max=math.log2(high), step=0.25, **how)
     if control.kind == "slider":
         return ipywidgets.FloatSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     return (ipywidgets.FloatText if control.kind == "number" else ipywidgets.ColorPicker)(**how)
+
+
+class Pad(anywidget.AnyWidget):
+    """HTML whose boxes tell where they are pressed."""
+
+    _esm = f"""
+    const pressed = {PRESSED};
+    export default {{ render({{ model, el }}) {{
+      const show = () => {{ el.innerHTML = model.get('value'); }};
+      const send = text => {{ model.set('sent', text); model.save_changes(); }};
+      show();
+      model.on('change:value', show);
+      el.onpointerdown = event => pressed(event, send);
+    }} }};
+    """
+    value = traitlets.Unicode().tag(sync=True)
+    sent = traitlets.Unicode().tag(sync=True)
 
 
 class PromptCanvas(RenderCanvas):

@@ -13,13 +13,14 @@ from jaxtyping import Float
 
 from ..._util.checks import finite_array
 from ...compositing.blending import Compositing
-from ...compositing.modes import Mode, compositing_of
+from ...compositing.isosurface import Isosurface
+from ...compositing.modes import MODES, Mode, compositing_of
 from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
 from ...march.transforms import (
-    AdaptiveSampling,
     AlphaCorrection,
+    Clip,
     EarlyTermination,
     EmptySpaceJitter,
     Jitter,
@@ -36,14 +37,16 @@ from ..framing import framed, visible_points
 
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
-STEEPEST = math.radians(89)  # elevation of a camera, at most: from straight above, nothing says what is up
+ISOSURFACE = "isosurface"
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+STEEPEST = math.radians(89.9)  # elevation of a camera, at most: from straight above, nothing says what is up
 
 Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """A perspective camera that looks at a point.
+    """A camera that looks at a point.
 
     Attributes:
         focal_point: world point.
@@ -83,10 +86,8 @@ class Orbit:
 
     def panned(self, right: float, down: float) -> "Orbit":
         """After a drag along the image: what lies at the focal point's distance stays under the pointer."""
-        height = 2 * self.distance * math.tan(math.radians(self.view_angle) / 2)
-        across = np.cross(-self.toward, self.view_up)
-        across = across / np.linalg.norm(across)
-        upward = np.cross(across, -self.toward)
+        height = 2 * self.half_height
+        across, upward, _ = self.axes()
         return replace(self, focal_point=self.focal_point + height * (down * upward - right * across))
 
     def zoomed(self, factor: float) -> "Orbit":
@@ -98,10 +99,59 @@ class Orbit:
         """World position of the camera."""
         return self.focal_point + self.distance * self.toward
 
-    def camera(self, size: tuple[int, int], window: object = None, corner: object = None) -> Camera:
-        """The camera, for an image of this size in pixels."""
-        place = (self.position, self.focal_point, self.view_up, self.view_angle)
-        return Camera(*place, size=size, window=window, corner=corner)  # pyright: ignore[reportArgumentType]
+    @property
+    def half_height(self) -> float:
+        """Of what is seen at the focal point's distance, world length."""
+        return self.distance * math.tan(math.radians(self.view_angle) / 2)
+
+    def facing(self, axis: int, sign: int) -> "Orbit":
+        """From a side of the volume: x, y or z, and which end of it. From above, y is up in the image."""
+        toward = sign * np.eye(3)[axis]
+        if abs(toward @ self.view_up) > 0.5:
+            toward = toward - 1e-3 * np.eye(3)[(axis + 2) % 3]
+        return Orbit.at(
+            self.focal_point + self.distance * toward, self.focal_point, self.view_up, self.view_angle
+        )
+
+    def axes(self) -> tuple[Vector, Vector, Vector]:
+        """Unit vectors to the right and up in the image, and forward."""
+        right = np.cross(-self.toward, self.view_up)
+        right = right / np.linalg.norm(right)
+        return right, np.cross(right, -self.toward), -self.toward
+
+    def ray(self, x: float, y: float, *, parallel: bool) -> tuple[Vector, Vector]:
+        """Origin and unit direction of a ray, whose place in the image is to the right and up of its middle, in
+        half heights."""
+        right, up, forward = self.axes()
+        across = (x * right + y * up) * self.half_height
+        if parallel:
+            return self.position + across, forward
+        direction = self.distance * forward + across
+        return self.position, direction / np.linalg.norm(direction)
+
+    def place(self, point: Vector, *, parallel: bool) -> tuple[float, float] | None:
+        """Where a world point appears, as `ray` counts; None behind the camera."""
+        right, up, forward = self.axes()
+        offset = point - self.position
+        depth = self.distance if parallel else float(offset @ forward)
+        scale = self.half_height * depth / self.distance
+        return (float(offset @ right) / scale, float(offset @ up) / scale) if depth > 0 else None
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What is cut away: all outside of a box, and behind a plane.
+
+    Attributes:
+        box: as `Volume.bounds`.
+        normal: of the plane, which points to what is shown.
+        offset: of the plane from the middle of the volume along its normal, in half diagonals; by default none
+            of the volume lies behind it.
+    """
+
+    box: tuple[float, ...]
+    normal: tuple[float, ...] = (0.0, 0.0, 1.0)
+    offset: float = -1.0
 
 
 @dataclass(frozen=True)
@@ -114,7 +164,14 @@ class State:
         transfer: the transfer function.
         step: distance between samples, in voxels.
         enabled: names of the transforms that are applied.
-        lit: whether there is light.
+        lit: whether there is light, where there can be.
+        mode: how cells become a pixel, a key of `Scene.modes` or `ISOSURFACE`.
+        isovalue: of the isosurface.
+        background: linear RGB.
+        parallel: whether the camera is orthographic, of the same height at the focal point.
+        clip: whether `cut` is applied.
+        cut: what is cut away.
+        point: world point that was picked.
     """
 
     orbit: Orbit
@@ -123,6 +180,24 @@ class State:
     step: float
     enabled: frozenset[str]
     lit: bool
+    mode: str
+    isovalue: float
+    background: tuple[float, float, float]
+    parallel: bool
+    clip: bool
+    cut: Cut
+    point: Vector | None = None
+
+    def camera(self, size: tuple[int, int], window: object = None, corner: object = None) -> Camera:
+        """The camera, for an image of this size in pixels."""
+        orbit: Any = self.orbit
+        place = orbit.position, orbit.focal_point, orbit.view_up, orbit.view_angle
+        scale, part = orbit.half_height if self.parallel else None, {"window": window, "corner": corner}
+        return Camera(*place, size=size, parallel_scale=scale, **part)  # pyright: ignore[reportArgumentType]
+
+
+PROGRAM = "enabled", "lit", "mode", "parallel", "clip"
+"""Fields of a state, of which each has a program of its own. So has each form of transfer function."""
 
 
 @dataclass(frozen=True)
@@ -133,29 +208,53 @@ class Scene:
         volume: what is looked at.
         transforms: those that can be turned on, in the order in which they are applied.
         given: the march whose quadrature and `max_samples` are kept.
-        lighting: the light that can be turned on; None where nothing can be lit.
+        lighting: the light that can be turned on.
         voxel: world length of a step of 1.
-        compositing: how cells become a pixel.
-        background: linear RGB.
+        modes: how cells may become a pixel, besides isosurfaces.
     """
 
     volume: Volume
     transforms: tuple[Transform, ...]
     given: March
-    lighting: Lighting | None
+    lighting: Lighting
     voxel: float
-    compositing: Compositing[Any]
-    background: tuple[float, float, float]
+    modes: dict[str, Compositing[Any]]
 
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
         enabled = tuple(t for t in self.transforms if type(t).__name__ in state.enabled)
+        if state.clip:
+            enabled = (Clip(state.cut.box, [self.plane(state.cut)]), *enabled)
         step = state.step * step_factor * self.voxel
         return March(step, enabled, self.given.quadrature, max_samples=self.given.max_samples)
 
+    def plane(self, cut: Cut) -> tuple[Vector, Vector]:
+        """Origin and normal of the plane."""
+        low, high = (np.asarray(corner, np.float64) for corner in self.volume.corners)
+        normal = np.asarray(cut.normal, np.float64) / np.linalg.norm(cut.normal)
+        # a little farther than the half diagonal, so that nothing is cut away at -1
+        return (low + high) / 2 + 1.001 * cut.offset * np.linalg.norm(high - low) / 2 * normal, normal
+
+    def compositing(self, state: State) -> Compositing[Any]:
+        """How cells become a pixel."""
+        return Isosurface(state.isovalue) if state.mode == ISOSURFACE else self.modes[state.mode]
+
     def light(self, state: State) -> Lighting | None:
-        """The light, if it is on."""
-        return self.lighting if state.lit else None
+        """The light, if it is on, and the mode can be lit."""
+        return self.lighting if state.lit and self.compositing(state).can_be_lit else None
+
+    def in_mode(self, state: State, mode: str) -> State:
+        """The state in another mode, and before the background that is usual for it, unless another was chosen.
+        **Raises** `ValueError` where the mode cannot show the transfer function."""
+        changed = replace(state, mode=mode)
+        self.compositing(changed).marched(changed.transfer, self.given, self.volume)
+        usual = state.background == usual_background(state.mode)
+        return replace(changed, background=usual_background(mode)) if usual else changed
+
+
+def usual_background(mode: str) -> tuple[float, float, float]:
+    """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
+    return BLACK if mode in MODES.keys() - {"over"} else WHITE
 
 
 def initial(
@@ -180,12 +279,9 @@ def initial(
     shown: Any = sized(transfer, volume)
     names = {"volume": volume, "transfer": shown, "camera": chosen, "march": given, "lighting": lighting}
     check_arguments("view(volume, transfer, camera, march)", **names)
-    if chosen.parallel_scale is not None:
-        raise ValueError("the viewer's camera must be perspective; got one with a parallel_scale.")
     mode = compositing_of(compositing)
     mode.marched(shown, given, volume)  # refuses what it cannot show
-    can_be_lit = mode.can_be_lit
-    if lighting is not None and not can_be_lit:
+    if lighting is not None and not mode.can_be_lit:
         raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
     r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
@@ -197,12 +293,24 @@ def initial(
             f"{MAX_STEP:g} voxels, to be shown; got one of {float(given.step):.4g}, {step:.4g} voxels."
         )
     # not a constant: their arrays are made on a device, and none may be in use before `jax.distributed`
-    offered = EmptySpaceJitter(seed=0), Jitter(seed=0), AdaptiveSampling(0.005)
+    offered = EmptySpaceJitter(seed=0), Jitter(seed=0)
     default = AlphaCorrection(), SpaceLeaping(), EarlyTermination(1 / 256)
     own = {type(transform) for transform in given.transforms}
     others = (each for each in (*offered, *default) if type(each) not in own)
-    light = Phong() if lighting is None and can_be_lit else lighting
-    scene = Scene(volume, (*given.transforms, *others), given, light, voxel, mode, (r, g, b))
+    modes: dict[str, Compositing[Any]] = {name: kind() for name, kind in MODES.items()}
+    is_surface = isinstance(mode, Isosurface)
+    name = next((n for n, kind in MODES.items() if type(mode) is kind), type(mode).__name__.lower())
+    modes |= {} if is_surface else {name: mode}
+    scene = Scene(volume, (*given.transforms, *others), given, lighting or Phong(), voxel, modes)
     enabled = frozenset(type(t).__name__ for t in (default if march is None else given.transforms))
-    orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, float(chosen.view_angle))
-    return scene, State(orbit, whole.size, shown, step, enabled, lit and can_be_lit)
+    data = np.asarray(volume.data)
+    between = (float(data.min()) + float(data.max())) / 2
+    isovalue = float(mode.value) if isinstance(mode, Isosurface) else between
+    angle, parallel = float(chosen.view_angle), chosen.parallel_scale is not None
+    orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, angle)
+    if parallel:  # from as far as shows the same height
+        orbit = orbit.zoomed(orbit.half_height / float(chosen.parallel_scale))
+    cut = Cut(tuple(np.asarray(volume.bounds).tolist()))
+    return scene, State(
+        orbit, whole.size, shown, step, enabled, lit, name, isovalue, (r, g, b), parallel, False, cut
+    )

@@ -12,12 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
+from PIL import Image
 
 from ..._util.srgb import to_srgb
 from ...metrics import rmse
 from ...render import render
+from ...scene.rendering import Rendering
 from .editing import padded
-from .state import Scene, State
+from .state import PROGRAM, Scene, State
 
 
 SIDE = 192
@@ -62,12 +64,16 @@ class Grid:
         middle = self.size[0] / SIDE / 2 - 0.5, self.size[1] / SIDE / 2 - 0.5
         return sorted(tiles, key=lambda tile: math.dist(tile, middle))
 
-    def canvas(self, pixels: Pixels) -> Pixels:
-        """An image that holds all tiles whole: each pixel the nearest one of another image."""
-        rows, columns, _ = pixels.shape
-        row = np.minimum(np.arange(self.rows * SIDE) * rows // self.size[1], rows - 1)
-        column = np.minimum(np.arange(self.columns * SIDE) * columns // self.size[0], columns - 1)
-        return pixels[row[:, None], column[None, :]]
+    def canvas(self, coarse: "Picture") -> "Picture":
+        """An image that holds all tiles whole: another one, stretched; smoothly, so that no blocks show beside
+        finished tiles."""
+        width, height = self.size
+        beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width)
+        pixels = Image.fromarray(coarse.pixels).resize(self.size, Image.Resampling.BILINEAR)
+        depth = Image.fromarray(coarse.depth).resize(self.size, Image.Resampling.NEAREST)
+        return Picture(
+            np.pad(np.asarray(pixels), (*beyond, (0, 0)), "edge"), np.pad(np.asarray(depth), beyond, "edge")
+        )
 
     def window(self, column: int, row: int, aspect: float) -> tuple[float, float, float, float]:
         """A tile's part of the image plane, as `Camera.window`. `aspect`: width over height of the view."""
@@ -76,45 +82,76 @@ class Grid:
         return column * x - aspect, (column + 1) * x - aspect, 1 - (row + 1) * y, 1 - row * y
 
 
+@dataclass(frozen=True)
+class Picture:
+    """What tiles are drawn into.
+
+    Attributes:
+        pixels: sRGB.
+        depth: as that of a `Rendering`; infinite where a mode has none.
+    """
+
+    pixels: Pixels
+    depth: Float[np.ndarray, "height width"]
+
+    @classmethod
+    def empty(cls, columns: int, rows: int) -> "Picture":
+        """For so many tiles."""
+        shape = rows * SIDE, columns * SIDE
+        return cls(np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32))
+
+    def upper_left(self, width: int, height: int) -> "Picture":
+        """A copy of so many pixels."""
+        return Picture(self.pixels[:height, :width].copy(), self.depth[:height, :width].copy())
+
+
 class TileRenderer:
     """Draws tiles of one state of a viewer, with steps that are `step_factor` times as long."""
 
     def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
         self.volume, self.state, self.march = scene.volume, state, scene.march(state, step_factor)
         self.transfer = padded(state.transfer)
-        self.background = np.asarray(scene.background, np.float32)
-        self.how = {"compositing": scene.compositing, "lighting": scene.light(state), "outputs": "rgba"}
+        self.background = np.asarray(state.background, np.float32)
+        self.how = {"compositing": scene.compositing(state), "lighting": scene.light(state)}
 
     @property
     def program_key(self) -> tuple[Any, ...]:
         """Equal for states that one compiled program draws."""
         leaves, structure = jax.tree.flatten(self.transfer)
-        return self.state.enabled, self.state.lit, structure, *map(np.shape, leaves)
+        fields = (getattr(self.state, name) for name in PROGRAM)
+        return *fields, structure, *map(np.shape, leaves)
 
-    def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
+    def rendering(self, grid: Grid, column: int, row: int) -> Rendering:
         """A tile as `render` returns it."""
         width, height = self.state.size
         window, corner = grid.window(column, row, width / height), (column * SIDE, row * SIDE)
-        camera = self.state.orbit.camera((SIDE, SIDE), window, corner)
-        return render(self.volume, self.transfer, camera, self.march, **self.how).rgba
+        camera = self.state.camera((SIDE, SIDE), window, corner)
+        return render(self.volume, self.transfer, camera, self.march, **self.how)
 
-    def draw(self, pixels: Pixels, grid: Grid, column: int, row: int) -> None:
+    def draw(self, picture: Picture, grid: Grid, column: int, row: int) -> None:
         """Draw a tile into its place in an image that holds all tiles whole."""
-        drawn = np.asarray(_displayed(self.rgba(grid, column, row), self.background))
-        pixels[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE] = drawn
+        found = self.rendering(grid, column, row)
+        place = np.s_[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
+        picture.pixels[place] = np.asarray(_displayed(found.rgba, self.background))
+        depth = found.details.depth
+        picture.depth[place] = np.inf if depth is None else np.asarray(depth)
 
-    def coarse(self, most: int) -> Pixels:
+    def coarse(self, most: int) -> Picture:
         """An image of at most so many tiles."""
         grid = Grid.coarse(self.state.size, most)
-        pixels = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.uint8)
+        picture = Picture.empty(grid.columns, grid.rows)
         for column, row in grid.tiles():
-            self.draw(pixels, grid, column, row)
-        return pixels
+            self.draw(picture, grid, column, row)
+        return picture
+
+    def linear(self, grid: Grid, column: int, row: int) -> Float[np.ndarray, "side side 3"]:
+        """Linear colours of a tile."""
+        rgba = np.asarray(self.rendering(grid, column, row).rgba)
+        return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
 
     def overview(self) -> Float[np.ndarray, "side side 3"]:
         """Linear colours of one tile that is stretched over the view."""
-        rgba = np.asarray(self.rgba(Grid.coarse(self.state.size, 1), 0, 0))
-        return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
+        return self.linear(Grid.coarse(self.state.size, 1), 0, 0)
 
 
 def estimated_error(
