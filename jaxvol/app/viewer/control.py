@@ -1,28 +1,26 @@
-"""What is a control? A description of which each face makes a widget of its own."""
+"""What is a control? A description, of which each face makes a widget of its own."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
-
-import numpy as np
+from typing import Any, Literal, NamedTuple
 
 
 @dataclass(frozen=True)
 class Control:
-    """Something to look at ("html") or to change.
+    """Something to look at or to change.
 
     Attributes:
-        kind: of widget. "pad": to look at, with boxes in which the pointer presses and drags: elements with
+        kind: of widget. "pad": HTML to look at, with boxes in which the pointer presses and drags: elements with
             `data-pad`, the name of the box, and in them `data-part`.
         label: beside it.
         get: what it shows now: a text, a number, two in a range, True or False, or a color: sRGB, `#rrggbb`.
-        set: changes the model; of buttons, called with the text of one, of pads with a `Press`.
+        set: changes the model; of buttons, called with the text of one, of pads with that of a `Press`.
         limits: of a slider or range, lowest and highest number and the step between two.
         choices: of a dropdown or buttons, the texts that there are now.
     """
 
     kind: Literal[
-        "html", "pad", "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown"
+        "pad", "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown"
     ]
     label: str = ""
     get: Callable[[], Any] = str
@@ -31,18 +29,10 @@ class Control:
     choices: Callable[[], list[str]] = list
 
 
-@dataclass(frozen=True)
-class Press:
-    """Where the pointer is that was pressed in a box. Those between may be lost, so that each tells all.
-
-    Attributes:
-        gesture: differs from one press to the next.
-        pad: name of the box.
-        part: what was pressed in it; empty for the box itself.
-        twice: whether the part had been pressed just before.
-        x: from the left edge of the box to its right one, 0 to 1.
-        y: from the upper edge.
-    """
+class Press(NamedTuple):
+    """A press of the pointer that is going on in the box `pad`: on one of its parts, empty for none, maybe twice;
+    and where the pointer is, from the upper left corner, 0 to 1. Those between may be lost, so that each tells
+    all; a `gesture` has one number."""
 
     gesture: str
     pad: str
@@ -52,14 +42,11 @@ class Press:
     y: float
 
     @classmethod
-    def of(cls, message: str) -> "Press | None":
-        """What a face's message says; None for what is none."""
-        try:
-            gesture, pad, part, twice, *at = message.split(",")
-            x, y = (min(max(float(each), 0.0), 1.0) for each in at)
-        except ValueError:
-            return None
-        return None if np.isnan(x + y) else cls(gesture, pad, part, twice == "true", x, y)
+    def of(cls, message: str) -> "Press":
+        """What a face's message says. **Raises** `ValueError` for another one."""
+        gesture, pad, part, twice, *at = message.split(",")
+        x, y = (min(max(float(each), 0.0), 1.0) for each in at)
+        return cls(gesture, pad, part, twice == "true", x, y)
 
 
 PRESSED = """(event, send) => {
@@ -78,5 +65,5 @@ PRESSED = """(event, send) => {
   window.addEventListener('pointermove', tell);
   window.addEventListener('pointerup', () => window.removeEventListener('pointermove', tell), {once: true});
 }"""
-"""JavaScript of both faces: handles `pointerdown`, and sends messages for `Press.of`. What was pressed may be drawn
-anew while the pointer moves."""
+"""JavaScript of both faces: handles `pointerdown`, and sends messages for `Press.of`. What was pressed may be
+drawn anew while the pointer moves."""

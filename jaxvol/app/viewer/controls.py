@@ -1,7 +1,5 @@
 """What can be changed in a viewer? Its controls by groups, for both faces."""
 
-import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +8,10 @@ from matplotlib.colors import to_rgb
 from ..._util.srgb import from_srgb
 from .control import Control
 from .curve import transfer_controls
-from .editing import display_color, rounded
+from .editing import display_color
 from .model import Model
 from .slices import slice_controls
-from .state import ISOSURFACE, MAX_STEP, MIN_STEP, Cut
+from .state import ISOSURFACE, MAX_STEP, MIN_STEP, Orbit
 
 
 FOLDED = {"clip", "save", "march"}
@@ -37,90 +35,78 @@ def controls_of(model: Model) -> dict[str, list[Control]]:
     return {heading: controls for heading, controls in groups.items() if controls}
 
 
+def _bound(model: Model, kind: Any, label: str, name: str, **more: Any) -> Control:
+    """A control of a field of the state."""
+    return Control(
+        kind, label, lambda: getattr(model.state, name), lambda to: model.change(**{name: to}), **more
+    )
+
+
 def _view_controls(model: Model) -> list[Control]:
     """From where the volume is looked at, and how cells become pixels."""
-    data = np.asarray(model.scene.volume.data)
+    data, modes = np.asarray(model.scene.volume.data), [*model.scene.modes, ISOSURFACE]
     low, high = float(data.min()), float(data.max())
+    span = high - low or max(abs(low), 1.0)
 
     def look(side: str) -> None:
-        old = model.first.orbit
-        model.change(orbit=old if side == "reset" else old.facing(*SIDES[side]))
+        orbit = model.first.orbit
+        if side != "reset":
+            axis, sign = SIDES[side]
+            position = orbit.focal_point + orbit.distance * sign * np.eye(3)[axis]
+            orbit = Orbit.at(position, orbit.focal_point, orbit.view_up, orbit.view_angle)
+        model.change(orbit=orbit)
 
     def set_background(color: str) -> None:
-        r, g, b = np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()
-        model.change(background=(r, g, b))
+        model.change(background=tuple(np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()))
 
-    modes = [*model.scene.modes, ISOSURFACE]
-    span = high - low or max(abs(low), 1.0)
-    limits = low, low + span, span / 1000
+    def background() -> str:
+        return display_color(np.array(model.state.background))
+
+    def set_mode(mode: str) -> None:
+        model.apply(lambda state: model.scene.in_mode(state, mode))
+
     return [
         Control("buttons", "look from", set=look, choices=lambda: [*SIDES, "reset"]),
-        Control(
-            "checkbox", "orthographic", lambda: model.state.parallel, lambda on: model.change(parallel=on)
-        ),
-        Control(
-            "dropdown",
-            "mode",
-            lambda: model.state.mode,
-            lambda mode: model.apply(lambda state: model.scene.in_mode(state, mode)),
-            choices=lambda: modes,
-        ),
-        Control(
-            "slider",
-            "isovalue",
-            lambda: rounded(model.state.isovalue, span),
-            lambda value: model.change(isovalue=value),
-            limits,
-        ),
-        Control("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on)),
-        Control(
-            "color", "background", lambda: display_color(np.array(model.state.background)), set_background
-        ),
+        _bound(model, "checkbox", "orthographic", "parallel"),
+        Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=lambda: modes),
+        _bound(model, "slider", "isovalue", "isovalue", limits=(low, low + span, span / 1000)),
+        _bound(model, "checkbox", "light", "lit"),
+        Control("color", "background", background, set_background),
     ]
 
 
 def _clip_controls(model: Model) -> list[Control]:
     """A box and a plane, of which any change turns clipping on."""
-    whole, chosen = model.state.cut, "none"
-
-    def cut(**changes: Any) -> None:
-        model.apply(lambda state: replace(state, clip=True, cut=replace(state.cut, **changes)))
+    bounds, chosen = model.state.box, "none"
 
     def range_of(axis: int) -> Control:
-        low, high = whole.box[2 * axis : 2 * axis + 2]
-        unit = 10.0 ** math.floor(math.log10((high - low) / 100))
-        ends = math.floor(low / unit) * unit, math.ceil(high / unit) * unit
-
-        def get() -> tuple[float, float]:
-            first, last = (
-                min(max(rounded(each, high - low), ends[0]), ends[1])
-                for each in model.state.cut.box[2 * axis : 2 * axis + 2]
-            )
-            return first, last
+        ends = slice(2 * axis, 2 * axis + 2)
+        low, high = bounds[ends]
+        step = (high - low) / 200
 
         def put(both: tuple[float, float]) -> None:
-            box = [*model.state.cut.box]
-            box[2 * axis : 2 * axis + 2] = both[0], max(both[1], both[0] + unit)
-            cut(box=tuple(box))
+            box = [*model.state.box]
+            box[ends] = both[0], max(both[1], both[0] + step)
+            model.change(clip=True, box=tuple(box))
 
-        return Control("range", "xyz"[axis], get, put, (*ends, unit))
+        return Control("range", "xyz"[axis], lambda: model.state.box[ends], put, (low, high, step))
 
     def choose(name: str) -> None:
         nonlocal chosen
         chosen = name
         if name == "none":
-            return cut(offset=Cut.offset)
-        toward = model.state.orbit.toward if name == "view" else np.eye(3)[SIDES[name][0]] * SIDES[name][1]
-        return cut(normal=tuple((-toward).tolist()), offset=0.0)
+            model.change(offset=-1.0)
+        else:
+            axis, sign = SIDES.get(name, (0, 1))
+            toward = model.state.orbit.toward if name == "view" else sign * np.eye(3)[axis]
+            model.change(clip=True, normal=tuple((-toward).tolist()), offset=0.0)
 
-    plane = Control(
-        "dropdown", "plane from", lambda: chosen, choose, choices=lambda: ["none", "view", *SIDES]
-    )
-    depth = Control(
-        "slider", "depth", lambda: model.state.cut.offset, lambda x: cut(offset=x), (-1.0, 1.0, 0.01)
-    )
-    on = Control("checkbox", "clip", lambda: model.state.clip, lambda on: model.change(clip=on))
-    return [on, *map(range_of, range(3)), plane, depth]
+    return [
+        _bound(model, "checkbox", "clip", "clip"),
+        *map(range_of, range(3)),
+        Control("dropdown", "cut from", lambda: chosen, choose, choices=lambda: ["none", "view", *SIDES]),
+        _bound(model, "slider", "depth", "offset", limits=(-1.0, 1.0, 0.01)),
+    ]
 
 
 def _save_controls(model: Model) -> list[Control]:
@@ -130,10 +116,11 @@ def _save_controls(model: Model) -> list[Control]:
         nonlocal width
         width = pixels
 
-    return [
-        Control("number", "width (pixels)", lambda: width, set_width),
-        Control("buttons", "image", set=lambda _: model.save(int(width)), choices=lambda: ["save PNG"]),
-    ]
+    def save(_: str) -> None:
+        model.save(width)
+
+    number = Control("number", "width (pixels)", lambda: width, set_width)
+    return [number, Control("buttons", "image", set=save, choices=lambda: ["save PNG"])]
 
 
 def _march_controls(model: Model) -> list[Control]:

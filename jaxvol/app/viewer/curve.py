@@ -34,7 +34,7 @@ def transfer_controls(model: Model) -> list[Control]:
         return _label_controls(model)
     if isinstance(transfer, TransferFunction):
         return _point_controls(model)
-    return [Control("html", get=lambda: "of another kind, not edited here")]
+    return [Control("pad", get=lambda: "of another kind, not edited here")]
 
 
 def edit(model: Model, change: Callable[..., Any], *arguments: Any) -> None:
@@ -55,12 +55,11 @@ def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]
 def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel: float, chosen: int) -> str:
     """A pad with the histogram, and as a line the square root of the opacity, which shows thin materials; its
     points, in their colours, are parts of the pad."""
-    values = np.linspace(low, high, 4 * BINS)
     at, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction)
+    across = WIDTH * np.clip((at - low) / (high - low), 0, 1)
     colors = [editing.display_color(color) for color in np.asarray(transfer.colors)]
-    few = len(at) <= editing.MAX_POINTS
 
-    def heights(extinction: Any) -> Any:
+    def height(extinction: Any) -> Any:
         return HEIGHT - (HEIGHT - 2) * np.sqrt(-np.expm1(-np.asarray(extinction, np.float64) * voxel))
 
     def points(down: Float[np.ndarray, " n"]) -> str:
@@ -68,15 +67,16 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
             f"{x:.1f},{y:.1f}" for x, y in zip(np.linspace(0, WIDTH, len(down)), down, strict=True)
         )
 
-    across = np.clip((at - low) / (high - low), 0, 1)
     stops = "".join(
-        f'<stop offset="{x:.4f}" stop-color="{c}" />' for x, c in zip(across, colors, strict=True)
+        f'<stop offset="{x / WIDTH:.4f}" stop-color="{color}" />'
+        for x, color in zip(across, colors, strict=True)
     )
     circles = "".join(
-        f'<circle data-part="{i}" cx="{WIDTH * x:.1f}" cy="{y:.1f}" r="{7 if i == chosen else 5}" fill="{color}"'
-        f' stroke="currentColor" stroke-width="{2 if i == chosen else 1}" style="cursor: move" />'
-        for i, (x, y, color) in enumerate(zip(across, heights(extinction), colors, strict=True))
+        f'<circle data-part="{i}" cx="{x:.1f}" cy="{y:.1f}" r="{7 if i == chosen else 5}" fill="{color}"'
+        f' stroke="currentColor" style="cursor: move" />'
+        for i, (x, y, color) in enumerate(zip(across, height(extinction), colors, strict=True))
     )
+    line = height(np.interp(np.linspace(low, high, 4 * BINS), at, extinction))
     return (
         f'<svg data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}" width="100%" xmlns="http://www.w3.org/2000/svg"'
         f' style="overflow: visible; touch-action: none; cursor: crosshair; display: block">'
@@ -84,135 +84,111 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
         f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#8882" />'
         f'<polygon points="0,{HEIGHT} {points(HEIGHT - (HEIGHT - 2) * bars)} {WIDTH},{HEIGHT}" fill="#8888" />'
         f'<rect y="{HEIGHT}" width="{WIDTH}" height="8" fill="url(#jaxvol-colors)" />'
-        f'<polyline points="{points(heights(np.interp(values, at, extinction)))}" fill="none"'
-        f' stroke="currentColor" />{circles if few else ""}</svg>'
+        f'<polyline points="{points(line)}" fill="none" stroke="currentColor" />'
+        f"{circles if len(at) <= editing.MAX_POINTS else ''}</svg>"
         f'<div style="display: flex; justify-content: space-between; font-size: 10px; margin-top: 8px">'
         f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
     )
 
 
 def _point_controls(model: Model) -> list[Control]:
-    """Presets and colormaps, the curve, window and level, and the chosen point: its value, colour and opacity,
-    which is that of a layer as thick as a voxel."""
+    """Presets and colormaps, the curve, window and level, and the point that was pressed last: its value, colour
+    and opacity, which is that of a layer as thick as a voxel."""
     low, high, bars = histogram(model.scene.volume)
-    voxel, given, chosen, gesture, dragging = model.scene.voxel, model.state.transfer, 0, "", False
+    voxel, given, chosen, gesture = model.scene.voxel, model.state.transfer, 0, ""
     names = {"preset": GIVEN, "colors": GIVEN}
 
     def transfer() -> TransferFunction:
         return cast(TransferFunction, model.state.transfer)
 
-    def put(new: Any) -> None:
+    def put(change: Callable[..., Any], *arguments: Any) -> None:
         nonlocal chosen
-        edit(model, lambda old: new(old) if callable(new) else new)
+        edit(model, change, *arguments)
         chosen = min(chosen, len(transfer().values) - 1)
 
     def choose_preset(name: str) -> None:
         names["preset"], names["colors"] = name, GIVEN
-        made = {GIVEN: lambda _: given, AUTOMATIC: lambda _: automatic_transfer(model.scene.volume)}
-        put(made.get(name, lambda _: preset(name, unit_distance=voxel)))
+        made = {GIVEN: lambda: given, AUTOMATIC: lambda: automatic_transfer(model.scene.volume)}
+        put(lambda _: made.get(name, lambda: preset(name, unit_distance=voxel))())
 
     def choose_colors(name: str) -> None:
         names["colors"] = name
         if name != GIVEN:
-            put(lambda old: editing.recolored(old, name))
+            put(editing.recolored, name)
 
-    def now() -> tuple[float, float]:
-        return editing.window_level(transfer())
-
-    window, level = now()
-    first, last = min(low, level - window / 2), max(high, level + window / 2)
-    span = last - first
-    unit = 10.0 ** (np.ceil(np.log10(span)) - 3)
-
-    def shown(number: float, limits: tuple[float, float, float]) -> float:
-        return min(max(editing.rounded(number, span), limits[0]), limits[1])
-
-    windows = min(unit, editing.rounded(window, span)), editing.rounded(4 * span, span), unit
-    levels = editing.rounded(first - span, span), editing.rounded(last + span, span), unit
-    range_controls = [
-        Control(
-            "slider",
-            "window",
-            lambda: shown(now()[0], windows),
-            lambda to: edit(model, editing.with_window_level, to, now()[1]),
-            windows,
-        ),
-        Control(
-            "slider",
-            "level",
-            lambda: shown(now()[1], levels),
-            lambda to: edit(model, editing.with_window_level, now()[0], to),
-            levels,
-        ),
-    ]
-
-    def press(pressed: Press) -> None:
-        nonlocal chosen, gesture, dragging
+    def press(message: str) -> None:
+        nonlocal chosen, gesture
+        pressed, count = Press.of(message), len(transfer().values)
         height = min((1 - pressed.y) * HEIGHT / (HEIGHT - 2), 1.0)
         value, opacity = editing.rounded(low + pressed.x * (high - low), high - low), round(height**2, 3)
         if pressed.gesture != gesture:
-            gesture, count, dragging = pressed.gesture, len(transfer().values), True
-            if pressed.part:
-                chosen = min(int(pressed.part), count - 1)
-            else:
-                edit(model, editing.with_point_at, value)
-                chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
-                dragging = len(transfer().values) > count
+            gesture, chosen = pressed.gesture, min(int(pressed.part or 0), count - 1)
             if pressed.twice:
-                dragging = False
-                put(lambda old: editing.without_point(old, chosen))
-        if dragging:
-            edit(
-                model,
-                lambda t: editing.with_opacity(editing.with_value(t, chosen, value), chosen, opacity, voxel),
+                put(editing.without_point, chosen)
+            elif not pressed.part:
+                put(editing.with_point_at, value)
+                chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
+        elif not pressed.twice:
+            put(
+                lambda old: editing.with_opacity(
+                    editing.with_value(old, chosen, value), chosen, opacity, voxel
+                )
             )
 
-    def point_names() -> list[str]:
-        return [f"{number}: {value:.4g}" for number, value in enumerate(transfer().values.tolist(), 1)]
+    def of_range(label: str, index: int, limits: tuple[float, float, float]) -> Control:
+        def get() -> float:
+            return min(
+                max(editing.rounded(editing.window_level(transfer())[index], span), limits[0]), limits[1]
+            )
 
-    def choose(name: str) -> None:
-        nonlocal chosen
-        chosen = point_names().index(name)
+        def put(value: float) -> None:
+            window_level = [*editing.window_level(transfer())]
+            window_level[index] = value
+            edit(model, editing.with_window_level, *window_level)
 
-    def change(how: Callable[..., Any], *more: Any) -> Callable[[Any], None]:
-        return lambda value: edit(model, how, chosen, value, *more)
+        return Control("slider", label, get, put, limits)
 
-    def add_or_remove(option: str) -> None:
-        how = editing.with_point_after if option == "add after" else editing.without_point
-        put(lambda old: how(old, chosen))
+    window, level = editing.window_level(transfer())
+    first, last = min(low, level - window / 2), max(high, level + window / 2)
+    span = editing.rounded(last - first, last - first)
+    unit, middle = (
+        editing.rounded(span / 1000, span) or span / 1000,
+        editing.rounded((first + last) / 2, span),
+    )
+    controls = [
+        *(
+            Control(
+                "dropdown",
+                label,
+                lambda label=label: names[label],
+                choose,
+                choices=lambda c=choices: [GIVEN, *c],
+            )
+            for label, choose, choices in (
+                ("preset", choose_preset, [AUTOMATIC, *PRESETS]),
+                ("colors", choose_colors, COLORMAPS),
+            )
+        ),
+        Control("pad", get=lambda: _plot(low, high, bars, transfer(), voxel, chosen), set=press),
+        of_range("window", 0, (min(unit, window), 4 * span, unit)),
+        of_range("level", 1, (middle - 1.5 * span, middle + 1.5 * span, unit)),
+    ]
+
+    def value() -> float:
+        return editing.rounded(float(transfer().values[chosen]), span)
 
     def color() -> str:
         return editing.display_color(np.asarray(transfer().colors)[chosen])
 
-    def dropdown(name: str, choose: Callable[[str], None], choices: list[str]) -> Control:
-        return Control("dropdown", name, lambda: names[name], choose, choices=lambda: choices)
+    def opacity() -> float:
+        return round(float(transfer().opacity(voxel)[chosen]), 3)
 
-    controls = [
-        dropdown("preset", choose_preset, [GIVEN, AUTOMATIC, *PRESETS]),
-        dropdown("colors", choose_colors, [GIVEN, *COLORMAPS]),
-        Control("pad", get=lambda: _plot(low, high, bars, transfer(), voxel, chosen), set=press),
-        *range_controls,
+    points = [
+        Control("number", "value", value, lambda to: put(editing.with_value, chosen, to)),
+        Control("color", "color", color, lambda to: put(editing.with_color, chosen, to)),
+        Control("slider", "opacity", opacity, lambda to: put(editing.with_opacity, chosen, to, voxel)),
     ]
-    if len(transfer().values) > editing.MAX_POINTS:
-        return controls
-    return [
-        *controls,
-        Control("dropdown", "point", lambda: point_names()[chosen], choose, choices=point_names),
-        Control(
-            "number",
-            "value",
-            lambda: float(f"{float(transfer().values[chosen]):.4g}"),
-            change(editing.with_value),
-        ),
-        Control("color", "color", color, change(editing.with_color)),
-        Control(
-            "slider",
-            "opacity",
-            lambda: round(float(transfer().opacity(voxel)[chosen]), 3),
-            change(editing.with_opacity, voxel),
-        ),
-        Control("buttons", "points", set=add_or_remove, choices=lambda: ["add after", "remove"]),
-    ]
+    return controls + points if len(transfer().values) <= editing.MAX_POINTS else controls
 
 
 def _label_controls(model: Model) -> list[Control]:
@@ -244,7 +220,7 @@ def _label_controls(model: Model) -> list[Control]:
 
     return [
         Control("dropdown", "label", lambda: names[chosen], choose, choices=lambda: names),
-        Control("html", get=swatch),
+        Control("pad", get=swatch),
         Control("checkbox", "shown", lambda: bool(get("shown")), show),
         Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),
     ]

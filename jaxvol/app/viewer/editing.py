@@ -66,17 +66,6 @@ def with_opacity(
     return _with_point(transfer, index, extinction=extinction_of([opacity], unit_distance)[0])
 
 
-def with_point_after(transfer: TransferFunction, index: int) -> TransferFunction:
-    """With one more point half-way between this one and the next, which does not change the function."""
-    values = np.asarray(transfer.values)
-    is_last = index + 1 == len(values)
-    if is_last or len(values) >= MAX_POINTS or values[index] == values[index + 1]:
-        raise ValueError(f"there is no room for another of {MAX_POINTS} points after point {index + 1}.")
-    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
-    between = (np.insert(p, index + 1, (p[index] + p[index + 1]) / 2, axis=0) for p in points)
-    return TransferFunction(*between)
-
-
 def with_point_at(transfer: TransferFunction, value: float) -> TransferFunction:
     """With one more point at a value, which does not change the function."""
     values = np.asarray(transfer.values, np.float64)

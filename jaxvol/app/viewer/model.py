@@ -14,8 +14,8 @@ import numpy as np
 from ...io.display import save_image
 from .marks import with_marks
 from .settings import text_of
-from .state import PROGRAM, Scene, State
-from .tiles import SIDE, Grid, Picture, Pixels, TileRenderer, estimated_error
+from .state import PROGRAM, Scene, State, Vector
+from .tiles import SIDE, Grid, Pixels, TileRenderer, estimated_error
 
 
 Stage = Literal["coarse", "drawing", "fine"]
@@ -56,7 +56,7 @@ class Model:
         state: how, at first.
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
         set_status: called likewise with a status of two lines, or three.
-        deliver: called by a thread of its own with the name and the bytes of an image that is saved.
+        deliver: called by a thread of its own with the PNG of an image that is saved.
         file: called for what a saved image tells of the volume's file: see `settings.text_of`.
     """
 
@@ -71,14 +71,14 @@ class Model:
         state: State,
         show: Callable[[Pixels, Stage], None],
         set_status: Callable[[str], None],
-        deliver: Callable[[str, bytes], None] = lambda name, content: None,
+        deliver: Callable[[bytes], None] = lambda content: None,
         file: Callable[[], dict[str, Any]] = dict,
     ):
         self.scene, self.state, self.first = scene, state, state
         self._face, self._deliver, self._file = (show, set_status), deliver, file
-        self._told, self._compiling, self._begun = "", "", 0.0
+        self._status, self._compiling, self._begun = "", "", 0.0
         self._last: State | None = None
-        self._shown: tuple[State, Picture] | None = None
+        self._shown: tuple[State, Pixels] | None = None
         self._level = 2
         self._compiled: set[Any] = set()
         self._changed = threading.Condition()
@@ -131,68 +131,63 @@ class Model:
             self.change(size=size, **changes)
 
     def pick(self, across: float, down: float) -> None:
-        """Pick the point that is seen at a fraction of the view's width and height: where the material is that
-        adds to the pixel, on average. Nothing is picked where there is none."""
-        if self._shown is None or not (0 <= across < 1 and 0 <= down < 1):
-            return
-        state, picture = self._shown
-        rows, columns = picture.depth.shape
-        depth = float(picture.depth[int(down * rows), int(across * columns)])
-        if math.isfinite(depth):
-            aspect = state.size[0] / state.size[1]
-            origin, direction = state.orbit.ray(
-                (2 * across - 1) * aspect, 1 - 2 * down, parallel=state.parallel
-            )
-            self.mark(origin + depth * direction)
+        """Mark the point that is seen at a fraction of the view's width and height, if there is one."""
+        if self._last is not None:  # whose program is compiled
+            point = TileRenderer(self.scene, self._last).picked(across, down)
+            if point is not None:
+                self.mark(point)
 
-    def mark(self, point: np.ndarray) -> None:
+    def mark(self, point: Vector) -> None:
         """Mark a point of the world in the image that is shown."""
         self.state = replace(self.state, point=point)
         self.marked()
         if self._shown is not None and not self._closed:
-            request, picture = self._shown
-            self._face[0](with_marks(picture.pixels, replace(request, point=point)), "drawing")
+            request, pixels = self._shown
+            self._face[0](with_marks(pixels, replace(request, point=point)), "drawing")
 
-    def save(self, width: int) -> None:
+    def save(self, width: float) -> None:
         """Render an image that is so many pixels wide, by a thread of its own, and deliver it as a PNG, which
         holds its settings as those that `jaxvol render` writes."""
         across, down = self.state.size
-        scale = min(width, MAX_SAVED, MAX_SAVED * across / down) / across
-        state = replace(self.state, size=(max(1, round(across * scale)), max(1, round(down * scale))))
-        threading.Thread(target=self._save, args=(state,), daemon=True, name="jaxvol viewer saves").start()
+        scale = min(max(width, 1), MAX_SAVED, MAX_SAVED * across / down) / across
+        state = replace(self.state, size=(round(across * scale), max(1, round(down * scale))))
+        threading.Thread(target=self._told, args=("saved", self._save, state), daemon=True).start()
 
     def _save(self, state: State) -> None:
-        try:
-            renderer, grid, (width, height) = (
-                TileRenderer(self.scene, state),
-                Grid.fine(state.size),
-                state.size,
-            )
-            image = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.float32)
-            for count, (column, row) in enumerate(tiles := grid.tiles()):
-                if self._closed:
-                    return
-                self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
-                place = np.s_[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
-                image[place] = renderer.linear(grid, column, row)
-            with TemporaryDirectory() as folder:
-                text = text_of(self.scene, state, self._file())
-                path = save_image(Path(folder) / "jaxvol.png", image[:height, :width], text=text)
-                self._set_status(f"saved {width} x {height}\n")
-                self._deliver(path.name, path.read_bytes())
-        except Exception as fault:
-            self._set_status(f"not saved:\n{' '.join(str(fault).split())}")
+        renderer, grid, (width, height) = TileRenderer(self.scene, state), Grid.fine(state.size), state.size
+        image = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.float32)
+        for count, (column, row) in enumerate(tiles := grid.tiles()):
+            if self._closed:
+                return
+            self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
+            place = np.s_[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
+            image[place] = renderer.linear(grid, column, row)
+        with TemporaryDirectory() as folder:
+            text = text_of(self.scene, state, self._file())
+            path = save_image(Path(folder) / "jaxvol.png", image[:height, :width], text=text)
+            self._set_status(f"saved {width} x {height}\n")
+            self._deliver(path.read_bytes())
 
-    def _show(self, picture: Picture, stage: Stage, seconds: float, request: State, factor: float = 1) -> str:
+    def _told(self, what: str, do: Callable[..., object], *arguments: Any) -> bool:
+        """Do something, and tell of a fault, after which the user may ask for something else."""
+        try:
+            do(*arguments)
+        except Exception as fault:
+            self._set_status(f"not {what}:\n{' '.join(str(fault).split())}")
+            return False
+        return True
+
+    def _show(self, pixels: Pixels, stage: Stage, seconds: float, request: State, factor: float = 1) -> str:
         """Show an image of a state, with steps that are longer by a factor. Returns what there is to say."""
-        self._shown, step = (request, picture), request.step * factor
+        self._shown = request, pixels
         if not self._closed:
-            self._face[0](with_marks(picture.pixels, replace(request, point=self.state.point)), stage)
-        height, width, _ = picture.pixels.shape
+            self._face[0](with_marks(pixels, replace(request, point=self.state.point)), stage)
+        height, width, _ = pixels.shape
+        step = request.step * factor
         return f"{stage}: {width} x {height}, step {step:.3g} voxels\n{1e3 * seconds:.0f} ms"
 
     def _set_status(self, text: str) -> None:
-        self._told, compiling = text, self._compiling
+        self._status, compiling = text, self._compiling
         if compiling:
             text += f"\ncompiling for {compiling}: {time.monotonic() - self._begun:.0f} s"
         if not self._closed:
@@ -210,47 +205,43 @@ class Model:
         while True:
             with self._changed:
                 while not self._changed.wait_for(self._newer, 1 if self._compiling else None):
-                    self._set_status(self._told)
+                    self._set_status(self._status)
                 if self._closed:
                     return
                 assert self._next is not None
                 request, self._next = self._next, None
-            try:
-                for part, _ in enumerate(self._draw(request)):
-                    if self._cancelled(0 if part else self.rest):
-                        break
-            except Exception as fault:  # for the user, who may ask for another image
-                self._set_status(f"not drawn:\n{' '.join(str(fault).split())}")
+            self._told("drawn", self._draw_parts, request)
             with self._changed:
                 self._idle = self._next is None
                 self._changed.notify_all()
 
+    def _draw_parts(self, request: State) -> None:
+        for part, _ in enumerate(self._draw(request)):
+            if self._cancelled(0 if part else self.rest):
+                break
+
     def _compile(self, request: State) -> None:
         """Compile the program of a state, and have the newest state drawn then."""
-        renderer, fault = TileRenderer(self.scene, request), None
-        try:
-            renderer.overview()
-            self._compiled.add(renderer.program_key)
-        except Exception as raised:
-            fault = raised
+        renderer = TileRenderer(self.scene, request)
+        done = self._told("compiled", renderer.overview)
         with self._changed:
             self._compiling = ""
-            if fault is None:
+            if done:
+                self._compiled.add(renderer.program_key)
                 self._next, self._idle = self.state, False
             self._changed.notify_all()
-        if fault is not None:
-            self._set_status(f"not drawn:\n{' '.join(str(fault).split())}")
 
     def _stand_in(self, request: State, last: State) -> State | None:
         """What is drawn until the program of a request is compiled, by that of the last one; None if that
         would be the image that is there. Has the program compiled, unless another is being compiled."""
         if not self._compiling:
-            changed = [name for name in PROGRAM if getattr(request, name) != getattr(last, name)]
-            names = sorted(request.enabled ^ last.enabled) + [name for name in changed if name != "enabled"]
-            self._compiling, self._begun = ", ".join(names) or "this transfer function", time.monotonic()
-            self._set_status(self._told)
-            compiler = threading.Thread(target=self._compile, args=(request,), daemon=True)
-            compiler.start()
+            names = (told for name, told in PROGRAM.items() if getattr(request, name) != getattr(last, name))
+            self._compiling = (
+                ", ".join([*sorted(request.enabled ^ last.enabled), *filter(None, names)]) or "points"
+            )
+            self._begun = time.monotonic()
+            self._set_status(self._status)
+            threading.Thread(target=self._compile, args=(request,), daemon=True).start()
         shown = replace(request, **{name: getattr(last, name) for name in PROGRAM})
         if TileRenderer(self.scene, shown).program_key not in self._compiled:
             shown = replace(shown, transfer=last.transfer)
@@ -259,19 +250,17 @@ class Model:
 
     def _draw(self, request: State) -> Generator[None]:
         """Yields after the coarse image, and after each tile of the fine one."""
-        renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
-        if renderer.program_key not in self._compiled and self._last is not None:
-            shown = self._stand_in(request, self._last)
-            if shown is None:
-                return
-            request, renderer = shown, TileRenderer(self.scene, shown)
-            grid = Grid.fine(request.size)
-        elif renderer.program_key not in self._compiled:
-            self._set_status("compiling …\nthe first image; the program is kept for the next time")
-            begun = time.perf_counter()
-            renderer.overview()
-            self._compiled.add(renderer.program_key)
-            self._set_status(f"compiled in {time.perf_counter() - begun:.1f} s\n")
+        renderer = TileRenderer(self.scene, request)
+        if renderer.program_key not in self._compiled:
+            if self._last is not None:
+                if (shown := self._stand_in(request, self._last)) is None:
+                    return
+                request, renderer = shown, TileRenderer(self.scene, shown)
+            else:
+                self._set_status("compiling …\nthe first image; the program is kept for the next time")
+                renderer.overview()
+                self._compiled.add(renderer.program_key)
+        grid = Grid.fine(request.size)
         self._last, tiles = request, grid.tiles()
         begun, (most, factor) = time.perf_counter(), LEVELS[self._level]
         coarse = TileRenderer(self.scene, request, factor).coarse(most)
@@ -280,18 +269,18 @@ class Model:
         self._set_status(self._show(coarse, "coarse", seconds, request, factor))
         yield
 
-        picture = grid.canvas(coarse)
+        pixels, (width, height) = grid.canvas(coarse), grid.size
         begun = shown = time.perf_counter()
 
         def show(stage: Stage) -> str:
             seconds = time.perf_counter() - begun
-            return self._show(picture.upper_left(*grid.size), stage, seconds, request)
+            return self._show(pixels[:height, :width].copy(), stage, seconds, request)
 
         for count, (column, row) in enumerate(tiles):
             if time.perf_counter() - shown > INTERVAL:
                 shown = time.perf_counter()
                 self._set_status(f"{show('drawing')}, {count} of {len(tiles)} tiles")
-            renderer.draw(picture, grid, column, row)
+            renderer.draw(pixels, grid, column, row)
             yield
         summary = show("fine")
         self._set_status(f"{summary}, estimating its error …")

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ...march.march import March
 from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from .control import PRESSED, Control, Press
+from .control import PRESSED, Control
 from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Scene, State
@@ -108,12 +109,10 @@ class NotebookView(ipywidgets.HBox):
         ipywidgets.Widget.close(self.canvas)
         super().close()
 
-    def _deliver(self, name: str, content: bytes) -> None:
-        path, number = Path(name), 1
-        while path.exists():
-            path, number = Path(f"{Path(name).stem}-{number}.png"), number + 1
-        path.write_bytes(content)
-        self._set_status(f"saved {path}\nin the folder of the notebook")
+    def _deliver(self, png: bytes) -> None:
+        path = Path(f"jaxvol-{int(time.time())}.png")
+        path.write_bytes(png)
+        self._set_status(f"saved in the notebook's folder:\n{path}")
 
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
@@ -165,16 +164,14 @@ class NotebookView(ipywidgets.HBox):
                 button.on_click(lambda pressed: self._change(control.set, pressed.description))
             return ipywidgets.HBox(buttons)
         widget = _widget_of_value(control)
-        if control.kind == "pad":
-            widget.observe(lambda event: self._change(control.set, Press.of(event["new"])), "sent")
-        elif control.kind != "html":
-            widget.observe(lambda event: self._change(control.set, event["new"]), "value")
+        name = "sent" if control.kind == "pad" else "value"
+        widget.observe(lambda event: self._change(control.set, event["new"]), name)
         self._widgets.append((widget, control))
         return widget
 
     def _change(self, change: Callable[[Any], None], value: Any) -> None:
         """Change the model, and let all controls show it; not while they are being made to."""
-        if self._updating or value is None:
+        if self._updating:
             return
         change(value)
         self._update()
@@ -192,8 +189,6 @@ class NotebookView(ipywidgets.HBox):
 
 def _widget_of_value(control: Control) -> Any:
     how: dict[str, Any] = {"value": control.get(), "layout": WIDE}
-    if control.kind == "html":
-        return ipywidgets.HTML(**how)
     if control.kind == "pad":
         return Pad(**how)
     how["description"] = control.label

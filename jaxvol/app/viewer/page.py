@@ -20,7 +20,7 @@ from matplotlib.colors import to_rgb
 from websockets.exceptions import ConnectionClosed
 
 from ..._util.checks import shortened
-from .control import PRESSED, Control, Press
+from .control import PRESSED, Control
 from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Orbit, Scene, State
@@ -149,6 +149,9 @@ class Page:
         async def clicked(event: viser.SceneClickEvent) -> None:
             model.pick(*event.screen_pos)
 
+        aspect = client.camera.image_width / max(client.camera.image_height, 1)
+        if aspect < (given := self._state.size[0] / self._state.size[1]):  # or its sides would be cut off
+            turn(self._state.orbit.zoomed(aspect / given))
         client.camera.on_update(turned)
         client.scene.on_click()(clicked)
         await turned(client.camera)
@@ -190,8 +193,8 @@ class _Panel:
                     self._add(control)
         self.model.marked = self._update
 
-    def _deliver(self, name: str, content: bytes) -> None:
-        self.client.send_file_download(name, content, save_immediately=True)
+    def _deliver(self, png: bytes) -> None:
+        self.client.send_file_download("jaxvol.png", png, save_immediately=True)
 
     def _show(self, pixels: Pixels, stage: Stage) -> None:
         self.client.scene.set_background_image(pixels, "jpeg", jpeg_quality=JPEG_QUALITY[stage])
@@ -202,17 +205,13 @@ class _Panel:
 
     def _add(self, control: Control) -> None:
         widget = _widget(self.client.gui, control)
-        source = widget
+        source = widget if control.kind != "pad" else self.client.gui.add_text("pad", "")
 
         # viser runs coroutines one after the other, and plain functions in any order
         async def changed(event: Any) -> None:
             if event.client is not None:  # in a browser, and not by `_update`
                 value, orbit = source.value, self.model.state.orbit
-                if control.kind == "color":
-                    value = "#{:02x}{:02x}{:02x}".format(*value)
-                if control.kind == "pad" and (value := Press.of(value)) is None:
-                    return
-                control.set(value)
+                control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
                 if self.model.state.orbit is not orbit:
                     self._turn(self.model.state.orbit)
                 self._update()
@@ -221,13 +220,11 @@ class _Panel:
             widget.on_click(changed)
             return
         if control.kind == "pad":
-            source = self.client.gui.add_text("pad", "")
             field = {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
-            control = replace(control, get=lambda get=control.get: PAD.format(**field, content=get()))
-            widget.content = control.get()
-        self._widgets.append((widget, control))
-        if control.kind != "html":
-            source.on_update(changed)
+            shown = replace(control, get=lambda: PAD.format(**field, content=control.get()))
+            _update(widget, shown)
+        self._widgets.append((widget, control if control.kind != "pad" else shown))
+        source.on_update(changed)
 
     def _update(self) -> None:
         for each in self._widgets:
@@ -235,8 +232,8 @@ class _Panel:
 
 
 def _widget(gui: viser.GuiApi, control: Control) -> Any:
-    if control.kind in ("html", "pad"):
-        return gui.add_html(control.get())
+    if control.kind == "pad":
+        return gui.add_html("")
     if control.kind == "buttons":
         return gui.add_button_group(control.label, tuple(control.choices()))
     label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
@@ -253,7 +250,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
 
 def _update(widget: Any, control: Control) -> None:
     """Let a widget show what the model has."""
-    if control.kind in ("html", "pad"):
+    if control.kind == "pad":
         if widget.content != (content := control.get()):
             widget.content = content
         return

@@ -75,11 +75,9 @@ def slice_controls(model: Model) -> list[Control]:
             )
         return shown[1]
 
-    def press(pressed: Press) -> None:
-        if pressed.pad not in ("0", "1", "2"):
-            return
-        at, axis = indices(), int(pressed.pad)
-        a, b = (each for each in range(3) if each != axis)
+    def press(message: str) -> None:
+        pressed, at = Press.of(message), indices()
+        a, b = (each for each in range(3) if each != int(pressed.pad))
         at[a] = (1 - pressed.x if down[a] else pressed.x) * (shape[a] - 1)
         at[b] = (pressed.y if down[b] else 1 - pressed.y) * (shape[b] - 1)
         model.mark(origin + turn @ (at * spacing))

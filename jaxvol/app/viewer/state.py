@@ -77,7 +77,7 @@ class Orbit:
         height = math.asin(float(np.clip(self.toward @ up, -1, 1)))
         level = self.toward - (self.toward @ up) * up
         if np.linalg.norm(level) < 1e-9:
-            level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+            level = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)  # so that y is up from above
         level = level / np.linalg.norm(level)
         angle = -math.pi * right  # the camera moves against what is seen
         level = math.cos(angle) * level + math.sin(angle) * np.cross(up, level)
@@ -104,54 +104,11 @@ class Orbit:
         """Of what is seen at the focal point's distance, world length."""
         return self.distance * math.tan(math.radians(self.view_angle) / 2)
 
-    def facing(self, axis: int, sign: int) -> "Orbit":
-        """From a side of the volume: x, y or z, and which end of it. From above, y is up in the image."""
-        toward = sign * np.eye(3)[axis]
-        if abs(toward @ self.view_up) > 0.5:
-            toward = toward - 1e-3 * np.eye(3)[(axis + 2) % 3]
-        return Orbit.at(
-            self.focal_point + self.distance * toward, self.focal_point, self.view_up, self.view_angle
-        )
-
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """Unit vectors to the right and up in the image, and forward."""
         right = np.cross(-self.toward, self.view_up)
         right = right / np.linalg.norm(right)
         return right, np.cross(right, -self.toward), -self.toward
-
-    def ray(self, x: float, y: float, *, parallel: bool) -> tuple[Vector, Vector]:
-        """Origin and unit direction of a ray, whose place in the image is to the right and up of its middle, in
-        half heights."""
-        right, up, forward = self.axes()
-        across = (x * right + y * up) * self.half_height
-        if parallel:
-            return self.position + across, forward
-        direction = self.distance * forward + across
-        return self.position, direction / np.linalg.norm(direction)
-
-    def place(self, point: Vector, *, parallel: bool) -> tuple[float, float] | None:
-        """Where a world point appears, as `ray` counts; None behind the camera."""
-        right, up, forward = self.axes()
-        offset = point - self.position
-        depth = self.distance if parallel else float(offset @ forward)
-        scale = self.half_height * depth / self.distance
-        return (float(offset @ right) / scale, float(offset @ up) / scale) if depth > 0 else None
-
-
-@dataclass(frozen=True)
-class Cut:
-    """What is cut away: all outside of a box, and behind a plane.
-
-    Attributes:
-        box: as `Volume.bounds`.
-        normal: of the plane, which points to what is shown.
-        offset: of the plane from the middle of the volume along its normal, in half diagonals; by default none
-            of the volume lies behind it.
-    """
-
-    box: tuple[float, ...]
-    normal: tuple[float, ...] = (0.0, 0.0, 1.0)
-    offset: float = -1.0
 
 
 @dataclass(frozen=True)
@@ -169,8 +126,10 @@ class State:
         isovalue: of the isosurface.
         background: linear RGB.
         parallel: whether the camera is orthographic, of the same height at the focal point.
-        clip: whether `cut` is applied.
-        cut: what is cut away.
+        clip: whether box and plane are applied.
+        box: what is inside is shown, as `Volume.bounds`.
+        normal: of the plane, to what is shown.
+        offset: of the plane from the middle of the volume, in half diagonals.
         point: world point that was picked.
     """
 
@@ -185,19 +144,21 @@ class State:
     background: tuple[float, float, float]
     parallel: bool
     clip: bool
-    cut: Cut
+    box: tuple[float, ...]
+    normal: tuple[float, ...] = (0.0, 0.0, 1.0)
+    offset: float = -1.0
     point: Vector | None = None
 
     def camera(self, size: tuple[int, int], window: object = None, corner: object = None) -> Camera:
         """The camera, for an image of this size in pixels."""
-        orbit: Any = self.orbit
-        place = orbit.position, orbit.focal_point, orbit.view_up, orbit.view_angle
-        scale, part = orbit.half_height if self.parallel else None, {"window": window, "corner": corner}
+        place = self.orbit.position, self.orbit.focal_point, self.orbit.view_up, self.orbit.view_angle
+        scale, part = self.orbit.half_height if self.parallel else None, {"window": window, "corner": corner}
         return Camera(*place, size=size, parallel_scale=scale, **part)  # pyright: ignore[reportArgumentType]
 
 
-PROGRAM = "enabled", "lit", "mode", "parallel", "clip"
-"""Fields of a state, of which each has a program of its own. So has each form of transfer function."""
+PROGRAM = {"enabled": "", "lit": "light", "mode": "mode", "parallel": "orthographic", "clip": "clip"}
+"""Fields of a state of whose values each has a program of its own, and their controls. So has each form of
+transfer function."""
 
 
 @dataclass(frozen=True)
@@ -224,16 +185,16 @@ class Scene:
         """The march, with steps that are so many times as long."""
         enabled = tuple(t for t in self.transforms if type(t).__name__ in state.enabled)
         if state.clip:
-            enabled = (Clip(state.cut.box, [self.plane(state.cut)]), *enabled)
+            enabled = (Clip(state.box, [self.plane(state)]), *enabled)
         step = state.step * step_factor * self.voxel
         return March(step, enabled, self.given.quadrature, max_samples=self.given.max_samples)
 
-    def plane(self, cut: Cut) -> tuple[Vector, Vector]:
-        """Origin and normal of the plane."""
+    def plane(self, state: State) -> tuple[Vector, Vector]:
+        """Origin and normal of the plane that clips."""
         low, high = (np.asarray(corner, np.float64) for corner in self.volume.corners)
-        normal = np.asarray(cut.normal, np.float64) / np.linalg.norm(cut.normal)
-        # a little farther than the half diagonal, so that nothing is cut away at -1
-        return (low + high) / 2 + 1.001 * cut.offset * np.linalg.norm(high - low) / 2 * normal, normal
+        normal = np.asarray(state.normal, np.float64)
+        # a little farther than half the diagonal, so that nothing is cut away at -1
+        return (low + high) / 2 + 0.501 * state.offset * np.linalg.norm(high - low) * normal, normal
 
     def compositing(self, state: State) -> Compositing[Any]:
         """How cells become a pixel."""
@@ -244,17 +205,13 @@ class Scene:
         return self.lighting if state.lit and self.compositing(state).can_be_lit else None
 
     def in_mode(self, state: State, mode: str) -> State:
-        """The state in another mode, and before the background that is usual for it, unless another was chosen.
+        """The state in another mode, with the light that is usual for it, and its background, if that was so before.
         **Raises** `ValueError` where the mode cannot show the transfer function."""
-        changed = replace(state, mode=mode)
+        old, new = (BLACK if each in MODES.keys() - {"over"} else WHITE for each in (state.mode, mode))
+        background = new if state.background == old else state.background
+        changed = replace(state, mode=mode, background=background, lit=mode in ("over", ISOSURFACE))
         self.compositing(changed).marched(changed.transfer, self.given, self.volume)
-        usual = state.background == usual_background(state.mode)
-        return replace(changed, background=usual_background(mode)) if usual else changed
-
-
-def usual_background(mode: str) -> tuple[float, float, float]:
-    """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
-    return BLACK if mode in MODES.keys() - {"over"} else WHITE
+        return changed
 
 
 def initial(
@@ -298,9 +255,8 @@ def initial(
     own = {type(transform) for transform in given.transforms}
     others = (each for each in (*offered, *default) if type(each) not in own)
     modes: dict[str, Compositing[Any]] = {name: kind() for name, kind in MODES.items()}
-    is_surface = isinstance(mode, Isosurface)
     name = next((n for n, kind in MODES.items() if type(mode) is kind), type(mode).__name__.lower())
-    modes |= {} if is_surface else {name: mode}
+    modes |= {} if isinstance(mode, Isosurface) else {name: mode}
     scene = Scene(volume, (*given.transforms, *others), given, lighting or Phong(), voxel, modes)
     enabled = frozenset(type(t).__name__ for t in (default if march is None else given.transforms))
     data = np.asarray(volume.data)
@@ -310,7 +266,6 @@ def initial(
     orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, angle)
     if parallel:  # from as far as shows the same height
         orbit = orbit.zoomed(orbit.half_height / float(chosen.parallel_scale))
-    cut = Cut(tuple(np.asarray(volume.bounds).tolist()))
-    return scene, State(
-        orbit, whole.size, shown, step, enabled, lit, name, isovalue, (r, g, b), parallel, False, cut
-    )
+    box, color = tuple(np.asarray(volume.bounds).tolist()), (r, g, b)
+    how = step, enabled, lit, name, isovalue, color, parallel, False, box
+    return scene, State(orbit, whole.size, shown, *how)

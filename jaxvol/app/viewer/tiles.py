@@ -17,6 +17,7 @@ from PIL import Image
 from ..._util.srgb import to_srgb
 from ...metrics import rmse
 from ...render import render
+from ...scene.camera import Camera
 from ...scene.rendering import Rendering
 from .editing import padded
 from .state import PROGRAM, Scene, State
@@ -64,45 +65,19 @@ class Grid:
         middle = self.size[0] / SIDE / 2 - 0.5, self.size[1] / SIDE / 2 - 0.5
         return sorted(tiles, key=lambda tile: math.dist(tile, middle))
 
-    def canvas(self, coarse: "Picture") -> "Picture":
-        """An image that holds all tiles whole: another one, stretched; smoothly, so that no blocks show beside
+    def canvas(self, pixels: Pixels) -> Pixels:
+        """An image that holds all tiles whole: another one, stretched smoothly, so that it shows no blocks beside
         finished tiles."""
         width, height = self.size
-        beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width)
-        pixels = Image.fromarray(coarse.pixels).resize(self.size, Image.Resampling.BILINEAR)
-        depth = Image.fromarray(coarse.depth).resize(self.size, Image.Resampling.NEAREST)
-        return Picture(
-            np.pad(np.asarray(pixels), (*beyond, (0, 0)), "edge"), np.pad(np.asarray(depth), beyond, "edge")
-        )
+        stretched = np.asarray(Image.fromarray(pixels).resize(self.size, Image.Resampling.BILINEAR))
+        beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width), (0, 0)
+        return np.pad(stretched, beyond, "edge")
 
     def window(self, column: int, row: int, aspect: float) -> tuple[float, float, float, float]:
         """A tile's part of the image plane, as `Camera.window`. `aspect`: width over height of the view."""
         width, height = self.size
         x, y = 2 * aspect * SIDE / width, 2 * SIDE / height
         return column * x - aspect, (column + 1) * x - aspect, 1 - (row + 1) * y, 1 - row * y
-
-
-@dataclass(frozen=True)
-class Picture:
-    """What tiles are drawn into.
-
-    Attributes:
-        pixels: sRGB.
-        depth: as that of a `Rendering`; infinite where a mode has none.
-    """
-
-    pixels: Pixels
-    depth: Float[np.ndarray, "height width"]
-
-    @classmethod
-    def empty(cls, columns: int, rows: int) -> "Picture":
-        """For so many tiles."""
-        shape = rows * SIDE, columns * SIDE
-        return cls(np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32))
-
-    def upper_left(self, width: int, height: int) -> "Picture":
-        """A copy of so many pixels."""
-        return Picture(self.pixels[:height, :width].copy(), self.depth[:height, :width].copy())
 
 
 class TileRenderer:
@@ -118,40 +93,51 @@ class TileRenderer:
     def program_key(self) -> tuple[Any, ...]:
         """Equal for states that one compiled program draws."""
         leaves, structure = jax.tree.flatten(self.transfer)
-        fields = (getattr(self.state, name) for name in PROGRAM)
-        return *fields, structure, *map(np.shape, leaves)
+        return *(getattr(self.state, name) for name in PROGRAM), structure, *map(np.shape, leaves)
 
-    def rendering(self, grid: Grid, column: int, row: int) -> Rendering:
+    def rendered(self, camera: Camera) -> Rendering:
+        """What `render` returns for a camera of a tile's size."""
+        return render(self.volume, self.transfer, camera, self.march, **self.how)
+
+    def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
         """A tile as `render` returns it."""
         width, height = self.state.size
         window, corner = grid.window(column, row, width / height), (column * SIDE, row * SIDE)
-        camera = self.state.camera((SIDE, SIDE), window, corner)
-        return render(self.volume, self.transfer, camera, self.march, **self.how)
+        return self.rendered(self.state.camera((SIDE, SIDE), window, corner)).rgba
 
-    def draw(self, picture: Picture, grid: Grid, column: int, row: int) -> None:
+    def draw(self, pixels: Pixels, grid: Grid, column: int, row: int) -> None:
         """Draw a tile into its place in an image that holds all tiles whole."""
-        found = self.rendering(grid, column, row)
-        place = np.s_[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
-        picture.pixels[place] = np.asarray(_displayed(found.rgba, self.background))
-        depth = found.details.depth
-        picture.depth[place] = np.inf if depth is None else np.asarray(depth)
+        drawn = np.asarray(_displayed(self.rgba(grid, column, row), self.background))
+        pixels[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE] = drawn
 
-    def coarse(self, most: int) -> Picture:
+    def coarse(self, most: int) -> Pixels:
         """An image of at most so many tiles."""
         grid = Grid.coarse(self.state.size, most)
-        picture = Picture.empty(grid.columns, grid.rows)
+        pixels = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.uint8)
         for column, row in grid.tiles():
-            self.draw(picture, grid, column, row)
-        return picture
+            self.draw(pixels, grid, column, row)
+        return pixels
 
     def linear(self, grid: Grid, column: int, row: int) -> Float[np.ndarray, "side side 3"]:
         """Linear colours of a tile."""
-        rgba = np.asarray(self.rendering(grid, column, row).rgba)
+        rgba = np.asarray(self.rgba(grid, column, row))
         return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
 
     def overview(self) -> Float[np.ndarray, "side side 3"]:
         """Linear colours of one tile that is stretched over the view."""
         return self.linear(Grid.coarse(self.state.size, 1), 0, 0)
+
+    def picked(self, across: float, down: float) -> Float[np.ndarray, "3"] | None:
+        """The world point that is seen at a fraction of the view's width and height, where the material is that
+        makes the pixel; None where there is none. By a tile of 1/1000 of the view."""
+        (width, height), least = self.state.size, 1e-3
+        x, y = (2 * across - 1) * width / height, 1 - 2 * down
+        camera = self.state.camera((SIDE, SIDE), (x - least, x + least, y - least, y + least))
+        depth = self.rendered(camera).details.depth
+        found = np.inf if depth is None else float(np.asarray(depth)[SIDE // 2, SIDE // 2])
+        return (
+            np.asarray(camera.point(SIDE // 2, SIDE // 2, found), np.float64) if np.isfinite(found) else None
+        )
 
 
 def estimated_error(
