@@ -10,7 +10,7 @@ class Control:
     """Something to look at or to change.
 
     Attributes:
-        kind: of widget. "pad": HTML to look at, with boxes in which the pointer presses and drags: elements with
+        kind: of widget. "pad": HTML, with boxes in which the pointer presses and drags: elements with
             `data-pad`, the name of the box, and in them `data-part`.
         label: beside it.
         get: what it shows now: a text, a number, two in a range, True or False, or a color: sRGB, `#rrggbb`.
@@ -30,9 +30,8 @@ class Control:
 
 
 class Press(NamedTuple):
-    """A press of the pointer that is going on in the box `pad`: on one of its parts, empty for none, maybe twice;
-    and where the pointer is, from the upper left corner, 0 to 1. Those between may be lost, so that each tells
-    all; a `gesture` has one number."""
+    """A press of the pointer in a box that goes on: on one of its parts, empty for none, maybe twice; and where
+    it is, from the upper left corner, 0 to 1. Those between may be lost; those of a `gesture` have one number."""
 
     gesture: str
     pad: str

@@ -1,7 +1,6 @@
-"""The controls of a viewer's transfer function: its curve over the histogram, points, presets and colormaps, or
-its labels."""
+"""The controls of a viewer's transfer function: presets, its curve and points, or its labels."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any, cast
 
@@ -21,10 +20,7 @@ from .model import Model
 MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
 BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
 GIVEN, AUTOMATIC = "as given", "automatic"
-COLORMAPS = (
-    *("gray", "viridis", "inferno", "magma", "plasma", "cividis", "turbo", "jet", "hot", "bone", "copper"),
-    *("coolwarm", "RdBu_r", "Spectral_r", "rainbow"),
-)
+COLORMAPS = "gray", "viridis", "inferno", "magma", "cividis", "turbo", "jet", "hot", "bone", "coolwarm"
 
 
 def transfer_controls(model: Model) -> list[Control]:
@@ -63,18 +59,15 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
         return HEIGHT - (HEIGHT - 2) * np.sqrt(-np.expm1(-np.asarray(extinction, np.float64) * voxel))
 
     def points(down: Float[np.ndarray, " n"]) -> str:
-        return " ".join(
-            f"{x:.1f},{y:.1f}" for x, y in zip(np.linspace(0, WIDTH, len(down)), down, strict=True)
-        )
+        across = np.linspace(0, WIDTH, len(down))
+        return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
 
-    stops = "".join(
-        f'<stop offset="{x / WIDTH:.4f}" stop-color="{color}" />'
-        for x, color in zip(across, colors, strict=True)
-    )
+    dots = list(zip(across, height(extinction), colors, strict=True))
+    stops = "".join(f'<stop offset="{x / WIDTH:.4f}" stop-color="{color}" />' for x, _, color in dots)
     circles = "".join(
         f'<circle data-part="{i}" cx="{x:.1f}" cy="{y:.1f}" r="{7 if i == chosen else 5}" fill="{color}"'
         f' stroke="currentColor" style="cursor: move" />'
-        for i, (x, y, color) in enumerate(zip(across, height(extinction), colors, strict=True))
+        for i, (x, y, color) in enumerate(dots)
     )
     line = height(np.interp(np.linspace(low, high, 4 * BINS), at, extinction))
     return (
@@ -129,46 +122,30 @@ def _point_controls(model: Model) -> list[Control]:
                 put(editing.with_point_at, value)
                 chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
         elif not pressed.twice:
-            put(
-                lambda old: editing.with_opacity(
-                    editing.with_value(old, chosen, value), chosen, opacity, voxel
-                )
-            )
+            put(editing.with_value, chosen, value)
+            put(editing.with_opacity, chosen, opacity, voxel)
 
     def of_range(label: str, index: int, limits: tuple[float, float, float]) -> Control:
         def get() -> float:
-            return min(
-                max(editing.rounded(editing.window_level(transfer())[index], span), limits[0]), limits[1]
-            )
+            return float(np.clip(editing.rounded(editing.window_level(transfer())[index], span), *limits[:2]))
 
-        def put(value: float) -> None:
-            window_level = [*editing.window_level(transfer())]
-            window_level[index] = value
-            edit(model, editing.with_window_level, *window_level)
+        def set_one(value: float) -> None:
+            both = [*editing.window_level(transfer())]
+            both[index] = value
+            put(editing.with_window_level, *both)
 
-        return Control("slider", label, get, put, limits)
+        return Control("slider", label, get, set_one, limits)
+
+    def listed(label: str, choose: Callable[[str], None], choices: Iterable[str]) -> Control:
+        return Control("dropdown", label, lambda: names[label], choose, choices=lambda: [GIVEN, *choices])
 
     window, level = editing.window_level(transfer())
     first, last = min(low, level - window / 2), max(high, level + window / 2)
     span = editing.rounded(last - first, last - first)
-    unit, middle = (
-        editing.rounded(span / 1000, span) or span / 1000,
-        editing.rounded((first + last) / 2, span),
-    )
+    unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
     controls = [
-        *(
-            Control(
-                "dropdown",
-                label,
-                lambda label=label: names[label],
-                choose,
-                choices=lambda c=choices: [GIVEN, *c],
-            )
-            for label, choose, choices in (
-                ("preset", choose_preset, [AUTOMATIC, *PRESETS]),
-                ("colors", choose_colors, COLORMAPS),
-            )
-        ),
+        listed("preset", choose_preset, [AUTOMATIC, *PRESETS]),
+        listed("colors", choose_colors, COLORMAPS),
         Control("pad", get=lambda: _plot(low, high, bars, transfer(), voxel, chosen), set=press),
         of_range("window", 0, (min(unit, window), 4 * span, unit)),
         of_range("level", 1, (middle - 1.5 * span, middle + 1.5 * span, unit)),

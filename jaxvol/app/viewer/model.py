@@ -1,21 +1,20 @@
 """A viewer without a face: its state, and a thread that draws it, coarse at once and fine at rest."""
 
+import io
 import math
 import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import fields, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-import numpy as np
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
-from ...io.display import save_image
 from .marks import with_marks
 from .settings import text_of
 from .state import PROGRAM, Scene, State, Vector
-from .tiles import SIDE, Grid, Pixels, TileRenderer, estimated_error
+from .tiles import Grid, Pixels, TileRenderer, estimated_error
 
 
 Stage = Literal["coarse", "drawing", "fine"]
@@ -48,8 +47,7 @@ def adapted(level: int, seconds: float, fine_tiles: int) -> int:
 class Model:
     """The state of a viewer, drawn whenever it changes, by a thread of its own. A newer state cancels a fine
     image between two tiles. A coarse image that was begun is finished, so that images follow a drag. Where a
-    state needs a program that is not compiled, another thread compiles it; until then the old image stays, and
-    follows drags as by the old program.
+    state needs another program, that is compiled beside: until then the old one draws what it can.
 
     Args:
         scene: what is viewed.
@@ -60,9 +58,7 @@ class Model:
         file: called for what a saved image tells of the volume's file: see `settings.text_of`.
     """
 
-    marked: Callable[[], None] = staticmethod(lambda: None)
-    """Called when a point was marked."""
-
+    marked: Callable[[], None] = staticmethod(lambda: None)  # called when a point was marked
     rest = 0.12  # seconds without a change after which a fine image is begun
 
     def __init__(
@@ -155,18 +151,17 @@ class Model:
 
     def _save(self, state: State) -> None:
         renderer, grid, (width, height) = TileRenderer(self.scene, state), Grid.fine(state.size), state.size
-        image = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.float32)
+        pixels, file, chunks = grid.empty(), io.BytesIO(), PngInfo()
         for count, (column, row) in enumerate(tiles := grid.tiles()):
             if self._closed:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
-            place = np.s_[row * SIDE : (row + 1) * SIDE, column * SIDE : (column + 1) * SIDE]
-            image[place] = renderer.linear(grid, column, row)
-        with TemporaryDirectory() as folder:
-            text = text_of(self.scene, state, self._file())
-            path = save_image(Path(folder) / "jaxvol.png", image[:height, :width], text=text)
-            self._set_status(f"saved {width} x {height}\n")
-            self._deliver(path.read_bytes())
+            renderer.draw(pixels, grid, column, row)
+        for keyword, text in text_of(self.scene, state, self._file()).items():
+            chunks.add_itxt(keyword, text, zip=True)
+        Image.fromarray(pixels[:height, :width]).save(file, "PNG", pnginfo=chunks)
+        self._set_status(f"saved {width} x {height}\n")
+        self._deliver(file.getvalue())
 
     def _told(self, what: str, do: Callable[..., object], *arguments: Any) -> bool:
         """Do something, and tell of a fault, after which the user may ask for something else."""
@@ -235,10 +230,9 @@ class Model:
         """What is drawn until the program of a request is compiled, by that of the last one; None if that
         would be the image that is there. Has the program compiled, unless another is being compiled."""
         if not self._compiling:
-            names = (told for name, told in PROGRAM.items() if getattr(request, name) != getattr(last, name))
-            self._compiling = (
-                ", ".join([*sorted(request.enabled ^ last.enabled), *filter(None, names)]) or "points"
-            )
+            names = [told for name, told in PROGRAM.items() if getattr(request, name) != getattr(last, name)]
+            names = [*sorted(request.enabled ^ last.enabled), *filter(None, names)]
+            self._compiling = ", ".join(names) or "points"
             self._begun = time.monotonic()
             self._set_status(self._status)
             threading.Thread(target=self._compile, args=(request,), daemon=True).start()
@@ -251,17 +245,17 @@ class Model:
     def _draw(self, request: State) -> Generator[None]:
         """Yields after the coarse image, and after each tile of the fine one."""
         renderer = TileRenderer(self.scene, request)
-        if renderer.program_key not in self._compiled:
-            if self._last is not None:
-                if (shown := self._stand_in(request, self._last)) is None:
-                    return
-                request, renderer = shown, TileRenderer(self.scene, shown)
-            else:
-                self._set_status("compiling …\nthe first image; the program is kept for the next time")
-                renderer.overview()
-                self._compiled.add(renderer.program_key)
-        grid = Grid.fine(request.size)
-        self._last, tiles = request, grid.tiles()
+        if renderer.program_key not in self._compiled and self._last is None:
+            self._set_status("compiling …\nthe first image; the program is kept for the next time")
+            renderer.overview()
+            self._compiled.add(renderer.program_key)
+        elif renderer.program_key not in self._compiled:
+            assert self._last is not None
+            if (shown := self._stand_in(request, self._last)) is None:
+                return
+            request, renderer = shown, TileRenderer(self.scene, shown)
+        self._last, grid = request, Grid.fine(request.size)
+        tiles = grid.tiles()
         begun, (most, factor) = time.perf_counter(), LEVELS[self._level]
         coarse = TileRenderer(self.scene, request, factor).coarse(most)
         seconds = time.perf_counter() - begun

@@ -27,7 +27,15 @@ from .state import Scene, State
 from .tiles import Pixels
 
 
-WIDE = {"width": "310px"}  # layout of what stands in a line of its own
+WIDE = {"width": "98%"}  # layout of what stands in a line of its own
+PANEL = {
+    "width": "298px",
+    "flex": "0 0 auto",
+    "display": "block",
+    "margin": "0 0 0 4px",
+    "overflow": "hidden auto",
+}
+"""Of the controls, which stand beside 640 pixels of an image in JupyterLab 1400 pixels wide."""
 
 
 class NotebookView(ipywidgets.HBox):
@@ -59,15 +67,11 @@ class NotebookView(ipywidgets.HBox):
         self._updating = False
         shown: list[ipywidgets.Widget] = [self._status]
         for heading, controls in controls_of(self.model).items():
-            group = ipywidgets.Accordion([ipywidgets.VBox([*map(self._widget, controls)])], titles=[heading])
-            group.selected_index = None if heading in FOLDED else 0
-            shown.append(group)
-        height = f"{max(state.size[1], 480)}px"
-        panel = {"margin": "0 0 0 8px", "width": "350px", "height": height, "overflow": "hidden auto"}
-        self.children = (
-            self.canvas,
-            ipywidgets.VBox(shown, layout=panel | {"flex": "0 0 auto", "display": "block"}),
-        )
+            inner = ipywidgets.VBox([*map(self._widget, controls)], layout={"margin": "-8px -12px"})
+            selected = None if heading in FOLDED else 0
+            shown.append(ipywidgets.Accordion([inner], titles=[heading], selected_index=selected))
+        panel = ipywidgets.VBox(shown, layout=PANEL | {"height": f"{max(state.size[1], 480)}px"})
+        self.children = (self.canvas, panel)
         self.layout.flex_flow = "row wrap"
         self.model.marked = self._update
         self.model.ask(state)
@@ -158,7 +162,7 @@ class NotebookView(ipywidgets.HBox):
     def _widget(self, control: Control) -> ipywidgets.Widget:
         """A widget that shows what a control describes, and changes the model."""
         if control.kind == "buttons":
-            narrow = {"width": "auto", "min_width": "38px", "padding": "0 5px"}
+            narrow = {"width": "auto", "min_width": "30px", "padding": "0 4px"}
             buttons = [ipywidgets.Button(description=text, layout=narrow) for text in control.choices()]
             for button in buttons:
                 button.on_click(lambda pressed: self._change(control.set, pressed.description))
@@ -194,7 +198,7 @@ def _widget_of_value(control: Control) -> Any:
     how["description"] = control.label
     if control.kind == "checkbox":
         return ipywidgets.Checkbox(indent=False, **how)
-    how["style"] = {"description_width": "90px"}
+    how["style"] = {"description_width": "72px"}
     low, high, step = control.limits
     if control.kind == "dropdown":
         return ipywidgets.Dropdown(options=control.choices(), **how)

@@ -8,7 +8,6 @@ import logging
 import math
 import re
 import secrets
-import socket
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -30,13 +29,13 @@ from .tiles import Pixels
 HOST = "127.0.0.1"
 OWN_NAMES = {HOST, "localhost"}
 
-PAD = """<style>.mantine-Flex-root:has(> div label[for="{field}"]) {{ position: absolute; opacity: 0; width: 0; height: 0;
-overflow: hidden }}</style><div onpointerdown="({pressed})(event, text => {{
+PAD = """<style>.mantine-Flex-root:has(> div label[for="{field}"]) {{ position: absolute; height: 0; width: 0;
+opacity: 0; overflow: hidden }}</style><div onpointerdown="({pressed})(event, text => {{
 const label = [...document.querySelectorAll('label')].find(each => each.htmlFor === '{field}');
 const input = label.closest('.mantine-Flex-root').querySelector('input');
 Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, text);
 input.dispatchEvent(new Event('input', {{bubbles: true}})) }})">{content}</div>"""
-"""Of viser's widgets, only a field of text sends what a script has to tell: each pad has one, which is hidden."""
+"""Of viser's widgets, only a field of text sends what a script tells: each pad has one, which is hidden."""
 
 
 class _Server(viser.ViserServer):
@@ -54,6 +53,7 @@ class Page:
         url: to open in a browser.
         port: on which it is served.
         models: of the pages that are open, by viser's numbers of clients.
+        shown: scene and first state.
 
     Args:
         scene: what is looked at. `serve` makes it.
@@ -76,7 +76,7 @@ class Page:
         token: str | None = None,
         file: Callable[[], dict[str, Any]] = dict,
     ):
-        self._scene, self._state, self._file = scene, state, file
+        self.shown, self.file = (scene, state), file
         is_local = host in OWN_NAMES
         self._token = secrets.token_urlsafe() if token is None and not is_local else token
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
@@ -89,11 +89,9 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self._server = _Server(host=host, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
-        name = "localhost" if is_local else socket.gethostname() if host in ("0.0.0.0", "::") else host
-        place = f"{name}:{self.port}"
-        self.url = f"http://{place}"
-        if self._token is not None:
-            self.url += f"/?websocket=ws://{place}/{self._token}"
+        place = f"{'localhost' if is_local else host}:{self.port}"
+        told = "" if self._token is None else f"/?websocket=ws://{place}/{self._token}"
+        self.url = f"http://{place}{told}"
         self._server._websock_server.on_client_connect(self._only_own_pages)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._server.gui.main_panel.dock_right()
@@ -138,7 +136,7 @@ class Page:
                 client.camera.position = self._to_viser(orbit.position)
                 client.camera.look_at = self._to_viser(orbit.focal_point)
 
-        model = _Panel(client, self._scene, self._state, turn, self._file).model
+        model = _Panel(client, self, turn).model
         self.models[client.client_id] = model
 
         async def turned(camera: viser.CameraHandle) -> None:
@@ -146,12 +144,12 @@ class Page:
             orbit = Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
             model.resize(camera.image_width, camera.image_height, orbit=orbit)
 
-        async def clicked(event: viser.SceneClickEvent) -> None:
+        async def clicked(event: viser.SceneClickEvent) -> Any:
             model.pick(*event.screen_pos)
 
         aspect = client.camera.image_width / max(client.camera.image_height, 1)
-        if aspect < (given := self._state.size[0] / self._state.size[1]):  # or its sides would be cut off
-            turn(self._state.orbit.zoomed(aspect / given))
+        if aspect < (given := self.shown[1].size[0] / self.shown[1].size[1]):  # or its sides would be cut off
+            turn(self.shown[1].orbit.zoomed(aspect / given))
         client.camera.on_update(turned)
         client.scene.on_click()(clicked)
         await turned(client.camera)
@@ -175,17 +173,10 @@ def _in_one_line(record: logging.LogRecord) -> bool:
 class _Panel:
     """The model and the controls of one page. `turn`: turns the browser's camera."""
 
-    def __init__(
-        self,
-        client: viser.ClientHandle,
-        scene: Scene,
-        state: State,
-        turn: Callable[[Orbit], None],
-        file: Callable[[], dict[str, Any]] = dict,
-    ):
+    def __init__(self, client: viser.ClientHandle, page: Page, turn: Callable[[Orbit], None]):
         self.client, self._turn = client, turn
         self.status = client.gui.add_markdown("starting …  \n")
-        self.model = Model(scene, state, self._show, self._set_status, self._deliver, file)
+        self.model = Model(*page.shown, self._show, self._set_status, self._deliver, page.file)
         self._widgets: list[tuple[Any, Control]] = []
         for heading, controls in controls_of(self.model).items():
             with client.gui.add_folder(heading, expand_by_default=heading not in FOLDED):
@@ -211,7 +202,8 @@ class _Panel:
         async def changed(event: Any) -> None:
             if event.client is not None:  # in a browser, and not by `_update`
                 value, orbit = source.value, self.model.state.orbit
-                control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
+                with contextlib.suppress(ValueError, KeyError):  # of what no widget sends
+                    control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
                 if self.model.state.orbit is not orbit:
                     self._turn(self.model.state.orbit)
                 self._update()
@@ -220,10 +212,10 @@ class _Panel:
             widget.on_click(changed)
             return
         if control.kind == "pad":
-            field = {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
-            shown = replace(control, get=lambda: PAD.format(**field, content=control.get()))
-            _update(widget, shown)
-        self._widgets.append((widget, control if control.kind != "pad" else shown))
+            told, field = control.get, {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
+            control = replace(control, get=lambda: PAD.format(**field, content=told()))
+            _update(widget, control)
+        self._widgets.append((widget, control))
         source.on_update(changed)
 
     def _update(self) -> None:

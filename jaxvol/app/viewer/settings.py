@@ -15,8 +15,8 @@ NO_FILE = {"name": "a volume in memory", "bytes": 0, "sha256": 64 * "0"}
 
 
 def text_of(scene: Scene, state: State, file: dict[str, Any]) -> dict[str, str]:
-    """The text that a PNG carries, for `save_image`: the settings as options of `jaxvol render`, and the transfer
-    function, if it is one of points. `file`: name, bytes and SHA-256 of the volume's file, if it has one."""
+    """The text that a PNG carries, by its keyword: the settings as options of `jaxvol render`, and a transfer
+    function of points. `file`: name, bytes and SHA-256 of the volume's file, if it has one."""
     orbit, (width, height) = state.orbit, state.size
     numbers: dict[str, Any] = {
         "--step": [state.step * scene.voxel],

@@ -39,7 +39,7 @@ def slice_controls(model: Model) -> list[Control]:
 
     def one(axis: int, at: np.ndarray) -> str:
         a, b = (each for each in range(3) if each != axis)
-        data = np.asarray(volume.data).take(int(round(at[axis])), axis)
+        data = np.asarray(volume.data).take(round(at[axis]), axis)
         every = tuple(slice(None, None, -(-n // MOST)) for n in data.shape)
         grey = np.clip((data[every].astype(np.float32) - low) / ((high - low) or 1.0), 0, 1)
         grey = grey[:: -1 if down[a] else 1, :: 1 if down[b] else -1].T
@@ -50,8 +50,8 @@ def slice_controls(model: Model) -> list[Control]:
         x, y = 1 - part[a] if down[a] else part[a], part[b] if down[b] else 1 - part[b]
         rule = "position: absolute; pointer-events: none"
         return (
-            f'<div data-pad="{axis}" style="flex: {size[a]:.4g} 0 0; aspect-ratio: {size[a]:.4g} / {size[b]:.4g};'
-            f" position: relative; overflow: hidden; cursor: crosshair; touch-action: none;"
+            f'<div data-pad="{axis}" style="flex: {size[a]:.4g} 0 0; position: relative; overflow: hidden;'
+            f" aspect-ratio: {size[a]:.4g} / {size[b]:.4g}; cursor: crosshair; touch-action: none;"
             f" box-shadow: 0 0 0 2px {COLORS[axis]};"
             f' background: 0 0 / 100% 100% url(data:image/jpeg;base64,{source})">'
             f'<div style="{rule}; left: {x:.2%}; height: 100%; border-left: 1px solid {COLORS[a]}"></div>'

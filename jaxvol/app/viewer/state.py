@@ -205,7 +205,7 @@ class Scene:
         return self.lighting if state.lit and self.compositing(state).can_be_lit else None
 
     def in_mode(self, state: State, mode: str) -> State:
-        """The state in another mode, with the light that is usual for it, and its background, if that was so before.
+        """The state in another mode, with the light that is usual for it, and its background, if that was so.
         **Raises** `ValueError` where the mode cannot show the transfer function."""
         old, new = (BLACK if each in MODES.keys() - {"over"} else WHITE for each in (state.mode, mode))
         background = new if state.background == old else state.background

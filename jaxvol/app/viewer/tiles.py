@@ -65,9 +65,13 @@ class Grid:
         middle = self.size[0] / SIDE / 2 - 0.5, self.size[1] / SIDE / 2 - 0.5
         return sorted(tiles, key=lambda tile: math.dist(tile, middle))
 
+    def empty(self) -> Pixels:
+        """An image that holds all tiles whole."""
+        return np.empty((self.rows * SIDE, self.columns * SIDE, 3), np.uint8)
+
     def canvas(self, pixels: Pixels) -> Pixels:
-        """An image that holds all tiles whole: another one, stretched smoothly, so that it shows no blocks beside
-        finished tiles."""
+        """An image that holds all tiles whole: another one, stretched smoothly, without blocks beside finished
+        tiles."""
         width, height = self.size
         stretched = np.asarray(Image.fromarray(pixels).resize(self.size, Image.Resampling.BILINEAR))
         beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width), (0, 0)
@@ -113,23 +117,19 @@ class TileRenderer:
     def coarse(self, most: int) -> Pixels:
         """An image of at most so many tiles."""
         grid = Grid.coarse(self.state.size, most)
-        pixels = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.uint8)
+        pixels = grid.empty()
         for column, row in grid.tiles():
             self.draw(pixels, grid, column, row)
         return pixels
 
-    def linear(self, grid: Grid, column: int, row: int) -> Float[np.ndarray, "side side 3"]:
-        """Linear colours of a tile."""
-        rgba = np.asarray(self.rgba(grid, column, row))
-        return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
-
     def overview(self) -> Float[np.ndarray, "side side 3"]:
         """Linear colours of one tile that is stretched over the view."""
-        return self.linear(Grid.coarse(self.state.size, 1), 0, 0)
+        rgba = np.asarray(self.rgba(Grid.coarse(self.state.size, 1), 0, 0))
+        return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
 
     def picked(self, across: float, down: float) -> Float[np.ndarray, "3"] | None:
-        """The world point that is seen at a fraction of the view's width and height, where the material is that
-        makes the pixel; None where there is none. By a tile of 1/1000 of the view."""
+        """The world point that is seen at a fraction of the view's width and height, by the depth of a rendering;
+        None where nothing is."""
         (width, height), least = self.state.size, 1e-3
         x, y = (2 * across - 1) * width / height, 1 - 2 * down
         camera = self.state.camera((SIDE, SIDE), (x - least, x + least, y - least, y + least))
