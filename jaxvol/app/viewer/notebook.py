@@ -84,7 +84,7 @@ class NotebookView(ipywidgets.HBox):
     @property
     def camera(self) -> Camera:
         """The camera, with the size of the image."""
-        return self.model.state.camera(self.model.state.size)
+        return self.model.state.orbit.camera(self.model.state.size, parallel=self.model.state.parallel)
 
     @property
     def transfer(self) -> Transfer:

@@ -110,6 +110,14 @@ class Orbit:
         right = right / np.linalg.norm(right)
         return right, np.cross(right, -self.toward), -self.toward
 
+    def camera(
+        self, size: tuple[int, int], window: object = None, corner: object = None, *, parallel: bool = False
+    ) -> Camera:
+        """The camera, for an image of this size in pixels; orthographic, of the same height at the focal point."""
+        place: Any = self.position, self.focal_point, self.view_up, self.view_angle
+        part: Any = {"window": window, "corner": corner}
+        return Camera(*place, size=size, parallel_scale=self.half_height if parallel else None, **part)
+
 
 @dataclass(frozen=True)
 class State:
@@ -125,7 +133,7 @@ class State:
         mode: how cells become a pixel, a key of `Scene.modes` or `ISOSURFACE`.
         isovalue: of the isosurface.
         background: linear RGB.
-        parallel: whether the camera is orthographic, of the same height at the focal point.
+        parallel: whether the camera is orthographic.
         clip: whether box and plane are applied.
         box: what is inside is shown, as `Volume.bounds`.
         normal: of the plane, to what is shown.
@@ -148,12 +156,6 @@ class State:
     normal: tuple[float, ...] = (0.0, 0.0, 1.0)
     offset: float = -1.0
     point: Vector | None = None
-
-    def camera(self, size: tuple[int, int], window: object = None, corner: object = None) -> Camera:
-        """The camera, for an image of this size in pixels."""
-        place = self.orbit.position, self.orbit.focal_point, self.orbit.view_up, self.orbit.view_angle
-        scale, part = self.orbit.half_height if self.parallel else None, {"window": window, "corner": corner}
-        return Camera(*place, size=size, parallel_scale=scale, **part)  # pyright: ignore[reportArgumentType]
 
 
 PROGRAM = {"enabled": "", "lit": "light", "mode": "mode", "parallel": "orthographic", "clip": "clip"}

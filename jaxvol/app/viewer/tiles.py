@@ -99,6 +99,10 @@ class TileRenderer:
         leaves, structure = jax.tree.flatten(self.transfer)
         return *(getattr(self.state, name) for name in PROGRAM), structure, *map(np.shape, leaves)
 
+    def camera(self, window: object, corner: object = None) -> Camera:
+        """That of a tile."""
+        return self.state.orbit.camera((SIDE, SIDE), window, corner, parallel=self.state.parallel)
+
     def rendered(self, camera: Camera) -> Rendering:
         """What `render` returns for a camera of a tile's size."""
         return render(self.volume, self.transfer, camera, self.march, **self.how)
@@ -107,7 +111,7 @@ class TileRenderer:
         """A tile as `render` returns it."""
         width, height = self.state.size
         window, corner = grid.window(column, row, width / height), (column * SIDE, row * SIDE)
-        return self.rendered(self.state.camera((SIDE, SIDE), window, corner)).rgba
+        return self.rendered(self.camera(window, corner)).rgba
 
     def draw(self, pixels: Pixels, grid: Grid, column: int, row: int) -> None:
         """Draw a tile into its place in an image that holds all tiles whole."""
@@ -132,7 +136,7 @@ class TileRenderer:
         None where nothing is."""
         (width, height), least = self.state.size, 1e-3
         x, y = (2 * across - 1) * width / height, 1 - 2 * down
-        camera = self.state.camera((SIDE, SIDE), (x - least, x + least, y - least, y + least))
+        camera = self.camera((x - least, x + least, y - least, y + least))
         depth = self.rendered(camera).details.depth
         found = np.inf if depth is None else float(np.asarray(depth)[SIDE // 2, SIDE // 2])
         return (

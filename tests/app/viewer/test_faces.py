@@ -142,7 +142,7 @@ def test_the_page(tmp_path):
         url = server.stdout.readline().split()[1]
         assert url == f"http://localhost:{port}"
         with opened(url, 1200, 800) as page:
-            page.wait_for("document.body.innerText.includes('march and light')", SECONDS)
+            page.wait_for("document.body.innerText.includes('slices')", SECONDS)
             face = Face(page, box_of(page, "canvas"))
             face.check_pointer()
             face.check_level(page_field("level"))
