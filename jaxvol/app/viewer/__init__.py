@@ -40,8 +40,8 @@ def view(
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
     Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click to pick a
-    point, of which slices are shown, or twice to return. Beside the image are sides to look from, the mode, the
-    transfer function's points, which are dragged on its curve, or its labels, clips, the step and each
+    point, of which slices are shown, or twice to return. Beside the image are sides to look from, the mode,
+    the transfer function's points, which are dragged on its curve, or its labels, clips, the step and each
     transform. While something changes, the image is as coarse as it must be to follow within some 150 ms; at
     rest it has all pixels. Where another program must be compiled, the old image stays. It needs
     `pip install jaxvol[notebooks]`. Compiled programs are kept, as by `keep_programs`.
@@ -96,9 +96,9 @@ def serve(
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
 
-    By default only this machine can connect, and only pages that this server sent (others that a browser shows
-    may not); with a token, whoever knows it, from any page. What a browser sends are numbers, colors and names
-    of controls; nothing of it is evaluated or used as a path. It needs `pip install jaxvol[view]`.
+    Without a token only this machine can connect, and only pages that this server sent (others that a browser
+    shows may not); with one, whoever knows it, from any page. What a browser sends are numbers, colors and
+    names of controls; nothing of it is evaluated or used as a path. It needs `pip install jaxvol[view]`.
 
     Args:
         volume: as for `view`.

@@ -30,8 +30,8 @@ class Control:
 
 
 class Press(NamedTuple):
-    """A press of the pointer in a box that goes on: on one of its parts, empty for none, maybe twice; and where
-    it is, from the upper left corner, 0 to 1. Those between may be lost; those of a `gesture` have one number."""
+    """A press of the pointer in a box that goes on: on one of its parts, empty for none, maybe twice; and
+    where it is, from the upper left corner, 0 to 1. A `gesture` has one number; some may be lost."""
 
     gesture: str
     pad: str

@@ -71,11 +71,11 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
     )
     line = height(np.interp(np.linspace(low, high, 4 * BINS), at, extinction))
     return (
-        f'<svg data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}" width="100%" xmlns="http://www.w3.org/2000/svg"'
-        f' style="overflow: visible; touch-action: none; cursor: crosshair; display: block">'
+        f'<svg xmlns="http://www.w3.org/2000/svg" data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}"'
+        f' style="overflow: visible; touch-action: none; cursor: crosshair; width: 100%; display: block">'
         f'<linearGradient id="jaxvol-colors">{stops}</linearGradient>'
         f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#8882" />'
-        f'<polygon points="0,{HEIGHT} {points(HEIGHT - (HEIGHT - 2) * bars)} {WIDTH},{HEIGHT}" fill="#8888" />'
+        f'<polygon points="0,{HEIGHT} {points(HEIGHT * (1 - bars))} {WIDTH},{HEIGHT}" fill="#8888" />'
         f'<rect y="{HEIGHT}" width="{WIDTH}" height="8" fill="url(#jaxvol-colors)" />'
         f'<polyline points="{points(line)}" fill="none" stroke="currentColor" />'
         f"{circles if len(at) <= editing.MAX_POINTS else ''}</svg>"
@@ -85,8 +85,8 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
 
 
 def _point_controls(model: Model) -> list[Control]:
-    """Presets and colormaps, the curve, window and level, and the point that was pressed last: its value, colour
-    and opacity, which is that of a layer as thick as a voxel."""
+    """Presets, the curve, window and level; and value, colour and opacity of the point that was pressed last,
+    the opacity that of a layer as thick as a voxel."""
     low, high, bars = histogram(model.scene.volume)
     voxel, given, chosen, gesture = model.scene.voxel, model.state.transfer, 0, ""
     names = {"preset": GIVEN, "colors": GIVEN}
@@ -146,7 +146,7 @@ def _point_controls(model: Model) -> list[Control]:
     controls = [
         listed("preset", choose_preset, [AUTOMATIC, *PRESETS]),
         listed("colors", choose_colors, COLORMAPS),
-        Control("pad", get=lambda: _plot(low, high, bars, transfer(), voxel, chosen), set=press),
+        Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen), press),
         of_range("window", 0, (min(unit, window), 4 * span, unit)),
         of_range("level", 1, (middle - 1.5 * span, middle + 1.5 * span, unit)),
     ]

@@ -70,7 +70,7 @@ class NotebookView(ipywidgets.HBox):
             inner = ipywidgets.VBox([*map(self._widget, controls)], layout={"margin": "-8px -12px"})
             selected = None if heading in FOLDED else 0
             shown.append(ipywidgets.Accordion([inner], titles=[heading], selected_index=selected))
-        panel = ipywidgets.VBox(shown, layout=PANEL | {"height": f"{max(state.size[1], 480)}px"})
+        panel = ipywidgets.VBox(shown, layout=PANEL | {"height": f"{max(state.size[1], 640)}px"})
         self.children = (self.canvas, panel)
         self.layout.flex_flow = "row wrap"
         self.model.marked = self._update
@@ -198,7 +198,7 @@ def _widget_of_value(control: Control) -> Any:
     how["description"] = control.label
     if control.kind == "checkbox":
         return ipywidgets.Checkbox(indent=False, **how)
-    how["style"] = {"description_width": "72px"}
+    how["style"] = {"description_width": "78px"}
     low, high, step = control.limits
     if control.kind == "dropdown":
         return ipywidgets.Dropdown(options=control.choices(), **how)

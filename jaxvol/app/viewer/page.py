@@ -196,7 +196,9 @@ class _Panel:
 
     def _add(self, control: Control) -> None:
         widget = _widget(self.client.gui, control)
-        source = widget if control.kind != "pad" else self.client.gui.add_text("pad", "")
+        source = (
+            widget if control.kind != "pad" else self.client.gui.add_text(control.label or control.kind, "")
+        )
 
         # viser runs coroutines one after the other, and plain functions in any order
         async def changed(event: Any) -> None:

@@ -82,4 +82,4 @@ def slice_controls(model: Model) -> list[Control]:
         at[b] = (pressed.y if down[b] else 1 - pressed.y) * (shape[b] - 1)
         model.mark(origin + turn @ (at * spacing))
 
-    return [Control("pad", get=get, set=press)]
+    return [Control("pad", "slices", get, press)]

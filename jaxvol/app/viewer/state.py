@@ -113,7 +113,7 @@ class Orbit:
     def camera(
         self, size: tuple[int, int], window: object = None, corner: object = None, *, parallel: bool = False
     ) -> Camera:
-        """The camera, for an image of this size in pixels; orthographic, of the same height at the focal point."""
+        """The camera, for an image of this size in pixels; `parallel`: as high at the focal point."""
         place: Any = self.position, self.focal_point, self.view_up, self.view_angle
         part: Any = {"window": window, "corner": corner}
         return Camera(*place, size=size, parallel_scale=self.half_height if parallel else None, **part)

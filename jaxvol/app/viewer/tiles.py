@@ -70,8 +70,8 @@ class Grid:
         return np.empty((self.rows * SIDE, self.columns * SIDE, 3), np.uint8)
 
     def canvas(self, pixels: Pixels) -> Pixels:
-        """An image that holds all tiles whole: another one, stretched smoothly, without blocks beside finished
-        tiles."""
+        """An image that holds all tiles whole: another one, stretched smoothly, so that it has no
+        blocks beside finished tiles."""
         width, height = self.size
         stretched = np.asarray(Image.fromarray(pixels).resize(self.size, Image.Resampling.BILINEAR))
         beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width), (0, 0)
@@ -132,8 +132,8 @@ class TileRenderer:
         return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
 
     def picked(self, across: float, down: float) -> Float[np.ndarray, "3"] | None:
-        """The world point that is seen at a fraction of the view's width and height, by the depth of a rendering;
-        None where nothing is."""
+        """The world point that is seen at a fraction of the view's width and height, at the mean depth; None
+        where nothing is."""
         (width, height), least = self.state.size, 1e-3
         x, y = (2 * across - 1) * width / height, 1 - 2 * down
         camera = self.camera((x - least, x + least, y - least, y + least))

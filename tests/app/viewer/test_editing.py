@@ -94,7 +94,7 @@ def test_a_colormap_leaves_the_opacity():
     colored = recolored(GIVEN, "gray")
     np.testing.assert_allclose(looked_up(padded(colored))[:, 3], looked_up(padded(GIVEN))[:, 3], atol=1e-6)
     grey = (np.asarray(colored.values) - 10) / 40
-    np.testing.assert_allclose(jv.to_srgb(colored.colors), grey[:, None] * np.ones(3), atol=3e-3)
+    np.testing.assert_allclose(jv.to_srgb(colored.colors), grey[:, None] * np.ones(3), atol=1 / 255)
 
 
 def test_a_step_alone_is_padded_and_moved():

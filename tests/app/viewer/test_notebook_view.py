@@ -74,12 +74,13 @@ def test_a_drag_orbits_and_with_shift_or_the_right_button_it_moves(shown):
 def test_what_is_drawn_and_told_is_shown(shown, monkeypatch):
     images, pixels = [], np.zeros((210, 300, 3), np.uint8)
     monkeypatch.setattr(shown.canvas, "show", lambda *image: images.append(image))
-    shown.model._show(pixels, "coarse", 0.1, 0.4)
+    shown.model._show(pixels, "coarse", 0.1, shown.model.state)
     shown.model._set_status("one\ntwo")
-    assert images == [(pixels, 85)]
+    assert images[0][0].shape == pixels.shape
+    assert images[0][1] == 85
     assert shown._status.value == "one<br>two"
     shown.model.close()
-    shown.model._show(pixels, "fine", 0.1, 0.4)
+    shown.model._show(pixels, "fine", 0.1, shown.model.state)
     shown.model._set_status("nothing more")
     assert (len(images), shown._status.value) == (1, "one<br>two")
 

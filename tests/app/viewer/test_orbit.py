@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.app.viewer.marks import AXES, MARGIN, PICKED, with_marks
-from jaxvol.app.viewer.state import STEEPEST, Orbit, State
+from jaxvol.app.viewer.state import STEEPEST, Orbit, initial
 
 
 START = Orbit.at((5.0, -3.0, 2.0), (1.0, 2.0, 0.5), (0.0, 0.0, 2.0), 40.0)
@@ -84,17 +83,20 @@ def test_the_camera_is_that_of_the_renderer():
 
 
 def test_marks_lie_where_the_camera_sees_the_point_and_the_axes():
-    none: Any = None
-    orbit, size = replace(START, distance=7.0), (600, HEIGHT)
+    state, orbit, size = (
+        initial(jv.phantom("sphere", 8), jv.colormap("gray", (0, 255)))[1],
+        START,
+        (600, HEIGHT),
+    )
     point = np.array([1.5, 1.0, 0.9])
-    state = State(orbit, size, none, 1.0, none, False, "over", 0, (1, 1, 1), False, False, none, point=point)
+    state = replace(state, orbit=orbit, size=size, point=point)
     image = with_marks(np.full((HEIGHT // 2, 300, 3), 255, np.uint8), state)  # of half the resolution
     yellow, red = (
         np.argwhere(np.abs(image.astype(int) - color).sum(-1) < 9) for color in (PICKED, AXES[0][1])
     )
     expected = np.array([300, HEIGHT / 2]) + HEIGHT * pixel(orbit, point)
     np.testing.assert_allclose(2 * yellow.mean(axis=0)[::-1], expected, atol=1.5)
-    x_axis = pixel(orbit, orbit.focal_point + [1e-3, 0, 0])
+    x_axis = pixel(orbit, orbit.focal_point + np.array([1e-3, 0, 0]))
     foot = np.array([MARGIN, HEIGHT - MARGIN])
     along = 2 * red.mean(axis=0)[::-1] - foot
     assert along @ x_axis > 0.95 * np.linalg.norm(along) * np.linalg.norm(x_axis)

@@ -56,7 +56,8 @@ def test_another_machine_needs_the_token():
     """Wherever a proxy shows the page."""
     served = jv.serve(VOLUME, GRAY, port=18070, host="127.0.0.2", token="secret")
     try:
-        assert served.url.startswith("http://127.0.0.2:") and served.url.endswith("/secret")
+        place = f"127.0.0.2:{served.port}"
+        assert served.url == f"http://{place}/?websocket=ws://{place}/secret"
         for path, expected in (
             ("/secret", True),
             ("/proxy/8080/secret", True),
@@ -197,16 +198,16 @@ def test_the_widgets_change_the_model_and_show_what_it_has():
         choose(found["level"], 20.0)
         assert found["value"].value == 7
         press = "1,curve,3,false,1,0"
-        choose(found["pad"], press)
+        choose(found["curve"], press)
         assert (found["value"].value, found["color"].value) == (33, (255, 255, 255))
         choose(found["color"], (128, 64, 255))
         assert display_color(np.asarray(panel.model.state.transfer.colors)[3]) == "#8040ff"
         choose(found["value"], 39.0)
         assert found["window"].value == pytest.approx(32)
-        choose(found["pad"], press.replace("1,", "2,", 1).replace("false", "true"))
+        choose(found["curve"], press.replace("1,", "2,", 1).replace("false", "true"))
         assert len(panel.model.state.transfer.values) == 3
-        for message in ("", "3,curve,x,false,0,0", "4,7,,false,0,0", "5,curve,99,true,nan,0", "<b>"):
-            choose(found["pad"], message)
+        for message in ("", "3,curve,x,false,0,0", "5,curve,9,false,nan,0", "<b>"):
+            choose(found["curve"], message)
         assert len(panel.model.state.transfer.values) == 3
         assert panel.turned == []
         choose(found["look from"], "-x")
