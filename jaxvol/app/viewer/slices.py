@@ -66,13 +66,9 @@ def slice_controls(model: Model) -> list[Control]:
             point = origin + turn @ (at * spacing)
             where = ", ".join(f"{each:.4g}" for each in point)
             slices = "".join(one(axis, at) for axis in range(3))
-            shown = (
-                tuple(at),
-                (
-                    f'<div style="display: flex; gap: 6px; align-items: flex-end; margin: 4px">{slices}</div>'
-                    f'<div style="font-size: 11px; margin: 0 4px">at ({where}): {float(value):.5g}</div>'
-                ),
-            )
+            text = f'<div style="display: flex; gap: 6px; align-items: flex-end; margin: 4px">{slices}</div>'
+            text += f'<div style="font-size: 11px; margin: 0 4px">at ({where}): {float(value):.5g}</div>'
+            shown = tuple(at), text
         return shown[1]
 
     def press(message: str) -> None:

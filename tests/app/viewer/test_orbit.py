@@ -9,7 +9,9 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.app.viewer.marks import AXES, MARGIN, PICKED, with_marks
-from jaxvol.app.viewer.state import STEEPEST, Orbit, initial
+from jaxvol.app.viewer.state import STEEPEST, Orbit
+
+from .test_model import begun
 
 
 START = Orbit.at((5.0, -3.0, 2.0), (1.0, 2.0, 0.5), (0.0, 0.0, 2.0), 40.0)
@@ -84,7 +86,7 @@ def test_the_camera_is_that_of_the_renderer():
 
 def test_marks_lie_where_the_camera_sees_the_point_and_the_axes():
     state, orbit, size = (
-        initial(jv.phantom("sphere", 8), jv.colormap("gray", (0, 255)))[1],
+        begun()[1],
         START,
         (600, HEIGHT),
     )
