@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 
 @dataclass(frozen=True)
@@ -10,8 +10,9 @@ class Control:
     """Something to look at or to change.
 
     Attributes:
-        kind: of widget. "pad": HTML, with boxes in which the pointer presses and drags: elements with
-            `data-pad`, the name of the box, and in them `data-part`.
+        kind: of widget: "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown";
+            or "pad", HTML with boxes in which the pointer presses and drags: elements with `data-pad`, the name
+            of the box, and in them `data-part`.
         label: beside it.
         get: what it shows now: a text, a number, two in a range, True or False, or a color: sRGB, `#rrggbb`.
         set: changes the model; of buttons, called with the text of one, of pads with that of a `Press`.
@@ -19,9 +20,7 @@ class Control:
         choices: of a dropdown or buttons, the texts that there are now.
     """
 
-    kind: Literal[
-        "pad", "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown"
-    ]
+    kind: str
     label: str = ""
     get: Callable[[], Any] = str
     set: Callable[[Any], None] = lambda value: None

@@ -35,11 +35,10 @@ def controls_of(model: Model) -> dict[str, list[Control]]:
     return {heading: controls for heading, controls in groups.items() if controls}
 
 
-def _bound(model: Model, kind: Any, label: str, name: str, **more: Any) -> Control:
+def _bound(model: Model, kind: str, label: str, name: str, **more: Any) -> Control:
     """A control of a field of the state."""
-    return Control(
-        kind, label, lambda: getattr(model.state, name), lambda to: model.change(**{name: to}), **more
-    )
+    how = lambda: getattr(model.state, name), lambda to: model.change(**{name: to})
+    return Control(kind, label, *how, **more)
 
 
 def _view_controls(model: Model) -> list[Control]:

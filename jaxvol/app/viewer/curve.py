@@ -63,7 +63,7 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
         return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
 
     dots = list(zip(across, height(extinction), colors, strict=True))
-    stops = "".join(f'<stop offset="{x / WIDTH:.4f}" stop-color="{color}" />' for x, _, color in dots)
+    stops = ", ".join(f"{color} {x / WIDTH:.2%}" for x, _, color in dots)
     circles = "".join(
         f'<circle data-part="{i}" cx="{x:.1f}" cy="{y:.1f}" r="{7 if i == chosen else 5}" fill="{color}"'
         f' stroke="currentColor" style="cursor: move" />'
@@ -73,13 +73,12 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}"'
         f' style="overflow: visible; touch-action: none; cursor: crosshair; width: 100%; display: block">'
-        f'<linearGradient id="jaxvol-colors">{stops}</linearGradient>'
         f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#8882" />'
         f'<polygon points="0,{HEIGHT} {points(HEIGHT * (1 - bars))} {WIDTH},{HEIGHT}" fill="#8888" />'
-        f'<rect y="{HEIGHT}" width="{WIDTH}" height="8" fill="url(#jaxvol-colors)" />'
         f'<polyline points="{points(line)}" fill="none" stroke="currentColor" />'
         f"{circles if len(at) <= editing.MAX_POINTS else ''}</svg>"
-        f'<div style="display: flex; justify-content: space-between; font-size: 10px; margin-top: 8px">'
+        f'<div style="height: 8px; background: linear-gradient(to right, {stops})"></div>'
+        f'<div style="display: flex; justify-content: space-between; font-size: 10px">'
         f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
     )
 

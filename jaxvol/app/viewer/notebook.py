@@ -28,13 +28,7 @@ from .tiles import Pixels
 
 
 WIDE = {"width": "98%"}  # layout of what stands in a line of its own
-PANEL = {
-    "width": "298px",
-    "flex": "0 0 auto",
-    "display": "block",
-    "margin": "0 0 0 4px",
-    "overflow": "hidden auto",
-}
+PANEL = {"width": "298px", "flex": "0 0 auto", "display": "block", "overflow": "hidden auto"}
 """Of the controls, which stand beside 640 pixels of an image in JupyterLab 1400 pixels wide."""
 
 
