@@ -10,9 +10,9 @@ class Control:
     """Something to look at or to change.
 
     Attributes:
-        kind: of widget: "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown";
-            or "pad", HTML with boxes in which the pointer presses and drags: elements with `data-pad`, the name
-            of the box, and in them `data-part`.
+        kind: of widget: "buttons", "number", "checkbox", "color", "slider", "log slider", "range" or
+            "dropdown"; or "pad", HTML with boxes in which the pointer presses and drags: elements with
+            `data-pad`, the name of the box, and in them `data-part`.
         label: beside it.
         get: what it shows now: a text, a number, two in a range, True or False, or a color: sRGB, `#rrggbb`.
         set: changes the model; of buttons, called with the text of one, of pads with that of a `Press`.

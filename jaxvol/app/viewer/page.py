@@ -144,14 +144,11 @@ class Page:
             orbit = Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
             model.resize(camera.image_width, camera.image_height, orbit=orbit)
 
-        async def clicked(event: viser.SceneClickEvent) -> Any:
-            model.pick(*event.screen_pos)
-
         aspect = client.camera.image_width / max(client.camera.image_height, 1)
         if aspect < (given := self.shown[1].size[0] / self.shown[1].size[1]):  # or its sides would be cut off
             turn(self.shown[1].orbit.zoomed(aspect / given))
         client.camera.on_update(turned)
-        client.scene.on_click()(clicked)
+        client.scene.on_click()(lambda event: model.pick(*event.screen_pos))
         await turned(client.camera)
 
     async def _closed(self, client: viser.ClientHandle) -> None:

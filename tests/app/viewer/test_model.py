@@ -173,7 +173,12 @@ def test_what_is_picked_lies_where_the_ray_meets_the_ball(shown):
 def test_a_saved_image_has_any_size_and_its_settings(tmp_path):
     saved, done = [], threading.Event()
     scene, state = begun()
-    drawn = Model(scene, state, lambda *_: None, lambda _: None, lambda png: (saved.append(png), done.set()))
+
+    def deliver(png):
+        saved.append(png)
+        done.set()
+
+    drawn = Model(scene, state, lambda *_: None, lambda _: None, deliver)
     state = drawn.state = replace(state, clip=False, isovalue=7.0, background=(0.0, 0.5, 1.0))
     drawn.save(2.5 * SIZE[0])
     assert done.wait(600)
@@ -380,6 +385,7 @@ def test_a_box_and_a_plane_clip_what_is_shown(controlled):
     orbit = model.state.orbit
     clip = model.scene.march(model.state).transforms[0]
     assert isinstance(clip, jv.Clip)
+    assert clip.box is not None
     np.testing.assert_allclose(clip.box, (3, 9, *np.asarray(BALL.bounds)[2:]))
     np.testing.assert_allclose((clip.origins[0], clip.normals[0]), (BALL.center, -orbit.toward), rtol=1e-5)
     for depth in (-1.0, 1.0):  # from nothing to all
