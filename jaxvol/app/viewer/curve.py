@@ -146,8 +146,8 @@ def _point_controls(model: Model) -> list[Control]:
         listed("preset", choose_preset, [AUTOMATIC, *PRESETS]),
         listed("colors", choose_colors, COLORMAPS),
         Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen), press),
-        of_range("window", 0, (min(unit, window), 4 * span, unit)),
-        of_range("level", 1, (middle - 1.5 * span, middle + 1.5 * span, unit)),
+        of_range("window", 0, (min(unit, window), 2 * span, unit)),
+        of_range("level", 1, (middle - span, middle + span, unit)),
     ]
 
     def value() -> float:

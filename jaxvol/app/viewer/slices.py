@@ -18,8 +18,8 @@ MOST = 320  # pixels of a slice's side
 
 
 def slice_controls(model: Model) -> list[Control]:
-    """A pad with a slice across each axis of the voxels, each to the right and upwards as the world's axes. A
-    press moves the point."""
+    """A pad with a slice across each axis of the voxels, each to the right as the world's axes, and upwards as
+    they are, or as the camera is. A press moves the point."""
     volume = model.scene.volume
     if np.ndim(volume.data) != 3 or volume.field is not None:
         return []
@@ -28,7 +28,9 @@ def slice_controls(model: Model) -> list[Control]:
     turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction, np.float64)
     shape = np.array(volume.shape)
     size = (shape - 1) * spacing
-    down = turn[np.abs(turn).argmax(axis=0), range(3)] < 0  # axes that run against the world's
+    upward = turn.T @ model.first.orbit.view_up
+    # axes that run down or to the left
+    down = np.where(np.abs(upward) > 0.7, upward, turn[np.abs(turn).argmax(axis=0), range(3)]) < 0
     shown: tuple[Any, str] = (), ""
 
     def indices() -> np.ndarray:

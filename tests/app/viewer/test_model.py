@@ -412,9 +412,12 @@ def test_slices_pass_through_the_point_and_move_it(controlled):
     assert [float(each) for each in told[1].split(", ")] == pytest.approx(model.state.point, rel=1e-3)
     assert float(told[2]) == float(BALL.data[17, 23, 23])
     pictures = [Image.open(io.BytesIO(base64.b64decode(p))) for p in re.findall(r"base64,(.*?)\)", pad.get())]
-    across_z = np.asarray(pictures[2], float)
-    expected = np.asarray(BALL.data, float)[::-1, ::-1, 23].T  # to the right and upwards as the world's axes
-    assert np.corrcoef(across_z.ravel(), expected.ravel())[0, 1] > 0.99
+    data = np.asarray(BALL.data, float)
+    # x of the data is drawn to the right, and against the world's y; y upwards, as the world's x
+    for picture, expected in zip(
+        pictures, (data[17, :, ::-1], data[::-1, 23, ::-1], data[::-1, ::-1, 23]), strict=True
+    ):
+        assert np.corrcoef(np.asarray(picture, float).ravel(), expected.T.ravel())[0, 1] > 0.99
 
 
 def test_labels_are_shown_and_changed_by_their_controls(controlled):
