@@ -1,5 +1,6 @@
 """What can be changed in a viewer? Its controls by groups, for both faces."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ def _view_controls(model: Model) -> list[Control]:
             axis, sign = SIDES[side]
             position = orbit.focal_point + orbit.distance * sign * np.eye(3)[axis]
             orbit = Orbit.at(position, orbit.focal_point, orbit.view_up, orbit.view_angle)
-        model.change(orbit=orbit)
+        model.change(orbit=replace(orbit, view_angle=model.state.orbit.view_angle))
 
     def set_background(color: str) -> None:
         model.change(background=tuple(np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()))

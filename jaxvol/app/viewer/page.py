@@ -141,12 +141,13 @@ class Page:
 
         async def turned(camera: viser.CameraHandle) -> None:
             position, focal = (self._center + self._radius * v for v in (camera.position, camera.look_at))
+            (width, height), first = self.shown[1].size, self.shown[1].orbit.view_angle
+            # a window that is narrower than what was framed shows all of its width
+            narrower = max(1.0, width / height * camera.image_height / max(camera.image_width, 1))
+            camera.fov = 2 * math.atan(narrower * math.tan(math.radians(first) / 2))
             orbit = Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
             model.resize(camera.image_width, camera.image_height, orbit=orbit)
 
-        aspect = client.camera.image_width / max(client.camera.image_height, 1)
-        if aspect < (given := self.shown[1].size[0] / self.shown[1].size[1]):  # or its sides would be cut off
-            turn(self.shown[1].orbit.zoomed(aspect / given))
         client.camera.on_update(turned)
         client.scene.on_click()(lambda event: model.pick(*event.screen_pos))
         await turned(client.camera)
