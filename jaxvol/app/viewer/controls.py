@@ -119,7 +119,7 @@ def _save_controls(model: Model) -> list[Control]:
     def save(_: str) -> None:
         model.save(width)
 
-    number = Control("number", "width (pixels)", lambda: width, set_width)
+    number = Control("number", "width", lambda: width, set_width)
     return [number, Control("buttons", "image", set=save, choices=lambda: ["save PNG"])]
 
 
