@@ -197,11 +197,11 @@ def _widget_of_value(control: Control) -> Any:
     if control.kind == "dropdown":
         return ipywidgets.Dropdown(options=control.choices(), **how)
     if control.kind == "range":
-        return ipywidgets.FloatRangeSlider(min=low, max=high, step=step, readout_format=".4~g", **how)
+        return ipywidgets.FloatRangeSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     if control.kind == "log slider":
         return ipywidgets.FloatLogSlider(base=2, min=math.log2(low), max=math.log2(high), step=0.25, **how)
     if control.kind == "slider":
-        return ipywidgets.FloatSlider(min=low, max=high, step=step, readout_format=".4~g", **how)
+        return ipywidgets.FloatSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     return (ipywidgets.FloatText if control.kind == "number" else ipywidgets.ColorPicker)(**how)
 
 
