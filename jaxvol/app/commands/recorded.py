@@ -41,13 +41,17 @@ def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
         value = getattr(options, name)
         if value != default and not isinstance(value, Path):
             words += words_of(name, value)
-    size = sum(file.stat().st_size for file in _files(options.file))
-    file = {"name": str(options.file), "bytes": size, "sha256": checksum(options.file)}
-    content: dict[str, Any] = {"options": words, "file": file}
+    content: dict[str, Any] = {"options": words, "file": fields_of(options.file)}
     from_file = options.transfer is not None or options.recorded_transfer is not None
     if from_file and isinstance(transfer, TransferFunction):
         content["transfer"] = transfer_fields(transfer)
     return {KEYWORD: json.dumps(content, sort_keys=True)}
+
+
+def fields_of(file: Path) -> dict[str, Any]:
+    """What a picture holds of its volume's file."""
+    size = sum(each.stat().st_size for each in _files(file))
+    return {"name": str(file), "bytes": size, "sha256": checksum(file)}
 
 
 def recorded_in(path: Path) -> dict[str, Any]:

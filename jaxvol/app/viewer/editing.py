@@ -15,6 +15,9 @@ MAX_POINTS = 16
 """Control points that a viewer edits. All transfer functions of so many points or fewer are padded to it, so
 that one program renders them all."""
 
+COLOR_POINTS = 9
+"""Control points that show the colours of a colormap."""
+
 POINTS = "values", "colors", "extinction"
 
 
@@ -29,6 +32,11 @@ def with_window_level(transfer: TransferFunction, window: float, level: float) -
     old_window, old_level = window_level(transfer)
     relative = (np.asarray(transfer.values, np.float64) - old_level) / (old_window or 1.0)
     return TransferFunction(level + window * relative, transfer.colors, transfer.extinction)
+
+
+def rounded(value: float, span: float) -> float:
+    """A value to a thousandth of a span, or a few: without digits that nobody set."""
+    return round(value, 3 - math.ceil(math.log10(span))) if span > 0 else value
 
 
 def display_color(linear: Float[np.ndarray, "3"]) -> str:
@@ -58,15 +66,19 @@ def with_opacity(
     return _with_point(transfer, index, extinction=extinction_of([opacity], unit_distance)[0])
 
 
-def with_point_after(transfer: TransferFunction, index: int) -> TransferFunction:
-    """With one more point half-way between this one and the next, which does not change the function."""
-    values = np.asarray(transfer.values)
-    is_last = index + 1 == len(values)
-    if is_last or len(values) >= MAX_POINTS or values[index] == values[index + 1]:
-        raise ValueError(f"there is no room for another of {MAX_POINTS} points after point {index + 1}.")
-    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
-    between = (np.insert(p, index + 1, (p[index] + p[index + 1]) / 2, axis=0) for p in points)
-    return TransferFunction(*between)
+def with_point_at(transfer: TransferFunction, value: float) -> TransferFunction:
+    """With one more point at a value, which does not change the function."""
+    values = np.asarray(transfer.values, np.float64)
+    if len(values) >= MAX_POINTS:
+        raise ValueError(f"there is no room for another of {MAX_POINTS} points.")
+    colors, extinction = np.asarray(transfer.colors), np.asarray(transfer.extinction)
+    color = [np.interp(value, values, channel) for channel in colors.T]
+    index = int(np.searchsorted(values, value))
+    return TransferFunction(
+        np.insert(values, index, value),
+        np.insert(colors, index, color, axis=0),
+        np.insert(extinction, index, np.interp(value, values, extinction)),
+    )
 
 
 def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
@@ -75,6 +87,23 @@ def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
         raise ValueError("a transfer function has at least 2 points.")
     points = (np.asarray(getattr(transfer, name)) for name in POINTS)
     return TransferFunction(*(np.delete(p, index, axis=0) for p in points))
+
+
+def recolored(transfer: TransferFunction, cmap: str) -> TransferFunction:
+    """With the colours of a matplotlib colormap over the range of its values, and the same opacities: points
+    are added until there are `COLOR_POINTS`."""
+    from matplotlib import colormaps
+
+    values, extinction = (
+        np.asarray(getattr(transfer, name), np.float64) for name in ("values", "extinction")
+    )
+    while len(values) < COLOR_POINTS and values[0] < values[-1]:
+        widest = int(np.argmax(np.diff(values)))
+        values, extinction = (
+            np.insert(p, widest + 1, p[widest : widest + 2].mean()) for p in (values, extinction)
+        )
+    at = (values - values[0]) / ((values[-1] - values[0]) or 1.0)
+    return TransferFunction(values, from_srgb(colormaps[cmap](at)[:, :3]), extinction)
 
 
 def padded(transfer: Any) -> Any:

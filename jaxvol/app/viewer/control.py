@@ -1,0 +1,67 @@
+"""What is a control? A description, of which each face makes a widget of its own."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+
+@dataclass(frozen=True)
+class Control:
+    """Something to look at or to change.
+
+    Attributes:
+        kind: of widget: "buttons", "number", "checkbox", "color", "slider", "log slider", "range" or
+            "dropdown"; or "pad", HTML with boxes in which the pointer presses and drags: elements with
+            `data-pad`, the name of the box, and in them `data-part`.
+        label: beside it.
+        get: what it shows now: a text, a number, two in a range, True or False, or a color: sRGB, `#rrggbb`.
+        set: changes the model; of buttons, called with the text of one, of pads with that of a `Press`.
+        limits: of a slider or range, lowest and highest number and the step between two.
+        choices: of a dropdown or buttons, the texts that there are now.
+    """
+
+    kind: str
+    label: str = ""
+    get: Callable[[], Any] = str
+    set: Callable[[Any], None] = lambda value: None
+    limits: tuple[float, float, float] = (0.0, 1.0, 0.001)
+    choices: Callable[[], list[str]] = list
+
+
+class Press(NamedTuple):
+    """A press of the pointer in a box that goes on: on one of its parts, empty for none, maybe twice; and
+    where it is, from the upper left corner, 0 to 1. A `gesture` has one number; some may be lost."""
+
+    gesture: str
+    pad: str
+    part: str
+    twice: bool
+    x: float
+    y: float
+
+    @classmethod
+    def of(cls, message: str) -> "Press":
+        """What a face's message says. **Raises** `ValueError` for another one."""
+        gesture, pad, part, twice, *at = message.split(",")
+        x, y = (min(max(float(each), 0.0), 1.0) for each in at)
+        return cls(gesture, pad, part, twice == "true", x, y)
+
+
+PRESSED = """(event, send) => {
+  const pad = event.target.closest('[data-pad]'), id = Date.now(), last = window.jaxvolPress ?? {};
+  if (!pad || event.button) return;
+  event.preventDefault();
+  const box = pad.getBoundingClientRect(), name = pad.dataset.pad, part = event.target.dataset.part ?? '';
+  const twice = part !== '' && last.key === name + part && id - last.id < 350;
+  window.jaxvolPress = {key: name + part, id};
+  const tell = at => {
+    const x = (at.clientX - box.x) / box.width, y = (at.clientY - box.y) / box.height;
+    send([id, name, part, twice, x.toFixed(5), y.toFixed(5)].join(','));
+  };
+  tell(event);
+  if (twice) return;
+  window.addEventListener('pointermove', tell);
+  window.addEventListener('pointerup', () => window.removeEventListener('pointermove', tell), {once: true});
+}"""
+"""JavaScript of both faces: handles `pointerdown`, and sends messages for `Press.of`. What was pressed may be
+drawn anew while the pointer moves."""
