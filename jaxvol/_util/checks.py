@@ -60,13 +60,12 @@ def is_concrete(array: Any) -> bool:
     return isinstance(array, np.ndarray | np.generic | jax.Array) and not is_traced(array)
 
 
-def pasted(array: Any) -> str | None:
-    """Numbers as nested tuples that Python reads, with the digits that their type has; None if traced."""
-    if not is_concrete(array):
-        return None
-    given = np.asarray(array)
-    inner = [] if given.ndim == 0 else [str(pasted(each)) for each in given]
-    return f"({', '.join(inner)}{',' * (len(inner) == 1)})" if given.ndim else str(given[()])
+def pasted(value: Any) -> str:
+    """Numbers as nested tuples that Python reads, with the digits that their type has; or a description."""
+    if not is_concrete(value):
+        return described(value)
+    given = np.asarray(value)
+    return f"({', '.join(map(pasted, given))}{',' * (len(given) == 1)})" if given.ndim else str(given[()])
 
 
 def near(given: str, names: Iterable[str]) -> str:

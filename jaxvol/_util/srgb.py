@@ -1,5 +1,7 @@
 """The sRGB curve: linear colour to display values, and back."""
 
+import io
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -63,6 +65,18 @@ def displayed(
     # straight alpha: viewers multiply by the opacity
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
     return np.asarray(_in_8_bits(color, opacity)).astype(np.uint8)
+
+
+def png_of(pixels: UInt8[np.ndarray, "height width channels"], text: Mapping[str, str] = {}) -> bytes:
+    """A PNG, with texts by keyword."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    file, chunks = io.BytesIO(), PngInfo()
+    for keyword, content in text.items():
+        chunks.add_itxt(keyword, content, zip=True)
+    Image.fromarray(pixels).save(file, "PNG", pnginfo=chunks)
+    return file.getvalue()
 
 
 # Jitted: one program for each shape, rather than one for each operation.

@@ -132,13 +132,11 @@ def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float,
         return THIN, (first + second) / 2
     extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
     for axis, step in enumerate(extent / (np.maximum(np.array(data.shape) - 1, 1) * unit)):
-        whole.append(step * middle.sum(axis)[middle.any(axis)])
-        for side in (slice(None), slice(None, None, -1)):
-            object_, stop = (np.moveaxis(each, axis, 0)[side] for each in (middle, dense))
-            seen = stop.any(0)
-            ends = stop.argmax(0)[None]
-            counts = np.take_along_axis(np.cumsum(object_, 0, np.int32), ends, 0)[0]
-            in_front.append(step * counts[seen])
+        object_, stop = np.moveaxis(middle, axis, 0), np.moveaxis(dense, axis, 0)
+        whole.append(step * object_.sum(0)[object_.any(0)])
+        for side in (1, -1):
+            before, ends = np.cumsum(object_[::side], 0, np.int32), stop[::side].argmax(0)[None]
+            in_front.append(step * np.take_along_axis(before, ends, 0)[0][stop.any(0)])
     depths = zip((IN_FRONT, THROUGH), (in_front, whole), strict=True)
     found = min(most / max(float(np.median(np.concatenate(each))), most) for most, each in depths)
     return -math.expm1(-found), float(data[middle].mean(dtype=np.float64))
@@ -198,17 +196,16 @@ def labels_shown(
     """A volume and a transfer function that show labels, each in a colour of its own and lit: those that the
     volume has, or its values, if they seem to be labels.
 
-    In and near labels the volume that is returned is smooth, from its least value to, inside of them, its
+    In and near labels the values that are returned are smooth, from the least to, inside of labels, the
     greatest; and labels reach two voxels beyond.
 
     Args:
         volume: the `Volume`.
-        around: what is shown of a volume with labels where these are 0; by default what `automatic_transfer`
-            shows.
+        around: what is shown where a volume's own labels are 0; by default by `automatic_transfer`.
 
     Returns:
-        The two, or None if there are no labels: none of its own, or more than 256; and values that are not
-        whole numbers of 3 to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
+        The two; None if the volume has no labels, or more than 256, and its values are not whole numbers of 3
+        to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
 
     Raises:
         ValueError: for what is no volume.

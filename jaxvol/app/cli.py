@@ -5,6 +5,7 @@ import argparse
 import os
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -57,8 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parsed(parser_of_all(), words)
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-        # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
-        ThreadPoolExecutor(1).submit(options.execute, options).result()
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = lambda told, *_: print(f"{program}: {told}", file=sys.stderr)
+            # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
+            ThreadPoolExecutor(1).submit(options.execute, options).result()
         sys.stdout.flush()
     except BrokenPipeError:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end

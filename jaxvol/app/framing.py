@@ -51,9 +51,9 @@ def automatic_camera(
         volume: what is seen.
         transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts.
         direction: from the volume to the camera; by default to the right, in front, and higher.
-        view_up: as in `Camera`. By default z; of a volume that does not say where it lies (its origin is 0,
-            its axes are the world's, as of raw files), away from the face that cuts through most of what is
-            visible, if the opposite one does not: the neck, or the pot of a plant, is below.
+        view_up: by default z; of a volume that does not say where it lies (its origin is 0, its axes are the
+            world's, as of raw files), away from the face that cuts through most of what is visible, if the
+            opposite one does not: the neck, or the pot of a plant, is below.
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
@@ -75,15 +75,9 @@ def upright(
 ) -> tuple[Any, Any]:
     """Direction and view up, where they are None as `automatic_camera` has them."""
     axis, sign = (2, 1.0) if view_up is not None else _up(volume, transfer)
-    if view_up is None:
-        view_up = sign * np.eye(3)[axis]
-    if direction is None:
-        right, front, above = FRONT
-        direction = np.array(
-            [[sign * above, front, right], [right, sign * above, -sign * front], FRONT][axis]
-        )
-        direction = direction * (1, 1, sign) if axis == 2 else direction
-    return direction, view_up
+    front = np.roll(FRONT, axis + 1)  # so that what is above lies along this axis
+    front[axis] *= sign
+    return front if direction is None else direction, sign * np.eye(3)[axis] if view_up is None else view_up
 
 
 def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
@@ -131,13 +125,9 @@ def _visible(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Bool
     elif isinstance(shown, LabelTransferFunction) and volume.labels is not None:
         extinction, kinds = np.zeros(data.shape), sampled(volume, volume.labels)
         factors = np.asarray(shown.opacity) * np.asarray(shown.shown)
-        table = zip(
-            np.asarray(shown.stacked.values), np.asarray(shown.stacked.extinction), factors, strict=True
-        )
-        for kind, (values, own, factor) in enumerate(table):
-            if (factor * own).any():
-                where = kinds == kind
-                extinction[where] = factor * np.interp(data[where], values, own)
+        functions = map(np.asarray, (shown.stacked.values, shown.stacked.extinction))
+        for kind, (values, own) in enumerate(zip(*functions, strict=True)):
+            extinction[kinds == kind] = factors[kind] * np.interp(data[kinds == kind], values, own)
     else:
         return np.ones(data.shape[:3], bool)
     return -np.expm1(-extinction * unit_of(volume)) > least

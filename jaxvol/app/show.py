@@ -1,25 +1,30 @@
 """One line from a volume to a picture, the one that `jaxvol render` makes."""
 
-import argparse
 import os
-import re
 import warnings
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from .._util.checks import described, near
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._util.checks import near
+from .._util.vec3 import apart
+from ..compositing.isosurface import Isosurface
+from ..ray import check_arguments
 from ..scene.rendering import Rendering, in_notebook
-from ..scene.transfer import Transfer
+from ..scene.space import enter
+from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
-from .commands.options import Parser, add_scene, check_exclusive
-from .commands.render import why_empty
-from .commands.scene import header_of, scene_of, with_march
+from .picture import DEFAULTS, Scene, check_exclusive, scene_of, with_march
 
 
-OF_FILES = "config", "like", "file"
-"""Options of the command that a call in Python has no use for."""
+FAINT = 0.01
+"""Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
 
 
 def show(
@@ -30,7 +35,6 @@ def show(
     """Renders a volume, and shows it, as `jaxvol render FILE` does: framed, upright, lit, with colours for
     labels, by a march that is planned for it.
 
-        jv.show("ct.nii.gz")
         jv.show("ct.nii.gz", preset="CT-Bone", direction=(0, -1, 0), size=800, background="black")
         jv.show("mr.nii.gz", compositing="maximum", window=400, level=200)
         jv.show(["ct.nii.gz", "pet.nii.gz"], [None, jv.colormap("hot", (1, 10))])
@@ -48,67 +52,77 @@ def show(
 
     Returns:
         The `Rendering`. In a notebook it shows itself as the last line of a cell; elsewhere it has been shown
-        in a window. `jv.save_png(path, rendering.image())` writes it.
+        in a window.
 
     Raises:
         ValueError: for an unknown option, those that exclude each other, and as `jv.load` and `jv.render` do.
 
     Warns of a preset whose values are others, and of an image in which hardly anything is visible.
     """
-    parser = Parser()
-    add_scene(parser)
-    known = {name: value for name, value in parser.defaults().items() if name not in OF_FILES}
-    for name in options:
-        if name not in known or name == "with":
-            raise ValueError(
-                f"show has no option {name!r}.{near(name, known)} jaxvol render --help has them."
-            )
-    volumes, transfers = _listed(volume, transfer)
-    if any(each is not None for each in transfers[:1]):
-        options["transfer"] = transfers[0]
+    known = DEFAULTS.keys() - {"transfer", "with"}
+    for name in options.keys() - known:
+        told = f"show has no option {name!r}.{near(name, known)}"
+        raise ValueError(f"{told} jaxvol render --help has them.")
+    volumes = list(volume) if isinstance(volume, list | tuple) else [volume]
+    several = isinstance(transfer, list | tuple)
+    transfers = list(transfer) if several else [transfer, *[None] * (len(volumes) - 1)]
+    if not volumes or len(volumes) != len(transfers):
+        got = f"{len(volumes)} and {len(transfers)}"
+        raise ValueError(f"volume and transfer must be lists of as many entries; got {got}.")
+    for one, look in zip(volumes, transfers, strict=True):
+        given = {} if isinstance(one, str | os.PathLike) else {"volume": one}
+        given |= {} if look is None else {"transfer": look}
+        check_arguments("show(volume, transfer)", **given)
+    files = [each if isinstance(each, Volume) else Path(each) for each in volumes]
+    options |= {} if transfers[0] is None else {"transfer": transfers[0]}
+    check_exclusive(options)
     keep_programs_by_default()
-    try:
-        check_exclusive({name: value for name, value in options.items() if value is not None})
-        given = argparse.Namespace(**known | options, recorded_transfer=None, file=volumes[0])
-        more = zip(volumes[1:], transfers[1:], strict=True)
-        vars(given)["with"] = [(each, *(() if own is None else (own,))) for each, own in more]
-        if isinstance(given.file, Volume):
-            if of_file := [name for name, value in header_of(given).items() if value is not None]:
-                raise ValueError(f"{of_file[0]} is of files; volume is a Volume.")
-        else:
-            given.file = Path(given.file)
-        scene = scene_of(given)
-        scene = with_march(scene, given, [scene.camera])
-        rendering = replace(scene.render(scene.camera), background=scene.background)
-        for note in (*scene.notes, why_empty(scene, rendering)):
-            if note:
-                warnings.warn(_in_python(note), stacklevel=2)
-    except ValueError as fault:
-        raise ValueError(_in_python(str(fault))) from fault
+    more = zip(files[1:], transfers[1:], strict=True)
+    options["with"] = [(file, *(() if look is None else (look,))) for file, look in more]
+    chosen = Namespace(**DEFAULTS | options, recorded_transfer=None, file=files[0])
+    scene = scene_of(chosen)
+    scene = with_march(scene, chosen, [scene.camera])
+    rendering = replace(scene.render(scene.camera), background=scene.background)
+    if why := why_empty(scene, rendering):
+        warnings.warn(why, stacklevel=2)
     if not in_notebook():
         rendering.show()
     return rendering
 
 
-def _listed(volume: Any, transfer: Any) -> tuple[list[Any], list[Any]]:
-    """A volume and a transfer function for each of several."""
-    volumes = list(volume) if isinstance(volume, list | tuple) else [volume]
-    transfers = list(transfer) if isinstance(transfer, list | tuple) else [transfer]
-    transfers += [None] * (len(volumes) - len(transfers) if transfer is None else 0)
-    if not volumes or len(volumes) != len(transfers):
-        got = f"got {len(volumes)} and {len(transfers)}"
-        raise ValueError(
-            f"volume and transfer must be lists of as many entries where there are several; {got}."
-        )
-    for kinds, name, each in (
-        *(((Volume, str, os.PathLike), "volume must be a jaxvol Volume or a path", v) for v in volumes),
-        *(((Transfer, type(None)), "transfer must be a transfer function or None", t) for t in transfers),
-    ):
-        if not isinstance(each, kinds):
-            raise ValueError(f"{name}; got {described(each)}.")
-    return volumes, transfers
+def why_empty(scene: Scene, rendering: Rendering) -> str | None:
+    """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`."""
+    volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
+    if opacity > FAINT or np.isnan(opacity):
+        return None
+    if opacity > 0:
+        size = f"voxels have the size {voxel_size(volume):.3g}"
+        change = f"a shorter unit_distance ({size}) or another clim"
+        return f"hardly anything is visible: the opacity is at most {opacity:.2g}. Use {change}."
+    return f"nothing is visible: {_why_nothing(scene)}"
 
 
-def _in_python(text: str) -> str:
-    """A text with the names of options as they are in Python."""
-    return re.sub(r"--([a-z][a-z-]*)", lambda found: found[1].replace("-", "_"), text)
+def _why_nothing(scene: Scene) -> str:
+    """Why all pixels are transparent."""
+    volume, transfer = scene.volume, scene.transfer
+    space, zero = scene.march.locate(volume), jnp.zeros((), jnp.int32)
+    lengths = jax.jit(jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)).length))
+    if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():
+        bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
+        return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
+    data = np.asarray(volume.data)
+    low, high = float(data.min()), float(data.max())
+    where = f"the volume's values run from {low:g} to {high:g}"
+    if isinstance(scene.compositing, Isosurface):
+        return f"{where}, and no ray crosses the isosurface's value, {float(scene.compositing.value):g}."
+    if not isinstance(transfer, TransferFunction):
+        return f"{where}, and the transfer function shows none of those that the rays meet."
+    shown = np.flatnonzero(np.asarray(transfer.extinction) > 0)
+    if not shown.size:
+        return f"{where}, and the transfer function's opacity is 0 everywhere."
+    # the opacity of a point extends to its neighbours, that of the first and the last to infinity
+    at = [-np.inf, *np.asarray(transfer.values), np.inf]
+    return (
+        f"{where}, and the transfer function shows values between {at[shown[0]]:g} and "
+        f"{at[shown[-1] + 2]:g}. A clim from {low:g} to {high:g} would show something."
+    )

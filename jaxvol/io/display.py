@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._util.checks import Arrayable, described, integer, output_file
-from .._util.srgb import displayed, to_srgb
+from .._util.srgb import displayed, png_of, to_srgb
 from .._util.whole_files import whole_file
 
 
@@ -63,15 +63,12 @@ def save_image(
 
             kind = "minisblack" if channels == 0 else "rgb"
             imwrite(part, image, photometric=kind, extrasamples=["assocalpha"] if channels == 4 else None)
+        elif ending == ".png":
+            part.write_bytes(png_of(displayed(image), text or {}))
         else:
             from PIL import Image
-            from PIL.PngImagePlugin import PngInfo
 
-            chunks = PngInfo()
-            for keyword, content in (text or {}).items():
-                chunks.add_itxt(keyword, content, zip=True)
-            options: dict[str, Any] = {"pnginfo": chunks} if ending == ".png" else {}
-            Image.fromarray(displayed(image)).save(part, **options)
+            Image.fromarray(displayed(image)).save(part)
     return path
 
 

@@ -103,18 +103,14 @@ class Camera(eqx.Module):
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
 
     def __repr__(self) -> str:
-        whole = np.array((-self.size[0] / self.size[1], self.size[0] / self.size[1], -1.0, 1.0))
-        usual: dict[str, Any] = {"parallel_scale": None, "window": whole, "corner": np.zeros(2)}
-        given: dict[str, Any] = {
-            name: getattr(self, name) for name in ("position", "focal_point", "view_up", "view_angle", *usual)
-        }
-        given = {name: value for name, value in given.items() if value is not None or name not in usual}
-        if not all(is_concrete(each) and each.ndim < 2 for each in given.values()):
-            return eqx.tree_pformat(self)
-        told = [
-            name for name in given if usual.get(name) is None or not np.allclose(given[name], usual[name])
-        ]
-        return f"Camera({', '.join(f'{name}={pasted(given[name])}' for name in told)}, size={self.size})"
+        whole = np.float32((-self.size[0] / self.size[1], self.size[0] / self.size[1], -1, 1))
+        usual = {"parallel_scale": None, "window": whole, "corner": np.zeros(2)}
+        told: list[str] = []
+        for name in ("position", "focal_point", "view_up", "view_angle", *usual):
+            given, expected = getattr(self, name), usual.get(name)
+            is_usual = expected is not None and is_concrete(given) and np.array_equal(given, expected)
+            told += [] if is_usual or given is None else [f"{name}={pasted(given)}"]
+        return f"Camera({', '.join(told)}, size={self.size})"
 
     @classmethod
     def looking_at(

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from .._util.checks import Arrayable, described, finite_array, integer, near, number, unit_interval
 from .._util.srgb import from_srgb
@@ -169,34 +169,32 @@ def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1
 
 
 def preset_name(name: str | Any) -> str:
-    """The key of `PRESETS` that is meant: case and what separates words do not count.
+    """The key of `PRESETS` that is meant: case and what separates words do not count. **Raises** `ValueError`
+    for an unknown name."""
 
-    Raises:
-        ValueError: for an unknown name.
-    """
-    keys = {re.sub("[^a-z0-9]", "", key.lower()): key for key in PRESETS}
-    if isinstance(name, str) and name in PRESETS:
-        return name
-    plain = re.sub("[^a-z0-9]", "", name.lower()) if isinstance(name, str) else ""
-    if plain not in keys:
-        raise ValueError(
-            f"preset must be one of {', '.join(PRESETS)}; got {name!r}.{near(str(name), PRESETS)}"
-        )
-    return keys[plain]
+    def plain(text: str) -> str:
+        return re.sub("[^a-z0-9]", "", text.lower())
+
+    keys = {plain(key): key for key in PRESETS} | {key: key for key in PRESETS}
+    for spelling in (name, plain(str(name))):
+        if isinstance(name, str) and spelling in keys:
+            return keys[spelling]
+    raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.{near(str(name), PRESETS)}")
 
 
-def fitted_range(name: str, low: float, high: float) -> tuple[tuple[float, float] | None, str | None]:
-    """To what a preset is stretched for values from `low` to `high` if nothing is said, None for its own
-    range; and a word where that does not fit. Values of MR have no unit, those of CT are Hounsfield units."""
-    own = PRESETS[preset_name(name)][1]
-    if name.upper().startswith("MR"):
-        if own[1] / 2 <= high <= 2 * own[1]:
-            return None, None
-        told = f"{name} is for values from {own[0]:g} to {own[1]:g}; it was stretched to 0 to {high:g}"
-        return (0.0, high), f"{told}. --clim LOW HIGH stretches it otherwise."
+def fitted_range(
+    name: str, values: Shaped[np.ndarray, "..."]
+) -> tuple[tuple[float, float] | None, str | None]:
+    """To what a preset is stretched for these values of a volume if nothing is said, None for its own range;
+    and a word where that does not fit. Values of MR have no unit, those of CT are Hounsfield units."""
+    name, low, high = preset_name(name), float(values.min()), float(np.percentile(values, 99.9))
+    first, last = PRESETS[name][1]
+    if name.upper().startswith("MR") and not last / 2 <= high <= 2 * last:
+        told = f"{name} is for values from {first:g} to {last:g}; it was stretched to 0 to {high:g}"
+        return (0.0, high), f"{told}. Another clim stretches it otherwise."
     if name.upper().startswith("CT") and (low >= 0 or high < 200):
         told = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to {high:g}"
-        return None, f"{told}. Of those that are stored + 1024, --clim {own[0] + 1024:g} {own[1] + 1024:g}."
+        return None, f"{told}. Of those stored + 1024, clim is ({first + 1024:g}, {last + 1024:g})."
     return None, None
 
 

@@ -1,6 +1,5 @@
 """What does a render return?"""
 
-import io
 import sys
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.srgb import displayed, linear_color
+from .._util.srgb import displayed, linear_color, png_of
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 
@@ -125,8 +124,7 @@ class Rendering(eqx.Module):
         import matplotlib.pyplot as plt
 
         pixels = displayed(np.asarray(self.image(), np.float32))
-        height, width = pixels.shape[:2]
-        figure = plt.figure(figsize=(width / 100, height / 100), dpi=100)
+        figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)
         figure.figimage(pixels)
         plt.show()
         plt.close(figure)
@@ -135,11 +133,7 @@ class Rendering(eqx.Module):
         """What notebooks show: the image as a PNG, if it is one."""
         if self.rgba.ndim != 3 or is_traced(self.rgba):
             return None
-        from PIL import Image
-
-        file = io.BytesIO()
-        Image.fromarray(displayed(np.asarray(self.image(), np.float32))).save(file, "png")
-        return file.getvalue()
+        return png_of(displayed(np.asarray(self.image(), np.float32)))
 
 
 def in_notebook() -> bool:

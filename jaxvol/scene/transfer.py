@@ -17,7 +17,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util import piecewise_linear as linear
-from .._util.checks import Arrayable, finite_array, flag, increasing, number, pasted, require, unit_interval
+from .._util.checks import (
+    Arrayable,
+    finite_array,
+    flag,
+    increasing,
+    is_concrete,
+    number,
+    pasted,
+    require,
+    unit_interval,
+)
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
@@ -171,7 +181,7 @@ BRIGHTEST = 8.0
 """Of colours, above which they are hardly meant as linear RGB."""
 
 MOST_WRITTEN = 16
-"""Points that a text of a transfer function holds."""
+"""Points that the text of a transfer function holds."""
 
 
 class TransferFunction(Transfer):
@@ -237,13 +247,10 @@ class TransferFunction(Transfer):
         return cls(values, colors, extinction_of(opacities, unit_distance))
 
     def __repr__(self) -> str:
-        texts = [pasted(each) for each in (self.values, self.colors, self.extinction)]
-        if None in texts or self.values.ndim > 1:
+        given = self.values, self.colors, self.extinction
+        if not all(map(is_concrete, given)) or self.values.ndim != 1 or len(self.values) > MOST_WRITTEN:
             return eqx.tree_pformat(self)
-        if (n := self.values.shape[0]) > MOST_WRITTEN:
-            (low, *_, high), most = np.asarray(self.values), np.asarray(self.extinction).max()
-            return f"<TransferFunction of {n} points from {low:g} to {high:g}, extinction up to {most:g}>"
-        values, colors, extinction = texts
+        values, colors, extinction = map(pasted, given)
         more = ", per_voxel=True" if self.per_voxel else ""
         return f"TransferFunction(values={values}, colors={colors}, extinction={extinction}{more})"
 

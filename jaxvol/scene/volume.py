@@ -123,46 +123,43 @@ class Volume(eqx.Module):
         self.field, self.fetch = field, OneByOne()
 
     def __repr__(self) -> str:
-        place = {"spacing": self.spacing, "origin": self.origin, "direction": self.direction}
-        texts = {name: pasted(value) for name, value in place.items() if value is not None}
-        if not texts or None in texts.values() or not is_concrete(self.data):
+        if not is_concrete(self.data):
             return eqx.tree_pformat(self)
-        data = np.asarray(self.data)
-        more = [f"{name}={text}" for name, text in texts.items()]
-        more += [] if self.labels is None else [f"labels to {np.asarray(self.labels).max()}"]
-        more += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
-        return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(more)}>"
+        data, place = np.asarray(self.data), ("spacing", "origin", "direction")
+        told = [f"{name}={pasted(getattr(self, name))}" for name in place if getattr(self, name) is not None]
+        told += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
+        told += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
+        return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(told)}>"
 
     def __getitem__(self, part: Any) -> "Volume":
-        """The part of it with these voxels, such as `volume[10:90, :, ::2]`, at its place in the world.
+        """The part with these voxels, such as `volume[10:90, :, ::2]`, at its place in the world.
 
         Raises:
             ValueError: for what is no slice with a step above 0, fewer than two voxels along an axis, and a
                 volume with a `field`.
         """
-        part = part if isinstance(part, tuple) else (part,)
-        expected = "volume[a:b, c:d, e:f] takes up to three slices that leave 2 voxels along each axis"
-        if len(part) > 3 or not all(isinstance(each, slice) for each in part) or self.field is not None:
-            raise ValueError(f"{expected}, of a volume without a field; got {shortened(part)}.")
-        slices = (*part, *[slice(None)] * (3 - len(part)))
-        ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)]
-        if any(len(each) < 2 or each.step < 1 for each in ranges) or self.fetch.window is not None:
-            raise ValueError(f"{expected}; got {shortened(part)} of {self.shape}.")
+        given = part if isinstance(part, tuple) else (part,)
+        slices = (*given, *[slice(None)] * (3 - len(given)))
+        taken = all(isinstance(each, slice) for each in given) and len(slices) == 3 and self.field is None
+        ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)] if taken else []
+        if not ranges or any(len(each) < 2 or each.step < 1 for each in ranges):
+            expected = "takes up to three slices that leave 2 voxels along each axis, of no field"
+            raise ValueError(f"volume[a:b, c:d, e:f] {expected}; got {shortened(part)} of {self.shape}.")
         # in NumPy where numbers are known, which compiles nothing
-        given = self.data, self.spacing, self.origin, self.direction, self.labels
-        known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in given]
+        own = self.data, self.spacing, self.origin, self.direction, self.labels
+        known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in own]
         data, spacing, origin, direction, labels = known
-        shift = spacing * np.array([each.start for each in ranges], spacing.dtype)
-        if direction is not None:
-            shift = (direction * shift[None, :]).sum(axis=1)
-        spacing = spacing * np.array([each.step for each in ranges], spacing.dtype)
+        start, step = (
+            np.array([getattr(r, name) for r in ranges], spacing.dtype) for name in ("start", "step")
+        )
+        shift = spacing * start
+        shift = shift if direction is None else (direction * shift[None, :]).sum(axis=1)
         labels = None if labels is None else labels[slices]
         how: Any = {"direction": direction, "label_ids": self.label_ids}
-        return Volume(data[slices], spacing, origin + shift, labels, **how)
+        return Volume(data[slices], spacing * step, origin + shift, labels, **how)
 
     def crop(self, box: Arrayable) -> "Volume":
-        """The part of it that just holds a box, at its place in the world; in axes that are turned, the box
-        around that one.
+        """The part that just holds a box, at its place in the world; in turned axes, the box around that.
 
         Args:
             box: (x_min, x_max, y_min, y_max, z_min, z_max) in the world, as `bounds`.
@@ -175,15 +172,15 @@ class Volume(eqx.Module):
         """
         ends = np.asarray(finite_array("box", box, (6,)), np.float64).reshape(3, 2)
         turn = np.eye(3) if self.direction is None else np.asarray(self.direction, np.float64)
-        corners = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 3)
-        at = np.linalg.solve(turn, (corners - np.asarray(self.origin, np.float64)).T).T
-        at, last = at / np.asarray(self.spacing, np.float64), np.array(self.shape) - 1
-        first = np.clip(np.floor(at.min(0) + PLACE), 0, last - 1).astype(int).tolist()
-        end = np.clip(np.ceil(at.max(0) - PLACE), 1, last).astype(int).tolist()
-        if (at.max(0) < 0).any() or (at.min(0) > last).any() or (ends[:, 0] >= ends[:, 1]).any():
+        corners = np.array(np.meshgrid(*ends)).reshape(3, -1) - np.asarray(self.origin, np.float64)[:, None]
+        at = np.linalg.solve(turn * np.asarray(self.spacing, np.float64), corners)
+        first, end = np.floor(at.min(1) + PLACE), np.ceil(at.max(1) - PLACE) + 1
+        if (end < 1).any() or (first > np.array(self.shape) - 1).any() or (ends[:, 0] >= ends[:, 1]).any():
             bounds = pasted(self.bounds)
             raise ValueError(f"box must be one that meets the volume, {bounds}; got {pasted(ends.ravel())}.")
-        return self[tuple(slice(low, max(high, low + 1) + 1) for low, high in zip(first, end, strict=True))]
+        low = np.clip(first, 0, np.array(self.shape) - 2).astype(int)
+        high = np.maximum(end.astype(int), low + 2)
+        return self[tuple(map(slice, low.tolist(), high.tolist()))]
 
     @property
     def valid(self) -> Bool[Array, ""]:

@@ -10,8 +10,8 @@ from scipy.ndimage import gaussian_filter
 import jaxvol as jv
 from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_shown, thresholds
 from jaxvol.app.commands.animate import turned
-from jaxvol.app.commands.scene import _transfer_of_bricks, copy_of
 from jaxvol.app.framing import MARGIN, framed, visible_points
+from jaxvol.app.picture import _transfer_of_bricks, copy_of
 from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
 

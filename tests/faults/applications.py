@@ -93,7 +93,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "command: the light does not reach the image",
-        "app.commands.scene:_lighting",
+        "app.picture:_lighting",
         lambda _: lambda options, mode, **_how: None,
         ("app/commands/test_render.py::test_options_of_the_look_make_the_scene[an isosurface]",),
     ),

@@ -16,9 +16,9 @@ from ..._util.checks import integer, output_file
 from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
 from ...scene.camera import Camera
+from ..picture import scene_of, with_march
+from ..show import why_empty
 from .options import add_command, add_output, add_scene, add_vector
-from .render import why_empty
-from .scene import scene_of, with_march
 
 
 FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
@@ -44,7 +44,6 @@ def _animate(options: argparse.Namespace) -> None:
     scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))
     begun = time.perf_counter()
     scene = with_march(scene, options, views(scene.camera, PLANNED_VIEWS))
-    print(*scene.notes, sep="\n", end="\n" * bool(scene.notes))
     empty: list[str | None] = []
 
     def image_of(camera: Camera) -> UInt8[np.ndarray, "height width 3"]:

@@ -6,33 +6,20 @@ import re
 import tomllib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ..._util.checks import near, shortened
 from ..._util.srgb import linear_color
 from ...compositing.modes import ELSEWHERE, MODES
+from ...io.formats import files_of
 from ...scene.presets import PRESETS, SLICER
+from ..picture import DEFAULTS, OVERRIDES, check_exclusive
 from .recorded import recorded_in, volume_of_picture, words_of
 
 
 SWITCH = argparse.BooleanOptionalAction
-
-OVERRIDES = {
-    "preset": {"cmap", "transfer", "recorded_transfer"},
-    "cmap": {"preset", "transfer", "recorded_transfer"},
-    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "window", "level", "unit_distance"},
-    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"},
-    "camera": {"direction", "parallel"},
-    "direction": {"camera"},
-    "parallel": {"camera"},
-    "clim": {"window", "level"},
-    "window": {"clim"},
-    "level": {"clim"},
-    "step": {"tolerance"},
-    "tolerance": {"step"},
-}
-"""Options that exclude this one, which is an error, and that it overrides in a picture."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -84,26 +71,13 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
 
 def in_full(words: Sequence[str]) -> list[str]:
     """Words in which `--size 512` is that of a square, and `--background white` is in linear RGB."""
-    found: list[str] = []
-    for word in words:
-        name, is_joined, value = word.partition("=")
-        found += [name, value] if is_joined and name in ("--size", "--background") else [word]
-    for number, (name, value) in reversed([*enumerate(pairwise(found))]):
-        if name == "--size" and not "".join(found[number + 2 : number + 3]).isdecimal():
+    found = [*words]
+    for number, (name, value) in reversed([*enumerate(pairwise(words))]):
+        if name == "--size" and not "".join(words[number + 2 : number + 3]).isdecimal():
             found.insert(number + 1, value)
         elif name == "--background" and not re.match(r"[-+.\d]", value):
             found[number + 1 : number + 2] = map(str, linear_color(name, value).tolist())
     return found
-
-
-def check_exclusive(settings: dict[str, Any]) -> None:
-    """Refuse options that exclude each other."""
-    on = {name for name, value in settings.items() if value is not False}
-    for name in sorted(on):
-        for other in sorted(on & OVERRIDES.get(name, set())):
-            both = " and ".join(f"--{each.replace('_', '-')}" for each in (name, other))
-            both = both.replace("--recorded-transfer", "the transfer function in the picture")
-            raise ValueError(f"{both} exclude each other; leave one out.")
 
 
 def _over(settings: dict[str, Any], weaker: dict[str, Any]) -> dict[str, Any]:
@@ -150,6 +124,16 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     return settings
 
 
+def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
+    """Refuse to write a file (an option of these names) that is the volume, one of its slices, or another."""
+    used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
+    for name in names:
+        path = getattr(options, name)
+        if path is not None and realpath(path) in map(realpath, used):
+            raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
+        used += [] if path is None else [path]
+
+
 def memory_size(text: str) -> int:
     """A number of bytes, such as 1000000, 256M or 2G (powers of 1024)."""
     found = re.fullmatch(r"(\d{1,15}(?:\.\d*)?|\.\d+)([KMG]?)", text.strip().upper())
@@ -187,6 +171,8 @@ def add_volume(parser: Parser, **more: Any) -> None:
     """Add the volume that a command reads."""
     text = "volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
     parser.add_argument("file", type=Path, metavar="FILE", help=text, **more)
+    text = "labels of the voxels (a segmentation), each shown in a colour, and around them what is shown else"
+    parser.add_argument("--labels", type=Path, metavar="FILE", help=text)
     group = parser.add_argument_group("data: needed if the file and its name do not specify it")
     add_vector(group, "--shape", "X Y Z", "voxels, x fastest in the file", type=int)
     group.add_argument("--dtype", help="such as uint8 or uint16le")
@@ -209,13 +195,6 @@ def add_clim(group: Any) -> None:
     add_vector(group, "--clim", "LOW HIGH", "range of values of the transfer function (default: all)")
 
 
-def add_window(group: Any) -> None:
-    """Add the range, also as radiologists give it."""
-    add_clim(group)
-    for name, text in (("window", "width of that range, with --level"), ("level", "middle of that range")):
-        group.add_argument(f"--{name}", type=float, metavar="VALUE", help=text)
-
-
 def add_transfer(parser: Parser) -> None:
     group = parser.add_argument_group("transfer function (default: what the histogram suggests)")
     own = {name: text for name, (text, _, _) in PRESETS.items() if not text.startswith(SLICER)}
@@ -226,7 +205,9 @@ def add_transfer(parser: Parser) -> None:
     group.add_argument("--cmap", metavar="NAME", help=text)
     text = "a transfer function written by jaxvol fit"
     group.add_argument("--transfer", type=Path, metavar="JSON", help=text)
-    add_window(group)
+    add_clim(group)
+    for name, text in (("window", "width of that range, with --level"), ("level", "middle of that range")):
+        group.add_argument(f"--{name}", type=float, metavar="VALUE", help=text)
     text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"
     group.add_argument("--unit-distance", type=float, metavar="LENGTH", help=text)
 
@@ -236,14 +217,12 @@ def add_scene(parser: Parser) -> None:
     add_volume(parser, nargs="?")
     add_sampling(parser)
     add_size(parser)
-    text = "labels of the voxels (a segmentation), each shown in a colour, and around them what is shown else"
-    parser.add_argument("--labels", type=Path, metavar="FILE", help=text)
     text = (
         "one more volume in the same image, such as PET in CT; by a colormap (default: hot) over LOW and "
         "HIGH (default: what stands out); may be given several times; without shading"
     )
     how: dict[str, Any] = {"nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
-    parser.add_argument("--with", default=[], help=text, **how)
+    parser.add_argument("--with", help=text, **how)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
     text = "options by their names, such as size = [640, 480]; those of the command line override them"
@@ -259,7 +238,7 @@ def add_scene(parser: Parser) -> None:
         "how samples become a pixel: over (default), by emission and absorption; maximum, minimum, average: "
         "that value of the ray, as classified; isosurface: where --isovalue is first crossed"
     )
-    group.add_argument("--compositing", choices=(*MODES, "isosurface"), default="over", help=text)
+    group.add_argument("--compositing", choices=(*MODES, "isosurface"), help=text)
     text = "with --compositing isosurface: the value on it"
     group.add_argument("--isovalue", type=float, metavar="VALUE", help=text)
     text = (
@@ -276,11 +255,11 @@ def add_scene(parser: Parser) -> None:
     text = "what is up (default: 0 0 1; of a raw file, away from the face that its content stands on)"
     add_vector(group, "--view-up", "X Y Z", text)
     text = "degrees from the lower to the upper edge of the image (default: 30)"
-    group.add_argument("--view-angle", type=float, default=30.0, metavar="DEGREES", help=text)
+    group.add_argument("--view-angle", type=float, metavar="DEGREES", help=text)
     text = "orthographic camera; use with --direction"
-    group.add_argument("--parallel", action=SWITCH, default=False, help=text)
+    group.add_argument("--parallel", action=SWITCH, help=text)
     text = "magnification of the image (default: 1)"
-    group.add_argument("--zoom", type=float, default=1.0, metavar="FACTOR", help=text)
+    group.add_argument("--zoom", type=float, metavar="FACTOR", help=text)
 
     group = parser.add_argument_group("clip: show a part of the volume; box and planes in world coordinates")
     text = "show what is inside this box"
@@ -289,6 +268,7 @@ def add_scene(parser: Parser) -> None:
         "show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) points; "
         "may be given several times"
     )
-    add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append", default=[])
+    add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append")
     text = "cut away what is inside the box and on that side of all planes, and show the rest"
-    group.add_argument("--clip-inside-out", action=SWITCH, default=False, help=text)
+    group.add_argument("--clip-inside-out", action=SWITCH, help=text)
+    parser.set_defaults(**DEFAULTS)

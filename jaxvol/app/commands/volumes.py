@@ -12,10 +12,10 @@ import numpy as np
 from ...io import datasets
 from ...io.formats import read
 from ...scene.volume import Volume
+from ..picture import header_of, look_of
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
 from .recorded import fields_of
-from .scene import header_of, is_automatic, transfer_of, volume_of
 
 
 def _datasets(options: argparse.Namespace) -> None:
@@ -88,11 +88,9 @@ def add_info(commands: Any) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    volume = volume_of(options)
-    transfer = None if is_automatic(options) else transfer_of(options, volume)[0]
-    how = {name: getattr(options, name) for name in ("port", "host", "token")}
-    file = options.file
-    page = serve(volume, transfer, lit=options.shade, title=file.name, file=lambda: fields_of(file), **how)
+    file, how = options.file, {name: getattr(options, name) for name in ("port", "host", "token")}
+    how |= {"lit": options.shade, "title": file.name, "file": lambda: fields_of(file)}
+    page = serve(*look_of(options), **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)

@@ -52,8 +52,7 @@ def view(
             whose labels can be hidden, and made fainter or denser; another is shown and not edited. By
             default one that is found from the volume's values; voxels that seem to be labels get a colour
             each.
-        camera: by default one that sees the whole volume, or, without a transfer function, what is visible of
-            it. Its size does not count.
+        camera: by default `automatic_camera`. Its size does not count.
         march: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
             voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`,
             `AlphaCorrection` and `EarlyTermination`.
@@ -61,7 +60,7 @@ def view(
             single place, such as `Average`.
         lit: whether the light is on at first.
         compositing: as for `render`.
-        background: linear RGB.
+        background: linear RGB, or a name.
         size: (width, height) of the image in the notebook's pixels.
 
     Returns:

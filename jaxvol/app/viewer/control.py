@@ -1,31 +1,22 @@
 """What is a control? A description, of which each face makes a widget of its own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 
 @dataclass(frozen=True)
 class Control:
-    """Something to look at or to change.
-
-    Attributes:
-        kind: of widget: "buttons", "number", "checkbox", "color", "slider", "log slider", "range" or
-            "dropdown"; or "pad", HTML with boxes in which the pointer presses and drags: elements with
-            `data-pad`, the name of the box, and in them `data-part`.
-        label: beside it.
-        get: what it shows now: a text, a number, two in a range, True or False, or a color: sRGB, `#rrggbb`.
-        set: changes the model; of buttons, called with the text of one, of pads with that of a `Press`.
-        limits: of a slider or range, lowest and highest number and the step between two.
-        choices: of a dropdown or buttons, the texts that there are now.
-    """
+    """Something to look at or to change, by a widget of a kind: "buttons", "number", "checkbox", "color",
+    "slider", "log slider", "range" or "dropdown"; or "pad", HTML with boxes in which the pointer presses and
+    drags: elements with `data-pad`, the name of the box, and in them `data-part`."""
 
     kind: str
     label: str = ""
-    get: Callable[[], Any] = str
-    set: Callable[[Any], None] = lambda value: None
-    limits: tuple[float, float, float] = (0.0, 1.0, 0.001)
-    choices: Callable[[], list[str]] = list
+    get: Callable[[], Any] = str  # what it shows: a text, number, two in a range, a color as sRGB, `#rrggbb`
+    set: Callable[[Any], None] = lambda value: None  # takes a button's text, a pad's `Press`
+    limits: tuple[float, float, float] = (0.0, 1.0, 0.001)  # lowest and highest number, and the step
+    choices: Sequence[str] = ()  # of a dropdown, or the texts of buttons
 
 
 class Press(NamedTuple):

@@ -12,7 +12,7 @@ from .curve import transfer_controls
 from .editing import display_color
 from .model import Model
 from .slices import slice_controls
-from .state import ISOSURFACE, MAX_STEP, MIN_STEP, Orbit
+from .state import ISOSURFACE, MAX_STEP, MIN_STEP
 
 
 FOLDED = {"clip", "save", "march"}
@@ -25,15 +25,10 @@ SIDES = {f"{'+-'[sign < 0]}{name}": (axis, sign) for axis, name in enumerate("xy
 def controls_of(model: Model) -> dict[str, list[Control]]:
     """A viewer's controls, by the heading of their group. When one has changed the model, others may have
     something else to show."""
-    groups = {
-        "view": _view_controls(model),
-        "transfer function": transfer_controls(model),
-        "slices": slice_controls(model),
-        "clip": _clip_controls(model),
-        "save": _save_controls(model),
-        "march": _march_controls(model),
-    }
-    return {heading: controls for heading, controls in groups.items() if controls}
+    groups = {"view": _view_controls, "transfer function": transfer_controls, "slices": slice_controls}
+    groups |= {"clip": _clip_controls, "save": _save_controls, "march": _march_controls}
+    made = {heading: controls(model) for heading, controls in groups.items()}
+    return {heading: controls for heading, controls in made.items() if controls}
 
 
 def _bound(model: Model, kind: str, label: str, name: str, **more: Any) -> Control:
@@ -49,12 +44,11 @@ def _view_controls(model: Model) -> list[Control]:
     span = high - low or max(abs(low), 1.0)
 
     def look(side: str) -> None:
-        orbit = model.first.orbit
+        orbit = replace(model.first.orbit, view_angle=model.state.orbit.view_angle)
         if side != "reset":
             axis, sign = SIDES[side]
-            position = orbit.focal_point + orbit.distance * sign * np.eye(3)[axis]
-            orbit = Orbit.at(position, orbit.focal_point, orbit.view_up, orbit.view_angle)
-        model.change(orbit=replace(orbit, view_angle=model.state.orbit.view_angle))
+            orbit = replace(orbit, toward=sign * np.eye(3)[axis]).turned(0, 0)
+        model.change(orbit=orbit)
 
     def set_background(color: str) -> None:
         model.change(background=tuple(np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()))
@@ -66,9 +60,9 @@ def _view_controls(model: Model) -> list[Control]:
         model.apply(lambda state: model.scene.in_mode(state, mode))
 
     return [
-        Control("buttons", "look from", set=look, choices=lambda: [*SIDES, "reset"]),
+        Control("buttons", "look from", set=look, choices=(*SIDES, "reset")),
         _bound(model, "checkbox", "orthographic", "parallel"),
-        Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=lambda: modes),
+        Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=modes),
         _bound(model, "slider", "isovalue", "isovalue", limits=(low, low + span, span / 1000)),
         _bound(model, "checkbox", "light", "lit"),
         Control("color", "background", background, set_background),
@@ -94,33 +88,23 @@ def _clip_controls(model: Model) -> list[Control]:
     def choose(name: str) -> None:
         nonlocal chosen
         chosen = name
-        if name == "none":
-            model.change(offset=-1.0)
-        else:
-            axis, sign = SIDES.get(name, (0, 1))
-            toward = model.state.orbit.toward if name == "view" else sign * np.eye(3)[axis]
-            model.change(clip=True, normal=tuple((-toward).tolist()), offset=0.0)
+        axis, sign = SIDES.get(name, (0, 1))
+        toward = model.state.orbit.toward if name == "view" else sign * np.eye(3)[axis]
+        cut = {"clip": True, "normal": tuple((-toward).tolist()), "offset": 0.0}
+        model.change(**{"offset": -1.0} if name == "none" else cut)
 
     return [
         _bound(model, "checkbox", "clip", "clip"),
         *map(range_of, range(3)),
-        Control("dropdown", "cut from", lambda: chosen, choose, choices=lambda: ["none", "view", *SIDES]),
+        Control("dropdown", "cut from", lambda: chosen, choose, choices=("none", "view", *SIDES)),
         _bound(model, "slider", "depth", "offset", limits=(-1.0, 1.0, 0.01)),
     ]
 
 
 def _save_controls(model: Model) -> list[Control]:
-    width = 1920.0
-
-    def set_width(pixels: float) -> None:
-        nonlocal width
-        width = pixels
-
-    def save(_: str) -> None:
-        model.save(width)
-
-    number = Control("number", "width", lambda: width, set_width)
-    return [number, Control("buttons", "image", set=save, choices=lambda: ["save PNG"])]
+    pixels = [1920.0]
+    width = Control("number", "width", lambda: pixels[0], lambda to: pixels.__setitem__(0, to))
+    return [width, Control("buttons", "image", set=lambda _: model.save(pixels[0]), choices=("save PNG",))]
 
 
 def _march_controls(model: Model) -> list[Control]:

@@ -1,6 +1,6 @@
 """The controls of a viewer's transfer function: presets, its curve and points, or its labels."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...scene.labels import LabelTransferFunction
-from ...scene.presets import PRESETS, preset
+from ...scene.presets import PRESETS, fitted_range, preset
 from ...scene.transfer import TransferFunction
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, sampled
@@ -25,10 +25,9 @@ COLORMAPS = "gray", "viridis", "inferno", "magma", "cividis", "turbo", "jet", "h
 
 def transfer_controls(model: Model) -> list[Control]:
     """The controls of the transfer function that is shown at first, of its kind."""
-    transfer = model.state.transfer
-    if isinstance(transfer, LabelTransferFunction):
+    if isinstance(model.state.transfer, LabelTransferFunction):
         return _label_controls(model)
-    if isinstance(transfer, TransferFunction):
+    if isinstance(model.state.transfer, TransferFunction):
         return _point_controls(model)
     return [Control("pad", get=lambda: "of another kind, not edited here")]
 
@@ -87,7 +86,7 @@ def _point_controls(model: Model) -> list[Control]:
     """Presets, the curve, window and level; and value, colour and opacity of the point that was pressed last,
     the opacity that of a layer as thick as a voxel."""
     low, high, bars = histogram(model.scene.volume)
-    voxel, given, chosen, gesture = model.scene.voxel, model.state.transfer, 0, ""
+    voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
     names = {"preset": GIVEN, "colors": GIVEN}
 
     def transfer() -> TransferFunction:
@@ -98,10 +97,18 @@ def _point_controls(model: Model) -> list[Control]:
         edit(model, change, *arguments)
         chosen = min(chosen, len(transfer().values) - 1)
 
+    def made(name: str) -> Any:
+        nonlocal note
+        note = ""
+        if name in (GIVEN, AUTOMATIC):
+            return given if name == GIVEN else automatic_transfer(model.scene.volume)
+        clim, told = fitted_range(name, sampled(model.scene.volume))
+        note = "" if told is None else f'<div style="font-size: 11px">{told}</div>'
+        return preset(name, clim, voxel)
+
     def choose_preset(name: str) -> None:
-        names["preset"], names["colors"] = name, GIVEN
-        made = {GIVEN: lambda: given, AUTOMATIC: lambda: automatic_transfer(model.scene.volume)}
-        put(lambda _: made.get(name, lambda: preset(name, unit_distance=voxel))())
+        names.update(preset=name, colors=GIVEN)
+        put(lambda _: made(name))
 
     def choose_colors(name: str) -> None:
         names["colors"] = name
@@ -118,7 +125,7 @@ def _point_controls(model: Model) -> list[Control]:
             if pressed.twice:
                 put(editing.without_point, chosen)
             elif not pressed.part:
-                put(editing.with_point_at, value)
+                put(editing.with_points_at, [value])
                 chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
         elif not pressed.twice:
             put(editing.with_value, chosen, value)
@@ -135,21 +142,6 @@ def _point_controls(model: Model) -> list[Control]:
 
         return Control("slider", label, get, set_one, limits)
 
-    def listed(label: str, choose: Callable[[str], None], choices: Iterable[str]) -> Control:
-        return Control("dropdown", label, lambda: names[label], choose, choices=lambda: [GIVEN, *choices])
-
-    window, level = editing.window_level(transfer())
-    first, last = min(low, level - window / 2), max(high, level + window / 2)
-    span = editing.rounded(last - first, last - first)
-    unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
-    controls = [
-        listed("preset", choose_preset, [AUTOMATIC, *PRESETS]),
-        listed("colors", choose_colors, COLORMAPS),
-        Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen), press),
-        of_range("window", 0, (min(unit, window), 2 * span, unit)),
-        of_range("level", 1, (middle - span, middle + span, unit)),
-    ]
-
     def value() -> float:
         return editing.rounded(float(transfer().values[chosen]), span)
 
@@ -159,12 +151,22 @@ def _point_controls(model: Model) -> list[Control]:
     def opacity() -> float:
         return round(float(transfer().opacity(voxel)[chosen]), 3)
 
-    points = [
+    window, level = editing.window_level(transfer())
+    first, last = min(low, level - window / 2), max(high, level + window / 2)
+    span = editing.rounded(last - first, last - first)
+    unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
+    presets, colors = (GIVEN, AUTOMATIC, *PRESETS), (GIVEN, *COLORMAPS)
+    controls = [
+        Control("dropdown", "preset", lambda: names["preset"], choose_preset, choices=presets),
+        Control("dropdown", "colors", lambda: names["colors"], choose_colors, choices=colors),
+        Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen) + note, press),
+        of_range("window", 0, (min(unit, window), 2 * span, unit)),
+        of_range("level", 1, (middle - span, middle + span, unit)),
         Control("number", "value", value, lambda to: put(editing.with_value, chosen, to)),
         Control("color", "color", color, lambda to: put(editing.with_color, chosen, to)),
         Control("slider", "opacity", opacity, lambda to: put(editing.with_opacity, chosen, to, voxel)),
     ]
-    return controls + points if len(transfer().values) <= editing.MAX_POINTS else controls
+    return controls if len(transfer().values) <= editing.MAX_POINTS else controls[:-3]
 
 
 def _label_controls(model: Model) -> list[Control]:
@@ -195,7 +197,7 @@ def _label_controls(model: Model) -> list[Control]:
         return min(get("opacity"), MAX_LABEL_OPACITY)
 
     return [
-        Control("dropdown", "label", lambda: names[chosen], choose, choices=lambda: names),
+        Control("dropdown", "label", lambda: names[chosen], choose, choices=names),
         Control("pad", get=swatch),
         Control("checkbox", "shown", lambda: bool(get("shown")), show),
         Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),

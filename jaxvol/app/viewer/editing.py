@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
 from ..._util.srgb import from_srgb, to_srgb
@@ -15,8 +16,8 @@ MAX_POINTS = 16
 """Control points that a viewer edits. All transfer functions of so many points or fewer are padded to it, so
 that one program renders them all."""
 
-COLOR_POINTS = 9
-"""Control points that show the colours of a colormap."""
+COLOR_POINTS = 7
+"""Control points that are added to show the colours of a colormap."""
 
 POINTS = "values", "colors", "extinction"
 
@@ -66,18 +67,17 @@ def with_opacity(
     return _with_point(transfer, index, extinction=extinction_of([opacity], unit_distance)[0])
 
 
-def with_point_at(transfer: TransferFunction, value: float) -> TransferFunction:
-    """With one more point at a value, which does not change the function."""
+def with_points_at(transfer: TransferFunction, at: Any) -> TransferFunction:
+    """With more points, at these increasing values, which do not change the function."""
     values = np.asarray(transfer.values, np.float64)
-    if len(values) >= MAX_POINTS:
+    if len(values) + len(at) > MAX_POINTS:
         raise ValueError(f"there is no room for another of {MAX_POINTS} points.")
     colors, extinction = np.asarray(transfer.colors), np.asarray(transfer.extinction)
-    color = [np.interp(value, values, channel) for channel in colors.T]
-    index = int(np.searchsorted(values, value))
+    index = np.searchsorted(values, at)
     return TransferFunction(
-        np.insert(values, index, value),
-        np.insert(colors, index, color, axis=0),
-        np.insert(extinction, index, np.interp(value, values, extinction)),
+        np.insert(values, index, at),
+        np.insert(colors, index, np.stack([np.interp(at, values, each) for each in colors.T], 1), axis=0),
+        np.insert(extinction, index, np.interp(at, values, extinction)),
     )
 
 
@@ -90,20 +90,14 @@ def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
 
 
 def recolored(transfer: TransferFunction, cmap: str) -> TransferFunction:
-    """With the colours of a matplotlib colormap over the range of its values, and the same opacities: points
-    are added until there are `COLOR_POINTS`."""
-    from matplotlib import colormaps
-
-    values, extinction = (
-        np.asarray(getattr(transfer, name), np.float64) for name in ("values", "extinction")
-    )
-    while len(values) < COLOR_POINTS and values[0] < values[-1]:
-        widest = int(np.argmax(np.diff(values)))
-        values, extinction = (
-            np.insert(p, widest + 1, p[widest : widest + 2].mean()) for p in (values, extinction)
-        )
-    at = (values - values[0]) / ((values[-1] - values[0]) or 1.0)
-    return TransferFunction(values, from_srgb(colormaps[cmap](at)[:, :3]), extinction)
+    """With the colours of a matplotlib colormap over the range of its values, and the same opacities; with
+    `COLOR_POINTS` more points, where there is room for them."""
+    low, high = np.asarray(transfer.values, np.float64)[[0, -1]]
+    if low < high and len(transfer.values) + COLOR_POINTS <= MAX_POINTS:
+        transfer = with_points_at(transfer, np.linspace(low, high, COLOR_POINTS + 2)[1:-1])
+    values = np.asarray(transfer.values, np.float64)
+    display = colormaps[cmap]((values - low) / ((high - low) or 1.0))
+    return TransferFunction(values, from_srgb(display[:, :3]), transfer.extinction)
 
 
 def padded(transfer: Any) -> Any:

@@ -1,6 +1,5 @@
 """A viewer without a face: its state, and a thread that draws it, coarse at once and fine at rest."""
 
-import io
 import math
 import threading
 import time
@@ -8,9 +7,7 @@ from collections.abc import Callable, Generator
 from dataclasses import fields, replace
 from typing import Any, Literal
 
-from PIL import Image
-from PIL.PngImagePlugin import PngInfo
-
+from ..._util.srgb import png_of
 from .marks import with_marks
 from .settings import text_of
 from .state import PROGRAM, Scene, State, Vector
@@ -151,17 +148,15 @@ class Model:
 
     def _save(self, state: State) -> None:
         renderer, grid, (width, height) = TileRenderer(self.scene, state), Grid.fine(state.size), state.size
-        pixels, file, chunks = grid.empty(), io.BytesIO(), PngInfo()
+        pixels = grid.empty()
         for count, (column, row) in enumerate(tiles := grid.tiles()):
             if self._closed:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
-        for keyword, text in text_of(self.scene, state, self._file()).items():
-            chunks.add_itxt(keyword, text, zip=True)
-        Image.fromarray(pixels[:height, :width]).save(file, "PNG", pnginfo=chunks)
+        png = png_of(pixels[:height, :width], text_of(self.scene, state, self._file()))
         self._set_status(f"saved {width} x {height}\n")
-        self._deliver(file.getvalue())
+        self._deliver(png)
 
     def _told(self, what: str, do: Callable[..., object], *arguments: Any) -> bool:
         """Do something, and tell of a fault, after which the user may ask for something else."""

@@ -157,7 +157,7 @@ class NotebookView(ipywidgets.HBox):
         """A widget that shows what a control describes, and changes the model."""
         if control.kind == "buttons":
             narrow = {"width": "auto", "min_width": "30px", "padding": "0 4px"}
-            buttons = [ipywidgets.Button(description=text, layout=narrow) for text in control.choices()]
+            buttons = [ipywidgets.Button(description=text, layout=narrow) for text in control.choices]
             for button in buttons:
                 button.on_click(lambda pressed: self._change(control.set, pressed.description))
             return ipywidgets.HBox(buttons)
@@ -178,8 +178,6 @@ class NotebookView(ipywidgets.HBox):
         self._updating = True
         try:
             for widget, control in self._widgets:
-                if control.kind == "dropdown":
-                    widget.options = control.choices()
                 widget.value = control.get()
         finally:
             self._updating = False
@@ -195,7 +193,7 @@ def _widget_of_value(control: Control) -> Any:
     how["style"] = {"description_width": "78px"}
     low, high, step = control.limits
     if control.kind == "dropdown":
-        return ipywidgets.Dropdown(options=control.choices(), **how)
+        return ipywidgets.Dropdown(options=control.choices, **how)
     if control.kind == "range":
         return ipywidgets.FloatRangeSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     if control.kind == "log slider":

@@ -58,11 +58,7 @@ class Page:
     Args:
         scene: what is looked at. `serve` makes it.
         state: how at first.
-        port: as for `serve`.
-        title: as for `serve`.
-        host: as for `serve`.
-        token: as for `serve`.
-        file: as for `Model`.
+        port: as for `serve`, as are `title`, `host`, `token` and `file`.
     """
 
     def __init__(
@@ -194,9 +190,7 @@ class _Panel:
 
     def _add(self, control: Control) -> None:
         widget = _widget(self.client.gui, control)
-        source = (
-            widget if control.kind != "pad" else self.client.gui.add_text(control.label or control.kind, "")
-        )
+        source = self.client.gui.add_text(control.label, "") if control.kind == "pad" else widget
 
         # viser runs coroutines one after the other, and plain functions in any order
         async def changed(event: Any) -> None:
@@ -227,7 +221,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
     if control.kind == "pad":
         return gui.add_html("")
     if control.kind == "buttons":
-        return gui.add_button_group(control.label, tuple(control.choices()))
+        return gui.add_button_group(control.label, tuple(control.choices))
     label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
     value = _value(control)
     if control.kind == "range":
@@ -235,7 +229,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
     if control.kind in ("slider", "log slider"):
         return gui.add_slider(label, *control.limits, value)
     if control.kind == "dropdown":
-        return gui.add_dropdown(label, tuple(control.choices()), initial_value=value)
+        return gui.add_dropdown(label, tuple(control.choices), initial_value=value)
     add = {"number": gui.add_number, "checkbox": gui.add_checkbox, "color": gui.add_rgb}[control.kind]
     return add(label, value)
 
@@ -246,8 +240,6 @@ def _update(widget: Any, control: Control) -> None:
         if widget.content != (content := control.get()):
             widget.content = content
         return
-    if control.kind == "dropdown":
-        widget.options = control.choices()
     value = _value(control)
     # what only rounding has changed is not sent back, or a slider would lag behind in a drag
     if not (isinstance(value, float) and math.isclose(value, widget.value, rel_tol=1e-5)):

@@ -18,26 +18,27 @@ def text_of(scene: Scene, state: State, file: dict[str, Any]) -> dict[str, str]:
     """The text that a PNG carries, by its keyword: the settings as options of `jaxvol render`, and a transfer
     function of points. `file`: name, bytes and SHA-256 of the volume's file, if it has one."""
     orbit, (width, height) = state.orbit, state.size
+    words = ["--no-shade" if scene.light(state) is None else "--shade"]
+    words += [f"--compositing={state.mode}"] if state.mode in (*MODES, ISOSURFACE) else []
     numbers: dict[str, Any] = {
-        "--step": [state.step * scene.voxel],
-        "--background": state.background,
-        "--view-up": np.round(orbit.view_up, 7) + 0.0,  # no -0
-        "--view-angle": [orbit.view_angle],
+        "size": state.size,
+        "step": [state.step * scene.voxel],
+        "background": state.background,
+        "view-up": np.round(orbit.view_up, 7) + 0.0,  # no -0
+        "view-angle": [orbit.view_angle],
     }
-    words = ["--size", str(width), str(height), "--no-shade" if scene.light(state) is None else "--shade"]
     if state.parallel:  # `jaxvol render` looks at the middle of the volume
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
         whole = np.linalg.norm(high - low) / 2 / min(1.0, width / height)
-        numbers |= {"--direction": orbit.toward, "--zoom": [whole / orbit.half_height]}
+        numbers |= {"direction": orbit.toward, "zoom": [whole / orbit.half_height]}
         words.append("--parallel")
     else:
-        numbers["--camera"] = [*orbit.position, *orbit.focal_point]
+        numbers["camera"] = [*orbit.position, *orbit.focal_point]
     if state.clip:
-        numbers |= {"--clip-box": state.box, "--clip-plane": np.concatenate(scene.plane(state))}
+        numbers |= {"clip-box": state.box, "clip-plane": np.concatenate(scene.plane(state))}
     if state.mode == ISOSURFACE:
-        numbers["--isovalue"] = [state.isovalue]
-    words += [f"--compositing={state.mode}"] if state.mode in (*MODES, ISOSURFACE) else []
-    words += [word for flag, found in numbers.items() for word in (flag, *(f"{x:.9g}" for x in found))]
+        numbers["isovalue"] = [state.isovalue]
+    words += [word for name, found in numbers.items() for word in (f"--{name}", *(f"{x:.9g}" for x in found))]
     content: dict[str, Any] = {"options": words, "file": file or NO_FILE}
     if isinstance(state.transfer, TransferFunction):
         content["transfer"] = transfer_fields(state.transfer)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import finite_array
+from ..._util.srgb import linear_color
 from ...compositing.blending import Compositing
 from ...compositing.isosurface import Isosurface
 from ...compositing.modes import MODES, Mode, compositing_of
@@ -33,7 +33,7 @@ from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, labels_shown
-from ..framing import automatic_camera, upright
+from ..framing import automatic_camera
 
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
@@ -121,41 +121,23 @@ class Orbit:
 
 @dataclass(frozen=True)
 class State:
-    """All that the controls of a viewer change.
-
-    Attributes:
-        orbit: the camera.
-        size: (width, height) of the view, pixels.
-        transfer: the transfer function.
-        step: distance between samples, in voxels.
-        enabled: names of the transforms that are applied.
-        lit: whether there is light, where there can be.
-        mode: how cells become a pixel, a key of `Scene.modes` or `ISOSURFACE`.
-        isovalue: of the isosurface.
-        background: linear RGB.
-        parallel: whether the camera is orthographic.
-        clip: whether box and plane are applied.
-        box: what is inside is shown, as `Volume.bounds`.
-        normal: of the plane, to what is shown.
-        offset: of the plane from the middle of the volume, in half diagonals.
-        point: world point that was picked.
-    """
+    """All that the controls of a viewer change."""
 
     orbit: Orbit
-    size: tuple[int, int]
+    size: tuple[int, int]  # (width, height) of the view, pixels
     transfer: Transfer
-    step: float
-    enabled: frozenset[str]
-    lit: bool
-    mode: str
+    step: float  # voxels
+    enabled: frozenset[str]  # names of the transforms that are applied
+    lit: bool  # whether there is light, where there can be
+    mode: str  # how cells become a pixel, a key of `Scene.modes` or `ISOSURFACE`
     isovalue: float
-    background: tuple[float, float, float]
-    parallel: bool
-    clip: bool
-    box: tuple[float, ...]
-    normal: tuple[float, ...] = (0.0, 0.0, 1.0)
-    offset: float = -1.0
-    point: Vector | None = None
+    background: tuple[float, float, float]  # linear RGB
+    parallel: bool  # whether the camera is orthographic
+    clip: bool  # whether box and plane are applied
+    box: tuple[float, ...]  # what is inside is shown, as `Volume.bounds`
+    normal: tuple[float, ...] = (0.0, 0.0, 1.0)  # of the plane, to what is shown
+    offset: float = -1.0  # of the plane from the middle of the volume, in half diagonals
+    point: Vector | None = None  # of the world, which was picked
 
 
 PROGRAM = {"enabled": "", "lit": "light", "mode": "mode", "parallel": "orthographic", "clip": "clip"}
@@ -165,23 +147,14 @@ transfer function."""
 
 @dataclass(frozen=True)
 class Scene:
-    """What stays the same while a volume is viewed, and what the controls choose from.
-
-    Attributes:
-        volume: what is looked at.
-        transforms: those that can be turned on, in the order in which they are applied.
-        given: the march whose quadrature and `max_samples` are kept.
-        lighting: the light that can be turned on.
-        voxel: world length of a step of 1.
-        modes: how cells may become a pixel, besides isosurfaces.
-    """
+    """What stays the same while a volume is viewed, and what the controls choose from."""
 
     volume: Volume
-    transforms: tuple[Transform, ...]
-    given: March
-    lighting: Lighting
-    voxel: float
-    modes: dict[str, Compositing[Any]]
+    transforms: tuple[Transform, ...]  # that can be turned on, in the order in which they are applied
+    given: March  # whose quadrature and `max_samples` are kept
+    lighting: Lighting  # that can be turned on
+    voxel: float  # world length of a step of 1
+    modes: dict[str, Compositing[Any]]  # besides isosurfaces
 
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
@@ -230,12 +203,9 @@ def initial(
 ) -> tuple[Scene, State]:
     """What is viewed, and how at first. Arguments and errors as for `view`."""
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
-    chosen: Any = whole if camera is None else camera
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-        chosen = automatic_camera(volume, transfer, size=size) if camera is None else chosen
-    elif camera is None and isinstance(transfer, Transfer):
-        chosen = Camera.looking_at(volume, *upright(volume, transfer, None, None), size=size)
+    chosen: Any = automatic_camera(volume, transfer, size=size) if camera is None else camera
     given = March(1.0, (), "midpoint") if march is None else march
     shown: Any = sized(transfer, volume)
     names = {"volume": volume, "transfer": shown, "camera": chosen, "march": given, "lighting": lighting}
@@ -244,7 +214,7 @@ def initial(
     mode.marched(shown, given, volume)  # refuses what it cannot show
     if lighting is not None and not mode.can_be_lit:
         raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
-    r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
+    r, g, b = np.asarray(linear_color("background", background)).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = float(median_node_distance(given.locate(volume), blocks))
     step = 0.5 if march is None else float(given.step) / voxel

@@ -139,9 +139,8 @@ class TileRenderer:
         camera = self.camera((x - least, x + least, y - least, y + least))
         depth = self.rendered(camera).details.depth
         found = np.inf if depth is None else float(np.asarray(depth)[SIDE // 2, SIDE // 2])
-        return (
-            np.asarray(camera.point(SIDE // 2, SIDE // 2, found), np.float64) if np.isfinite(found) else None
-        )
+        point = camera.point(SIDE // 2, SIDE // 2, found) if np.isfinite(found) else None
+        return None if point is None else np.asarray(point, np.float64)
 
 
 def estimated_error(

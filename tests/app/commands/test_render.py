@@ -11,8 +11,8 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main
-from jaxvol.app.commands.render import why_empty
-from jaxvol.app.commands.scene import Scene
+from jaxvol.app.picture import Scene
+from jaxvol.app.show import why_empty
 from jaxvol.compositing.blending import Over
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import Phong
@@ -188,7 +188,7 @@ def plans(monkeypatch):
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
-    monkeypatch.setattr("jaxvol.app.commands.scene.plan", plan)
+    monkeypatch.setattr("jaxvol.app.picture.plan", plan)
     return made
 
 
@@ -302,7 +302,7 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
             is_leaf=lambda leaf: leaf is None,
         )
 
-    monkeypatch.setattr("jaxvol.app.commands.scene.render_bricks", render_bricks)
+    monkeypatch.setattr("jaxvol.app.picture.render_bricks", render_bricks)
     words = ["--preset", "engine", "-o", tmp_path / "x.npy", "--memory"]
     assert render(volume_file, *words, "200K") == 0
     assert asked["memory"] == 200 * 2**10
@@ -378,7 +378,7 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys
     arguments, message = BAD[case]
     arguments = [a.replace("FILE", str(volume_file)).replace("DIR", str(tmp_path)) for a in arguments]
     (tmp_path / "headless.raw").write_bytes(bytes(8))
-    monkeypatch.setattr("jaxvol.app.commands.scene.render", None)  # fails if it is called
+    monkeypatch.setattr("jaxvol.app.picture.render", None)  # fails if it is called
     assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1

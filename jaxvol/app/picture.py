@@ -1,33 +1,34 @@
-"""From options to images: what is looked at, how it looks, from where, and by which march."""
+"""From options, of a command or of `show`, to images: what is looked at, how, from where, by which march."""
 
-import argparse
+import warnings
+from argparse import Namespace
 from collections.abc import Callable, Sequence
-from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from ..._util.srgb import linear_color
-from ...bricks import VoxelSource, levels_of, render_bricks
-from ...compositing.blending import Compositing, Over
-from ...compositing.isosurface import Isosurface
-from ...compositing.modes import MODES, compositing_of
-from ...fitting import read_transfer
-from ...io.formats import files_of, load
-from ...lighting import Lighting, Phong
-from ...march.march import March, Transform
-from ...march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
-from ...planning import Plan, plan
-from ...planning.memory import IN_MEMORY
-from ...render import PLANNED, render
-from ...scene.camera import Camera
-from ...scene.presets import SHADED, colormap, fitted_range, preset, preset_name
-from ...scene.rendering import Rendering
-from ...scene.transfer import Transfer
-from ...scene.volume import Volume
-from ..automatic import (
+from .._util.srgb import linear_color
+from ..bricks import VoxelSource, levels_of, render_bricks
+from ..compositing.blending import Compositing, Over
+from ..compositing.isosurface import Isosurface
+from ..compositing.modes import MODES, compositing_of
+from ..fitting import read_transfer
+from ..io.formats import load
+from ..lighting import Lighting, Phong
+from ..march.march import March, Transform
+from ..march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
+from ..planning import Plan, plan
+from ..planning.memory import IN_MEMORY
+from ..render import PLANNED, render
+from ..scene.camera import Camera
+from ..scene.presets import SHADED, colormap, fitted_range, preset, preset_name
+from ..scene.rendering import Rendering
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
+from .automatic import (
     SAMPLED,
     automatic_transfer,
     labels_shown,
@@ -36,17 +37,41 @@ from ..automatic import (
     thresholds,
     transfer_by_copy,
 )
-from ..framing import automatic_camera, framed, upright, visible_points
+from .framing import automatic_camera, framed, upright, visible_points
 
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
+
+OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
+OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
+OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
+DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))
+DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "with": []}
+DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
+"""Options of a picture, as they are where nothing is given."""
+
+OVERRIDES = {
+    "preset": {"cmap", "transfer", "recorded_transfer"},
+    "cmap": {"preset", "transfer", "recorded_transfer"},
+    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "window", "level", "unit_distance"},
+    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"},
+    "camera": {"direction", "parallel"},
+    "direction": {"camera"},
+    "parallel": {"camera"},
+    "clim": {"window", "level"},
+    "window": {"clim"},
+    "level": {"clim"},
+    "step": {"tolerance"},
+    "tolerance": {"step"},
+}
+"""Options that exclude this one, which is an error, and that it overrides in a picture."""
 
 
 class Scene(NamedTuple):
     """What is looked at, and how. Of a volume that is read in bricks from `source`, with so many bytes of
     memory, `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image,
     with their transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it
-    is known. `notes`: what the user should know."""
+    is known."""
 
     volume: Volume
     transfer: Transfer
@@ -59,7 +84,6 @@ class Scene(NamedTuple):
     memory: int | None = None
     march: Any = None
     others: tuple[tuple[Volume, Transfer], ...] = ()
-    notes: tuple[str, ...] = ()
 
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
@@ -85,17 +109,26 @@ class Scene(NamedTuple):
         return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
 
 
-def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
+def check_exclusive(settings: dict[str, Any]) -> None:
+    """Refuse options that exclude each other."""
+    on = {name for name, value in settings.items() if value is not None and value is not False}
+    for name in sorted(on):
+        for other in sorted(on & OVERRIDES.get(name, set())):
+            both = f"{name} and {other}".replace("recorded_transfer", "the transfer function in the picture")
+            raise ValueError(f"{both} exclude each other; leave one out.")
+
+
+def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
     """The scene that the options describe, without a march.
 
     Args:
-        options: of a command that has those of `add_scene`. `file` may be a `Volume`, `transfer` a
-            `Transfer`, and entries of `with` volumes with their transfer functions.
+        options: those of `DEFAULTS`, `recorded_transfer`, and `file`, a path or a `Volume`. `transfer` may be
+            a `Transfer`, and entries of `with` volumes with their transfer functions.
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
     is_surface, background = options.compositing == "isosurface", background_of(options)
     if is_surface == (options.isovalue is None):
-        raise ValueError("--compositing isosurface and --isovalue VALUE go together; one is missing.")
+        raise ValueError("compositing isosurface and isovalue go together; one is missing.")
     mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
     # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
     transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
@@ -103,18 +136,14 @@ def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Cam
     if options.clip_box is not None or planes:
         transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
     elif options.clip_inside_out:
-        raise ValueError("--clip-inside-out goes with --clip-box or --clip-plane.")
+        raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
-    automatic, source, note, more = is_automatic(options), None, None, vars(options)["with"]
+    source, more = None, vars(options)["with"]
     if options.memory is None:
-        volume = volume_of(options)
-        transfer, note = (None, None) if automatic else transfer_of(options, volume)
-        if automatic or options.labels is not None:
-            volume, transfer = labels_shown(volume, transfer) or (volume, transfer)
-        transfer = automatic_transfer(volume) if transfer is None else transfer
+        volume, transfer = look_of(options)
     else:
         if options.labels is not None or more:
-            raise ValueError("--memory reads one volume, without --labels and --with.")
+            raise ValueError("memory reads one volume, without labels and with.")
         header = {name: value for name, value in header_of(options).items() if value is not None}
         if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
             header["index"] = index
@@ -123,33 +152,39 @@ def scene_of(options: argparse.Namespace, orbit: Callable[[Camera], Sequence[Cam
         except TypeError as fault:  # such as a shape of what is no raw file
             raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
         volume = copy_of(source, options.memory)
-        if automatic:
-            transfer = _transfer_of_bricks(volume, source)
-        else:
-            transfer, note = transfer_of(options, volume, source)
+        automatic = is_automatic(options)
+        transfer = (_transfer_of_bricks if automatic else partial(transfer_of, options))(volume, source)
 
     others = tuple(_other(*each) for each in more)
     lighting = _lighting(options, mode, alone=not others)
-    camera = _camera(options, volume, transfer, orbit, automatic=automatic).zoom(options.zoom)
-    scene = Scene(volume, transfer, camera, mode, lighting, background, transforms, source, options.memory)
-    return scene._replace(others=others, notes=() if note is None else (note,))
+    camera = _camera(options, volume, transfer, orbit).zoom(options.zoom)
+    how = mode, lighting, background, transforms, source, options.memory
+    return Scene(volume, transfer, camera, *how, others=others)
+
+
+def look_of(options: Namespace) -> tuple[Volume, Transfer]:
+    """The volume, which may be another one where labels are shown, and its transfer function."""
+    volume, automatic = volume_of(options), is_automatic(options)
+    transfer = None if automatic else transfer_of(options, volume)
+    if automatic or options.labels is not None:
+        volume, transfer = labels_shown(volume, transfer) or (volume, transfer)
+    return volume, automatic_transfer(volume) if transfer is None else transfer
 
 
 def _camera(
-    options: argparse.Namespace,
+    options: Namespace,
     volume: Volume,
     transfer: Transfer,
     orbit: Callable[[Camera], Sequence[Camera]] | None,
-    *,
-    automatic: bool,
 ) -> Camera:
-    """That of the options; or else, `automatic`, one as near as what is visible allows, or of all."""
+    """That of the options; or else one as near as what is visible allows, and by a mode in which all values
+    count, as the volume does."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if options.camera:
         up = options.view_up or (0.0, 0.0, 1.0)
         return Camera(options.camera[:3], options.camera[3:], up, **given)
     given["parallel"] = options.parallel
-    if not automatic:
+    if options.compositing != "over":
         side = upright(volume, transfer, options.direction, options.view_up)
         return Camera.looking_at(volume, *side, **given)
     camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
@@ -163,21 +198,22 @@ def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
     if look and isinstance(look[0], Transfer):
         return volume, look[0]
     cmap, *clim = look or ("hot",)
-    if len(clim) not in (0, 2):
-        raise ValueError(
-            f"--with takes FILE, FILE CMAP or FILE CMAP LOW HIGH; got {' '.join(map(str, look))}."
-        )
-    if not clim:
-        values = sampled(volume).ravel().astype(np.float32)
-        clim = thresholds(values)[0], float(np.percentile(values, 99.9))
     try:
-        low, high = map(float, clim)
+        low, high = map(float, clim or _outstanding(volume))
     except ValueError as fault:
-        raise ValueError(f"--with: LOW and HIGH must be numbers; got {' '.join(map(str, clim))}.") from fault
-    return volume, colormap(cmap, (low, max(high, float(np.nextafter(np.float32(low), np.inf)))))
+        got = " ".join(map(str, look))
+        raise ValueError(f"with takes FILE, FILE CMAP or FILE CMAP LOW HIGH; got {got}.") from fault
+    return volume, colormap(cmap, (low, high))
 
 
-def with_march(scene: Scene, options: argparse.Namespace, cameras: Sequence[Camera]) -> Scene:
+def _outstanding(volume: Volume) -> tuple[float, float]:
+    """The range of values above the background."""
+    values = sampled(volume).ravel().astype(np.float32)
+    low = np.float32(thresholds(values)[0])
+    return float(low), float(max(np.percentile(values, 99.9), np.nextafter(low, np.float32(np.inf))))
+
+
+def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> Scene:
     """The scene with the given step; without one, with the shortest of those planned for the cameras (of
     several volumes, with half of their shortest spacing)."""
     step = options.step
@@ -186,86 +222,69 @@ def with_march(scene: Scene, options: argparse.Namespace, cameras: Sequence[Came
     if step is not None:
         return scene._replace(march=March(step, (*scene.transforms, *FAST), "midpoint"))
     found = min(scene.plans(cameras, options.tolerance), key=lambda plan: float(plan.march.step))
+    if not found.within:
+        told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
+        warnings.warn(told, stacklevel=3)
     source = None if found.bricks is None else found.source
-    scene = scene._replace(volume=found.volume, march=found.march, source=source)
-    if found.within:
-        return scene
-    told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
-    return scene._replace(notes=(*scene.notes, told))
+    return scene._replace(volume=found.volume, march=found.march, source=source)
 
 
-def volume_of(options: argparse.Namespace) -> Volume:
-    if isinstance(options.file, Volume):
-        return options.file
-    return load(options.file, labels=vars(options).get("labels"), **header_of(options))
+def volume_of(options: Namespace) -> Volume:
+    header = header_of(options) | {"labels": options.labels}
+    if not isinstance(options.file, Volume):
+        return load(options.file, **header)
+    if told := [name for name, value in header.items() if value is not None]:
+        raise ValueError(f"{told[0]} is of files; volume is a Volume.")
+    return options.file
 
 
-def header_of(options: argparse.Namespace) -> dict[str, Any]:
+def header_of(options: Namespace) -> dict[str, Any]:
     """What the options say of the file."""
-    return {name: getattr(options, name) for name in ("shape", "dtype", "spacing", "nan", "time", "channel")}
+    return {name: getattr(options, name) for name in OF_FILES}
 
 
-def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
-    """Refuse to write a file (an option of these names) that is the volume, one of its slices, or another."""
-    used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
-    for name in names:
-        path = getattr(options, name)
-        if path is not None and realpath(path) in map(realpath, used):
-            raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
-        used += [] if path is None else [path]
-
-
-def is_automatic(options: argparse.Namespace) -> bool:
+def is_automatic(options: Namespace) -> bool:
     """Whether nothing is said of the transfer function."""
-    names = ("preset", "cmap", "transfer", "recorded_transfer", "clim", "window", "level", "unit_distance")
-    return options.compositing == "over" and all(getattr(options, name) is None for name in names)
+    given = (getattr(options, name) for name in (*OF_COLORS, "recorded_transfer"))
+    return options.compositing == "over" and all(each is None for each in given)
 
 
-def background_of(options: argparse.Namespace) -> tuple[float, float, float]:
+def background_of(options: Namespace) -> tuple[float, float, float]:
     """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
     if options.background is None:
         level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
-    given = options.background
-    given = linear_color("--background", given) if isinstance(given, str) else given
-    red, green, blue = np.asarray(given, np.float64).tolist()
+    red, green, blue = np.asarray(linear_color("background", options.background), np.float64).tolist()
     if not all(0 <= each <= 1 for each in (red, green, blue)):
         got = f"{red:g} {green:g} {blue:g}"
         hint = " 8-bit colours are written '#336699'." if max(red, green, blue) > 1 else ""
-        raise ValueError(f"--background must be three numbers from 0 to 1 (linear RGB); got {got}.{hint}")
+        raise ValueError(f"background must be three numbers from 0 to 1 (linear RGB); got {got}.{hint}")
     return red, green, blue
 
 
-def transfer_of(
-    options: argparse.Namespace, volume: Volume, source: VoxelSource | None = None
-) -> tuple[Transfer, str | None]:
-    """The transfer function that the options ask for, and a word where a preset does not fit. `source`: of
-    which `volume` is a copy with fewer voxels."""
+def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
+    """The transfer function that the options ask for. `source`: of which `volume` is a copy with fewer
+    voxels."""
     if options.recorded_transfer is not None:
-        return options.recorded_transfer, None
+        return options.recorded_transfer
     if options.transfer is not None:
         given = options.transfer
-        return (read_transfer(given) if isinstance(given, str | Path) else given), None
-    unit, clim = options.unit_distance, _clim_of(options)
+        return read_transfer(given) if isinstance(given, str | Path) else given
+    unit, clim = options.unit_distance, options.clim
+    if (options.window is None) != (options.level is None):
+        raise ValueError("window and level go together; one is missing.")
+    if options.window is not None:
+        clim = options.level - options.window / 2, options.level + options.window / 2
     if options.preset is not None:
-        name, note = preset_name(options.preset), None
         if clim is None:
-            values = sampled(volume)
-            clim, note = fitted_range(name, float(values.min()), float(np.percentile(values, 99.9)))
-        return preset(name, clim, 1.0 if unit is None else unit), note
+            clim, told = fitted_range(options.preset, sampled(volume))
+            if told:
+                warnings.warn(told, stacklevel=5)
+        return preset(options.preset, clim, 1.0 if unit is None else unit)
     data = np.asarray(volume.data)
     clim = clim or (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
-    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit), None
-
-
-def _clim_of(options: argparse.Namespace) -> Any:
-    """--clim, or what --window and --level say instead."""
-    if (options.window is None) != (options.level is None):
-        raise ValueError("--window and --level go together; one is missing.")
-    if options.window is None:
-        return options.clim
-    return options.level - options.window / 2, options.level + options.window / 2
+    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 
 
 def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
@@ -275,7 +294,7 @@ def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
     return transfer_by_copy(copy, np.asarray(source.read(low, high)))
 
 
-def _lighting(options: argparse.Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
+def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
     """The light that the options ask for, or that is usual for what they show; none of several volumes."""
     shade = options.shade
     if shade is None:
