@@ -8,8 +8,7 @@ import contextlib
 import operator
 import os
 import tempfile
-from collections.abc import Callable, Iterable
-from difflib import get_close_matches
+from collections.abc import Callable
 from pathlib import Path
 from types import EllipsisType
 from typing import Any, TypeAlias, TypeVar
@@ -53,26 +52,6 @@ def shortened(value: Any) -> str:
     except ValueError:  # Python does not write integers of more than 4300 digits
         return f"a {type(value).__name__} with a very long integer"
     return text if len(text) <= 120 else f"{text[:50]} ... {text[-50:]}"
-
-
-def is_concrete(array: Any) -> bool:
-    """Whether this is an array whose numbers are known."""
-    return isinstance(array, np.ndarray | np.generic | jax.Array) and not is_traced(array)
-
-
-def pasted(value: Any) -> str:
-    """Numbers as nested tuples that Python reads, with the digits that their type has; or a description."""
-    if not is_concrete(value):
-        return described(value)
-    given = np.asarray(value)
-    return f"({', '.join(map(pasted, given))}{',' * (len(given) == 1)})" if given.ndim else str(given[()])
-
-
-def near(given: str, names: Iterable[str]) -> str:
-    """A sentence that asks whether one of up to three names like this one is meant; empty without any."""
-    by_case = {name.lower(): name for name in names}
-    found = [by_case[name] for name in get_close_matches(given.lower(), by_case, 3)]
-    return f" Did you mean {' or '.join(found)}?" if found else ""
 
 
 def printable(text: str) -> str:

@@ -46,7 +46,7 @@ OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
 OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
 OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
 DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))
-DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "with": []}
+DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "others": []}
 DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
 """Options of a picture, as they are where nothing is given."""
 
@@ -123,7 +123,7 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
 
     Args:
         options: those of `DEFAULTS`, `recorded_transfer`, and `file`, a path or a `Volume`. `transfer` may be
-            a `Transfer`, and entries of `with` volumes with their transfer functions.
+            a `Transfer`, and entries of `others` what `_other` takes.
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
     is_surface, background = options.compositing == "isosurface", background_of(options)
@@ -138,12 +138,12 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     elif options.clip_inside_out:
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
-    source, more = None, vars(options)["with"]
+    source, others = None, tuple(_other(*each) for each in options.others)
     if options.memory is None:
         volume, transfer = look_of(options)
     else:
-        if options.labels is not None or more:
-            raise ValueError("memory reads one volume, without labels and with.")
+        if options.labels is not None or others:
+            raise ValueError("memory reads one volume, without labels and others.")
         header = {name: value for name, value in header_of(options).items() if value is not None}
         if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
             header["index"] = index
@@ -155,7 +155,6 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         automatic = is_automatic(options)
         transfer = (_transfer_of_bricks if automatic else partial(transfer_of, options))(volume, source)
 
-    others = tuple(_other(*each) for each in more)
     lighting = _lighting(options, mode, alone=not others)
     camera = _camera(options, volume, transfer, orbit).zoom(options.zoom)
     how = mode, lighting, background, transforms, source, options.memory
@@ -198,19 +197,16 @@ def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
     if look and isinstance(look[0], Transfer):
         return volume, look[0]
     cmap, *clim = look or ("hot",)
+    if not clim:
+        values = sampled(volume).ravel().astype(np.float32)
+        low = thresholds(values)[0]
+        clim = low, np.percentile(values[values >= low], 99)
     try:
-        low, high = map(float, clim or _outstanding(volume))
+        low, high = map(float, clim)
     except ValueError as fault:
         got = " ".join(map(str, look))
-        raise ValueError(f"with takes FILE, FILE CMAP or FILE CMAP LOW HIGH; got {got}.") from fault
+        raise ValueError(f"others are FILE, FILE CMAP or FILE CMAP LOW HIGH; got {got}.") from fault
     return volume, colormap(cmap, (low, high))
-
-
-def _outstanding(volume: Volume) -> tuple[float, float]:
-    """The range of values above the background."""
-    values = sampled(volume).ravel().astype(np.float32)
-    low = np.float32(thresholds(values)[0])
-    return float(low), float(max(np.percentile(values, 99.9), np.nextafter(low, np.float32(np.inf))))
 
 
 def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> Scene:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import near
+from .._util.texts import near
 from .._util.vec3 import apart
 from ..compositing.isosurface import Isosurface
 from ..ray import check_arguments
@@ -28,26 +28,25 @@ FAINT = 0.01
 
 
 def show(
-    volume: Volume | str | os.PathLike[str] | list[Any] | Any,
-    transfer: Transfer | list[Any] | Any | None = None,
-    **options: Any,
+    volume: Volume | str | os.PathLike[str] | Any, transfer: Transfer | Any | None = None, **options: Any
 ) -> Rendering:
     """Renders a volume, and shows it, as `jaxvol render FILE` does: framed, upright, lit, with colours for
     labels, by a march that is planned for it.
 
         jv.show("ct.nii.gz", preset="CT-Bone", direction=(0, -1, 0), size=800, background="black")
         jv.show("mr.nii.gz", compositing="maximum", window=400, level=200)
-        jv.show(["ct.nii.gz", "pet.nii.gz"], [None, jv.colormap("hot", (1, 10))])
+        jv.show("ct.nii.gz", others=[("pet.nii.gz", "hot", 1, 10)])
 
     Args:
-        volume: a `Volume`, or the path of a file that `jv.load` reads; or a list of several in one image.
+        volume: a `Volume`, or the path of a file that `jv.load` reads.
         transfer: a transfer function. By default that of `preset` or `cmap`, or else what suits the values;
-            or labels get a colour each. Of several volumes a list, with None where nothing is said.
+            or labels get a colour each.
         options: those of `jaxvol render`, with _ for -. Colours: `preset`, `cmap`, `clim`, or `window` and
-            `level`, `unit_distance`, `labels` (a file). Look: `compositing`, `isovalue`, `shade`,
-            `background`. Camera: `camera`, `direction`, `view_up`, `view_angle`, `parallel`, `zoom`, `size`.
-            What is cut away: `clip_box`, `clip_plane`, `clip_inside_out`. How it is computed: `step` or
-            `tolerance`, `memory`. Of a raw file: `shape`, `dtype`, `spacing`, `nan`, `time`, `channel`.
+            `level`, `unit_distance`, `labels` (a file). More volumes: `others`, each a file or `Volume`, and
+            its transfer function, or a colormap and maybe its range. Look: `compositing`, `isovalue`,
+            `shade`, `background`. Camera: `camera`, `direction`, `view_up`, `view_angle`, `parallel`, `zoom`,
+            `size`. What is cut away: `clip_box`, `clip_plane`, `clip_inside_out`. How it is computed: `step`
+            or `tolerance`, `memory`. Of a raw file: `shape`, `dtype`, `spacing`, `nan`, `time`, `channel`.
             `jaxvol render --help` describes each.
 
     Returns:
@@ -59,27 +58,19 @@ def show(
 
     Warns of a preset whose values are others, and of an image in which hardly anything is visible.
     """
-    known = DEFAULTS.keys() - {"transfer", "with"}
+    known = DEFAULTS.keys() - {"transfer"}
     for name in options.keys() - known:
         told = f"show has no option {name!r}.{near(name, known)}"
         raise ValueError(f"{told} jaxvol render --help has them.")
-    volumes = list(volume) if isinstance(volume, list | tuple) else [volume]
-    several = isinstance(transfer, list | tuple)
-    transfers = list(transfer) if several else [transfer, *[None] * (len(volumes) - 1)]
-    if not volumes or len(volumes) != len(transfers):
-        got = f"{len(volumes)} and {len(transfers)}"
-        raise ValueError(f"volume and transfer must be lists of as many entries; got {got}.")
-    for one, look in zip(volumes, transfers, strict=True):
-        given = {} if isinstance(one, str | os.PathLike) else {"volume": one}
-        given |= {} if look is None else {"transfer": look}
-        check_arguments("show(volume, transfer)", **given)
-    files = [each if isinstance(each, Volume) else Path(each) for each in volumes]
-    options |= {} if transfers[0] is None else {"transfer": transfers[0]}
+    is_file = isinstance(volume, str | os.PathLike)
+    given = {} if is_file else {"volume": volume}
+    given |= {} if transfer is None else {"transfer": transfer}
+    check_arguments("show(volume, transfer)", **given)
+    options["transfer"] = transfer
     check_exclusive(options)
     keep_programs_by_default()
-    more = zip(files[1:], transfers[1:], strict=True)
-    options["with"] = [(file, *(() if look is None else (look,))) for file, look in more]
-    chosen = Namespace(**DEFAULTS | options, recorded_transfer=None, file=files[0])
+    file = Path(volume) if is_file else volume
+    chosen = Namespace(**DEFAULTS | options, recorded_transfer=None, file=file)
     scene = scene_of(chosen)
     scene = with_march(scene, chosen, [scene.camera])
     rendering = replace(scene.render(scene.camera), background=scene.background)

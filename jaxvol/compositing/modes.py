@@ -4,7 +4,8 @@ from typing import Any, Literal, TypeAlias
 
 import jax
 
-from .._util.checks import described, near
+from .._util.checks import described
+from .._util.texts import near
 from .blending import Compositing, Over, Weighting
 from .line_integral import LineIntegral
 from .projections import Average, Maximum, Minimum

@@ -20,13 +20,12 @@ from .._util.checks import (
     finite_array,
     flag,
     integer,
-    is_concrete,
     is_flag,
     number,
-    pasted,
     require,
     shortened,
 )
+from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import is_traced
 from .space import Line

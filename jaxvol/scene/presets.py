@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
 
-from .._util.checks import Arrayable, described, finite_array, integer, near, number, unit_interval
+from .._util.checks import Arrayable, described, finite_array, integer, number, unit_interval
 from .._util.srgb import from_srgb
+from .._util.texts import near
 from .transfer import TransferFunction, extinction_of
 
 

@@ -17,18 +17,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util import piecewise_linear as linear
-from .._util.checks import (
-    Arrayable,
-    finite_array,
-    flag,
-    increasing,
-    is_concrete,
-    number,
-    pasted,
-    require,
-    unit_interval,
-)
+from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
+from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums

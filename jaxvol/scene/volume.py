@@ -16,17 +16,9 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
 
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
-from .._util.checks import (
-    Arrayable,
-    described,
-    finite_array,
-    integers,
-    is_concrete,
-    pasted,
-    require,
-    shortened,
-)
+from .._util.checks import Arrayable, described, finite_array, integers, require, shortened
 from .._util.named_axes import along_xyz, is_named
+from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather

@@ -10,8 +10,9 @@ from os.path import realpath  # unlike `Path.resolve`, it raises nothing for lin
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..._util.checks import near, shortened
+from ..._util.checks import shortened
 from ..._util.srgb import linear_color
+from ..._util.texts import near
 from ...compositing.modes import ELSEWHERE, MODES
 from ...io.formats import files_of
 from ...scene.presets import PRESETS, SLICER
@@ -107,7 +108,7 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
     found = recorded_in(path)
     own = [action for action in command._actions if action.type is not Path]
-    known = [action for action in own if action.dest not in ("help", "with")]
+    known = [action for action in own if action.dest not in ("help", "others")]
     flags = {flag for action in known for flag in action.option_strings}
     words = [word for word in found["options"] if word != "--transparent" or word in flags]
     for word in words:
@@ -222,7 +223,7 @@ def add_scene(parser: Parser) -> None:
         "HIGH (default: what stands out); may be given several times; without shading"
     )
     how: dict[str, Any] = {"nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
-    parser.add_argument("--with", help=text, **how)
+    parser.add_argument("--with", "--others", dest="others", help=text, **how)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
     text = "options by their names, such as size = [640, 480]; those of the command line override them"

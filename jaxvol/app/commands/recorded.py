@@ -34,7 +34,7 @@ def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
     """The text that a PNG carries, for `save_image`: the options that are not at their defaults, as words of
     a command line, and the transfer function if a file or a picture held it. None of a picture with volumes
     of other files, which it may not name."""
-    if options.labels is not None or vars(options)["with"]:
+    if options.labels is not None or options.others:
         return {}
     words: list[str] = []
     for name, default in options.defaults.items():

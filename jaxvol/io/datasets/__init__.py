@@ -14,8 +14,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..._util.checks import described, near
+from ..._util.checks import described
 from ..._util.files import MOST_VOXELS, check_size
+from ..._util.texts import near
 from ...scene.volume import Volume
 from ..formats import load as load_file
 
