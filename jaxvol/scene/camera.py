@@ -102,12 +102,12 @@ class Camera(eqx.Module):
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
 
     def __repr__(self) -> str:
-        whole = np.float32((-self.size[0] / self.size[1], self.size[0] / self.size[1], -1, 1))
-        usual = {"parallel_scale": None, "window": whole, "corner": np.zeros(2)}
+        aspect = self.size[0] / self.size[1]
+        usual: dict[str, Any] = {"parallel_scale": None, "window": (-aspect, aspect, -1, 1), "corner": (0, 0)}
         told: list[str] = []
         for name in ("position", "focal_point", "view_up", "view_angle", *usual):
             given, expected = getattr(self, name), usual.get(name)
-            is_usual = expected is not None and is_concrete(given) and np.array_equal(given, expected)
+            is_usual = expected is not None and is_concrete(given) and np.allclose(given, expected)
             told += [] if is_usual or given is None else [f"{name}={pasted(given)}"]
         return f"Camera({', '.join(told)}, size={self.size})"
 

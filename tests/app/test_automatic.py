@@ -1,5 +1,6 @@
 """Does a transfer function that is guessed from a histogram show what is there?"""
 
+import itertools
 import math
 
 import jax
@@ -240,20 +241,17 @@ def test_other_volumes_are_not_taken_for_labels():
 def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows():
     data = np.asarray(ball(0.5, 0.2).data)
     transfer, stand = jv.automatic_transfer(jv.Volume(data)), data
-    for axis in range(3):
-        for sign in (1, -1):
-            stand = np.array(data)  # a slab on one face
-            stand[(slice(None),) * axis + (slice(31, None) if sign < 0 else slice(0, 1),)] = 200
-            camera = jv.automatic_camera(volume := jv.Volume(stand), transfer, size=(32, 32))
-            np.testing.assert_array_equal(camera.view_up, sign * np.eye(3)[axis])
-            away = np.asarray(camera.position - camera.focal_point)
-            assert away @ np.asarray(camera.view_up) > 0.3 * np.linalg.norm(away)  # from above
-            seen = in_picture(camera, visible_points(volume, transfer))
-            assert np.abs(seen).max() == pytest.approx(1 / MARGIN, abs=1e-4)
-    placed = jv.Volume(
-        stand, origin=(0, 0, 1)
-    )  # a file that says where it lies, and a user who says what is up
-    for volume, up in ((placed, None), (jv.Volume(stand), (0, 0, 1))):
+    for axis, sign in itertools.product(range(3), (1, -1)):
+        stand = np.array(data)  # a slab on one face
+        np.moveaxis(stand, axis, 0)[-1 if sign < 0 else 0] = 200
+        camera = jv.automatic_camera(volume := jv.Volume(stand), transfer, size=(32, 32))
+        np.testing.assert_array_equal(camera.view_up, sign * np.eye(3)[axis])
+        away = np.asarray(camera.position - camera.focal_point)
+        assert away @ np.asarray(camera.view_up) > 0.3 * np.linalg.norm(away)  # from above
+        seen = in_picture(camera, visible_points(volume, transfer))
+        assert np.abs(seen).max() == pytest.approx(1 / MARGIN, abs=1e-4)
+    # a file that says where it lies, and a user who says what is up
+    for volume, up in ((jv.Volume(stand, origin=(0, 0, 1)), None), (jv.Volume(stand), (0, 0, 1))):
         camera = jv.automatic_camera(volume, transfer, (1, 2, 0.5), up, size=(32, 32))
         np.testing.assert_array_equal(camera.view_up, (0, 0, 1))
         away = np.asarray(camera.position - camera.focal_point)

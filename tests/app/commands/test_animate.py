@@ -84,7 +84,7 @@ BAD = {
     "fps": (["--fps", "0"], "--fps of a .gif must be above 0"),
     "fps of a gif": (["--fps", "60"], "--fps of a .gif must be above 0, and 50 at most; got 60"),
     "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
-    "step and tolerance": (["--tolerance", "0.1"], "--step and --tolerance exclude"),
+    "step and tolerance": (["--tolerance", "0.1"], "step and tolerance exclude"),
     "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }
 

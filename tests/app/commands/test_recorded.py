@@ -82,7 +82,7 @@ def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path
     assert like("c.png", "--preset", "engine") == 0
     assert "transfer" not in text_in("c.png")
     assert like("d.png", "--clim", "0", "1") == 2
-    assert "the transfer function in the picture and --clim exclude each other" in capsys.readouterr().err
+    assert "the transfer function in the picture and clim exclude each other" in capsys.readouterr().err
 
 
 def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypatch):
@@ -108,7 +108,7 @@ def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypat
     assert all(getattr(found(words), flag) for flag in flags)
     assert not any(getattr(found(words, *off), flag) for flag in flags)
     assert not hasattr(options("plan", "--like", "a.png"), "transparent")
-    with pytest.raises(ValueError, match="--cmap and --preset exclude each other"):
+    with pytest.raises(ValueError, match="cmap and preset exclude each other"):
         found("--preset=head --cmap=hot")
 
 

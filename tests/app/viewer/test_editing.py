@@ -17,7 +17,7 @@ from jaxvol.app.viewer.editing import (
     window_level,
     with_color,
     with_opacity,
-    with_point_at,
+    with_points_at,
     with_value,
     with_window_level,
     without_point,
@@ -80,14 +80,14 @@ def test_a_value_stays_between_its_neighbours():
 
 
 def test_a_point_that_is_added_changes_nothing():
-    split = with_point_at(GIVEN, 35)
+    split = with_points_at(GIVEN, [35])
     assert len(split.values) == 5
     assert_same_function(split, GIVEN)
     assert_same_function(without_point(split, 3), GIVEN)
     with pytest.raises(ValueError, match="at least 2"):
         without_point(without_point(without_point(GIVEN, 0), 0), 0)
     with pytest.raises(ValueError, match="no room for another"):
-        with_point_at(padded(GIVEN), 30)
+        with_points_at(padded(GIVEN), [30])
 
 
 def test_a_colormap_leaves_the_opacity():

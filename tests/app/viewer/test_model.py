@@ -21,7 +21,7 @@ from jaxvol import to_srgb
 from jaxvol.app.cli import parser_of_all
 from jaxvol.app.commands.recorded import recorded_in
 from jaxvol.app.viewer.controls import controls_of
-from jaxvol.app.viewer.editing import padded, with_color, with_opacity, with_point_at, with_window_level
+from jaxvol.app.viewer.editing import padded, with_color, with_opacity, with_points_at, with_window_level
 from jaxvol.app.viewer.model import BUDGET, LEVELS, Model, adapted
 from jaxvol.app.viewer.state import initial
 from jaxvol.app.viewer.tiles import Grid, TileRenderer, estimated_error
@@ -101,7 +101,7 @@ def test_changes_need_no_other_program(shown, side):
     """What a drag or a slider changes is traced: nothing is compiled again."""
     scene, state = shown.model.scene, shown.model.state
     changed = replace(state, step=state.step * 1.7, orbit=state.orbit.turned(0.1, 0.2).zoomed(1.3))
-    transfer = with_point_at(with_window_level(state.transfer, 90, 110), 120)
+    transfer = with_points_at(with_window_level(state.transfer, 90, 110), [120])
     changed = replace(changed, transfer=transfer, size=(67, 43))
     before, after = TileRenderer(scene, state), TileRenderer(scene, changed, 4.0)
     before.coarse(1)
@@ -172,31 +172,21 @@ def test_what_is_picked_lies_where_the_ray_meets_the_ball(shown):
 
 
 def test_a_saved_image_has_any_size_and_its_settings(tmp_path):
-    saved, done = [], threading.Event()
-    scene, state = begun()
-
-    def deliver(png):
-        saved.append(png)
-        done.set()
-
-    drawn = Model(scene, state, lambda *_: None, lambda _: None, deliver)
-    state = drawn.state = replace(state, clip=False, isovalue=7.0, background=(0.0, 0.5, 1.0))
+    path, done = tmp_path / "saved.png", threading.Event()
+    drawn = Model(*begun(), lambda *_: None, lambda _: None, lambda png: path.write_bytes(png) and done.set())
+    state = drawn.state = replace(drawn.state, isovalue=7.0, background=(0.0, 0.5, 1.0))
     drawn.save(2.5 * SIZE[0])
     assert done.wait(600)
     drawn.close()
-    (tmp_path / "saved.png").write_bytes(saved[0])
-    image = np.asarray(Image.open(tmp_path / "saved.png"))
+    image = np.asarray(Image.open(path))
     assert image.shape == (68, 95, 3)
     np.testing.assert_array_equal(image[0, 0], (0, 188, 255))
-    found = recorded_in(tmp_path / "saved.png")
+    found = recorded_in(path)
     np.testing.assert_allclose(found["transfer"].extinction, LOOK.extinction, rtol=1e-6)
-    words = found["options"]
-    assert words[words.index("--size") + 1 :][:2] == ["95", "68"]
-    place = [float(word) for word in words[words.index("--camera") + 1 :][:6]]
-    np.testing.assert_allclose(place, [*state.orbit.position, *state.orbit.focal_point], rtol=1e-6)
-    assert float(words[words.index("--step") + 1]) == pytest.approx(0.4)
-    options = parser_of_all().parse_args(["render", "volume.raw", *words])
-    assert (options.compositing, options.shade, options.clip_box) == ("over", False, None)
+    options = parser_of_all().parse_args(["render", "volume.raw", *found["options"]])
+    assert (options.size, options.shade, options.clip_box) == ([95, 68], False, None)
+    place = [*state.orbit.position, *state.orbit.focal_point]
+    np.testing.assert_allclose([*options.camera, options.step], [*place, 0.4], rtol=1e-6)
 
 
 def until(condition):
@@ -424,13 +414,14 @@ def test_slices_pass_through_the_point_and_move_it(controlled):
     for picture, expected in zip(
         pictures, (data[17, :, ::-1], data[::-1, 23, ::-1], data[::-1, ::-1, 23]), strict=True
     ):
-        assert np.corrcoef(np.asarray(picture, float).ravel(), expected.T.ravel())[0, 1] > 0.99
+        grey = np.asarray(picture.resize((24, 24)), float)[..., 1]  # with lines at the point
+        assert np.corrcoef(grey.ravel(), expected.T.ravel())[0, 1] > 0.9
 
 
 def test_labels_are_shown_and_changed_by_their_controls(controlled):
     model, controls = controlled(LABELS, None)
     given = model.state.transfer
-    assert controls["label"].choices() == ["1", "2"]
+    assert controls["label"].choices == ["1", "2"]
     assert "#1f77b4" in controls["pad"].get()
     controls["shown"].set(False)
     assert not controls["shown"].get()

@@ -85,22 +85,13 @@ def test_the_camera_is_that_of_the_renderer():
 
 
 def test_marks_lie_where_the_camera_sees_the_point_and_the_axes():
-    state, orbit, size = (
-        begun()[1],
-        START,
-        (600, HEIGHT),
-    )
-    point = np.array([1.5, 1.0, 0.9])
-    state = replace(state, orbit=orbit, size=size, point=point)
+    point, orbit = np.array([1.5, 1.0, 0.9]), START
+    state = replace(begun()[1], orbit=orbit, size=(600, HEIGHT), point=point)
     image = with_marks(np.full((HEIGHT // 2, 300, 3), 255, np.uint8), state)  # of half the resolution
-    yellow, red = (
-        np.argwhere(np.abs(image.astype(int) - color).sum(-1) < 9) for color in (PICKED, AXES[0][1])
-    )
-    expected = np.array([300, HEIGHT / 2]) + HEIGHT * pixel(orbit, point)
-    np.testing.assert_allclose(2 * yellow.mean(axis=0)[::-1], expected, atol=1.5)
-    x_axis = pixel(orbit, orbit.focal_point + np.array([1e-3, 0, 0]))
-    foot = np.array([MARGIN, HEIGHT - MARGIN])
-    along = 2 * red.mean(axis=0)[::-1] - foot
+    near = [np.abs(image.astype(int) - color).sum(-1) < 9 for color in (PICKED, AXES[0][1])]
+    yellow, red = (2 * np.argwhere(each).mean(axis=0)[::-1] for each in near)
+    np.testing.assert_allclose(yellow, np.array([300, HEIGHT / 2]) + HEIGHT * pixel(orbit, point), atol=1.5)
+    x_axis, along = pixel(orbit, orbit.focal_point + (1e-3, 0, 0)), red - (MARGIN, HEIGHT - MARGIN)
     assert along @ x_axis > 0.95 * np.linalg.norm(along) * np.linalg.norm(x_axis)
     small = replace(state, size=(300, 100))
     assert np.all(with_marks(np.full((100, 300, 3), 255, np.uint8), small) == 255)

@@ -34,9 +34,10 @@ def page():
     served.close()
 
 
-def is_taken(page, origin: str) -> bool:
+def is_taken(page, origin: str, address: str | None = None) -> bool:
     """Whether a client from a page of this origin receives anything before it is sent away."""
-    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=VISER) as connection:
+    address = f"ws://{address or f'127.0.0.1:{page.port}'}"
+    with client.connect(address, origin=origin, subprotocols=VISER) as connection:
         try:
             connection.recv(timeout=30)
         except exceptions.ConnectionClosed:
@@ -58,20 +59,10 @@ def test_another_machine_needs_the_token():
     try:
         place = f"127.0.0.2:{served.port}"
         assert served.url == f"http://{place}/?websocket=ws://{place}/secret"
-        for path, expected in (
-            ("/secret", True),
-            ("/proxy/8080/secret", True),
-            ("/", False),
-            ("/secre", False),
-        ):
-            address = f"ws://127.0.0.2:{served.port}{path}"
-            with client.connect(address, origin="https://example.org", subprotocols=VISER) as connection:
-                taken = True
-                try:
-                    connection.recv(timeout=30)
-                except exceptions.ConnectionClosed:
-                    taken = False
-            assert taken == expected
+        taken = [
+            is_taken(served, "https://example.org", place + path) for path in ("/a/secret", "/", "/secre")
+        ]
+        assert taken == [True, False, False]
         with pytest.raises(ValueError, match="token must"):
             jv.serve(VOLUME, GRAY, host="0.0.0.0", token="")
     finally:
