@@ -59,6 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = lambda told, *_: print(f"{program}: {told}", file=sys.stderr)
             # the main thread gets the signals, and can handle them while it waits, also if XLA is busy

@@ -55,9 +55,8 @@ OVERRIDES = {
     "cmap": {"preset", "transfer", "recorded_transfer"},
     "transfer": {"preset", "cmap", "recorded_transfer", "clim", "window", "level", "unit_distance"},
     "recorded_transfer": {"preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"},
-    "camera": {"direction", "parallel"},
+    "camera": {"direction"},
     "direction": {"camera"},
-    "parallel": {"camera"},
     "clim": {"window", "level"},
     "window": {"clim"},
     "level": {"clim"},
@@ -179,9 +178,11 @@ def _camera(
     """That of the options; or else one as near as what is visible allows, and by a mode in which all values
     count, as the volume does."""
     given = {"view_angle": options.view_angle, "size": options.size}
-    if options.camera:
-        up = options.view_up or (0.0, 0.0, 1.0)
-        return Camera(options.camera[:3], options.camera[3:], up, **given)
+    if options.camera is not None:
+        up, place = options.view_up, (options.camera[:3], options.camera[3:])
+        height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
+        scale = height if options.parallel else None  # as high at the focal point
+        return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
     given["parallel"] = options.parallel
     if options.compositing != "over":
         side = upright(volume, transfer, options.direction, options.view_up)

@@ -257,7 +257,7 @@ def add_scene(parser: Parser) -> None:
     add_vector(group, "--view-up", "X Y Z", text)
     text = "degrees from the lower to the upper edge of the image (default: 30)"
     group.add_argument("--view-angle", type=float, metavar="DEGREES", help=text)
-    text = "orthographic camera; use with --direction"
+    text = "orthographic camera; with --camera, as high as its view at the focal point"
     group.add_argument("--parallel", action=SWITCH, help=text)
     text = "magnification of the image (default: 1)"
     group.add_argument("--zoom", type=float, metavar="FACTOR", help=text)

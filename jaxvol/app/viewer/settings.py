@@ -17,8 +17,8 @@ NO_FILE = {"name": "a volume in memory", "bytes": 0, "sha256": 64 * "0"}
 def text_of(scene: Scene, state: State, file: dict[str, Any]) -> dict[str, str]:
     """The text that a PNG carries, by its keyword: the settings as options of `jaxvol render`, and a transfer
     function of points. `file`: name, bytes and SHA-256 of the volume's file, if it has one."""
-    orbit, (width, height) = state.orbit, state.size
-    words = ["--no-shade" if scene.light(state) is None else "--shade"]
+    orbit = state.orbit
+    words = ["--no-shade" if scene.light(state) is None else "--shade", *["--parallel"] * state.parallel]
     words += [f"--compositing={state.mode}"] if state.mode in (*MODES, ISOSURFACE) else []
     numbers: dict[str, Any] = {
         "size": state.size,
@@ -26,14 +26,8 @@ def text_of(scene: Scene, state: State, file: dict[str, Any]) -> dict[str, str]:
         "background": state.background,
         "view-up": np.round(orbit.view_up, 7) + 0.0,  # no -0
         "view-angle": [orbit.view_angle],
+        "camera": [*orbit.position, *orbit.focal_point],
     }
-    if state.parallel:  # `jaxvol render` looks at the middle of the volume
-        low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
-        whole = np.linalg.norm(high - low) / 2 / min(1.0, width / height)
-        numbers |= {"direction": orbit.toward, "zoom": [whole / orbit.half_height]}
-        words.append("--parallel")
-    else:
-        numbers["camera"] = [*orbit.position, *orbit.focal_point]
     if state.clip:
         numbers |= {"clip-box": state.box, "clip-plane": np.concatenate(scene.plane(state))}
     if state.mode == ISOSURFACE:

@@ -180,10 +180,11 @@ BUSY = """
 import signal, sys
 import jax, jax.numpy as jnp
 import jaxvol.app.cli
-from jaxvol.app.commands import animate, scene
+from jaxvol.app import picture
+from jaxvol.app.commands import animate
 from tests.app.commands.conftest import Drawn
 
-scene.render = Drawn()
+picture.render = Drawn()
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
 def display(*_):
     print("under way", flush=True)

@@ -127,7 +127,8 @@ def test_options_of_the_look_make_the_scene(case, volume_file, tmp_path, monkeyp
     assert same(how["compositing"], compositing_of(mode))
     assert type(how["lighting"]) is type(lighting)
     assert same(how["lighting"], lighting)
-    assert same(camera, jv.Camera.looking_at(volume, size=(16, 16)))
+    near = jv.automatic_camera(volume, found, size=(16, 16))
+    assert same(camera, near if mode == "over" else jv.Camera.looking_at(volume, size=(16, 16)))
     assert same(march, jv.March(0.4, FAST, "midpoint"))
     rgba = drawn(volume, found, camera, march).rgba
     np.testing.assert_allclose(np.load("x.npy"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind, atol=1e-6)
@@ -159,6 +160,8 @@ def test_options_of_the_view_make_the_camera(volume_file, tmp_path, drawn):
     assert render(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
     camera = drawn.scenes[-1][2]
     assert camera.parallel_scale is not None
+    assert render(volume_file, "--parallel", "--camera", 100, *[0] * 5, "-o", output) == 0
+    assert float(drawn.scenes[-1][2].parallel_scale) == pytest.approx(100 * np.tan(np.pi / 12))
     away = np.asarray(camera.focal_point - camera.position)
     np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
 
@@ -196,11 +199,11 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
     words = ["--preset", "engine", *CUT]
     assert render(volume_file, *words, "-o", tmp_path / "x.png", step=None) == 0
     assert float(drawn.scenes[0][3].step) == np.float32(0.7)
-    printed = capsys.readouterr().out
-    assert "(reading and planning " in printed
-    assert "not proven to be within an RMSE of 0.0039; jaxvol plan tells more" in printed
+    printed = capsys.readouterr()
+    assert "(reading and planning " in printed.out
+    assert "not proven to be within an RMSE of 0.0039; jaxvol plan tells more" in printed.err
     assert render(volume_file, *words, "--tolerance", "0.01", "-o", tmp_path / "x.png", step=None) == 0
-    assert "not proven" not in capsys.readouterr().out
+    assert "not proven" not in capsys.readouterr().err
     assert main(["plan", str(volume_file), *map(str, words), "--tolerance", "0.01"]) == 0
     assert "step 0.7, left, Clip" in capsys.readouterr().out
     assert [tolerance for *_, tolerance, _ in plans] == [1 / 255, 0.01, 0.01]
@@ -210,7 +213,7 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
         assert how["once"]
     for bad in (["--tolerance", "0.1", "--step", "1"], ["--step", "1"]):
         assert main(["plan", str(volume_file), *bad]) == 2
-        assert "--step" in capsys.readouterr().err
+        assert "step" in capsys.readouterr().err
     # of an orbit, for four views, by the shortest step
     assert (
         main(
@@ -259,7 +262,7 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
     assert render(tmp_path / "v.npy", *bone) == 0
     told = capsys.readouterr().out
     assert "hardly anything is visible: the opacity is at most" in told
-    assert "a shorter --unit-distance (voxels have the size 1)" in told
+    assert "a shorter unit_distance (voxels have the size 1)" in told
 
 
 DARK = np.full((3, 3), 0.5)
@@ -344,7 +347,7 @@ BAD = {
         ["FILE", "--transfer", "t.json", "--clim", "0", "1"],
         "transfer and clim exclude",
     ),
-    "parallel": (["FILE", "--parallel", "--camera", *"123456"], "camera and parallel exclude each other"),
+    "direction": (["FILE", "--camera", *"123456", "--direction", *"123"], "camera and direction exclude"),
     "no file": (["nowhere.raw"], "error: there is no file"),
     "cmap": (["FILE", "--cmap", "moon"], "cmap must be"),
     "background": (

@@ -409,7 +409,7 @@ def test_slices_pass_through_the_point_and_move_it(controlled):
     assert told is not None
     assert [float(each) for each in told[1].split(", ")] == pytest.approx(model.state.point, rel=1e-3)
     assert float(told[2]) == float(data[17, 23, 23])
-    pictures = [Image.open(io.BytesIO(base64.b64decode(p))) for p in re.findall(r"base64,(.*?)\)", pad.get())]
+    pictures = [Image.open(io.BytesIO(base64.b64decode(p))) for p in re.findall('base64,(.*?)"', pad.get())]
     # x of the data is drawn to the right, and against the world's y; y upwards, as the world's x
     for picture, expected in zip(
         pictures, (data[17, :, ::-1], data[::-1, 23, ::-1], data[::-1, ::-1, 23]), strict=True

@@ -91,7 +91,7 @@ def test_marks_lie_where_the_camera_sees_the_point_and_the_axes():
     near = [np.abs(image.astype(int) - color).sum(-1) < 9 for color in (PICKED, AXES[0][1])]
     yellow, red = (2 * np.argwhere(each).mean(axis=0)[::-1] for each in near)
     np.testing.assert_allclose(yellow, np.array([300, HEIGHT / 2]) + HEIGHT * pixel(orbit, point), atol=1.5)
-    x_axis, along = pixel(orbit, orbit.focal_point + (1e-3, 0, 0)), red - (MARGIN, HEIGHT - MARGIN)
+    x_axis, along = pixel(orbit, np.add(orbit.focal_point, (1e-3, 0, 0))), red - (MARGIN, HEIGHT - MARGIN)
     assert along @ x_axis > 0.95 * np.linalg.norm(along) * np.linalg.norm(x_axis)
     small = replace(state, size=(300, 100))
     assert np.all(with_marks(np.full((100, 300, 3), 255, np.uint8), small) == 255)
