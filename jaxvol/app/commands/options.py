@@ -17,7 +17,7 @@ from ...compositing.modes import ELSEWHERE, MODES
 from ...io.formats import files_of
 from ...scene.presets import PRESETS, SLICER
 from ..picture import DEFAULTS, OVERRIDES, check_exclusive
-from .recorded import recorded_in, volume_of_picture, words_of
+from ..recorded import recorded_in, volume_of_picture, words_of
 
 
 SWITCH = argparse.BooleanOptionalAction

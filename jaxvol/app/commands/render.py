@@ -11,9 +11,9 @@ import numpy as np
 from ...io.display import image_file, save_image
 from ...scene.rendering import Rendering
 from ..picture import Scene, scene_of, with_march
+from ..recorded import text_of_options
 from ..show import why_empty
 from .options import SWITCH, add_command, add_output, add_scene, refuse_to_replace
-from .recorded import text_of
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -32,7 +32,7 @@ def _render(options: argparse.Namespace) -> None:
     _print_facts(options.output, scene, rendering, f"{ended - begun:.2f} s ({steps})")
     image = rendering.rgba if options.transparent else rendering.image(scene.background)
     is_png = options.output.suffix.lower() == ".png"
-    save_image(options.output, image, text=text_of(options, scene.transfer) if is_png else {})
+    save_image(options.output, image, text=text_of_options(options, scene.transfer) if is_png else {})
     if options.depth:
         print(f"{save_image(options.depth, rendering.depth)}: distances, world length")
     if why := why_empty(scene, rendering):

@@ -13,9 +13,9 @@ from ...io import datasets
 from ...io.formats import read
 from ...scene.volume import Volume
 from ..picture import header_of, look_of
+from ..recorded import fields_of
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
-from .recorded import fields_of
 
 
 def _datasets(options: argparse.Namespace) -> None:

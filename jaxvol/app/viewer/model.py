@@ -8,8 +8,8 @@ from dataclasses import fields, replace
 from typing import Any, Literal
 
 from ..._util.srgb import png_of
+from ..recorded import text_of
 from .marks import with_marks
-from .settings import text_of
 from .state import PROGRAM, Scene, State, Vector
 from .tiles import Grid, Pixels, TileRenderer, estimated_error
 
@@ -52,7 +52,7 @@ class Model:
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
         set_status: called likewise with a status of two lines, or three.
         deliver: called by a thread of its own with the PNG of an image that is saved.
-        file: called for what a saved image tells of the volume's file: see `settings.text_of`.
+        file: called for what a saved image tells of the volume's file: see `fields_of`.
     """
 
     marked: Callable[[], None] = staticmethod(lambda: None)  # called when a point was marked
@@ -154,7 +154,9 @@ class Model:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
-        png = png_of(pixels[:height, :width], text_of(self.scene, state, self._file()))
+        png = png_of(
+            pixels[:height, :width], text_of(self.scene.settings(state), self._file(), state.transfer)
+        )
         self._set_status(f"saved {width} x {height}\n")
         self._deliver(png)
 

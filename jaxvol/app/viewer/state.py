@@ -179,6 +179,19 @@ class Scene:
         """The light, if it is on, and the mode can be lit."""
         return self.lighting if state.lit and self.compositing(state).can_be_lit else None
 
+    def settings(self, state: State) -> dict[str, Any]:
+        """Options of `jaxvol render` that draw a state."""
+        orbit = state.orbit
+        options = {"size": state.size, "step": state.step * self.voxel, "background": state.background}
+        options |= {"camera": [*orbit.position.tolist(), *orbit.focal_point.tolist()]}
+        options |= {"view_up": orbit.view_up.tolist(), "view_angle": orbit.view_angle}
+        options |= {"parallel": state.parallel, "shade": self.light(state) is not None}
+        if state.clip:
+            planes = [[each for vector in self.plane(state) for each in vector.tolist()]]
+            options |= {"clip_box": state.box, "clip_plane": planes}
+        options |= {"compositing": state.mode} if state.mode in (*MODES, ISOSURFACE) else {}
+        return options | ({"isovalue": state.isovalue} if state.mode == ISOSURFACE else {})
+
     def in_mode(self, state: State, mode: str) -> State:
         """The state in another mode, with the light that is usual for it, and its background, if that was so.
         **Raises** `ValueError` where the mode cannot show the transfer function."""

@@ -19,7 +19,7 @@ from PIL import Image
 import jaxvol as jv
 from jaxvol import to_srgb
 from jaxvol.app.cli import parser_of_all
-from jaxvol.app.commands.recorded import recorded_in
+from jaxvol.app.recorded import recorded_in
 from jaxvol.app.viewer.controls import controls_of
 from jaxvol.app.viewer.editing import padded, with_color, with_opacity, with_points_at, with_window_level
 from jaxvol.app.viewer.model import BUDGET, LEVELS, Model, adapted
