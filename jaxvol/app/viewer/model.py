@@ -154,11 +154,9 @@ class Model:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
-        png = png_of(
-            pixels[:height, :width], text_of(self.scene.settings(state), self._file(), state.transfer)
-        )
+        text = text_of(self.scene.settings(state), self._file(), state.transfer)
         self._set_status(f"saved {width} x {height}\n")
-        self._deliver(png)
+        self._deliver(png_of(pixels[:height, :width], text))
 
     def _told(self, what: str, do: Callable[..., object], *arguments: Any) -> bool:
         """Do something, and tell of a fault, after which the user may ask for something else."""
