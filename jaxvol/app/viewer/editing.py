@@ -92,9 +92,11 @@ def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
 def recolored(transfer: TransferFunction, cmap: str) -> TransferFunction:
     """With the colours of a matplotlib colormap over the range of its values, and the same opacities; with
     `COLOR_POINTS` more points, where there is room for them."""
-    low, high = np.asarray(transfer.values, np.float64)[[0, -1]]
-    if low < high and len(transfer.values) + COLOR_POINTS <= MAX_POINTS:
-        transfer = with_points_at(transfer, np.linspace(low, high, COLOR_POINTS + 2)[1:-1])
+    values = np.asarray(transfer.values)
+    low, high = values[[0, -1]]
+    if len(values) + COLOR_POINTS <= MAX_POINTS:
+        at = np.linspace(low, high, COLOR_POINTS + 2, dtype=values.dtype)
+        transfer = with_points_at(transfer, np.setdiff1d(at, values))
     values = np.asarray(transfer.values, np.float64)
     display = colormaps[cmap]((values - low) / ((high - low) or 1.0))
     return TransferFunction(values, from_srgb(display[:, :3]), transfer.extinction)
