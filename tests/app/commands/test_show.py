@@ -10,7 +10,6 @@ import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
 from jaxvol.app.picture import DEFAULTS
-from jaxvol.scene.presets import SHADED, fitted_range, preset_name
 
 from .test_render import render, same
 
@@ -42,18 +41,8 @@ def test_one_line_makes_the_picture_of_the_command(case, volume_file, tmp_path, 
 
 
 def test_it_has_the_options_of_the_command():
-    found = vars(parsed(parser_of_all(), ["render", "x.raw"]))
-    own = {
-        "execute",
-        "defaults",
-        "file",
-        "like",
-        "config",
-        "recorded_transfer",
-        "output",
-        "transparent",
-        "depth",
-    }
+    found = parsed(parser_of_all(), ["render", "x.raw"]).defaults
+    own = {"file", "like", "config", "output", "transparent", "depth"}
     assert {name: found[name] for name in found.keys() - own} == DEFAULTS
 
 
@@ -101,27 +90,3 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
     drawn.level = 0.0
     with pytest.warns(UserWarning, match="nothing is visible: the volume's values run .* A clim from"):
         jv.show(volume, jv.preset("engine", (500, 900)), size=8, step=0.4)
-
-
-def test_presets_of_slicer_are_found_by_any_spelling_and_have_its_values():
-    for name in ("CT-Bones", "ct_bones", "ct bones", "CTBONES"):
-        assert preset_name(name) == "CT-Bones"
-    assert [preset_name(name) for name in ("ct_bone", "CT-Bone")] == [
-        "ct_bone",
-        "CT-Bone",
-    ]  # ours, and theirs
-    assert {"CT-AAA", "MR-Default"} <= SHADED
-    assert not {"MR-MIP", "CT-Fat"} & SHADED
-    found = jv.preset("CT-Bone")  # of presets.xml
-    assert np.asarray(found.values).tolist() == pytest.approx([-3024, -16.4458, 641.385, 3071])
-    display = np.array([[0.729412, 0.254902, 0.301961], [0.905882, 0.815686, 0.552941]])
-    np.testing.assert_allclose(np.asarray(found.colors)[1:3], ((display + 0.055) / 1.055) ** 2.4, rtol=1e-3)
-    opacity = -np.expm1(-np.asarray(found.extinction))
-    np.testing.assert_allclose(opacity, [0, 0, 0.715686, 0.705882], atol=1e-6)
-    # MR has no unit, and is stretched; CT is not, and it is said that it does not fit
-    low, middle, high = np.array([0, 250]), np.array([-1000, 2000]), np.array([0, 900])
-    assert fitted_range("MR-Default", low) == fitted_range("CT-Bone", middle) == (None, None)
-    clim, told = fitted_range("mr default", high)
-    assert clim == pytest.approx((0, 900), rel=2e-3)
-    assert told is not None
-    assert "Hounsfield" in str(fitted_range("CT-Bone", low)[1])
