@@ -11,7 +11,7 @@ from ...scene.labels import LabelTransferFunction
 from ...scene.presets import PRESETS, fitted_range, preset
 from ...scene.transfer import TransferFunction
 from ...scene.volume import Volume
-from ..automatic import automatic_transfer, sampled
+from ..automatic import sampled
 from . import editing
 from .control import Control, Press
 from .model import Model
@@ -19,7 +19,7 @@ from .model import Model
 
 MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
 BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
-GIVEN, AUTOMATIC = "as given", "automatic"
+GIVEN = "as given"
 COLORMAPS = "gray", "viridis", "inferno", "magma", "cividis", "turbo", "jet", "hot", "bone", "coolwarm"
 
 
@@ -97,18 +97,13 @@ def _point_controls(model: Model) -> list[Control]:
         edit(model, change, *arguments)
         chosen = min(chosen, len(transfer().values) - 1)
 
-    def made(name: str) -> Any:
-        nonlocal note
-        note = ""
-        if name in (GIVEN, AUTOMATIC):
-            return given if name == GIVEN else automatic_transfer(model.scene.volume)
-        clim, told = fitted_range(name, sampled(model.scene.volume))
-        note = "" if told is None else f'<div style="font-size: 11px">{told}</div>'
-        return preset(name, clim, voxel)
-
     def choose_preset(name: str) -> None:
+        nonlocal note
         names.update(preset=name, colors=GIVEN)
-        put(lambda _: made(name))
+        values = sampled(model.scene.volume)
+        clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
+        note = f'<div style="font-size: 11px">{told or ""}</div>'
+        put(lambda _: given if name == GIVEN else preset(name, clim, voxel))
 
     def choose_colors(name: str) -> None:
         names["colors"] = name
@@ -155,7 +150,7 @@ def _point_controls(model: Model) -> list[Control]:
     first, last = min(low, level - window / 2), max(high, level + window / 2)
     span = editing.rounded(last - first, last - first)
     unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
-    presets, colors = (GIVEN, AUTOMATIC, *PRESETS), (GIVEN, *COLORMAPS)
+    presets, colors = (GIVEN, *PRESETS), (GIVEN, *COLORMAPS)
     controls = [
         Control("dropdown", "preset", lambda: names["preset"], choose_preset, choices=presets),
         Control("dropdown", "colors", lambda: names["colors"], choose_colors, choices=colors),

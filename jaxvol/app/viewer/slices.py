@@ -40,7 +40,7 @@ def slice_controls(model: Model) -> list[Control]:
     def one(axis: int, at: np.ndarray) -> str:
         a, b = (each for each in range(3) if each != axis)
         data = np.asarray(volume.data).take(round(at[axis]), axis).astype(np.float32)
-        grey = np.uint8(255 * np.clip((data - low) / ((high - low) or 1.0), 0, 1))
+        grey = (255 * np.clip((data - low) / ((high - low) or 1.0), 0, 1)).astype(np.uint8)
         grey = Image.fromarray(np.ascontiguousarray(grey[:: -1 if down[a] else 1, :: 1 if down[b] else -1].T))
         picture = grey.resize((pixels[a], pixels[b])).convert("RGB")
         x, y = (1 - at[a] / last[a] if down[a] else at[a] / last[a]), at[b] / last[b]
