@@ -1,8 +1,9 @@
 """What is a control? A description, of which each face makes a widget of its own."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -14,28 +15,20 @@ class Control:
     kind: str
     label: str = ""
     get: Callable[[], Any] = str  # what it shows: a text, number, two in a range, a color as sRGB, `#rrggbb`
-    set: Callable[[Any], None] = lambda value: None  # takes a button's text, a pad's `Press`
+    set: Callable[[Any], None] = lambda value: None  # takes a button's text, of a pad what `press_of` reads
     limits: tuple[float, float, float] = (0.0, 1.0, 0.001)  # lowest and highest number, and the step
     choices: Sequence[str] = ()  # of a dropdown, or the texts of buttons
 
 
-class Press(NamedTuple):
-    """A press of the pointer in a box that goes on: on one of its parts, empty for none, maybe twice; and
-    where it is, from the upper left corner, 0 to 1. A `gesture` has one number; some may be lost."""
-
-    gesture: str
-    pad: str
-    part: str
-    twice: bool
-    x: float
-    y: float
-
-    @classmethod
-    def of(cls, message: str) -> "Press":
-        """What a face's message says. **Raises** `ValueError` for another one."""
-        gesture, pad, part, twice, *at = message.split(",")
-        x, y = (min(max(float(each), 0.0), 1.0) for each in at)
-        return cls(gesture, pad, part, twice == "true", x, y)
+def press_of(message: str) -> tuple[str, str, str, bool, float, float]:
+    """What a face tells of a press of the pointer that goes on: a number of its own, the box, its part, empty
+    for none, whether it is the second one, and where it is now, from the upper left corner, 0 to 1. Some
+    messages may be lost. **Raises** `ValueError` for another text."""
+    press, pad, part, twice, *at = message.split(",")
+    x, y = (min(max(float(each), 0.0), 1.0) for each in at)
+    if math.isnan(x + y):
+        raise ValueError(f"a press lies somewhere; got {at}.")
+    return press, pad, part, twice == "true", x, y
 
 
 PRESSED = """(event, send) => {
@@ -54,5 +47,5 @@ PRESSED = """(event, send) => {
   window.addEventListener('pointermove', tell);
   window.addEventListener('pointerup', () => window.removeEventListener('pointermove', tell), {once: true});
 }"""
-"""JavaScript of both faces: handles `pointerdown`, and sends messages for `Press.of`. What was pressed may be
+"""JavaScript of both faces: handles `pointerdown`, and sends messages for `press_of`. What was pressed may be
 drawn anew while the pointer moves."""

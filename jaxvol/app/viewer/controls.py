@@ -53,19 +53,17 @@ def _view_controls(model: Model) -> list[Control]:
     def set_background(color: str) -> None:
         model.change(background=tuple(np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()))
 
-    def background() -> str:
-        return display_color(np.array(model.state.background))
-
     def set_mode(mode: str) -> None:
         model.apply(lambda state: model.scene.in_mode(state, mode))
 
+    background = lambda: display_color(np.array(model.state.background)), set_background
     return [
         Control("buttons", "look from", set=look, choices=(*SIDES, "reset")),
         _bound(model, "checkbox", "orthographic", "parallel"),
         Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=modes),
         _bound(model, "slider", "isovalue", "isovalue", limits=(low, low + span, span / 1000)),
         _bound(model, "checkbox", "light", "lit"),
-        Control("color", "background", background, set_background),
+        Control("color", "background", *background),
     ]
 
 

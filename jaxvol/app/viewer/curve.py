@@ -13,7 +13,7 @@ from ...scene.transfer import TransferFunction
 from ...scene.volume import Volume
 from ..automatic import sampled
 from . import editing
-from .control import Control, Press
+from .control import Control, press_of
 from .model import Model
 
 
@@ -112,17 +112,17 @@ def _point_controls(model: Model) -> list[Control]:
 
     def press(message: str) -> None:
         nonlocal chosen, gesture
-        pressed, count = Press.of(message), len(transfer().values)
-        height = min((1 - pressed.y) * HEIGHT / (HEIGHT - 2), 1.0)
-        value, opacity = editing.rounded(low + pressed.x * (high - low), high - low), round(height**2, 3)
-        if pressed.gesture != gesture:
-            gesture, chosen = pressed.gesture, min(int(pressed.part or 0), count - 1)
-            if pressed.twice:
+        (number, _, part, twice, x, y), count = press_of(message), len(transfer().values)
+        height = min((1 - y) * HEIGHT / (HEIGHT - 2), 1.0)
+        value, opacity = editing.rounded(low + x * (high - low), high - low), round(height**2, 3)
+        if number != gesture:
+            gesture, chosen = number, min(int(part or 0), count - 1)
+            if twice:
                 put(editing.without_point, chosen)
-            elif not pressed.part:
+            elif not part:
                 put(editing.with_points_at, [value])
                 chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
-        elif not pressed.twice:
+        elif not twice:
             put(editing.with_value, chosen, value)
             put(editing.with_opacity, chosen, opacity, voxel)
 

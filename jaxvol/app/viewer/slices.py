@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from ..._util.srgb import png_of
 from ..automatic import sampled
-from .control import Control, Press
+from .control import Control, press_of
 from .marks import AXES
 from .model import Model
 
@@ -66,10 +66,10 @@ def slice_controls(model: Model) -> list[Control]:
         return shown[1]
 
     def press(message: str) -> None:
-        pressed, at = Press.of(message), indices()
-        a, b = (each for each in range(3) if each != int(pressed.pad))
-        at[a] = (1 - pressed.x if down[a] else pressed.x) * last[a]
-        at[b] = (pressed.y if down[b] else 1 - pressed.y) * last[b]
+        (_, pad, _, _, x, y), at = press_of(message), indices()
+        a, b = (each for each in range(3) if each != int(pad))
+        at[a] = (1 - x if down[a] else x) * last[a]
+        at[b] = (y if down[b] else 1 - y) * last[b]
         model.mark(origin + turn @ (at * spacing))
 
     return [Control("pad", "slices", get, press)]

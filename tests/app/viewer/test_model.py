@@ -407,6 +407,8 @@ def test_slices_pass_through_the_point_and_move_it(controlled):
     pad.set("1,2,,false,0.25,1")  # across z: x of the data runs along -y of the world, and y along x
     np.testing.assert_allclose(model.state.point, at(0.75 * 23, 0, 11.5), rtol=1e-6)
     pad.set("2,0,,false,1,0")
+    with pytest.raises(ValueError, match="a press lies somewhere"):
+        pad.set("2,0,,false,nan,0")
     np.testing.assert_allclose(model.state.point, at(0.75 * 23, 23, 23), rtol=1e-6)
     told = re.search(r"at \((.*)\): (.*)</div>", pad.get())
     assert told is not None
