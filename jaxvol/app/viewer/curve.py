@@ -99,9 +99,9 @@ def _point_controls(model: Model) -> list[Control]:
 
     def choose_preset(name: str) -> None:
         nonlocal note
-        names.update(preset=name, colors=GIVEN)
         values = sampled(model.scene.volume)
         clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
+        names.update(preset=name, colors=GIVEN)
         note = f'<div style="font-size: 11px">{told or ""}</div>'
         put(lambda _: given if name == GIVEN else preset(name, clim, voxel))
 
