@@ -44,7 +44,7 @@ def view(
     the transfer function's points, which are dragged on its curve, or its labels, clips, the step and each
     transform. While something changes, the image is as coarse as it must be to follow within some 150 ms; at
     rest it has all pixels. Where another program must be compiled, the old image stays. It needs
-    `pip install jaxvol[notebooks]`. Compiled programs are kept, as by `keep_programs`.
+    `pip install "jaxvol[notebooks]"`. Compiled programs are kept, as by `keep_programs`.
 
     Args:
         volume: what is looked at.
@@ -74,7 +74,7 @@ def view(
     try:
         from .notebook import NotebookView
     except ImportError as fault:
-        raise ImportError(f"view needs {fault.name}: pip install jaxvol[notebooks]") from fault
+        raise ImportError(f"view needs {fault.name}: pip install 'jaxvol[notebooks]'") from fault
     keep_programs_by_default()
     how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
     return NotebookView(*initial(volume, transfer, camera, march, size=size, **how))
@@ -97,7 +97,7 @@ def serve(
 
     Without a token only this machine can connect, and only pages that this server sent (others that a browser
     shows may not); with one, whoever knows it, from any page. What a browser sends are numbers, colors and
-    names of controls; nothing of it is evaluated or used as a path. It needs `pip install jaxvol[view]`.
+    names of controls; nothing of it is evaluated or used as a path. It needs `pip install "jaxvol[view]"`.
 
     Args:
         volume: as for `view`.
@@ -122,7 +122,7 @@ def serve(
     try:
         from .page import Page
     except ImportError as fault:
-        raise ImportError(f"serve needs {fault.name}: pip install jaxvol[view]") from fault
+        raise ImportError(f"serve needs {fault.name}: pip install 'jaxvol[view]'") from fault
     port = integer("port", port, 1, 65535)
     if token is not None and not re.fullmatch("[A-Za-z0-9_-]{1,200}", token):
         raise ValueError(f'token must be letters, digits, "-" and "_", 1 to 200; got {shortened(token)}.')
