@@ -20,9 +20,9 @@ from ..scene.space import Space
 SIDE = 8
 """Pixels along the side of a patch, as of the engine's beams, so that its samples are those of the image."""
 
-PATCHES, FEW = (128, 512), 32
-"""Patches that are rendered, a thirty-second of 512 x 512 pixels; and of images of fewer than 512 patches,
-whose plan would else take longer than ten of them."""
+PATCHES, SMALL, FEW = 128, 512, 32
+"""Patches that are rendered, a thirty-second of 512 x 512 pixels; of images of fewer than SMALL patches FEW,
+or their plan would take longer than ten of them."""
 
 LIKELY = 7 / 8
 """Fraction of the patches that are chosen where visible blocks lie on or near their middle ray; the others,
@@ -71,7 +71,7 @@ class Probe(NamedTuple):
         likely = hit & np.asarray(_passes(camera, space, near)).reshape(-1)
         hit[0] |= not hit.any()
         groups = np.flatnonzero(likely), np.flatnonzero(hit & ~likely)
-        patches = PATCHES[0] if hit.size >= PATCHES[1] else FEW
+        patches = PATCHES if hit.size >= SMALL else FEW
         reserved = min(groups[1].size, round(patches * (1 - LIKELY)))
         first = min(groups[0].size, patches - reserved)
         random, chosen, strata = np.random.default_rng(seed), [], []

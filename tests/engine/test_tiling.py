@@ -9,7 +9,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.engine.image import render_scene
-from jaxvol.engine.tiling import Tiling
+from jaxvol.engine.tiling import GPU, LEAST_BATCH, Tiling
 from jaxvol.ray import Scene
 from jaxvol.scene.transfer import Transfer
 
@@ -53,6 +53,15 @@ def test_tiles_and_batches_that_are_refilled_do_not_show(sizes):
             np.testing.assert_array_equal(few.samples, whole.samples)
         careful = scene._replace(march=jv.March(0.9, transforms, max_samples=256))
         np.testing.assert_allclose(render_scene(careful, "rgba", "replay").rgba, whole.rgba, atol=1e-6)
+
+
+def test_small_images_are_several_batches_too():
+    """So that other rays can take the places of those that end; on a GPU, lanes count for more."""
+    for groups in (1, LEAST_BATCH, LEAST_BATCH + 1, 256, 4096, 2**14, 2**20):
+        batch = Tiling().batch_of(groups)
+        assert 0 < batch <= min(Tiling().batch, groups)
+        assert batch < groups or groups <= LEAST_BATCH
+        assert GPU.batch_of(groups) == min(GPU.batch, groups)
 
 
 def test_rays_of_ones_own_see_what_the_camera_sees():
