@@ -32,11 +32,11 @@ def words_of(name: str, value: Any) -> list[str]:
     return [word for row in rows for word in (f"--{flag}", *map(str, row))]
 
 
-def text_of(settings: Mapping[str, Any], file: Mapping[str, Any], transfer: Any = None) -> dict[str, str]:
-    """The text that a PNG carries, by its keyword: options, as words of a command line; the volume's
-    `fields_of`; and a transfer function of points, if it holds one."""
+def text_of(settings: Mapping[str, Any], file: Path | None, transfer: Any = None) -> dict[str, str]:
+    """The text that a PNG carries, by its keyword: options, as words of a command line; the volume's file, if
+    it has one; and a transfer function of points, if it holds one."""
     words = [word for name, value in settings.items() for word in words_of(name, value)]
-    content: dict[str, Any] = {"options": words, "file": file or NO_FILE}
+    content: dict[str, Any] = {"options": words, "file": NO_FILE if file is None else fields_of(file)}
     if isinstance(transfer, TransferFunction):
         content["transfer"] = transfer_fields(transfer)
     return {KEYWORD: json.dumps(content, sort_keys=True)}
@@ -51,7 +51,7 @@ def text_of_options(options: argparse.Namespace, transfer: Transfer) -> dict[str
     changed = {name: value for name, value in given.items() if value != options.defaults[name]}
     settings = {name: value for name, value in changed.items() if not isinstance(value, Path)}
     from_file = options.transfer is not None or options.recorded_transfer is not None
-    return text_of(settings, fields_of(options.file), transfer if from_file else None)
+    return text_of(settings, options.file, transfer if from_file else None)
 
 
 def fields_of(file: Path) -> dict[str, Any]:

@@ -13,7 +13,6 @@ from ...io import datasets
 from ...io.formats import read
 from ...scene.volume import Volume
 from ..picture import header_of, look_of
-from ..recorded import fields_of
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
 
@@ -88,9 +87,9 @@ def add_info(commands: Any) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    file, how = options.file, {name: getattr(options, name) for name in ("port", "host", "token")}
-    how |= {"lit": options.shade, "title": file.name, "file": lambda: fields_of(file)}
-    page = serve(*look_of(options), **how)
+    how = {name: getattr(options, name) for name in ("port", "host", "token")}
+    file = options.file if options.labels is None else None  # a picture names no other file
+    page = serve(*look_of(options), lit=options.shade, title=options.file.name, file=file, **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)

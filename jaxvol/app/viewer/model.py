@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from ..._util.srgb import png_of
@@ -52,7 +53,7 @@ class Model:
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
         set_status: called likewise with a status of two lines, or three.
         deliver: called by a thread of its own with the PNG of an image that is saved.
-        file: called for what a saved image tells of the volume's file: see `fields_of`.
+        file: the volume's, which saved images name.
     """
 
     marked: Callable[[], None] = staticmethod(lambda: None)  # called when a point was marked
@@ -65,7 +66,7 @@ class Model:
         show: Callable[[Pixels, Stage], None],
         set_status: Callable[[str], None],
         deliver: Callable[[bytes], None] = lambda content: None,
-        file: Callable[[], dict[str, Any]] = dict,
+        file: Path | None = None,
     ):
         self.scene, self.state, self.first = scene, state, state
         self._face, self._deliver, self._file = (show, set_status), deliver, file
@@ -154,7 +155,7 @@ class Model:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
-        text = text_of(self.scene.settings(state), self._file(), state.transfer)
+        text = text_of(self.scene.settings(state), self._file, state.transfer)
         self._set_status(f"saved {width} x {height}\n")
         self._deliver(png_of(pixels[:height, :width], text))
 

@@ -10,6 +10,7 @@ import re
 import secrets
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -70,7 +71,7 @@ class Page:
         title: str = "jaxvol",
         host: str = HOST,
         token: str | None = None,
-        file: Callable[[], dict[str, Any]] = dict,
+        file: Path | None = None,
     ):
         self.shown, self.file = (scene, state), file
         is_local = host in OWN_NAMES
