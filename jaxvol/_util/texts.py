@@ -27,5 +27,6 @@ def pasted(value: Any) -> str:
 def near(given: str, names: Iterable[str]) -> str:
     """A sentence that asks whether one of up to three names like this one is meant; empty without any."""
     by_case = {name.lower(): name for name in names}
-    found = [by_case[name] for name in get_close_matches(given.lower(), by_case, 3)]
+    most = 1 if given.lower() in by_case else 3
+    found = [by_case[name] for name in get_close_matches(given.lower(), by_case, most)]
     return f" Did you mean {' or '.join(found)}?" if found else ""

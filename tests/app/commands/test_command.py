@@ -52,7 +52,7 @@ BAD = [
     (["paint"], "error: argument COMMAND: invalid choice: 'paint' (choose from"),
     (["rendr"], "'view'). Did you mean render? (jaxvol --help lists"),
     (["render", "x.raw", "--compositing", "mip"], "invalid choice: 'mip' (choose from"),
-    (["render", "x.raw", "--compositing", "mip"], "'isosurface'). Did you mean maximum"),
+    (["render", "x.raw", "--compositing", "mip"], "'isosurface'). Did you mean maximum?"),
 ]
 
 
