@@ -3,7 +3,6 @@
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -152,7 +151,7 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
             raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
         volume = copy_of(source, options.memory)
         automatic = is_automatic(options)
-        transfer = (_transfer_of_bricks if automatic else partial(transfer_of, options))(volume, source)
+        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
 
     lighting = _lighting(options, mode, alone=not others)
     camera = _camera(options, volume, transfer, orbit).zoom(options.zoom)
@@ -175,8 +174,8 @@ def _camera(
     transfer: Transfer,
     orbit: Callable[[Camera], Sequence[Camera]] | None,
 ) -> Camera:
-    """That of the options; or else one as near as what is visible allows, and by a mode in which all values
-    count, as the volume does."""
+    """That of the options; or else one as near as what is visible allows, or, under other modes than "over",
+    as the volume does."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if options.camera is not None:
         up, place = options.view_up, (options.camera[:3], options.camera[3:])
