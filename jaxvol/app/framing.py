@@ -17,7 +17,7 @@ from .automatic import sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
-FAINT = 0.01  # the same where it is asked on which face an object stands
+FAINT = 0.01  # the same of a transfer function that was given, and where it is asked on which face it stands
 SPECK = 0.02  # pieces smaller than this fraction of the largest one need not be in the picture
 REACH = 3  # voxels of the cube around each visible one that connects it to others, as the leaves of a tree
 NEAREST = 0.1  # least distance of the camera from what is visible, as a fraction of the diagonal of that
@@ -44,6 +44,7 @@ def automatic_camera(
     *,
     parallel: bool | Any = False,
     size: tuple[int, int] | int | Any = (512, 512),
+    least: float = VISIBLE,
 ) -> Camera:
     """A camera as near as what a transfer function shows allows, specks left out, and upright.
 
@@ -57,6 +58,8 @@ def automatic_camera(
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
+        least: opacity along a hundredth of the volume's diagonal from which on a voxel counts; 0.01 where
+            what is visible may be fog.
 
     Returns:
         The `Camera`.
@@ -67,7 +70,7 @@ def automatic_camera(
     check_arguments("automatic_camera(volume, transfer)", volume=volume, transfer=transfer)
     side = upright(volume, transfer, direction, view_up)
     camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
-    return framed(camera, visible_points(volume, transfer))
+    return framed(camera, visible_points(volume, transfer, least))
 
 
 def upright(
@@ -92,13 +95,13 @@ def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     return found
 
 
-def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3"]:
+def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Float[np.ndarray, "n 3"]:
     """Points in the world around what a transfer function shows, specks left out; the corners of the volume
     where nothing is visible, or that is not known."""
     from scipy.ndimage import label, maximum_filter
     from scipy.spatial import ConvexHull, QhullError
 
-    visible, last = _visible(volume, transfer), np.array(volume.shape) - 1
+    visible, last = _visible(volume, transfer, least), np.array(volume.shape) - 1
     grid = CORNERS * last
     if visible.any():
         found: Any = label(maximum_filter(visible, REACH))  # scipy's types allow a number, too
@@ -117,7 +120,7 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
     return np.asarray(volume.origin, np.float64) + (grid * np.asarray(volume.spacing, np.float64)) @ turn.T
 
 
-def _visible(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Bool[np.ndarray, "nx ny nz"]:
+def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarray, "nx ny nz"]:
     """Which of the volume's `sampled` voxels a transfer function shows with at least this opacity."""
     data, shown = sampled(volume), sized(transfer, volume)
     if isinstance(shown, TransferFunction):

@@ -36,7 +36,7 @@ from .automatic import (
     thresholds,
     transfer_by_copy,
 )
-from .framing import automatic_camera, framed, upright, visible_points
+from .framing import FAINT, VISIBLE, automatic_camera, framed, upright, visible_points
 
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
@@ -186,8 +186,9 @@ def _camera(
     if options.compositing != "over":
         side = upright(volume, transfer, options.direction, options.view_up)
         return Camera.looking_at(volume, *side, **given)
+    given["least"] = least = VISIBLE if is_automatic(options) else FAINT
     camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
-    return framed(camera, visible_points(volume, transfer), orbit(camera)) if orbit else camera
+    return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
 
 
 def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:

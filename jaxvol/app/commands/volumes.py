@@ -12,7 +12,7 @@ import numpy as np
 from ...io import datasets
 from ...io.formats import read
 from ...scene.volume import Volume
-from ..picture import header_of, look_of
+from ..picture import header_of, is_automatic, look_of, volume_of
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
 
@@ -89,7 +89,8 @@ def add_info(commands: Any) -> None:
 def _view(options: argparse.Namespace) -> None:
     how = {name: getattr(options, name) for name in ("port", "host", "token")}
     file = options.file if options.labels is None else None  # a picture names no other file
-    page = serve(*look_of(options), lit=options.shade, title=options.file.name, file=file, **how)
+    look = (volume_of(options),) if is_automatic(options) else look_of(options)
+    page = serve(*look, lit=options.shade, title=options.file.name, file=file, **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)

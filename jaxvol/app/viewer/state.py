@@ -33,7 +33,7 @@ from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, labels_shown
-from ..framing import automatic_camera
+from ..framing import FAINT, VISIBLE, automatic_camera
 
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
@@ -216,9 +216,10 @@ def initial(
 ) -> tuple[Scene, State]:
     """What is viewed, and how at first. Arguments and errors as for `view`."""
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
+    least = VISIBLE if transfer is None else FAINT
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-    chosen: Any = automatic_camera(volume, transfer, size=size) if camera is None else camera
+    chosen: Any = automatic_camera(volume, transfer, size=size, least=least) if camera is None else camera
     given = March(1.0, (), "midpoint") if march is None else march
     shown: Any = sized(transfer, volume)
     names = {"volume": volume, "transfer": shown, "camera": chosen, "march": given, "lighting": lighting}
