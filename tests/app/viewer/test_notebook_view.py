@@ -187,5 +187,5 @@ def test_without_the_extra_the_error_says_what_to_install(call, module, extra, m
     for own in ("notebook", "page"):
         monkeypatch.delitem(sys.modules, f"jaxvol.app.viewer.{own}", raising=False)
         monkeypatch.delattr(f"jaxvol.app.viewer.{own}", raising=False)
-    with pytest.raises(ImportError, match=rf"pip install jaxvol\[{extra}\]"):
+    with pytest.raises(ImportError, match=rf"pip install 'jaxvol\[{extra}\]'"):
         call(BALL)
