@@ -13,7 +13,9 @@ from ._util import interruption as _interruption  # noqa: F401  # pyright: ignor
 from . import bricks as bricks, lighting as lighting, metrics as metrics
 from ._util.srgb import from_srgb as from_srgb, to_srgb as to_srgb
 from ._util.version import __version__ as __version__
-from .app.automatic import automatic_transfer as automatic_transfer
+from .app.automatic import automatic_transfer as automatic_transfer, labels_shown as labels_shown
+from .app.framing import automatic_camera as automatic_camera
+from .app.show import show as show
 from .app.viewer import serve as serve, view as view
 from .bricks import render_bricks as render_bricks
 from .compositing.blending import Compositing as Compositing, Over as Over, Weighting as Weighting

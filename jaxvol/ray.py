@@ -122,7 +122,7 @@ EXPECTED: dict[str, tuple[type, str, str]] = {
     "lighting": (
         Lighting,
         "None or a Lighting",
-        "Pass jv.lighting.Phong(lights) or jv.lighting.ScattererTemplates(materials, lights).",
+        "Pass jv.lighting.Phong() or jv.lighting.ScattererTemplates(materials, lights).",
     ),
 }
 """For each argument name: its type, a description, and how to make one."""

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, integer, require
@@ -23,6 +24,7 @@ from .scene.rendering import Rendering, pooled
 from .scene.several import together
 from .scene.transfer import Transfer
 from .scene.volume import Volume
+from .xla.platform import is_traced
 from .xla.sharding import shard_number
 
 
@@ -134,6 +136,7 @@ def render(
         raise ValueError(f'tolerance goes with march="auto"; got {tolerance!r} with {described(march)}.')
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
     assert isinstance(march, March)
+    _warn_of_step(volume, march)
     n, source = integer("antialias", antialias, 1), camera
     if n > 1:
         source = finer(camera, n)
@@ -143,6 +146,17 @@ def render(
     scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
     rendering = render_scene(scene, outputs, adjoint, devices=devices)
     return rendering if n == 1 else pooled(rendering, n)
+
+
+def _warn_of_step(volume: Volume, march: March) -> None:
+    """Say so if a step is longer than a volume that no transform bends, where both are known."""
+    if is_traced(march.step, volume.spacing) or march.overriding("locate"):
+        return
+    spacing = np.asarray(volume.spacing)
+    across = float(np.linalg.norm((np.array(volume.shape) - 1) * spacing))
+    if float(march.step) > across:
+        told = f"march.step is {float(march.step):.4g}, longer than the volume, which is {across:.4g} across"
+        warnings.warn(f"{told}; half a voxel is {float(spacing.min()) / 2:.4g}.", stacklevel=3)
 
 
 def render_rays(

@@ -32,9 +32,8 @@ FEWER = {"96": "24", "(256, 256)": "(20, 16)", "(96, 96)": "(20, 16)"}
 """Voxels and pixels of README's examples, with which they take seconds."""
 
 
-def run(blocks):
+def run(blocks, **names):
     """What the blocks define, of which an image, `rendering` or `image`, shows something."""
-    names: dict = {}
     for block in blocks:
         exec(block, names)
     image = names["rendering"].rgba if "rendering" in names else names["image"]
@@ -75,7 +74,7 @@ def test_python_in_the_documents_runs(name, tmp_path):
 
 
 def check(name):
-    names = run(DOCUMENTS[name])
+    names = run(DOCUMENTS[name], path=jv.save(jv.phantom("head", 24), "scan.npz"))
     if name == "README.md":
         assert names["found"].losses[-1] < 0.1 * names["found"].losses[0]
         assert_tells_something(names["found"].parameters)

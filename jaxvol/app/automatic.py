@@ -10,6 +10,7 @@ from jaxtyping import Float, Shaped
 from .._util.checks import described
 from .._util.srgb import from_srgb
 from .._util.voxels import is_flat
+from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import TransferFunction, extinction_of
 from ..scene.volume import Volume, check_one_channel
@@ -22,6 +23,10 @@ CUT = 0.25  # fraction of the voxels at the volume's faces from which on the fac
 BODY = 0.15
 """Least fraction of the voxels between the thresholds whose six neighbours lie between them, too, if they are
 a body: 0.25 to 0.92 in scans and simulations, 0.09 at most in angiograms, where only rims of vessels do."""
+
+IN_FRONT, THROUGH, THIN = 0.3, 1.2, 0.15
+"""Optical depth of the object in front of what is dense, and all through it, at most, in the median of rays
+along the axes; and opacity from which on it is thin."""
 
 ROUGH, NOISY = 0.7, 0.1
 """Grain has second differences above this fraction of first differences over two steps (0.6 at most in scans,
@@ -46,10 +51,10 @@ def stride_of(shape: tuple[int, ...], most: int = SAMPLED) -> int:
     return stride
 
 
-def sampled(volume: Volume) -> Shaped[np.ndarray, "nx ny nz"]:
-    """Every n-th voxel along each axis."""
+def sampled(volume: Volume, data: Any = None) -> Shaped[np.ndarray, "nx ny nz *c"]:
+    """Every n-th voxel along each axis, or what `data` hold there."""
     stride = stride_of(volume.shape)
-    return np.asarray(volume.data)[::stride, ::stride, ::stride]
+    return np.asarray(volume.data if data is None else data)[::stride, ::stride, ::stride]
 
 
 def unit_of(volume: Volume) -> float:
@@ -104,14 +109,37 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
         data = np.asarray(copy.data)
         outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
         if np.mean(outer > first) < CUT and is_body(part, first, second):
+            depth, usual = depth_of_object(copy, first, second)
             w = min(first - low, second - first) / 3
-            border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, 0.07)]
-            points = [*border, (second - d, TISSUE, 0.04), *points]
+            border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, max(0.07, depth))]
+            if depth > THIN:  # leaves, say: no border, which noise also crosses
+                border = [(first, EDGE, 0.0), (min(usual, second - 2 * d), SKIN, depth)]
+            points = [*border, (second - d, TISSUE, depth), *points]
         else:
             points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
     return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
+
+
+def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float, float]:
+    """Opacity that the object, values between two thresholds, may have along `unit_of` a volume: so that what
+    is dense is seen through it, and so that it has some itself, if it is thin. And its usual value."""
+    data, unit = sampled(volume), unit_of(volume)
+    middle, dense = (data > first) & (data <= second), data > second
+    in_front, whole = [np.zeros(1)], []
+    if not middle.any():
+        return THIN, (first + second) / 2
+    extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
+    for axis, step in enumerate(extent / (np.maximum(np.array(data.shape) - 1, 1) * unit)):
+        object_, stop = np.moveaxis(middle, axis, 0), np.moveaxis(dense, axis, 0)
+        whole.append(step * object_.sum(0)[object_.any(0)])
+        for side in (1, -1):
+            before, ends = np.cumsum(object_[::side], 0, np.int32), stop[::side].argmax(0)[None]
+            in_front.append(step * np.take_along_axis(before, ends, 0)[0][stop.any(0)])
+    depths = zip((IN_FRONT, THROUGH), (in_front, whole), strict=True)
+    found = min(most / max(float(np.median(np.concatenate(each))), most) for most, each in depths)
+    return -math.expm1(-found), float(data[middle].mean(dtype=np.float64))
 
 
 def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
@@ -162,32 +190,58 @@ def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -
     return bool(inside.sum() >= BODY * middle.sum()) and not is_grain
 
 
-def labels_shown(volume: Volume) -> tuple[Volume, LabelTransferFunction] | None:
-    """A volume and a transfer function that show each label but the lowest in its own colour; None if there
-    are no labels. The volume is smooth, 255 inside of all labels, and its labels reach two voxels beyond."""
+def labels_shown(
+    volume: Volume | Any, around: TransferFunction | Any | None = None
+) -> tuple[Volume, LabelTransferFunction] | None:
+    """A volume and a transfer function that show labels, each in a colour of its own and lit: those that the
+    volume has, or its values, if they seem to be labels.
+
+    In and near labels the values that are returned are smooth, from the least to, inside of labels, the
+    greatest; and labels reach two voxels beyond.
+
+    Args:
+        volume: the `Volume`.
+        around: what is shown where a volume's own labels are 0; by default by `automatic_transfer`.
+
+    Returns:
+        The two; None if the volume has no labels, or more than 256, and its values are not whole numbers of 3
+        to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
+
+    Raises:
+        ValueError: for what is no volume.
+    """
     import matplotlib
     from matplotlib.colors import ListedColormap, hsv_to_rgb
     from scipy.ndimage import gaussian_filter, maximum_filter
 
-    data = np.asarray(volume.data)
-    if data.dtype.kind not in "iu" or not is_flat(data):
+    check_arguments("labels_shown(volume)", volume=volume)
+    own, data = volume.labels is not None, np.asarray(volume.data)
+    given = np.asarray(volume.labels) if own else data
+    if not own and (given.dtype.kind not in "iu" or not is_flat(given)):
         return None
-    kinds = np.unique(data)
-    if not 2 < len(kinds) <= MOST_LABELS:
+    kinds = np.unique(np.append(given, 0) if own else given)
+    if len(kinds) > MOST_LABELS or not (own or len(kinds) > 2):
         return None
-    labels = np.searchsorted(kinds, data).astype(np.uint8)
+    labels = np.searchsorted(kinds, given).astype(np.uint8)
     # smoothed, so that the border of what has a label has a gradient
-    inside = gaussian_filter(np.where(labels > 0, np.float32(INSIDE), np.float32(0)), 0.8)
+    inside = gaussian_filter(np.where(labels > 0, np.float32(1), np.float32(0)), 0.8)
     beyond = np.where(labels > 0, labels, maximum_filter(labels, size=5))
+    low, high, kind = (data.min(), data.max(), data.dtype) if own else (0, INSIDE, np.dtype(np.uint8))
+    low, high = float(low), float(high)
+    smooth = low + (high - low) * inside
+    smooth = (smooth if kind.kind == "f" else np.round(smooth)).astype(kind)
+    shown = np.where(beyond > 0, smooth, data if own else kind.type(0))
     place = volume.spacing, volume.origin
-    shown = Volume((inside + 0.5).astype(np.uint8), *place, beyond, direction=volume.direction)
     tab20 = np.array(cast(ListedColormap, matplotlib.colormaps["tab20"]).colors)
     dark_then_light = np.delete(np.concatenate([tab20[::2], tab20[1::2]]), (7, 17), axis=0)  # without greys
     more = np.arange(max(len(kinds) - len(dark_then_light), 0))
     spread = np.stack([0.618034 * more % 1, 1 - 0.25 * (more % 3), 1 - 0.2 * (more % 4)], axis=-1)
     colors = np.asarray(from_srgb(np.concatenate([dark_then_light, hsv_to_rgb(spread)])))
-    values, opacity = [0, 0.35 * INSIDE, 0.65 * INSIDE], extinction_of([0.0, 0.0, 0.9], unit_of(volume))
-    functions = {
+    values = low + (high - low) * np.array([0, 0.35, 0.65])
+    opacity = extinction_of([0.0, 0.0, 0.9], unit_of(volume))
+    functions: dict[int, Any] = {
         label: TransferFunction(values, [colors[label - 1]] * 3, opacity) for label in range(1, len(kinds))
     }
-    return shown, LabelTransferFunction(functions)
+    if own:
+        functions[0] = automatic_transfer(volume) if around is None else around
+    return Volume(shown, *place, beyond, direction=volume.direction), LabelTransferFunction(functions)

@@ -3,7 +3,9 @@ is interrupted."""
 
 import argparse
 import os
+import re
 import sys
+import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -56,8 +58,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parsed(parser_of_all(), words)
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-        # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
-        ThreadPoolExecutor(1).submit(options.execute, options).result()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = lambda told, *_: print(f"{program}: {told}", file=sys.stderr)
+            # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
+            ThreadPoolExecutor(1).submit(options.execute, options).result()
         sys.stdout.flush()
     except BrokenPipeError:
         # Python's documentation, "Note on SIGPIPE": else it complains when it flushes stdout at its end
@@ -81,8 +87,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
+ARGUMENT = re.compile(r'\b(shape|dtype|spacing|nan|time|channel)=(?:\(([\w, ]+)\)|"?(\w+)"?)')
+"""Of `jv.load`, as messages quote it, such as `shape=(nx, ny, nz)`: an option of the command, too."""
+
+
 def _told(program: str, fault: str) -> int:
     """Print a fault in one line, which may hold text of files. Returns the exit code."""
+    fault = ARGUMENT.sub(lambda found: f"--{found[1]} {(found[2] or found[3]).replace(',', '')}", fault)
     print(f"{program}: error: {printable(' '.join(fault.split()))}", file=sys.stderr)
     return 2
 

@@ -5,16 +5,19 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
+from .._util.checks import Arrayable
+from ..ray import check_arguments
 from ..scene.camera import Camera, axes_of
 from ..scene.labels import LabelTransferFunction
-from ..scene.transfer import Transfer, TransferFunction
+from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
-from .automatic import INSIDE, sampled, stride_of, unit_of
+from .automatic import sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
+FAINT = 0.01  # the same of a transfer function that was given, and where it is asked on which face it stands
 SPECK = 0.02  # pieces smaller than this fraction of the largest one need not be in the picture
 REACH = 3  # voxels of the cube around each visible one that connects it to others, as the leaves of a tree
 NEAREST = 0.1  # least distance of the camera from what is visible, as a fraction of the diagonal of that
@@ -27,19 +30,78 @@ FRONT = (0.5, -1.0, 0.4)
 """From the volume to the camera, where z is up: to the right, in front, and higher."""
 
 
-def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3"]:
-    """Points in the world around what a transfer function of `automatic_transfer` or `labels_shown` shows,
-    specks left out; the corners of the volume where nothing is visible."""
+CUT_FACE, OTHER_FACE = 0.1, 1 / 3
+"""An object stands on a face of the volume that cuts through so much of it, if the opposite one cuts through
+at most that part as much: the neck, or the pot of a plant."""
+
+
+def automatic_camera(
+    volume: Volume | Any,
+    transfer: Transfer | Any,
+    direction: Arrayable | None = None,
+    view_up: Arrayable | None = None,
+    view_angle: Arrayable = 30.0,
+    *,
+    parallel: bool | Any = False,
+    size: tuple[int, int] | int | Any = (512, 512),
+    least: float = VISIBLE,
+) -> Camera:
+    """A camera as near as what a transfer function shows allows, specks left out, and upright.
+
+    Args:
+        volume: what is seen.
+        transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts.
+        direction: from the volume to the camera; by default to the right, in front, and higher.
+        view_up: by default z; of a volume that does not say where it lies (its origin is 0, its axes are the
+            world's, as of raw files), away from the face that cuts through most of what is visible, if the
+            opposite one does not: the neck, or the pot of a plant, is below.
+        view_angle: degrees.
+        parallel: whether the camera is orthographic.
+        size: (width, height) of the image in pixels.
+        least: opacity along a hundredth of the volume's diagonal from which on a voxel counts; 0.01 where
+            what is visible may be fog.
+
+    Returns:
+        The `Camera`.
+
+    Raises:
+        ValueError: as `Camera.looking_at` does.
+    """
+    check_arguments("automatic_camera(volume, transfer)", volume=volume, transfer=transfer)
+    side = upright(volume, transfer, direction, view_up)
+    camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
+    return framed(camera, visible_points(volume, transfer, least))
+
+
+def upright(
+    volume: Volume, transfer: Transfer, direction: Arrayable | None, view_up: Arrayable | None
+) -> tuple[Any, Any]:
+    """Direction and view up, where they are None as `automatic_camera` has them."""
+    axis, sign = (2, 1.0) if view_up is not None else _up(volume, transfer)
+    front = np.roll(FRONT, axis + 1)  # so that what is above lies along this axis
+    front[axis] *= sign
+    return front if direction is None else direction, sign * np.eye(3)[axis] if view_up is None else view_up
+
+
+def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
+    """The axis that points up, and whether it does so forward or backward."""
+    known = volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
+    visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
+    for axis in () if known else (2, 1, 0):
+        low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))
+        cut, other, sign = (low, high, 1.0) if low >= high else (high, low, -1.0)
+        if cut > most and other <= OTHER_FACE * cut:
+            found, most = (axis, sign), cut
+    return found
+
+
+def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Float[np.ndarray, "n 3"]:
+    """Points in the world around what a transfer function shows, specks left out; the corners of the volume
+    where nothing is visible, or that is not known."""
     from scipy.ndimage import label, maximum_filter
     from scipy.spatial import ConvexHull, QhullError
 
-    data, last = sampled(volume), np.array(volume.shape) - 1
-    if isinstance(transfer, LabelTransferFunction):
-        visible = data > INSIDE / 2
-    else:
-        assert isinstance(transfer, TransferFunction)
-        extinction = np.interp(data, np.asarray(transfer.values), np.asarray(transfer.extinction))
-        visible = -np.expm1(-extinction * unit_of(volume)) > VISIBLE
+    visible, last = _visible(volume, transfer, least), np.array(volume.shape) - 1
     grid = CORNERS * last
     if visible.any():
         found: Any = label(maximum_filter(visible, REACH))  # scipy's types allow a number, too
@@ -56,6 +118,22 @@ def visible_points(volume: Volume, transfer: Transfer) -> Float[np.ndarray, "n 3
         grid = np.clip(around.reshape(-1, 3), 0, last)
     turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction, np.float64)
     return np.asarray(volume.origin, np.float64) + (grid * np.asarray(volume.spacing, np.float64)) @ turn.T
+
+
+def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarray, "nx ny nz"]:
+    """Which of the volume's `sampled` voxels a transfer function shows with at least this opacity."""
+    data, shown = sampled(volume), sized(transfer, volume)
+    if isinstance(shown, TransferFunction):
+        extinction = np.interp(data, np.asarray(shown.values), np.asarray(shown.extinction))
+    elif isinstance(shown, LabelTransferFunction) and volume.labels is not None:
+        extinction, kinds = np.zeros(data.shape), sampled(volume, volume.labels)
+        factors = np.asarray(shown.opacity) * np.asarray(shown.shown)
+        functions = map(np.asarray, (shown.stacked.values, shown.stacked.extinction))
+        for kind, (values, own) in enumerate(zip(*functions, strict=True)):
+            extinction[kinds == kind] = factors[kind] * np.interp(data[kinds == kind], values, own)
+    else:
+        return np.ones(data.shape[:3], bool)
+    return -np.expm1(-extinction * unit_of(volume)) > least
 
 
 def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:

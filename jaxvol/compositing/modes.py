@@ -5,6 +5,7 @@ from typing import Any, Literal, TypeAlias
 import jax
 
 from .._util.checks import described
+from .._util.texts import near
 from .blending import Compositing, Over, Weighting
 from .line_integral import LineIntegral
 from .projections import Average, Maximum, Minimum
@@ -23,6 +24,12 @@ MODES: dict[str, type[Compositing[Any]]] = {
 }
 
 
+ELSEWHERE = {"composite": "over", "dvr": "over", "mip": "maximum", "max": "maximum", "minip": "minimum"}
+ELSEWHERE |= {"min": "minimum", "aip": "average", "mean": "average", "additive": "integral"}
+ELSEWHERE |= {"xray": "integral", "x-ray": "integral", "drr": "integral", "iso": "isosurface"}
+"""What other programs call them."""
+
+
 def compositing_of(given: Mode | Any) -> Compositing[Any]:
     """The mode of this name, or the mode itself. **Raises** `ValueError` for anything else, and for a
     `Weighting` whose fields are not all static although its weights may depend on them."""
@@ -36,7 +43,8 @@ def compositing_of(given: Mode | Any) -> Compositing[Any]:
     if isinstance(given, str) and given in MODES:
         return MODES[given]()
     names = ", ".join(f'"{name}"' for name in MODES)
+    hint = near(ELSEWHERE.get(given.lower(), given), MODES) if isinstance(given, str) else ""
     raise ValueError(
         f"compositing must be one of {names}, a jaxvol.Isosurface, or another Weighting or Selection; "
-        f"got {described(given)}."
+        f"got {described(given)}.{hint}"
     )

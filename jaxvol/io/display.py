@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from .._util.checks import Arrayable, described, integer, output_file
-from .._util.srgb import to_srgb
+from .._util.srgb import displayed, png_of, to_srgb
 from .._util.whole_files import whole_file
 
 
@@ -64,15 +63,12 @@ def save_image(
 
             kind = "minisblack" if channels == 0 else "rgb"
             imwrite(part, image, photometric=kind, extrasamples=["assocalpha"] if channels == 4 else None)
+        elif ending == ".png":
+            part.write_bytes(png_of(displayed(image), text or {}))
         else:
             from PIL import Image
-            from PIL.PngImagePlugin import PngInfo
 
-            chunks = PngInfo()
-            for keyword, content in (text or {}).items():
-                chunks.add_itxt(keyword, content, zip=True)
-            options: dict[str, Any] = {"pnginfo": chunks} if ending == ".png" else {}
-            Image.fromarray(displayed(image)).save(part, **options)
+            Image.fromarray(displayed(image)).save(part)
     return path
 
 
@@ -164,14 +160,3 @@ def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
     if path.suffix.lower() not in allowed:
         raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(allowed)}; got {path}.")
     return output_file(name, path)
-
-
-def displayed(
-    image: Float[np.ndarray, "height width channels"],
-) -> UInt8[np.ndarray, "height width channels"]:
-    """Linear RGB, or premultiplied RGBA, as 8-bit sRGB with straight alpha."""
-    color, opacity = image[..., :3], image[..., 3:]
-    # straight alpha: viewers multiply by the opacity
-    color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
-    display = jnp.concatenate([to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1)
-    return np.asarray(jnp.round(display * 255)).astype(np.uint8)

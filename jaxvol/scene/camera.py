@@ -14,7 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from .._util.checks import Arrayable, described, finite_array, flag, integer, number, require, shortened
+from .._util.checks import (
+    Arrayable,
+    described,
+    finite_array,
+    flag,
+    integer,
+    is_flag,
+    number,
+    require,
+    shortened,
+)
+from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import is_traced
 from .space import Line
@@ -34,7 +45,7 @@ class Camera(eqx.Module):
         view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).
         parallel_scale: half the height of the view, in world length. Makes the camera orthographic, with ray
             origins in the plane through `position`.
-        size: (width, height) of the image in pixels.
+        size: (width, height) of the image in pixels; one number is a square.
         window: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
             half heights of the whole view; by default all of it. Set by `crop` and `zoom`.
         corner: (column, row) of the first pixel in the image that this one was cropped from, so that its
@@ -89,6 +100,16 @@ class Camera(eqx.Module):
         whole = (-width / height, width / height, -1.0, 1.0)
         self.window = finite_array("window", whole if window is None else window, (4,))
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
+
+    def __repr__(self) -> str:
+        aspect = self.size[0] / self.size[1]
+        usual: dict[str, Any] = {"parallel_scale": None, "window": (-aspect, aspect, -1, 1), "corner": (0, 0)}
+        told: list[str] = []
+        for name in ("position", "focal_point", "view_up", "view_angle", *usual):
+            given, expected = getattr(self, name), usual.get(name)
+            is_usual = expected is not None and is_concrete(given) and np.allclose(given, expected)
+            told += [] if is_usual or given is None else [f"{name}={pasted(given)}"]
+        return f"Camera({', '.join(told)}, size={self.size})"
 
     @classmethod
     def looking_at(
@@ -468,6 +489,7 @@ def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
 
 
 def _image_size(size: Any) -> tuple[int, int]:
+    size = (size, size) if isinstance(size, int) and not is_flag(size) else size
     try:
         width, height = (int(n) for n in size)
         whole = (width, height) == tuple(size)

@@ -1,15 +1,18 @@
 """Transfer functions by name: presets for kinds of data, and any matplotlib colormap."""
 
-from difflib import get_close_matches
-from typing import Any
+import json
+import re
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 from .._util.checks import Arrayable, described, finite_array, integer, number, unit_interval
 from .._util.srgb import from_srgb
+from .._util.texts import near
 from .transfer import TransferFunction, extinction_of
 
 
@@ -17,7 +20,9 @@ from .transfer import TransferFunction, extinction_of
 # dense: a grazing ray stays in the foot and draws a dark contour.
 #
 # name: (what it is for, its range of values, control points (value, linear rgb, opacity per mm))
-PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float, float, float], float]]]] = {
+Preset: TypeAlias = tuple[str, tuple[float, float], list[tuple[float, tuple[float, float, float], float]]]
+
+PRESETS: dict[str, Preset] = {
     "ct_bone": (
         "CT in Hounsfield units: bone only",
         (-1000, 3000),
@@ -125,15 +130,27 @@ PRESETS: dict[str, tuple[str, tuple[float, float], list[tuple[float, tuple[float
     ),
 }
 
-SHADED = frozenset(PRESETS) - {"mr_head"}
+SHADED = set(PRESETS) - {"mr_head"}
 """Presets that the command line shades: gradients of magnetic resonance images are mostly noise."""
+
+SLICER = "3D Slicer"
+
+# Its presets, of its Modules/Loadable/VolumeRendering/Resources/presets.xml: points at the values of both its
+# curves, colours made linear. Its opacity by the gradient, 1 above 0 in all of them, is left out.
+for _name, _given in json.loads(Path(__file__).with_name("slicer_presets.json").read_text("utf-8")).items():
+    _points = [(value, (r, g, b), opacity) for value, r, g, b, opacity in _given["points"]]
+    _ends = (0.0, _points[-2][0]) if _name.startswith("MR") else (_points[0][0], _points[-1][0])
+    PRESETS[_name] = f"{SLICER}'s {_name}", _ends, _points
+    SHADED |= {_name} if _given["shaded"] else set()
 
 
 def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1.0) -> TransferFunction:
     """A transfer function by name.
 
     Args:
-        name: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values.
+        name: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values: ours, and
+            those of 3D Slicer ("CT-AAA", "MR-Default", …). Case and what separates words do not count, but
+            for "ct_bone" (ours) and "CT-Bone".
         clim: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
             Hounsfield units + 1000 needs (0, 4000).
         unit_distance: world length to which the opacities refer; they are designed for 1 mm. Or a `Volume`,
@@ -145,12 +162,41 @@ def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1
     Raises:
         ValueError: for an unknown name, and a `clim` that does not increase.
     """
-    if not isinstance(name, str) or name not in PRESETS:
-        raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.")
-    _, own_range, points = PRESETS[name]
+    _, own_range, points = PRESETS[preset_name(name)]
     values, colors, opacities = zip(*points, strict=True)
-    stretched = np.interp(values, own_range, _range(own_range if clim is None else clim))
+    low, high = _range(own_range if clim is None else clim)
+    stretched = low + (np.array(values) - own_range[0]) * ((high - low) / (own_range[1] - own_range[0]))
     return TransferFunction(stretched, colors, extinction_of(opacities, unit_distance))
+
+
+def preset_name(name: str | Any) -> str:
+    """The key of `PRESETS` that is meant: case and what separates words do not count. **Raises** `ValueError`
+    for an unknown name."""
+
+    def plain(text: str) -> str:
+        return re.sub("[^a-z0-9]", "", text.lower())
+
+    keys = {plain(key): key for key in PRESETS} | {key: key for key in PRESETS}
+    for spelling in (name, plain(str(name))):
+        if isinstance(name, str) and spelling in keys:
+            return keys[spelling]
+    raise ValueError(f"preset must be one of {', '.join(PRESETS)}; got {name!r}.{near(str(name), PRESETS)}")
+
+
+def fitted_range(
+    name: str, values: Shaped[np.ndarray, "..."]
+) -> tuple[tuple[float, float] | None, str | None]:
+    """To what a preset is stretched for these values of a volume if nothing is said, None for its own range;
+    and a word where that does not fit. Values of MR have no unit, those of CT are Hounsfield units."""
+    name, low, high = preset_name(name), float(values.min()), float(np.percentile(values, 99.9))
+    first, last = PRESETS[name][1]
+    if name.upper().startswith("MR") and not last / 2 <= high <= 2 * last:
+        told = f"{name} is for values from {first:g} to {last:g}; it was stretched to 0 to {high:g}"
+        return (0.0, high), f"{told}. Another clim stretches it otherwise."
+    if name.upper().startswith("CT") and (low >= 0 or high < 200):
+        told = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to {high:g}"
+        return None, f"{told}. Of those stored + 1024, clim is ({first + 1024:g}, {last + 1024:g})."
+    return None, None
 
 
 def attenuation(water: Arrayable) -> TransferFunction:
@@ -223,8 +269,7 @@ def _display_colors(cmap: Any, at: Float[np.ndarray, " n"]) -> Float[np.ndarray,
         if len(rgb) == 0 or rgb.min() < 0 or rgb.max() > 1:
             raise ValueError
     except (ValueError, TypeError) as fault:
-        near = get_close_matches(cmap.lower(), list(colormaps), 3) if isinstance(cmap, str) else []
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        hint = near(cmap, colormaps) if isinstance(cmap, str) else ""
         got = repr(cmap) if isinstance(cmap, list | tuple) else described(cmap)
         raise ValueError(
             f"cmap must be a matplotlib colormap, or colours by name or sRGB in [0, 1]; got {got}.{hint}"

@@ -1,14 +1,16 @@
 """What does a render return?"""
 
+import sys
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import finite_array
+from .._util.srgb import displayed, linear_color, png_of
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 
@@ -57,6 +59,10 @@ class Rendering(eqx.Module):
         aligned: whether a last cell that is not transparent was cut at the exit (Kye 2013, Fig. 13).
         normal: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
         bricks: the `BrickReport` of `render_bricks`.
+        background: linear RGB, over which it shows itself and `image` composites it; white, but where
+            `jaxvol.show` was given another. Static.
+
+    As the last line of a notebook's cell it shows itself; `show` does so anywhere.
 
     With `antialias`, a pixel has the mean of its rays' `rgba`, that of `depth` and `normal` weighted by
     opacity, and the sum of `samples`; it is `exhausted` or `aligned` where any of them is.
@@ -68,6 +74,7 @@ class Rendering(eqx.Module):
     rgba: Float[Array, "*rays 4"]
     exhausted: Bool[Array, "*rays"]
     details: Details = Details()
+    background: tuple[float, ...] = eqx.field(static=True, default=(1.0, 1.0, 1.0))
 
     @property
     def depth(self) -> Float[Array, "*rays"]:
@@ -94,19 +101,45 @@ class Rendering(eqx.Module):
             raise AttributeError(f'{name} is not part of this rendering: {more}pass outputs="all".')
         return value
 
-    def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "*rays 3"]:
-        """Linear RGB over a background: one colour (3,), or an image of the same shape.
+    def image(self, background: Any = None) -> Float[Array, "*rays 3"]:
+        """Linear RGB over a background: one colour, (3,) or by name ("white"), or an image of the same shape;
+        by default that of the rendering.
 
         Raises:
-            ValueError: for a background of another shape, or that is not finite.
+            ValueError: for a background of another shape, or that is not finite, and an unknown name.
         """
-        if not is_traced(background):  # a traced one may be NaN, which then shows in the image
-            background = finite_array("background", background, (..., 3))
-        background = jnp.asarray(background, self.rgba.dtype)
+        given = self.background if background is None else background
+        background = jnp.asarray(linear_color("background", given, (..., 3)), self.rgba.dtype)
         if background.shape not in ((3,), shape := (*self.rgba.shape[:-1], 3)):
             expected = f"one colour (3,) or an image {shape}"
             raise ValueError(f"background must be {expected}; got shape {background.shape}.")
         return _over(self.rgba, background)
+
+    def show(self) -> None:
+        """Shows the image over its background: under the cell of a notebook, at once, or else in a window of
+        matplotlib, until that is closed."""
+        if in_notebook():
+            sys.modules["IPython"].display.display(self)
+            return
+        import matplotlib.pyplot as plt
+
+        pixels = displayed(np.asarray(self.image(), np.float32))
+        figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)
+        figure.figimage(pixels)
+        plt.show()
+        plt.close(figure)
+
+    def _repr_png_(self) -> bytes | None:
+        """What notebooks show: the image as a PNG, if it is one."""
+        if self.rgba.ndim != 3 or is_traced(self.rgba):
+            return None
+        return png_of(displayed(np.asarray(self.image(), np.float32)))
+
+
+def in_notebook() -> bool:
+    """Whether a kernel runs this, whose cells show their last value."""
+    ipython = sys.modules.get("IPython")
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
 @partial(jax.jit, static_argnums=1)

@@ -4,6 +4,7 @@ A transfer function says what it reads at a place besides the value (`attributes
 and extinction (`classifier`), and how great the extinction can be in a block of the volume (`majorant`).
 """
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util import piecewise_linear as linear
 from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
+from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
@@ -166,6 +168,13 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
     return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)
 
 
+BRIGHTEST = 8.0
+"""Of colours, above which they are hardly meant as linear RGB."""
+
+MOST_WRITTEN = 16
+"""Points that the text of a transfer function holds."""
+
+
 class TransferFunction(Transfer):
     """Colour and extinction, piecewise linear in the volume's value and constant beyond the ends.
 
@@ -201,6 +210,9 @@ class TransferFunction(Transfer):
         self.values = increasing("values", values)
         n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
+        if not is_traced(self.colors) and (most := float(np.asarray(self.colors).max())) > BRIGHTEST:
+            told = f"colors reach {most:g}; in linear RGB, white is 1"
+            warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb(colors / 255).", stacklevel=3)
         extinction = finite_array("extinction", extinction, (n,))
         self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
 
@@ -224,6 +236,14 @@ class TransferFunction(Transfer):
         except (TypeError, ValueError) as fault:
             raise ValueError(f"points must be (value, (r, g, b), opacity); got {points!r}.") from fault
         return cls(values, colors, extinction_of(opacities, unit_distance))
+
+    def __repr__(self) -> str:
+        given = self.values, self.colors, self.extinction
+        if not all(map(is_concrete, given)) or self.values.ndim != 1 or len(self.values) > MOST_WRITTEN:
+            return eqx.tree_pformat(self)
+        values, colors, extinction = map(pasted, given)
+        more = ", per_voxel=True" if self.per_voxel else ""
+        return f"TransferFunction(values={values}, colors={colors}, extinction={extinction}{more})"
 
     def __call__(self, value: Scalar) -> tuple[Vec3, Scalar]:
         """Colour (r, g, b) and extinction of a value."""

@@ -16,13 +16,18 @@ from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
 
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
-from .._util.checks import Arrayable, described, finite_array, integers, require
+from .._util.checks import Arrayable, described, finite_array, integers, require, shortened
 from .._util.named_axes import along_xyz, is_named
+from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
 from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
+
+
+PLACE = 1e-4
+"""Voxels by which a box may miss a node through rounding."""
 
 
 class Field(eqx.Module):
@@ -108,6 +113,66 @@ class Volume(eqx.Module):
         if not isinstance(field, Field | None):
             raise ValueError(f"field must be a jaxvol Field, or None; got {described(field)}.")
         self.field, self.fetch = field, OneByOne()
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.data):
+            return eqx.tree_pformat(self)
+        data, place = np.asarray(self.data), ("spacing", "origin", "direction")
+        told = [f"{name}={pasted(getattr(self, name))}" for name in place if getattr(self, name) is not None]
+        told += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
+        told += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
+        return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(told)}>"
+
+    def __getitem__(self, part: Any) -> "Volume":
+        """The part with these voxels, such as `volume[10:90, :, ::2]`, at its place in the world.
+
+        Raises:
+            ValueError: for what is no slice with a step above 0, fewer than two voxels along an axis, and a
+                volume with a `field`.
+        """
+        given = part if isinstance(part, tuple) else (part,)
+        slices = (*given, *[slice(None)] * (3 - len(given)))
+        taken = all(isinstance(each, slice) for each in given) and len(slices) == 3 and self.field is None
+        ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)] if taken else []
+        if not ranges or any(len(each) < 2 or each.step < 1 for each in ranges):
+            expected = "takes up to three slices that leave 2 voxels along each axis, of no field"
+            raise ValueError(f"volume[a:b, c:d, e:f] {expected}; got {shortened(part)} of {self.shape}.")
+        # in NumPy where numbers are known, which compiles nothing
+        own = self.data, self.spacing, self.origin, self.direction, self.labels
+        known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in own]
+        data, spacing, origin, direction, labels = known
+        start, step = (
+            np.array([getattr(r, name) for r in ranges], spacing.dtype) for name in ("start", "step")
+        )
+        shift = spacing * start
+        shift = shift if direction is None else (direction * shift[None, :]).sum(axis=1)
+        labels = None if labels is None else labels[slices]
+        how: Any = {"direction": direction, "label_ids": self.label_ids}
+        return Volume(data[slices], spacing * step, origin + shift, labels, **how)
+
+    def crop(self, box: Arrayable) -> "Volume":
+        """The part that just holds a box, at its place in the world; in turned axes, the box around that.
+
+        Args:
+            box: (x_min, x_max, y_min, y_max, z_min, z_max) in the world, as `bounds`.
+
+        Returns:
+            The `Volume`, of whole voxels.
+
+        Raises:
+            ValueError: for a box outside of it, and as slices are.
+        """
+        ends = np.asarray(finite_array("box", box, (6,)), np.float64).reshape(3, 2)
+        turn = np.eye(3) if self.direction is None else np.asarray(self.direction, np.float64)
+        corners = np.array(np.meshgrid(*ends)).reshape(3, -1) - np.asarray(self.origin, np.float64)[:, None]
+        at = np.linalg.solve(turn * np.asarray(self.spacing, np.float64), corners)
+        first, end = np.floor(at.min(1) + PLACE), np.ceil(at.max(1) - PLACE) + 1
+        if (end < 1).any() or (first > np.array(self.shape) - 1).any() or (ends[:, 0] >= ends[:, 1]).any():
+            bounds = pasted(self.bounds)
+            raise ValueError(f"box must be one that meets the volume, {bounds}; got {pasted(ends.ravel())}.")
+        low = np.clip(first, 0, np.array(self.shape) - 2).astype(int)
+        high = np.maximum(end.astype(int), low + 2)
+        return self[tuple(map(slice, low.tolist(), high.tolist()))]
 
     @property
     def valid(self) -> Bool[Array, ""]:

@@ -1,16 +1,18 @@
 """Does a transfer function that is guessed from a histogram show what is there?"""
 
+import itertools
 import math
 
 import jax
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
 from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_shown, thresholds
 from jaxvol.app.commands.animate import turned
-from jaxvol.app.commands.scene import _transfer_of_bricks, copy_of
 from jaxvol.app.framing import MARGIN, framed, visible_points
+from jaxvol.app.picture import _transfer_of_bricks, copy_of
 from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
 
@@ -234,3 +236,37 @@ def test_other_volumes_are_not_taken_for_labels():
     many = np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4)
     for data in (floats, two, many):
         assert labels_shown(jv.Volume(data)) is None
+
+
+def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows():
+    data = np.asarray(ball(0.5, 0.2).data)
+    transfer, stand = jv.automatic_transfer(jv.Volume(data)), data
+    for axis, sign in itertools.product(range(3), (1, -1)):
+        stand = np.array(data)  # a slab on one face
+        np.moveaxis(stand, axis, 0)[-1 if sign < 0 else 0] = 200
+        camera = jv.automatic_camera(volume := jv.Volume(stand), transfer, size=(32, 32))
+        np.testing.assert_array_equal(camera.view_up, sign * np.eye(3)[axis])
+        away = np.asarray(camera.position - camera.focal_point)
+        assert away @ np.asarray(camera.view_up) > 0.3 * np.linalg.norm(away)  # from above
+        seen = in_picture(camera, visible_points(volume, transfer))
+        assert np.abs(seen).max() == pytest.approx(1 / MARGIN, abs=1e-4)
+    # a file that says where it lies, and a user who says what is up
+    for volume, up in ((jv.Volume(stand, origin=(0, 0, 1)), None), (jv.Volume(stand), (0, 0, 1))):
+        camera = jv.automatic_camera(volume, transfer, (1, 2, 0.5), up, size=(32, 32))
+        np.testing.assert_array_equal(camera.view_up, (0, 0, 1))
+        away = np.asarray(camera.position - camera.focal_point)
+        np.testing.assert_allclose(away / away[2], (2, 4, 1), rtol=1e-3)
+
+
+def test_what_is_thin_is_dense_and_what_hides_is_not():
+    """Leaves beside a trunk, and a body around bones; both of value 100, and of 200 what is dense."""
+    leaves = np.full((64, 64, 64), 10, np.float32)
+    for at in range(8):
+        x, y, z = (8 * (at * step % 8) for step in (1, 3, 5))
+        leaves[x : x + 6, y : y + 6, z : z + 6] = 100
+    leaves[28:36, 60:64, 2:62] = 200
+    leaves = jv.Volume(gaussian_filter(leaves, 0.7).astype(np.uint8))
+    thin, thick = map(jv.automatic_transfer, (leaves, ball(0.8, 0.35)))
+    assert opacity_at(thin, 90, 64 * 3**0.5 / 100) > 3 * opacity_at(thick, 100, 32 * 3**0.5 / 100)
+    assert opacity_at(thin, 45, 64 * 3**0.5 / 100) < 0.05  # noise above the threshold
+    assert opacity_at(thin, 39, 64 * 3**0.5) == 0

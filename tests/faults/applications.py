@@ -33,7 +33,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "like: what a picture names is read whatever it is",
-        "app.commands.recorded:_is_ordinary",
+        "app.recorded:_is_ordinary",
         lambda _: lambda path: path.is_file() or path.is_dir(),
         ("app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[header]",),
     ),
@@ -87,14 +87,14 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "command: a picture is made again of a volume that has changed",
-        "app.commands.recorded:checksum",
+        "app.recorded:checksum",
         lambda _: lambda path: 64 * "0",
         ("app/commands/test_recorded.py::test_the_volume_may_lie_beside_the_picture_and_must_be_the_same",),
     ),
     Fault(
         "command: the light does not reach the image",
-        "app.commands.scene:_lighting",
-        lambda _: lambda options, mode: None,
+        "app.picture:_lighting",
+        lambda _: lambda options, mode, **_how: None,
         ("app/commands/test_render.py::test_options_of_the_look_make_the_scene[an isosurface]",),
     ),
     Fault(

@@ -92,11 +92,12 @@ def test_bad_paths_are_named(tmp_path):
 def test_image_over_a_background():
     rendering = jv.Rendering(jnp.asarray(RGBA), exhausted=jnp.zeros(RGBA.shape[:2], bool))
     np.testing.assert_allclose(rendering.image((1, 1, 1))[0], [[0.7, 0.6, 0.5], [1, 1, 1], [1, 1, 1]])
+    np.testing.assert_array_equal(rendering.image("white"), rendering.image())
     over = rendering.image(np.full((2, 3, 3), 0.5))
     np.testing.assert_allclose(over[1], [[0.45, 0.35, 0.25], [0.5, 0.5, 0.5], [1, 1, 1]])
     for wrong, message in (
         (np.zeros((5, 3)), "background must be one colour"),
-        ("white", r"background must be numbers of shape \(\*rays, 3\); got 'white'"),
+        ("whit", "background must be a colour's name, such as \"white\", or linear RGB; got 'whit'"),
         ((1, np.nan, 1), "background must be finite"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -290,3 +290,17 @@ def test_bad_input_is_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_texts_can_be_pasted():
+    for made in (
+        jv.Camera((1, 2, 0.1), (0, 0, 0), size=16),
+        jv.Camera((1, 2, 3), (0, 0, 1), (0, 0, 1), 45, size=(8, 4), parallel_scale=2, window=(-1, 0, 0, 1)),
+        jv.TransferFunction([0, 0.1], [[1, 0, 0.3], [1, 1, 1]], [0, 3], per_voxel=True),
+    ):
+        again = eval(repr(made), dict(vars(jv)))
+        assert all(map(np.array_equal, jax.tree.leaves(again), jax.tree.leaves(made)))
+    long = jv.TransferFunction(np.arange(20), np.ones((20, 3)), np.arange(20))
+    assert "values=f32[20]" in repr(long)
+    with pytest.warns(UserWarning, match="colors reach 255; in linear RGB, white is 1"):
+        jv.TransferFunction([0, 0.1], [[255, 0, 0]] * 2, [0, 3])

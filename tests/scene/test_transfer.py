@@ -11,6 +11,7 @@ import pytest
 import jaxvol as jv
 from jaxvol._util.piecewise_linear import points_below, positive_between
 from jaxvol.scene.occupancy import Blocks
+from jaxvol.scene.presets import SHADED, fitted_range, preset_name
 from jaxvol.scene.transfer import Transfer
 
 from ..scenes import anisotropic_noise
@@ -155,10 +156,32 @@ def test_presets_are_stretched_to_a_range(name):
 def test_presets_show_something_and_hide_something():
     for name, (_, (low, high), points) in jv.PRESETS.items():
         values, _, opacities = zip(*points, strict=True)
+        own = not name.startswith(("CT", "MR", "DTI"))  # 3D Slicer's are fainter, and may reach beyond
         assert opacities[0] == 0, name
-        assert max(opacities) > 0.25, name
-        assert low <= min(values), name
-        assert max(values) <= high, name
+        assert max(opacities) > (0.25 if own else 0.1), name
+        assert not own or low <= min(values), name
+        assert not own or max(values) <= high, name
+
+
+def test_presets_of_slicer_are_found_by_any_spelling_and_have_its_values():
+    for name in ("CT-Bones", "ct_bones", "ct bones", "CTBONES"):
+        assert preset_name(name) == "CT-Bones"
+    assert list(map(preset_name, ("ct_bone", "CT-Bone"))) == ["ct_bone", "CT-Bone"]  # ours, and theirs
+    assert {"CT-AAA", "MR-Default"} <= SHADED
+    assert not {"MR-MIP", "CT-Fat"} & SHADED
+    found = jv.preset("CT-Bone")  # of presets.xml
+    assert np.asarray(found.values).tolist() == pytest.approx([-3024, -16.4458, 641.385, 3071])
+    display = np.array([[0.729412, 0.254902, 0.301961], [0.905882, 0.815686, 0.552941]])
+    np.testing.assert_allclose(np.asarray(found.colors)[1:3], ((display + 0.055) / 1.055) ** 2.4, rtol=1e-3)
+    opacity = -np.expm1(-np.asarray(found.extinction))
+    np.testing.assert_allclose(opacity, [0, 0, 0.715686, 0.705882], atol=1e-6)
+    # MR has no unit, and is stretched; CT is not, and it is said that it does not fit
+    low, middle, high = np.array([0, 250]), np.array([-1000, 2000]), np.array([0, 900])
+    assert fitted_range("MR-Default", low) == fitted_range("CT-Bone", middle) == (None, None)
+    clim, told = fitted_range("mr default", high)
+    assert clim == pytest.approx((0, 900), rel=2e-3)
+    assert told is not None
+    assert "Hounsfield" in str(fitted_range("CT-Bone", low)[1])
 
 
 def test_colormaps_have_the_colours_of_matplotlib_in_linear_light():
@@ -245,7 +268,7 @@ BAD = [
     (lambda: jv.colormap([(255, 0, 0)], (0, 1)), r"cmap must be .* in \[0, 1\]; got \[\("),
     (lambda: jv.colormap("gray", (0, 1), n_colors=1), "n_colors must be an integer of at least 2"),
     (lambda: jv.colormap("gray", (0, 1), "cubic"), "opacity must be"),
-    (lambda: jv.preset("ct-bone"), "preset must be one of ct_bone.*got 'ct-bone'"),
+    (lambda: jv.preset("ct-bnoe"), "preset must be one of ct_bone.*got 'ct-bnoe'"),
     (lambda: jv.preset("engine", clim=(5, 5)), "clim must be .*low < high"),
 ]
 

@@ -203,3 +203,33 @@ def test_traced_voxels_are_checked_when_the_program_runs():
         ValueError, match=r"data must be of type .* if traced; got int32.*astype\(jnp\.float32"
     ):
         build(np.zeros(SHAPE, np.int32))
+
+
+def test_parts_and_crops_stay_where_they_are():
+    """Their nodes lie where those of the whole do, with the same values and labels."""
+    turn = np.array([[0, -1, 0], [0.6, 0, 0.8], [-0.8, 0, 0.6]])
+    data = np.arange(8 * 7 * 6, dtype=np.uint16).reshape(8, 7, 6)
+    whole = jv.Volume(data, (1, 2, 0.5), (10, -3, 4), data % 5, direction=turn)
+
+    def place(volume, index):
+        along = np.asarray(volume.spacing, np.float64) * index
+        return np.asarray(volume.origin, np.float64) + np.asarray(volume.direction, np.float64) @ along
+
+    part = whole[2:7, ::3, 1:]
+    np.testing.assert_array_equal(part.data, data[2:7, ::3, 1:])
+    np.testing.assert_array_equal(part.labels, (data % 5)[2:7, ::3, 1:])
+    np.testing.assert_allclose(place(part, (4, 2, 3)), place(whole, (6, 6, 4)), atol=1e-5)
+    box = np.sort([place(whole, (2, 1, 2)), place(whole, (4, 3, 3))], axis=0).T.ravel()
+    crop = whole.crop(box)
+    assert data[2, 1, 2] in np.asarray(crop.data)
+    assert data[4, 3, 3] in np.asarray(crop.data)
+    for wrong in (3, slice(1, 2), slice(None, None, -1), (slice(None),) * 4):
+        with pytest.raises(ValueError, match=r"volume\[a:b, c:d, e:f\] takes"):
+            whole[wrong]
+    with pytest.raises(ValueError, match="box must be one that meets the volume"):
+        whole.crop((0, 1, 90, 91, 0, 1))
+    assert repr(part) == (
+        "<Volume shape=(5, 3, 5), dtype=uint16, spacing=(1.0, 6.0, 0.5), origin=(10.0, -1.4, 2.7), "
+        "direction=((0.0, -1.0, 0.0), (0.6, 0.0, 0.8), (-0.8, 0.0, 0.6)), labels to 4, values 85 to 293>"
+    )
+    jax.jit(lambda volume: repr(volume) and volume.data)(whole)  # of traced ones, their shapes

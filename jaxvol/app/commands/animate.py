@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..._util.checks import integer, output_file
+from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
-from ...io.display import displayed
 from ...scene.camera import Camera
+from ..picture import scene_of, with_march
+from ..show import why_empty
 from .options import add_command, add_output, add_scene, add_vector
-from .render import why_empty
-from .scene import scene_of, with_march
 
 
 FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
@@ -38,7 +38,7 @@ def _animate(options: argparse.Namespace) -> None:
         raise ImportError('--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]".')
 
     def views(camera: Camera, count: int) -> list[Camera]:
-        axis = options.axis or options.view_up
+        axis = camera.view_up if options.axis is None else options.axis
         return [turned(camera, angle, axis) for angle in angles_of(options.degrees, count)]
 
     scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))

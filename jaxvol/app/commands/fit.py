@@ -9,8 +9,8 @@ from typing import Any
 from ..._util.checks import output_file
 from ...fitting import ImageResidual, fit, flat_grey, read_views, write_transfer
 from ...march.march import March
-from .options import add_clim, add_command, add_output, add_sampling, add_volume
-from .scene import FAST, background_of, refuse_to_replace, volume_of
+from ..picture import FAST, background_of, volume_of
+from .options import add_clim, add_command, add_output, add_sampling, add_volume, refuse_to_replace
 
 
 def _fit(options: argparse.Namespace) -> None:

@@ -5,29 +5,22 @@ import argparse
 import re
 import tomllib
 from collections.abc import Callable, Sequence
+from itertools import pairwise
+from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ..._util.checks import shortened
-from ...compositing.modes import MODES
-from ...scene.presets import PRESETS
-from .recorded import recorded_in, volume_of_picture, words_of
+from ..._util.srgb import linear_color
+from ..._util.texts import near
+from ...compositing.modes import ELSEWHERE, MODES
+from ...io.formats import files_of
+from ...scene.presets import PRESETS, SLICER
+from ..picture import DEFAULTS, OVERRIDES, check_exclusive
+from ..recorded import recorded_in, volume_of_picture, words_of
 
 
 SWITCH = argparse.BooleanOptionalAction
-
-OVERRIDES = {
-    "preset": {"cmap", "transfer", "recorded_transfer"},
-    "cmap": {"preset", "transfer", "recorded_transfer"},
-    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "unit_distance"},
-    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "unit_distance"},
-    "camera": {"direction", "parallel"},
-    "direction": {"camera"},
-    "parallel": {"camera"},
-    "step": {"tolerance"},
-    "tolerance": {"step"},
-}
-"""Options that exclude this one, which is an error, and that it overrides in a picture."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -38,6 +31,10 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"^-(\d|\.\d)")  # argparse's own takes -1e-5 for a flag
 
     def error(self, message: str) -> NoReturn:
+        if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
+            message += "." + near(ELSEWHERE.get(wrong[1].lower(), wrong[1]), re.split("[', ]+", wrong[2]))
+        if wrong := re.search("unrecognized arguments: (--[a-z-]+)", message):
+            message += "." + near(wrong[1], self._option_string_actions)
         raise ValueError(f"{message} ({self.prog} --help lists the options)")
 
     def defaults(self) -> dict[str, Any]:
@@ -53,6 +50,7 @@ class Parser(argparse.ArgumentParser):
 
 def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     """The options of a command, their `defaults`, and the function that is to `execute` it."""
+    words = in_full(words)
     found = parser.parse_known_args(words)[0]
     command: Parser = found.parser
     settings = command.given(words[1:])
@@ -63,18 +61,24 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
             except ValueError as fault:
                 raise ValueError(f"--{name}: {str(fault)[:400]}") from fault
             settings = _over(settings, weaker)
-    on = {name for name, value in settings.items() if value is not False}
-    for name in sorted(on):
-        for other in sorted(on & OVERRIDES.get(name, set())):
-            both = " and ".join(f"--{each.replace('_', '-')}" for each in (name, other))
-            both = both.replace("--recorded-transfer", "the transfer function in the picture")
-            raise ValueError(f"{both} exclude each other; leave one out.")
+    check_exclusive(settings)
     defaults = command.defaults()
     # two that not every command has: as the viewer composites, and what a picture may hold
     options = {"compositing": "over", "recorded_transfer": None} | defaults | settings
     if options.get("file", "") is None:
         command.error("the following arguments are required: FILE")
     return argparse.Namespace(execute=found.execute, defaults=defaults, **options)
+
+
+def in_full(words: Sequence[str]) -> list[str]:
+    """Words in which `--size 512` is that of a square, and `--background white` is in linear RGB."""
+    found = [*words]
+    for number, (name, value) in reversed([*enumerate(pairwise(words))]):
+        if name == "--size" and not "".join(words[number + 2 : number + 3]).isdecimal():
+            found.insert(number + 1, value)
+        elif name == "--background" and not re.match(r"[-+.\d]", value):
+            found[number + 1 : number + 2] = map(str, linear_color(name, value).tolist())
+    return found
 
 
 def _over(settings: dict[str, Any], weaker: dict[str, Any]) -> dict[str, Any]:
@@ -103,7 +107,8 @@ def _of_toml(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
 def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
     found = recorded_in(path)
-    known = [action for action in command._actions if action.type is not Path and action.dest != "help"]
+    own = [action for action in command._actions if action.type is not Path]
+    known = [action for action in own if action.dest not in ("help", "others")]
     flags = {flag for action in known for flag in action.option_strings}
     words = [word for word in found["options"] if word != "--transparent" or word in flags]
     for word in words:
@@ -118,6 +123,16 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
         file = found["file"]
         settings["file"] = volume_of_picture(path, file["name"], file.get("bytes"), file["sha256"])
     return settings
+
+
+def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
+    """Refuse to write a file (an option of these names) that is the volume, one of its slices, or another."""
+    used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
+    for name in names:
+        path = getattr(options, name)
+        if path is not None and realpath(path) in map(realpath, used):
+            raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
+        used += [] if path is None else [path]
 
 
 def memory_size(text: str) -> int:
@@ -149,13 +164,16 @@ def add_vector(group: Any, flag: str, names: str, help: str, **more: Any) -> Non
 
 
 def add_size(parser: Parser) -> None:
-    add_vector(parser, "--size", "W H", "pixels (default: 512 512)", type=int, default=(512, 512))
+    text = "pixels (default: 512 512); one number: a square"
+    add_vector(parser, "--size", "W H", text, type=int, default=(512, 512))
 
 
 def add_volume(parser: Parser, **more: Any) -> None:
     """Add the volume that a command reads."""
     text = "volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
     parser.add_argument("file", type=Path, metavar="FILE", help=text, **more)
+    text = "labels of the voxels (a segmentation), each shown in a colour, and around them what is shown else"
+    parser.add_argument("--labels", type=Path, metavar="FILE", help=text)
     group = parser.add_argument_group("data: needed if the file and its name do not specify it")
     add_vector(group, "--shape", "X Y Z", "voxels, x fastest in the file", type=int)
     group.add_argument("--dtype", help="such as uint8 or uint16le")
@@ -170,7 +188,7 @@ def add_sampling(parser: Parser) -> None:
     """Add the step and the background of images."""
     text = "distance between samples, world length (default: half a voxel for fit; as planned for render)"
     parser.add_argument("--step", type=float, help=text)
-    text = "linear RGB (default: white; black behind maximum, minimum and average)"
+    text = "linear RGB, or a name (default: white; black behind maximum, minimum and average)"
     add_vector(parser, "--background", "R G B", text)
 
 
@@ -180,13 +198,17 @@ def add_clim(group: Any) -> None:
 
 def add_transfer(parser: Parser) -> None:
     group = parser.add_argument_group("transfer function (default: what the histogram suggests)")
-    presets = "; ".join(f"{name}: {text}" for name, (text, _, _) in PRESETS.items())
+    own = {name: text for name, (text, _, _) in PRESETS.items() if not text.startswith(SLICER)}
+    presets = "; ".join(f"{name}: {text}" for name, text in own.items())
+    presets += f"; of {SLICER}: {', '.join(name for name in PRESETS if name not in own)}"
     group.add_argument("--preset", metavar="NAME", help=presets.replace("%", "%%"))
     text = "a matplotlib colormap, or a colour, over --clim (default with --clim: gray; isosurfaces: white)"
     group.add_argument("--cmap", metavar="NAME", help=text)
     text = "a transfer function written by jaxvol fit"
     group.add_argument("--transfer", type=Path, metavar="JSON", help=text)
     add_clim(group)
+    for name, text in (("window", "width of that range, with --level"), ("level", "middle of that range")):
+        group.add_argument(f"--{name}", type=float, metavar="VALUE", help=text)
     text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"
     group.add_argument("--unit-distance", type=float, metavar="LENGTH", help=text)
 
@@ -196,6 +218,12 @@ def add_scene(parser: Parser) -> None:
     add_volume(parser, nargs="?")
     add_sampling(parser)
     add_size(parser)
+    text = (
+        "one more volume in the same image, such as PET in CT; by a colormap (default: hot) over LOW and "
+        "HIGH (default: what stands out); may be given several times; without shading"
+    )
+    how: dict[str, Any] = {"nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
+    parser.add_argument("--with", "--others", dest="others", help=text, **how)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
     text = "options by their names, such as size = [640, 480]; those of the command line override them"
@@ -211,7 +239,7 @@ def add_scene(parser: Parser) -> None:
         "how samples become a pixel: over (default), by emission and absorption; maximum, minimum, average: "
         "that value of the ray, as classified; isosurface: where --isovalue is first crossed"
     )
-    group.add_argument("--compositing", choices=(*MODES, "isosurface"), default="over", help=text)
+    group.add_argument("--compositing", choices=(*MODES, "isosurface"), help=text)
     text = "with --compositing isosurface: the value on it"
     group.add_argument("--isovalue", type=float, metavar="VALUE", help=text)
     text = (
@@ -225,14 +253,14 @@ def add_scene(parser: Parser) -> None:
     add_vector(group, "--camera", "X Y Z FX FY FZ", text)
     text = "without --camera: the side from which to view the whole volume (default: 0.5 -1 0.4)"
     add_vector(group, "--direction", "X Y Z", text)
-    text = "what is up in the image (default: 0 0 1)"
-    add_vector(group, "--view-up", "X Y Z", text, default=(0.0, 0.0, 1.0))
+    text = "what is up (default: 0 0 1; of a raw file, away from the face that its content stands on)"
+    add_vector(group, "--view-up", "X Y Z", text)
     text = "degrees from the lower to the upper edge of the image (default: 30)"
-    group.add_argument("--view-angle", type=float, default=30.0, metavar="DEGREES", help=text)
-    text = "orthographic camera; use with --direction"
-    group.add_argument("--parallel", action=SWITCH, default=False, help=text)
+    group.add_argument("--view-angle", type=float, metavar="DEGREES", help=text)
+    text = "orthographic camera; with --camera, as high as its view at the focal point"
+    group.add_argument("--parallel", action=SWITCH, help=text)
     text = "magnification of the image (default: 1)"
-    group.add_argument("--zoom", type=float, default=1.0, metavar="FACTOR", help=text)
+    group.add_argument("--zoom", type=float, metavar="FACTOR", help=text)
 
     group = parser.add_argument_group("clip: show a part of the volume; box and planes in world coordinates")
     text = "show what is inside this box"
@@ -241,6 +269,7 @@ def add_scene(parser: Parser) -> None:
         "show what lies on the side of the plane through (X, Y, Z) to which the normal (NX, NY, NZ) points; "
         "may be given several times"
     )
-    add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append", default=[])
+    add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append")
     text = "cut away what is inside the box and on that side of all planes, and show the rest"
-    group.add_argument("--clip-inside-out", action=SWITCH, default=False, help=text)
+    group.add_argument("--clip-inside-out", action=SWITCH, help=text)
+    parser.set_defaults(**DEFAULTS)

@@ -12,9 +12,9 @@ import numpy as np
 from ...io import datasets
 from ...io.formats import read
 from ...scene.volume import Volume
+from ..picture import header_of, is_automatic, look_of, volume_of
 from ..viewer import serve
 from .options import SWITCH, add_command, add_transfer, add_volume
-from .scene import header_of, is_automatic, transfer_of, volume_of
 
 
 def _datasets(options: argparse.Namespace) -> None:
@@ -87,9 +87,10 @@ def add_info(commands: Any) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    volume = volume_of(options)
-    transfer = None if is_automatic(options) else transfer_of(options, volume)
-    page = serve(volume, transfer, lit=options.shade, port=options.port, title=options.file.name)
+    how = {name: getattr(options, name) for name in ("port", "host", "token")}
+    file = options.file if options.labels is None else None  # a picture names no other file
+    look = (volume_of(options),) if is_automatic(options) else look_of(options)
+    page = serve(*look, lit=options.shade, title=options.file.name, file=file, **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)
@@ -97,11 +98,15 @@ def _view(options: argparse.Namespace) -> None:
 
 
 def add_view(commands: Any) -> None:
-    text = "look at a volume file in the browser; only this machine can connect, and Ctrl-C ends it"
+    text = "look at a volume file in the browser; without --host only on this machine; Ctrl-C ends it"
     parser = add_command(commands, "view", text, _view)
     add_volume(parser)
     add_transfer(parser)
     parser.add_argument("--shade", action=SWITCH, default=True, help="with light at first")
     text = "of the page (default: 8080, or the next free)"
     parser.add_argument("--port", type=int, default=8080, help=text)
+    text = "address to listen at, such as 0.0.0.0: whoever knows the --token may connect, unencrypted"
+    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
+    text = "letters and digits that a browser must tell (default: none on this machine, else random)"
+    parser.add_argument("--token", metavar="TEXT", help=text)
     parser.add_argument("--browser", action=SWITCH, default=True, help="open it")

@@ -4,9 +4,12 @@ One `model`, whose `state` a thread draws in `tiles`, and one list of its `contr
 `notebook` and `page`.
 """
 
+import os
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..._util.checks import integer
+from ..._util.checks import integer, shortened
 from ...compositing.blending import Compositing
 from ...compositing.modes import Mode
 from ...lighting.shading import Lighting
@@ -37,12 +40,12 @@ def view(
 ) -> "NotebookView":
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
-    Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click twice to
-    return. Beside the image are window and level, the histogram, the points of the transfer function or its
-    labels, the step, and a switch for each transform and the light. While something changes, the image is as
-    coarse as it must be to follow within some 150 ms; at rest it has all pixels. Its time, step and estimated
-    error are shown. It needs `pip install jaxvol[notebooks]`. Compiled programs are kept, as by
-    `keep_programs`.
+    Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click to pick a
+    point, of which slices are shown, or twice to return. Beside the image are sides to look from, the mode,
+    the transfer function's points, which are dragged on its curve, or its labels, clips, the step and each
+    transform. While something changes, the image is as coarse as it must be to follow within some 150 ms; at
+    rest it has all pixels. Where another program must be compiled, the old image stays. It needs
+    `pip install "jaxvol[notebooks]"`. Compiled programs are kept, as by `keep_programs`.
 
     Args:
         volume: what is looked at.
@@ -50,8 +53,7 @@ def view(
             whose labels can be hidden, and made fainter or denser; another is shown and not edited. By
             default one that is found from the volume's values; voxels that seem to be labels get a colour
             each.
-        camera: by default one that sees the whole volume, or, without a transfer function, what is visible of
-            it. Its size does not count.
+        camera: by default `automatic_camera`. Its size does not count.
         march: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
             voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`,
             `AlphaCorrection` and `EarlyTermination`.
@@ -59,22 +61,21 @@ def view(
             single place, such as `Average`.
         lit: whether the light is on at first.
         compositing: as for `render`.
-        background: linear RGB.
+        background: linear RGB, or a name.
         size: (width, height) of the image in the notebook's pixels.
 
     Returns:
-        A widget. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting)` of such a widget `v`
-        renders what it shows.
+        A widget `v`. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting,
+        compositing=v.compositing)` renders what it shows.
 
     Raises:
-        ValueError: as `render` does, and for what it cannot show: an orthographic camera, other steps or
-            backgrounds.
+        ValueError: as `render` does, and for other steps or backgrounds.
         ImportError: without rendercanvas or ipywidgets.
     """
     try:
         from .notebook import NotebookView
     except ImportError as fault:
-        raise ImportError(f"view needs {fault.name}: pip install jaxvol[notebooks]") from fault
+        raise ImportError(f"view needs {fault.name}: pip install 'jaxvol[notebooks]'") from fault
     keep_programs_by_default()
     how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
     return NotebookView(*initial(volume, transfer, camera, march, size=size, **how))
@@ -88,13 +89,16 @@ def serve(
     *,
     port: int | Any = 8080,
     title: str = "jaxvol",
+    host: str = "127.0.0.1",
+    token: str | None = None,
+    file: str | os.PathLike[str] | None = None,
     **how: Any,
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
 
-    Only this machine can connect, and only pages that this server sent (others that a browser shows may not).
-    What a browser sends are numbers and colors of controls; nothing of it is evaluated or used as a path. It
-    needs `pip install jaxvol[view]`.
+    Without a token only this machine can connect, and only pages that this server sent (others that a browser
+    shows may not); with one, whoever knows it, from any page. What a browser sends are numbers, colors and
+    names of controls; nothing of it is evaluated or used as a path. It needs `pip install "jaxvol[view]"`.
 
     Args:
         volume: as for `view`.
@@ -103,19 +107,27 @@ def serve(
         march: as for `view`.
         port: from 1 to 65535; if it is taken, the next free one.
         title: of the page's panel.
+        host: the address to listen at. Another one than this machine's own, such as "0.0.0.0" for all, needs
+            a token, which is made if none is given; what is sent is not encrypted.
+        token: what a browser must tell, as part of `Page.url`, from 1 to 200 letters, digits, "-" and "_".
+        file: the volume's, which saved pictures name.
         how: `lighting`, `lit`, `compositing` and `background`, as for `view`.
 
     Returns:
         The `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
 
     Raises:
-        ValueError: as `view` does, and for another port.
+        ValueError: as `view` does, and for another port or token.
         ImportError: without viser.
     """
     try:
         from .page import Page
     except ImportError as fault:
-        raise ImportError(f"serve needs {fault.name}: pip install jaxvol[view]") from fault
+        raise ImportError(f"serve needs {fault.name}: pip install 'jaxvol[view]'") from fault
     port = integer("port", port, 1, 65535)
+    if token is not None and not re.fullmatch("[A-Za-z0-9_-]{1,200}", token):
+        raise ValueError(f'token must be letters, digits, "-" and "_", 1 to 200; got {shortened(token)}.')
     keep_programs_by_default()
-    return Page(*initial(volume, transfer, camera, march, **how), port=port, title=title)
+    served: dict[str, Any] = {"port": port, "title": title, "host": host, "token": token}
+    served["file"] = None if file is None else Path(file)
+    return Page(*initial(volume, transfer, camera, march, **how), **served)

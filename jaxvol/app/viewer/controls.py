@@ -1,195 +1,108 @@
-"""What can be changed in a viewer? Its controls, described once; each face makes its own widgets of them."""
+"""What can be changed in a viewer? Its controls by groups, for both faces."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from matplotlib.colors import to_rgb
 
-from ...scene.labels import LabelTransferFunction
-from ...scene.transfer import TransferFunction
-from ...scene.volume import Volume
-from ..automatic import sampled
-from . import editing
+from ..._util.srgb import from_srgb
+from .control import Control
+from .curve import transfer_controls
+from .editing import display_color
 from .model import Model
-from .state import MAX_STEP, MIN_STEP
+from .slices import slice_controls
+from .state import ISOSURFACE, MAX_STEP, MIN_STEP
 
 
-MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
-BINS, WIDTH, HEIGHT = 128, 320, 84  # of the plot of the histogram
+FOLDED = {"clip", "save", "march"}
+"""Groups that are closed at first."""
 
-
-@dataclass(frozen=True)
-class Control:
-    """Something to look at ("html") or to change.
-
-    Attributes:
-        kind: of widget.
-        label: beside it.
-        get: what it shows now: a text, a number, True or False, or a color: sRGB, `#rrggbb`.
-        set: changes the model; of buttons, called with the text of one.
-        limits: of a slider, lowest and highest number and the step between two.
-        choices: of a dropdown or buttons, the texts that there are now.
-    """
-
-    kind: Literal["html", "buttons", "number", "checkbox", "color", "slider", "log slider", "dropdown"]
-    label: str = ""
-    get: Callable[[], Any] = str
-    set: Callable[[Any], None] = lambda value: None
-    limits: tuple[float, float, float] = (0.0, 1.0, 0.001)
-    choices: Callable[[], list[str]] = list
+SIDES = {f"{'+-'[sign < 0]}{name}": (axis, sign) for axis, name in enumerate("xyz") for sign in (1, -1)}
+"""From which the camera looks: the axis, and which end of it."""
 
 
 def controls_of(model: Model) -> dict[str, list[Control]]:
     """A viewer's controls, by the heading of their group. When one has changed the model, others may have
     something else to show."""
-    transfer = model.state.transfer
-    if isinstance(transfer, LabelTransferFunction):
-        controls = _label_controls(model)
-    elif isinstance(transfer, TransferFunction):
-        controls = _range_controls(model)
-        controls += _point_controls(model) if len(transfer.values) <= editing.MAX_POINTS else []
-    else:
-        controls = [Control("html", get=lambda: "of another kind, not edited here")]
-    return {"transfer function": controls, "march and light": _march_controls(model)}
+    groups = {"view": _view_controls, "transfer function": transfer_controls, "slices": slice_controls}
+    groups |= {"clip": _clip_controls, "save": _save_controls, "march": _march_controls}
+    made = {heading: controls(model) for heading, controls in groups.items()}
+    return {heading: controls for heading, controls in made.items() if controls}
 
 
-def _edit(model: Model, change: Callable[..., Any], *arguments: Any) -> None:
-    """Replace the transfer function by `change(transfer, *arguments)`."""
-    model.apply(lambda state: replace(state, transfer=change(state.transfer, *arguments)))
+def _bound(model: Model, kind: str, label: str, name: str, **more: Any) -> Control:
+    """A control of a field of the state."""
+    how = lambda: getattr(model.state, name), lambda to: model.change(**{name: to})
+    return Control(kind, label, *how, **more)
 
 
-def _range_controls(model: Model) -> list[Control]:
-    """The histogram with the transfer function, and window and level."""
-    low, high, bars = histogram(model.scene.volume)
+def _view_controls(model: Model) -> list[Control]:
+    """From where the volume is looked at, and how cells become pixels."""
+    data, modes = np.asarray(model.scene.volume.data), [*model.scene.modes, ISOSURFACE]
+    low, high = float(data.min()), float(data.max())
+    span = high - low or max(abs(low), 1.0)
 
-    def shown() -> TransferFunction:
-        return cast(TransferFunction, model.state.transfer)
+    def look(side: str) -> None:
+        orbit = replace(model.first.orbit, view_angle=model.state.orbit.view_angle)
+        if side != "reset":
+            axis, sign = SIDES[side]
+            orbit = replace(orbit, toward=sign * np.eye(3)[axis]).turned(0, 0)
+        model.change(orbit=orbit)
 
-    def now() -> tuple[float, float]:
-        return editing.window_level(shown())
+    def set_background(color: str) -> None:
+        model.change(background=tuple(np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()))
 
-    def set_window(window: float) -> None:
-        _edit(model, editing.with_window_level, window, now()[1])
+    def set_mode(mode: str) -> None:
+        model.apply(lambda state: model.scene.in_mode(state, mode))
 
-    def set_level(level: float) -> None:
-        _edit(model, editing.with_window_level, now()[0], level)
-
-    window, level = now()
-    width = window or high - low
-    windows = min(width / 100, window), 4 * width, width / 100
-    levels = level - window / 2 - width, level + window / 2 + width, width / 100
+    background = lambda: display_color(np.array(model.state.background)), set_background
     return [
-        Control("html", get=lambda: _plot(low, high, bars, shown(), model.scene.voxel)),
-        Control("slider", "window", lambda: now()[0], set_window, windows),
-        Control("slider", "level", lambda: now()[1], set_level, levels),
+        Control("buttons", "look from", set=look, choices=(*SIDES, "reset")),
+        _bound(model, "checkbox", "orthographic", "parallel"),
+        Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=modes),
+        _bound(model, "slider", "isovalue", "isovalue", limits=(low, low + span, span / 1000)),
+        _bound(model, "checkbox", "light", "lit"),
+        Control("color", "background", *background),
     ]
 
 
-def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]:
-    """The least and the greatest value, and log(1 + count) of the bins between them, 1 at most."""
-    values = sampled(volume).ravel().astype(np.float64)
-    values = values[np.isfinite(values)]
-    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
-    high = high if high > low else low + max(abs(low), 1.0)
-    counts = np.log1p(np.histogram(values, BINS, (low, high))[0])
-    return low, high, counts / max(counts.max(), 1)
+def _clip_controls(model: Model) -> list[Control]:
+    """A box and a plane, of which any change turns clipping on."""
+    bounds, chosen = model.state.box, "none"
 
+    def range_of(axis: int) -> Control:
+        ends = slice(2 * axis, 2 * axis + 2)
+        low, high = bounds[ends]
+        step = (high - low) / 200
 
-def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, unit_distance: float) -> str:
-    """An SVG of the histogram and, as a line, the square root of the opacity, which shows thin materials."""
-    values = np.linspace(low, high, 4 * BINS)
-    extinction = np.interp(values, np.asarray(transfer.values), np.asarray(transfer.extinction))
+        def put(both: tuple[float, float]) -> None:
+            box = [*model.state.box]
+            box[ends] = both[0], max(both[1], both[0] + step)
+            model.change(clip=True, box=tuple(box))
 
-    def points(heights: Float[np.ndarray, " n"]) -> str:
-        across, down = np.linspace(0, WIDTH, len(heights)), HEIGHT - (HEIGHT - 2) * heights
-        return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
-
-    line = points(np.sqrt(-np.expm1(-extinction * unit_distance)))
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" width="100%" xmlns="http://www.w3.org/2000/svg">'
-        f'<polygon points="0,{HEIGHT} {points(bars)} {WIDTH},{HEIGHT}" fill="#8888" />'
-        f'<polyline points="{line}" fill="none" stroke="currentColor" /></svg>'
-        f'<div style="display: flex; justify-content: space-between; font-size: 10px">'
-        f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
-    )
-
-
-def _point_controls(model: Model) -> list[Control]:
-    """A point, its value, colour and opacity, which is that of a layer as thick as a voxel."""
-    voxel, chosen = model.scene.voxel, 0
-
-    def transfer() -> Any:
-        return model.state.transfer
-
-    def names() -> list[str]:
-        return [f"{number}: {value:.5g}" for number, value in enumerate(transfer().values.tolist(), 1)]
+        return Control("range", "xyz"[axis], lambda: model.state.box[ends], put, (low, high, step))
 
     def choose(name: str) -> None:
         nonlocal chosen
-        chosen = names().index(name)
-
-    def edit(change: Callable[..., Any], *more: Any) -> Callable[[Any], None]:
-        return lambda value: _edit(model, change, chosen, value, *more)
-
-    def add_or_remove(option: str) -> None:
-        nonlocal chosen
-        change = editing.with_point_after if option == "add after" else editing.without_point
-        _edit(model, change, chosen)
-        chosen = min(chosen, len(transfer().values) - 1)
-
-    def value() -> float:
-        return float(f"{float(transfer().values[chosen]):.6g}")
-
-    def color() -> str:
-        return editing.display_color(np.asarray(transfer().colors)[chosen])
-
-    def opacity() -> float:
-        return float(transfer().opacity(voxel)[chosen])
+        chosen = name
+        axis, sign = SIDES.get(name, (0, 1))
+        toward = model.state.orbit.toward if name == "view" else sign * np.eye(3)[axis]
+        cut = {"clip": True, "normal": tuple((-toward).tolist()), "offset": 0.0}
+        model.change(**{"offset": -1.0} if name == "none" else cut)
 
     return [
-        Control("dropdown", "point", lambda: names()[chosen], choose, choices=names),
-        Control("number", "value", value, edit(editing.with_value)),
-        Control("color", "color", color, edit(editing.with_color)),
-        Control("slider", "opacity", opacity, edit(editing.with_opacity, voxel)),
-        Control("buttons", "points", set=add_or_remove, choices=lambda: ["add after", "remove"]),
+        _bound(model, "checkbox", "clip", "clip"),
+        *map(range_of, range(3)),
+        Control("dropdown", "cut from", lambda: chosen, choose, choices=("none", "view", *SIDES)),
+        _bound(model, "slider", "depth", "offset", limits=(-1.0, 1.0, 0.01)),
     ]
 
 
-def _label_controls(model: Model) -> list[Control]:
-    """A label that can be seen, its densest colour, whether it is shown, and the factor of its extinction."""
-    stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
-    extinction = np.asarray(stacked.extinction)
-    labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
-    colors = np.asarray(stacked.colors)[labels, extinction[labels].argmax(axis=1)]
-    names, chosen = [str(label) for label in labels], 0
-
-    def choose(name: str) -> None:
-        nonlocal chosen
-        chosen = names.index(name)
-
-    def swatch() -> str:
-        return f'<div style="background: {editing.display_color(colors[chosen])}; height: 14px"></div>'
-
-    def get(name: str) -> float:
-        return float(np.asarray(getattr(model.state.transfer, name))[labels[chosen]])
-
-    def show(on: bool) -> None:
-        _edit(model, LabelTransferFunction.with_visibility, {labels[chosen]: on})
-
-    def set_opacity(opacity: float) -> None:
-        _edit(model, LabelTransferFunction.with_opacity, {labels[chosen]: opacity})
-
-    def opacity() -> float:
-        return min(get("opacity"), MAX_LABEL_OPACITY)
-
-    return [
-        Control("dropdown", "label", lambda: names[chosen], choose, choices=lambda: names),
-        Control("html", get=swatch),
-        Control("checkbox", "shown", lambda: bool(get("shown")), show),
-        Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),
-    ]
+def _save_controls(model: Model) -> list[Control]:
+    pixels = [1920.0]
+    width = Control("number", "width", lambda: pixels[0], lambda to: pixels.__setitem__(0, to))
+    return [width, Control("buttons", "image", set=lambda _: model.save(pixels[0]), choices=("save PNG",))]
 
 
 def _march_controls(model: Model) -> list[Control]:
@@ -205,6 +118,4 @@ def _march_controls(model: Model) -> list[Control]:
 
     limits = (MIN_STEP, MAX_STEP, MIN_STEP)
     step = Control("log slider", "step (voxels)", lambda: model.state.step, set_step, limits)
-    switches = [switch(type(transform).__name__) for transform in model.scene.transforms]
-    light = Control("checkbox", "light", lambda: model.state.lit, lambda on: model.change(lit=on))
-    return [step, *switches, light] if model.scene.lighting is not None else [step, *switches]
+    return [step, *(switch(type(transform).__name__) for transform in model.scene.transforms)]

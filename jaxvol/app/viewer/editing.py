@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
 from ..._util.srgb import from_srgb, to_srgb
@@ -14,6 +15,9 @@ from ...scene.transfer import TransferFunction, extinction_of
 MAX_POINTS = 16
 """Control points that a viewer edits. All transfer functions of so many points or fewer are padded to it, so
 that one program renders them all."""
+
+COLOR_POINTS = 7
+"""Control points that are added to show the colours of a colormap."""
 
 POINTS = "values", "colors", "extinction"
 
@@ -29,6 +33,11 @@ def with_window_level(transfer: TransferFunction, window: float, level: float) -
     old_window, old_level = window_level(transfer)
     relative = (np.asarray(transfer.values, np.float64) - old_level) / (old_window or 1.0)
     return TransferFunction(level + window * relative, transfer.colors, transfer.extinction)
+
+
+def rounded(value: float, span: float) -> float:
+    """A value to a thousandth of a span, or a few: without digits that nobody set."""
+    return round(value, 3 - math.ceil(math.log10(span))) if span > 0 else value
 
 
 def display_color(linear: Float[np.ndarray, "3"]) -> str:
@@ -58,15 +67,18 @@ def with_opacity(
     return _with_point(transfer, index, extinction=extinction_of([opacity], unit_distance)[0])
 
 
-def with_point_after(transfer: TransferFunction, index: int) -> TransferFunction:
-    """With one more point half-way between this one and the next, which does not change the function."""
-    values = np.asarray(transfer.values)
-    is_last = index + 1 == len(values)
-    if is_last or len(values) >= MAX_POINTS or values[index] == values[index + 1]:
-        raise ValueError(f"there is no room for another of {MAX_POINTS} points after point {index + 1}.")
-    points = (np.asarray(getattr(transfer, name)) for name in POINTS)
-    between = (np.insert(p, index + 1, (p[index] + p[index + 1]) / 2, axis=0) for p in points)
-    return TransferFunction(*between)
+def with_points_at(transfer: TransferFunction, at: Any) -> TransferFunction:
+    """With more points, at these increasing values, which do not change the function."""
+    values = np.asarray(transfer.values, np.float64)
+    if len(values) + len(at) > MAX_POINTS:
+        raise ValueError(f"there is no room for another of {MAX_POINTS} points.")
+    colors, extinction = np.asarray(transfer.colors), np.asarray(transfer.extinction)
+    index = np.searchsorted(values, at)
+    return TransferFunction(
+        np.insert(values, index, at),
+        np.insert(colors, index, np.stack([np.interp(at, values, each) for each in colors.T], 1), axis=0),
+        np.insert(extinction, index, np.interp(at, values, extinction)),
+    )
 
 
 def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
@@ -75,6 +87,19 @@ def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
         raise ValueError("a transfer function has at least 2 points.")
     points = (np.asarray(getattr(transfer, name)) for name in POINTS)
     return TransferFunction(*(np.delete(p, index, axis=0) for p in points))
+
+
+def recolored(transfer: TransferFunction, cmap: str) -> TransferFunction:
+    """With the colours of a matplotlib colormap over the range of its values, and the same opacities; with
+    `COLOR_POINTS` more points, where there is room for them."""
+    values = np.asarray(transfer.values)
+    low, high = values[[0, -1]]
+    if len(values) + COLOR_POINTS <= MAX_POINTS:
+        at = np.linspace(low, high, COLOR_POINTS + 2, dtype=values.dtype)
+        transfer = with_points_at(transfer, np.setdiff1d(at, values))
+    values = np.asarray(transfer.values, np.float64)
+    display = colormaps[cmap]((values - low) / ((high - low) or 1.0))
+    return TransferFunction(values, from_srgb(display[:, :3]), transfer.extinction)
 
 
 def padded(transfer: Any) -> Any:

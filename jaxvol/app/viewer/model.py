@@ -4,10 +4,14 @@ import math
 import threading
 import time
 from collections.abc import Callable, Generator
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, Literal
 
-from .state import Scene, State
+from ..._util.srgb import png_of
+from ..recorded import text_of
+from .marks import with_marks
+from .state import PROGRAM, Scene, State, Vector
 from .tiles import Grid, Pixels, TileRenderer, estimated_error
 
 
@@ -18,6 +22,7 @@ JPEG_QUALITY: dict[Stage, int] = {"coarse": 85, "drawing": 88, "fine": 94}
 """With which images are sent to a browser."""
 
 MAX_SIDE = 2048  # pixels of a view's width and height
+MAX_SAVED = 8192  # pixels of the larger side of an image that is saved
 INTERVAL = 0.25  # seconds after which an unfinished fine image is shown again
 BUDGET = 0.06  # seconds that a coarse image may take, of the 150 ms in which it is to follow the pointer
 
@@ -39,15 +44,19 @@ def adapted(level: int, seconds: float, fine_tiles: int) -> int:
 
 class Model:
     """The state of a viewer, drawn whenever it changes, by a thread of its own. A newer state cancels a fine
-    image between two tiles. A coarse image that was begun is finished, so that images follow a drag.
+    image between two tiles. A coarse image that was begun is finished, so that images follow a drag. Where a
+    state needs another program, that is compiled beside: until then the old one draws what it can.
 
     Args:
         scene: what is viewed.
         state: how, at first.
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
-        set_status: called likewise with a status of two lines.
+        set_status: called likewise with a status of two lines, or three.
+        deliver: called by a thread of its own with the PNG of an image that is saved.
+        file: the volume's, which saved images name.
     """
 
+    marked: Callable[[], None] = staticmethod(lambda: None)  # called when a point was marked
     rest = 0.12  # seconds without a change after which a fine image is begun
 
     def __init__(
@@ -56,9 +65,14 @@ class Model:
         state: State,
         show: Callable[[Pixels, Stage], None],
         set_status: Callable[[str], None],
+        deliver: Callable[[bytes], None] = lambda content: None,
+        file: Path | None = None,
     ):
-        self.scene, self.state = scene, state
-        self._face = show, set_status
+        self.scene, self.state, self.first = scene, state, state
+        self._face, self._deliver, self._file = (show, set_status), deliver, file
+        self._status, self._compiling, self._begun = "", "", 0.0
+        self._last: State | None = None
+        self._shown: tuple[State, Pixels] | None = None
         self._level = 2
         self._compiled: set[Any] = set()
         self._changed = threading.Condition()
@@ -84,7 +98,9 @@ class Model:
     def wait(self, seconds: float = 600) -> bool:
         """Wait until all that was asked for is drawn, fine; False if that takes longer."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._idle or self._closed, seconds)
+            return self._changed.wait_for(
+                lambda: (self._idle and not self._compiling) or self._closed, seconds
+            )
 
     def change(self, **changes: Any) -> None:
         """Replace fields of the state, and draw it."""
@@ -108,14 +124,63 @@ class Model:
             size = max(1, round(width * scale)), max(1, round(height * scale))
             self.change(size=size, **changes)
 
-    def _show(self, pixels: Pixels, stage: Stage, seconds: float, step: float) -> str:
-        """Show an image of a step in voxels. Returns what there is to say of it."""
+    def pick(self, across: float, down: float) -> None:
+        """Mark the point that is seen at a fraction of the view's width and height, if there is one."""
+        if self._last is not None:  # whose program is compiled
+            point = TileRenderer(self.scene, self._last).picked(across, down)
+            if point is not None:
+                self.mark(point)
+
+    def mark(self, point: Vector) -> None:
+        """Mark a point of the world in the image that is shown."""
+        self.state = replace(self.state, point=point)
+        self.marked()
+        if self._shown is not None and not self._closed:
+            request, pixels = self._shown
+            self._face[0](with_marks(pixels, replace(request, point=point)), "drawing")
+
+    def save(self, width: float) -> None:
+        """Render an image that is so many pixels wide, by a thread of its own, and deliver it as a PNG, which
+        holds its settings as those that `jaxvol render` writes."""
+        across, down = self.state.size
+        scale = min(max(width, 1), MAX_SAVED, MAX_SAVED * across / down) / across
+        state = replace(self.state, size=(round(across * scale), max(1, round(down * scale))))
+        threading.Thread(target=self._told, args=("saved", self._save, state), daemon=True).start()
+
+    def _save(self, state: State) -> None:
+        renderer, grid, (width, height) = TileRenderer(self.scene, state), Grid.fine(state.size), state.size
+        pixels = grid.empty()
+        for count, (column, row) in enumerate(tiles := grid.tiles()):
+            if self._closed:
+                return
+            self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
+            renderer.draw(pixels, grid, column, row)
+        text = text_of(self.scene.settings(state), self._file, state.transfer)
+        self._set_status(f"saved {width} x {height}\n")
+        self._deliver(png_of(pixels[:height, :width], text))
+
+    def _told(self, what: str, do: Callable[..., object], *arguments: Any) -> bool:
+        """Do something, and tell of a fault, after which the user may ask for something else."""
+        try:
+            do(*arguments)
+        except Exception as fault:
+            self._set_status(f"not {what}:\n{' '.join(str(fault).split())}")
+            return False
+        return True
+
+    def _show(self, pixels: Pixels, stage: Stage, seconds: float, request: State, factor: float = 1) -> str:
+        """Show an image of a state, with steps that are longer by a factor. Returns what there is to say."""
+        self._shown = request, pixels
         if not self._closed:
-            self._face[0](pixels, stage)
+            self._face[0](with_marks(pixels, replace(request, point=self.state.point)), stage)
         height, width, _ = pixels.shape
+        step = request.step * factor
         return f"{stage}: {width} x {height}, step {step:.3g} voxels\n{1e3 * seconds:.0f} ms"
 
     def _set_status(self, text: str) -> None:
+        self._status, compiling = text, self._compiling
+        if compiling:
+            text += f"\ncompiling for {compiling}: {time.monotonic() - self._begun:.0f} s"
         if not self._closed:
             self._face[1](text)
 
@@ -130,36 +195,68 @@ class Model:
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(self._newer)
+                while not self._changed.wait_for(self._newer, 1 if self._compiling else None):
+                    self._set_status(self._status)
                 if self._closed:
                     return
                 assert self._next is not None
                 request, self._next = self._next, None
-            try:
-                for part, _ in enumerate(self._draw(request)):
-                    if self._cancelled(0 if part else self.rest):
-                        break
-            except Exception as fault:  # for the user, who may ask for another image
-                self._set_status(f"not drawn:\n{' '.join(str(fault).split())}")
+            self._told("drawn", self._draw_parts, request)
             with self._changed:
                 self._idle = self._next is None
                 self._changed.notify_all()
 
+    def _draw_parts(self, request: State) -> None:
+        for part, _ in enumerate(self._draw(request)):
+            if self._cancelled(0 if part else self.rest):
+                break
+
+    def _compile(self, request: State) -> None:
+        """Compile the program of a state, and have the newest state drawn then."""
+        renderer = TileRenderer(self.scene, request)
+        done = self._told("compiled", renderer.overview)
+        with self._changed:
+            self._compiling = ""
+            if done:
+                self._compiled.add(renderer.program_key)
+                self._next, self._idle = self.state, False
+            self._changed.notify_all()
+
+    def _stand_in(self, request: State, last: State) -> State | None:
+        """What is drawn until the program of a request is compiled, by that of the last one; None if that
+        would be the image that is there. Has the program compiled, unless another is being compiled."""
+        if not self._compiling:
+            names = [told for name, told in PROGRAM.items() if getattr(request, name) != getattr(last, name)]
+            names = [*sorted(request.enabled ^ last.enabled), *filter(None, names)]
+            self._compiling = ", ".join(names) or "points"
+            self._begun = time.monotonic()
+            self._set_status(self._status)
+            threading.Thread(target=self._compile, args=(request,), daemon=True).start()
+        shown = replace(request, **{name: getattr(last, name) for name in PROGRAM})
+        if TileRenderer(self.scene, shown).program_key not in self._compiled:
+            shown = replace(shown, transfer=last.transfer)
+        same = all(getattr(shown, field.name) is getattr(last, field.name) for field in fields(State))
+        return None if same else shown
+
     def _draw(self, request: State) -> Generator[None]:
         """Yields after the coarse image, and after each tile of the fine one."""
-        renderer, grid = TileRenderer(self.scene, request), Grid.fine(request.size)
-        tiles = grid.tiles()
-        if renderer.program_key not in self._compiled:
-            self._set_status("compiling …\nfor these transforms; the program is kept for the next time")
-            begun = time.perf_counter()
+        renderer = TileRenderer(self.scene, request)
+        if renderer.program_key not in self._compiled and self._last is None:
+            self._set_status("compiling …\nthe first image; the program is kept for the next time")
             renderer.overview()
             self._compiled.add(renderer.program_key)
-            self._set_status(f"compiled in {time.perf_counter() - begun:.1f} s\n")
+        elif renderer.program_key not in self._compiled:
+            assert self._last is not None
+            if (shown := self._stand_in(request, self._last)) is None:
+                return
+            request, renderer = shown, TileRenderer(self.scene, shown)
+        self._last, grid = request, Grid.fine(request.size)
+        tiles = grid.tiles()
         begun, (most, factor) = time.perf_counter(), LEVELS[self._level]
         coarse = TileRenderer(self.scene, request, factor).coarse(most)
         seconds = time.perf_counter() - begun
         self._level = adapted(self._level, seconds, len(tiles))
-        self._set_status(self._show(coarse, "coarse", seconds, request.step * factor))
+        self._set_status(self._show(coarse, "coarse", seconds, request, factor))
         yield
 
         pixels, (width, height) = grid.canvas(coarse), grid.size
@@ -167,7 +264,7 @@ class Model:
 
         def show(stage: Stage) -> str:
             seconds = time.perf_counter() - begun
-            return self._show(pixels[:height, :width].copy(), stage, seconds, request.step)
+            return self._show(pixels[:height, :width].copy(), stage, seconds, request)
 
         for count, (column, row) in enumerate(tiles):
             if time.perf_counter() - shown > INTERVAL:

@@ -3,25 +3,33 @@
 import asyncio
 import contextlib
 import math
+import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
+import anywidget
 import ipywidgets
 import numpy as np
+import traitlets
 from rendercanvas.anywidget import RenderCanvas
 
+from ...compositing.blending import Compositing
 from ...lighting.shading import Lighting
 from ...march.march import March
 from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
-from .controls import Control, controls_of
+from .control import PRESSED, Control
+from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Scene, State
 from .tiles import Pixels
 
 
-WIDE = {"width": "330px"}  # layout of what stands in a line of its own
+WIDE = {"width": "98%"}  # layout of what stands in a line of its own
+PANEL = {"width": "298px", "flex": "0 0 auto", "display": "block", "overflow": "hidden auto"}
+"""Of the controls, which stand beside 640 pixels of an image in JupyterLab 1400 pixels wide."""
 
 
 class NotebookView(ipywidgets.HBox):
@@ -46,15 +54,20 @@ class NotebookView(ipywidgets.HBox):
         self.canvas.add_event_handler(self._resized, "resize")
         self.canvas.add_event_handler(self._reset, "double_click")
         self._status = ipywidgets.HTML(layout=WIDE)
-        self.model = Model(scene, state, self._show, self._set_status)
-        self._first = state
+        self.model = Model(scene, state, self._show, self._set_status, self._deliver)
         self._pointer: tuple[float, float] | None = None
+        self._pressed: tuple[float, float] | None = None
         self._widgets: list[tuple[Any, Control]] = []
         self._updating = False
         shown: list[ipywidgets.Widget] = [self._status]
         for heading, controls in controls_of(self.model).items():
-            shown += [ipywidgets.HTML(f"<b>{heading}</b>"), *map(self._widget, controls)]
-        self.children = (self.canvas, ipywidgets.VBox(shown, layout={"margin": "0 0 0 12px"}))
+            inner = ipywidgets.VBox([*map(self._widget, controls)], layout={"margin": "-8px -12px"})
+            selected = None if heading in FOLDED else 0
+            shown.append(ipywidgets.Accordion([inner], titles=[heading], selected_index=selected))
+        panel = ipywidgets.VBox(shown, layout=PANEL | {"height": f"{max(state.size[1], 640)}px"})
+        self.children = (self.canvas, panel)
+        self.layout.flex_flow = "row wrap"
+        self.model.marked = self._update
         self.model.ask(state)
 
     @property
@@ -65,7 +78,7 @@ class NotebookView(ipywidgets.HBox):
     @property
     def camera(self) -> Camera:
         """The camera, with the size of the image."""
-        return self.model.state.orbit.camera(self.model.state.size)
+        return self.model.state.orbit.camera(self.model.state.size, parallel=self.model.state.parallel)
 
     @property
     def transfer(self) -> Transfer:
@@ -82,12 +95,22 @@ class NotebookView(ipywidgets.HBox):
         """The light, None if it is off."""
         return self.model.scene.light(self.model.state)
 
+    @property
+    def compositing(self) -> Compositing[Any]:
+        """How cells become a pixel."""
+        return self.model.scene.compositing(self.model.state)
+
     def close(self) -> None:
         """Remove the widget, and end its thread. A cell that shows another viewer does not end it."""
         self.model.close()
         self.canvas._is_closed = True  # its scheduler ends; in rendercanvas 2.7, its `close` calls itself
         ipywidgets.Widget.close(self.canvas)
         super().close()
+
+    def _deliver(self, png: bytes) -> None:
+        path = Path(f"jaxvol-{int(time.time())}.png")
+        path.write_bytes(png)
+        self._set_status(f"saved in the notebook's folder:\n{path}")
 
     # The thread that draws calls these two; widgets belong to the thread of the event loop.
 
@@ -109,9 +132,12 @@ class NotebookView(ipywidgets.HBox):
             notches = -float(event["dy"]) / 100  # of a mouse's wheel, as browsers report it
             self.model.change(orbit=self.model.state.orbit.zoomed(1.2**notches))
         elif kind == "pointer_down":
-            self._pointer = at
+            self._pointer = self._pressed = at
         elif kind == "pointer_up":
-            self._pointer = None
+            if self._pressed is not None and math.dist(at, self._pressed) < 3:
+                ratio, size = self.canvas.get_pixel_ratio(), self.model.state.size
+                self.model.pick(at[0] * ratio / size[0], at[1] * ratio / size[1])
+            self._pointer = self._pressed = None
         elif self._pointer is not None and event["buttons"]:
             # a move without a button may come late, after the button went down
             scale = self.canvas.get_pixel_ratio() / self.model.state.size[1]
@@ -125,18 +151,19 @@ class NotebookView(ipywidgets.HBox):
         self.model.resize(event["width"] * ratio, event["height"] * ratio)
 
     def _reset(self, _: Any = None) -> None:
-        self.model.change(orbit=self._first.orbit)
+        self.model.change(orbit=self.model.first.orbit)
 
     def _widget(self, control: Control) -> ipywidgets.Widget:
         """A widget that shows what a control describes, and changes the model."""
         if control.kind == "buttons":
-            buttons = [ipywidgets.Button(description=text) for text in control.choices()]
+            narrow = {"width": "auto", "min_width": "30px", "padding": "0 4px"}
+            buttons = [ipywidgets.Button(description=text, layout=narrow) for text in control.choices]
             for button in buttons:
                 button.on_click(lambda pressed: self._change(control.set, pressed.description))
             return ipywidgets.HBox(buttons)
         widget = _widget_of_value(control)
-        if control.kind != "html":
-            widget.observe(lambda event: self._change(control.set, event["new"]), "value")
+        name = "sent" if control.kind == "pad" else "value"
+        widget.observe(lambda event: self._change(control.set, event["new"]), name)
         self._widgets.append((widget, control))
         return widget
 
@@ -145,11 +172,12 @@ class NotebookView(ipywidgets.HBox):
         if self._updating:
             return
         change(value)
+        self._update()
+
+    def _update(self) -> None:
         self._updating = True
         try:
             for widget, control in self._widgets:
-                if control.kind == "dropdown":
-                    widget.options = control.choices()
                 widget.value = control.get()
         finally:
             self._updating = False
@@ -157,20 +185,39 @@ class NotebookView(ipywidgets.HBox):
 
 def _widget_of_value(control: Control) -> Any:
     how: dict[str, Any] = {"value": control.get(), "layout": WIDE}
-    if control.kind == "html":
-        return ipywidgets.HTML(**how)
+    if control.kind == "pad":
+        return Pad(**how)
     how["description"] = control.label
     if control.kind == "checkbox":
         return ipywidgets.Checkbox(indent=False, **how)
-    how["style"] = {"description_width": "90px"}
+    how["style"] = {"description_width": "78px"}
     low, high, step = control.limits
     if control.kind == "dropdown":
-        return ipywidgets.Dropdown(options=control.choices(), **how)
+        return ipywidgets.Dropdown(options=control.choices, **how)
+    if control.kind == "range":
+        return ipywidgets.FloatRangeSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     if control.kind == "log slider":
         return ipywidgets.FloatLogSlider(base=2, min=math.log2(low), max=math.log2(high), step=0.25, **how)
     if control.kind == "slider":
         return ipywidgets.FloatSlider(min=low, max=high, step=step, readout_format=".4g", **how)
     return (ipywidgets.FloatText if control.kind == "number" else ipywidgets.ColorPicker)(**how)
+
+
+class Pad(anywidget.AnyWidget):
+    """HTML whose boxes tell where they are pressed."""
+
+    _esm = f"""
+    const pressed = {PRESSED};
+    export default {{ render({{ model, el }}) {{
+      const show = () => {{ el.innerHTML = model.get('value'); }};
+      const send = text => {{ model.set('sent', text); model.save_changes(); }};
+      show();
+      model.on('change:value', show);
+      el.onpointerdown = event => pressed(event, send);
+    }} }};
+    """
+    value = traitlets.Unicode().tag(sync=True)
+    sent = traitlets.Unicode().tag(sync=True)
 
 
 class PromptCanvas(RenderCanvas):

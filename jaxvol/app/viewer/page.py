@@ -2,10 +2,15 @@
 of viser's scene, which is empty."""
 
 import contextlib
+import html
 import io
 import logging
 import math
 import re
+import secrets
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -15,7 +20,8 @@ from matplotlib.colors import to_rgb
 from websockets.exceptions import ConnectionClosed
 
 from ..._util.checks import shortened
-from .controls import Control, controls_of
+from .control import PRESSED, Control
+from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
 from .state import Orbit, Scene, State
 from .tiles import Pixels
@@ -23,6 +29,14 @@ from .tiles import Pixels
 
 HOST = "127.0.0.1"
 OWN_NAMES = {HOST, "localhost"}
+
+PAD = """<style>.mantine-Flex-root:has(> div label[for="{field}"]) {{ position: absolute; height: 0; width: 0;
+opacity: 0; overflow: hidden }}</style><div onpointerdown="({pressed})(event, text => {{
+const label = [...document.querySelectorAll('label')].find(each => each.htmlFor === '{field}');
+const input = label.closest('.mantine-Flex-root').querySelector('input');
+Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, text);
+input.dispatchEvent(new Event('input', {{bubbles: true}})) }})">{content}</div>"""
+"""Of viser's widgets, only a field of text sends what a script tells: each pad has one, which is hidden."""
 
 
 class _Server(viser.ViserServer):
@@ -40,16 +54,28 @@ class Page:
         url: to open in a browser.
         port: on which it is served.
         models: of the pages that are open, by viser's numbers of clients.
+        shown: scene and first state.
 
     Args:
         scene: what is looked at. `serve` makes it.
         state: how at first.
-        port: as for `serve`.
-        title: as for `serve`.
+        port: as for `serve`, as are `title`, `host`, `token` and `file`.
     """
 
-    def __init__(self, scene: Scene, state: State, *, port: int = 8080, title: str = "jaxvol"):
-        self._scene, self._state = scene, state
+    def __init__(
+        self,
+        scene: Scene,
+        state: State,
+        *,
+        port: int = 8080,
+        title: str = "jaxvol",
+        host: str = HOST,
+        token: str | None = None,
+        file: Path | None = None,
+    ):
+        self.shown, self.file = (scene, state), file
+        is_local = host in OWN_NAMES
+        self._token = secrets.token_urlsafe() if token is None and not is_local else token
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
         # viser's cameras have limits that suit scenes of about this size
         self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
@@ -58,9 +84,11 @@ class Page:
         log = logging.getLogger("websockets.server")
         log.addFilter(_in_one_line)
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
-            self._server = _Server(host=HOST, port=port, label=title, verbose=False)
+            self._server = _Server(host=host, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
-        self.url = f"http://localhost:{self.port}"
+        place = f"{'localhost' if is_local else host}:{self.port}"
+        told = "" if self._token is None else f"/?websocket=ws://{place}/{self._token}"
+        self.url = f"http://{place}{told}"
         self._server._websock_server.on_client_connect(self._only_own_pages)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._server.gui.main_panel.dock_right()
@@ -82,29 +110,43 @@ class Page:
     async def _only_own_pages(self, connection: Any) -> None:
         """Any page that a browser shows may connect to a port of this machine; viser takes them all. It reads
         messages only after this call, so that those of others are read here, and dropped."""
-        socket = self._server._websock_server._live_connections[connection.client_id]
-        request = socket.request
-        origin = urlsplit(request.headers.get("Origin", "") if request else "")
-        if origin.hostname not in OWN_NAMES or origin.port != self.port:
-            await socket.close(1008, "this viewer is shown by its own pages only")
+        client = self._server._websock_server._live_connections[connection.client_id]
+        origin = urlsplit(client.request.headers.get("Origin", "") if client.request else "")
+        is_own = origin.hostname in OWN_NAMES and origin.port == self.port
+        if self._token is not None:  # a page of whichever name that a proxy gives it
+            given = urlsplit(client.request.path if client.request else "").path.rsplit("/", 1)[-1]
+            is_own = secrets.compare_digest(given.encode(), self._token.encode())
+        if not is_own:
+            await client.close(1008, "this viewer is shown by its own pages only")
             with contextlib.suppress(ConnectionClosed):
                 while True:
-                    await socket.recv(decode=False)
+                    await client.recv(decode=False)
 
     def _to_viser(self, point: np.ndarray) -> np.ndarray:
         """A world point in viser's scene."""
         return (point - self._center) / self._radius
 
     async def _opened(self, client: viser.ClientHandle) -> None:
-        model = _Panel(client, self._scene, self._state).model
+        def turn(orbit: Orbit) -> None:
+            with client.atomic():
+                client.camera.up_direction = tuple(orbit.view_up)
+                client.camera.position = self._to_viser(orbit.position)
+                client.camera.look_at = self._to_viser(orbit.focal_point)
+
+        model = _Panel(client, self, turn).model
         self.models[client.client_id] = model
 
         async def turned(camera: viser.CameraHandle) -> None:
             position, focal = (self._center + self._radius * v for v in (camera.position, camera.look_at))
+            (width, height), first = self.shown[1].size, self.shown[1].orbit.view_angle
+            # a window that is narrower than what was framed shows all of its width
+            narrower = max(1.0, width / height * camera.image_height / max(camera.image_width, 1))
+            camera.fov = 2 * math.atan(narrower * math.tan(math.radians(first) / 2))
             orbit = Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
             model.resize(camera.image_width, camera.image_height, orbit=orbit)
 
         client.camera.on_update(turned)
+        client.scene.on_click()(lambda event: model.pick(*event.screen_pos))
         await turned(client.camera)
 
     async def _closed(self, client: viser.ClientHandle) -> None:
@@ -124,17 +166,21 @@ def _in_one_line(record: logging.LogRecord) -> bool:
 
 
 class _Panel:
-    """The model and the controls of one page."""
+    """The model and the controls of one page. `turn`: turns the browser's camera."""
 
-    def __init__(self, client: viser.ClientHandle, scene: Scene, state: State):
-        self.client = client
+    def __init__(self, client: viser.ClientHandle, page: Page, turn: Callable[[Orbit], None]):
+        self.client, self._turn = client, turn
         self.status = client.gui.add_markdown("starting …  \n")
-        self.model = Model(scene, state, self._show, self._set_status)
+        self.model = Model(*page.shown, self._show, self._set_status, self._deliver, page.file)
         self._widgets: list[tuple[Any, Control]] = []
         for heading, controls in controls_of(self.model).items():
-            with client.gui.add_folder(heading):
+            with client.gui.add_folder(heading, expand_by_default=heading not in FOLDED):
                 for control in controls:
                     self._add(control)
+        self.model.marked = self._update
+
+    def _deliver(self, png: bytes) -> None:
+        self.client.send_file_download("jaxvol.png", png, save_immediately=True)
 
     def _show(self, pixels: Pixels, stage: Stage) -> None:
         self.client.scene.set_background_image(pixels, "jpeg", jpeg_quality=JPEG_QUALITY[stage])
@@ -145,45 +191,56 @@ class _Panel:
 
     def _add(self, control: Control) -> None:
         widget = _widget(self.client.gui, control)
+        source = self.client.gui.add_text(control.label, "") if control.kind == "pad" else widget
 
         # viser runs coroutines one after the other, and plain functions in any order
         async def changed(event: Any) -> None:
             if event.client is not None:  # in a browser, and not by `_update`
-                value = widget.value
-                control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
-                for each in self._widgets:
-                    _update(*each)
+                value, orbit = source.value, self.model.state.orbit
+                with contextlib.suppress(ValueError, KeyError):  # of what no widget sends
+                    control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
+                if self.model.state.orbit is not orbit:
+                    self._turn(self.model.state.orbit)
+                self._update()
 
         if control.kind == "buttons":
             widget.on_click(changed)
             return
+        if control.kind == "pad":
+            told, field = control.get, {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
+            control = replace(control, get=lambda: PAD.format(**field, content=told()))
+            _update(widget, control)
         self._widgets.append((widget, control))
-        if control.kind != "html":
-            widget.on_update(changed)
+        source.on_update(changed)
+
+    def _update(self) -> None:
+        for each in self._widgets:
+            _update(*each)
 
 
 def _widget(gui: viser.GuiApi, control: Control) -> Any:
-    if control.kind == "html":
-        return gui.add_html(control.get())
+    if control.kind == "pad":
+        return gui.add_html("")
     if control.kind == "buttons":
-        return gui.add_button_group(control.label, tuple(control.choices()))
+        return gui.add_button_group(control.label, tuple(control.choices))
     label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
     value = _value(control)
+    if control.kind == "range":
+        return gui.add_multi_slider(label, *control.limits, value)
     if control.kind in ("slider", "log slider"):
         return gui.add_slider(label, *control.limits, value)
     if control.kind == "dropdown":
-        return gui.add_dropdown(label, tuple(control.choices()), initial_value=value)
+        return gui.add_dropdown(label, tuple(control.choices), initial_value=value)
     add = {"number": gui.add_number, "checkbox": gui.add_checkbox, "color": gui.add_rgb}[control.kind]
     return add(label, value)
 
 
 def _update(widget: Any, control: Control) -> None:
     """Let a widget show what the model has."""
-    if control.kind == "html":
-        widget.content = control.get()
+    if control.kind == "pad":
+        if widget.content != (content := control.get()):
+            widget.content = content
         return
-    if control.kind == "dropdown":
-        widget.options = control.choices()
     value = _value(control)
     # what only rounding has changed is not sent back, or a slider would lag behind in a drag
     if not (isinstance(value, float) and math.isclose(value, widget.value, rel_tol=1e-5)):

@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import finite_array
+from ..._util.srgb import linear_color
 from ...compositing.blending import Compositing
-from ...compositing.modes import Mode, compositing_of
+from ...compositing.isosurface import Isosurface
+from ...compositing.modes import MODES, Mode, compositing_of
 from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
 from ...march.transforms import (
     AlphaCorrection,
+    Clip,
     EarlyTermination,
     EmptySpaceJitter,
     Jitter,
@@ -31,18 +33,20 @@ from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, labels_shown
-from ..framing import framed, visible_points
+from ..framing import FAINT, VISIBLE, automatic_camera
 
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
-STEEPEST = math.radians(89)  # elevation of a camera, at most: from straight above, nothing says what is up
+ISOSURFACE = "isosurface"
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+STEEPEST = math.radians(89.9)  # elevation of a camera, at most: from straight above, nothing says what is up
 
 Vector = Float[np.ndarray, "3"]
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """A perspective camera that looks at a point.
+    """A camera that looks at a point.
 
     Attributes:
         focal_point: world point.
@@ -73,7 +77,7 @@ class Orbit:
         height = math.asin(float(np.clip(self.toward @ up, -1, 1)))
         level = self.toward - (self.toward @ up) * up
         if np.linalg.norm(level) < 1e-9:
-            level = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+            level = np.cross(np.eye(3)[np.argmin(np.abs(up))], up)  # so that y is up from above
         level = level / np.linalg.norm(level)
         angle = -math.pi * right  # the camera moves against what is seen
         level = math.cos(angle) * level + math.sin(angle) * np.cross(up, level)
@@ -82,10 +86,8 @@ class Orbit:
 
     def panned(self, right: float, down: float) -> "Orbit":
         """After a drag along the image: what lies at the focal point's distance stays under the pointer."""
-        height = 2 * self.distance * math.tan(math.radians(self.view_angle) / 2)
-        across = np.cross(-self.toward, self.view_up)
-        across = across / np.linalg.norm(across)
-        upward = np.cross(across, -self.toward)
+        height = 2 * self.half_height
+        across, upward, _ = self.axes()
         return replace(self, focal_point=self.focal_point + height * (down * upward - right * across))
 
     def zoomed(self, factor: float) -> "Orbit":
@@ -97,64 +99,107 @@ class Orbit:
         """World position of the camera."""
         return self.focal_point + self.distance * self.toward
 
-    def camera(self, size: tuple[int, int], window: object = None, corner: object = None) -> Camera:
-        """The camera, for an image of this size in pixels."""
-        place = (self.position, self.focal_point, self.view_up, self.view_angle)
-        return Camera(*place, size=size, window=window, corner=corner)  # pyright: ignore[reportArgumentType]
+    @property
+    def half_height(self) -> float:
+        """Of what is seen at the focal point's distance, world length."""
+        return self.distance * math.tan(math.radians(self.view_angle) / 2)
+
+    def axes(self) -> tuple[Vector, Vector, Vector]:
+        """Unit vectors to the right and up in the image, and forward."""
+        right = np.cross(-self.toward, self.view_up)
+        right = right / np.linalg.norm(right)
+        return right, np.cross(right, -self.toward), -self.toward
+
+    def camera(
+        self, size: tuple[int, int], window: object = None, corner: object = None, *, parallel: bool = False
+    ) -> Camera:
+        """The camera, for an image of this size in pixels; `parallel`: as high at the focal point."""
+        place: Any = self.position, self.focal_point, self.view_up, self.view_angle
+        part: Any = {"window": window, "corner": corner}
+        return Camera(*place, size=size, parallel_scale=self.half_height if parallel else None, **part)
 
 
 @dataclass(frozen=True)
 class State:
-    """All that the controls of a viewer change.
-
-    Attributes:
-        orbit: the camera.
-        size: (width, height) of the view, pixels.
-        transfer: the transfer function.
-        step: distance between samples, in voxels.
-        enabled: names of the transforms that are applied.
-        lit: whether there is light.
-    """
+    """All that the controls of a viewer change."""
 
     orbit: Orbit
-    size: tuple[int, int]
+    size: tuple[int, int]  # (width, height) of the view, pixels
     transfer: Transfer
-    step: float
-    enabled: frozenset[str]
-    lit: bool
+    step: float  # voxels
+    enabled: frozenset[str]  # names of the transforms that are applied
+    lit: bool  # whether there is light, where there can be
+    mode: str  # how cells become a pixel, a key of `Scene.modes` or `ISOSURFACE`
+    isovalue: float
+    background: tuple[float, float, float]  # linear RGB
+    parallel: bool  # whether the camera is orthographic
+    clip: bool  # whether box and plane are applied
+    box: tuple[float, ...]  # what is inside is shown, as `Volume.bounds`
+    normal: tuple[float, ...] = (0.0, 0.0, 1.0)  # of the plane, to what is shown
+    offset: float = -1.0  # of the plane from the middle of the volume, in half diagonals
+    point: Vector | None = None  # of the world, which was picked
+
+
+PROGRAM = {"enabled": "", "lit": "light", "mode": "mode", "parallel": "orthographic", "clip": "clip"}
+"""Fields of a state of whose values each has a program of its own, and their controls. So has each form of
+transfer function."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What stays the same while a volume is viewed, and what the controls choose from.
-
-    Attributes:
-        volume: what is looked at.
-        transforms: those that can be turned on, in the order in which they are applied.
-        given: the march whose quadrature and `max_samples` are kept.
-        lighting: the light that can be turned on; None where nothing can be lit.
-        voxel: world length of a step of 1.
-        compositing: how cells become a pixel.
-        background: linear RGB.
-    """
+    """What stays the same while a volume is viewed, and what the controls choose from."""
 
     volume: Volume
-    transforms: tuple[Transform, ...]
-    given: March
-    lighting: Lighting | None
-    voxel: float
-    compositing: Compositing[Any]
-    background: tuple[float, float, float]
+    transforms: tuple[Transform, ...]  # that can be turned on, in the order in which they are applied
+    given: March  # whose quadrature and `max_samples` are kept
+    lighting: Lighting  # that can be turned on
+    voxel: float  # world length of a step of 1
+    modes: dict[str, Compositing[Any]]  # besides isosurfaces
 
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
         enabled = tuple(t for t in self.transforms if type(t).__name__ in state.enabled)
+        if state.clip:
+            enabled = (Clip(state.box, [self.plane(state)]), *enabled)
         step = state.step * step_factor * self.voxel
         return March(step, enabled, self.given.quadrature, max_samples=self.given.max_samples)
 
+    def plane(self, state: State) -> tuple[Vector, Vector]:
+        """Origin and normal of the plane that clips."""
+        low, high = (np.asarray(corner, np.float64) for corner in self.volume.corners)
+        normal = np.asarray(state.normal, np.float64)
+        # a little farther than half the diagonal, so that nothing is cut away at -1
+        return (low + high) / 2 + 0.501 * state.offset * np.linalg.norm(high - low) * normal, normal
+
+    def compositing(self, state: State) -> Compositing[Any]:
+        """How cells become a pixel."""
+        return Isosurface(state.isovalue) if state.mode == ISOSURFACE else self.modes[state.mode]
+
     def light(self, state: State) -> Lighting | None:
-        """The light, if it is on."""
-        return self.lighting if state.lit else None
+        """The light, if it is on, and the mode can be lit."""
+        return self.lighting if state.lit and self.compositing(state).can_be_lit else None
+
+    def settings(self, state: State) -> dict[str, Any]:
+        """Options of `jaxvol render` that draw a state."""
+        orbit = state.orbit
+        options = {"size": state.size, "step": state.step * self.voxel, "background": state.background}
+        options |= {"camera": [*orbit.position.tolist(), *orbit.focal_point.tolist()]}
+        options |= {"view_up": orbit.view_up.tolist(), "view_angle": orbit.view_angle}
+        options |= {"parallel": state.parallel, "shade": self.light(state) is not None}
+        if state.clip:
+            planes = [[each for vector in self.plane(state) for each in vector.tolist()]]
+            options |= {"clip_box": state.box, "clip_plane": planes}
+        options |= {"compositing": state.mode} if state.mode in (*MODES, ISOSURFACE) else {}
+        return options | ({"isovalue": state.isovalue} if state.mode == ISOSURFACE else {})
+
+    def in_mode(self, state: State, mode: str) -> State:
+        """The state in another mode, with the light that is usual for it, and its background, if that was so.
+        **Raises** `ValueError` where the mode cannot show the transfer function."""
+        old, new = (BLACK if each in MODES.keys() - {"over"} else WHITE for each in (state.mode, mode))
+        background = new if state.background == old else state.background
+        changed = replace(state, mode=mode, background=background, lit=mode in ("over", ISOSURFACE))
+        self.compositing(changed).marched(changed.transfer, self.given, self.volume)
+        return changed
 
 
 def initial(
@@ -171,22 +216,19 @@ def initial(
 ) -> tuple[Scene, State]:
     """What is viewed, and how at first. Arguments and errors as for `view`."""
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
-    chosen: Any = whole if camera is None else camera
+    least = VISIBLE if transfer is None else FAINT
     if transfer is None:
         volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-        chosen = framed(chosen, visible_points(volume, transfer)) if camera is None else chosen
+    chosen: Any = automatic_camera(volume, transfer, size=size, least=least) if camera is None else camera
     given = March(1.0, (), "midpoint") if march is None else march
     shown: Any = sized(transfer, volume)
     names = {"volume": volume, "transfer": shown, "camera": chosen, "march": given, "lighting": lighting}
     check_arguments("view(volume, transfer, camera, march)", **names)
-    if chosen.parallel_scale is not None:
-        raise ValueError("the viewer's camera must be perspective; got one with a parallel_scale.")
     mode = compositing_of(compositing)
     mode.marched(shown, given, volume)  # refuses what it cannot show
-    can_be_lit = mode.can_be_lit
-    if lighting is not None and not can_be_lit:
+    if lighting is not None and not mode.can_be_lit:
         raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
-    r, g, b = np.asarray(finite_array("background", background, (3,))).tolist()
+    r, g, b = np.asarray(linear_color("background", background)).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = float(median_node_distance(given.locate(volume), blocks))
     step = 0.5 if march is None else float(given.step) / voxel
@@ -200,8 +242,18 @@ def initial(
     default = AlphaCorrection(), SpaceLeaping(), EarlyTermination(1 / 256)
     own = {type(transform) for transform in given.transforms}
     others = (each for each in (*offered, *default) if type(each) not in own)
-    light = Phong() if lighting is None and can_be_lit else lighting
-    scene = Scene(volume, (*given.transforms, *others), given, light, voxel, mode, (r, g, b))
+    modes: dict[str, Compositing[Any]] = {name: kind() for name, kind in MODES.items()}
+    name = next((n for n, kind in MODES.items() if type(mode) is kind), type(mode).__name__.lower())
+    modes |= {} if isinstance(mode, Isosurface) else {name: mode}
+    scene = Scene(volume, (*given.transforms, *others), given, lighting or Phong(), voxel, modes)
     enabled = frozenset(type(t).__name__ for t in (default if march is None else given.transforms))
-    orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, float(chosen.view_angle))
-    return scene, State(orbit, whole.size, shown, step, enabled, lit and can_be_lit)
+    data = np.asarray(volume.data)
+    between = (float(data.min()) + float(data.max())) / 2
+    isovalue = float(mode.value) if isinstance(mode, Isosurface) else between
+    angle, parallel = float(chosen.view_angle), chosen.parallel_scale is not None
+    orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, angle)
+    if parallel:  # from as far as shows the same height
+        orbit = orbit.zoomed(orbit.half_height / float(chosen.parallel_scale))
+    box, color = tuple(np.asarray(volume.bounds).tolist()), (r, g, b)
+    how = step, enabled, lit, name, isovalue, color, parallel, False, box
+    return scene, State(orbit, whole.size, shown, *how)

@@ -12,12 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
+from PIL import Image
 
 from ..._util.srgb import to_srgb
 from ...metrics import rmse
 from ...render import render
+from ...scene.camera import Camera
+from ...scene.rendering import Rendering
 from .editing import padded
-from .state import Scene, State
+from .state import PROGRAM, Scene, State
 
 
 SIDE = 192
@@ -62,12 +65,17 @@ class Grid:
         middle = self.size[0] / SIDE / 2 - 0.5, self.size[1] / SIDE / 2 - 0.5
         return sorted(tiles, key=lambda tile: math.dist(tile, middle))
 
+    def empty(self) -> Pixels:
+        """An image that holds all tiles whole."""
+        return np.empty((self.rows * SIDE, self.columns * SIDE, 3), np.uint8)
+
     def canvas(self, pixels: Pixels) -> Pixels:
-        """An image that holds all tiles whole: each pixel the nearest one of another image."""
-        rows, columns, _ = pixels.shape
-        row = np.minimum(np.arange(self.rows * SIDE) * rows // self.size[1], rows - 1)
-        column = np.minimum(np.arange(self.columns * SIDE) * columns // self.size[0], columns - 1)
-        return pixels[row[:, None], column[None, :]]
+        """An image that holds all tiles whole: another one, stretched smoothly, so that it has no
+        blocks beside finished tiles."""
+        width, height = self.size
+        stretched = np.asarray(Image.fromarray(pixels).resize(self.size, Image.Resampling.BILINEAR))
+        beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width), (0, 0)
+        return np.pad(stretched, beyond, "edge")
 
     def window(self, column: int, row: int, aspect: float) -> tuple[float, float, float, float]:
         """A tile's part of the image plane, as `Camera.window`. `aspect`: width over height of the view."""
@@ -82,21 +90,28 @@ class TileRenderer:
     def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
         self.volume, self.state, self.march = scene.volume, state, scene.march(state, step_factor)
         self.transfer = padded(state.transfer)
-        self.background = np.asarray(scene.background, np.float32)
-        self.how = {"compositing": scene.compositing, "lighting": scene.light(state), "outputs": "rgba"}
+        self.background = np.asarray(state.background, np.float32)
+        self.how = {"compositing": scene.compositing(state), "lighting": scene.light(state)}
 
     @property
     def program_key(self) -> tuple[Any, ...]:
         """Equal for states that one compiled program draws."""
         leaves, structure = jax.tree.flatten(self.transfer)
-        return self.state.enabled, self.state.lit, structure, *map(np.shape, leaves)
+        return *(getattr(self.state, name) for name in PROGRAM), structure, *map(np.shape, leaves)
+
+    def camera(self, window: object, corner: object = None) -> Camera:
+        """That of a tile."""
+        return self.state.orbit.camera((SIDE, SIDE), window, corner, parallel=self.state.parallel)
+
+    def rendered(self, camera: Camera) -> Rendering:
+        """What `render` returns for a camera of a tile's size."""
+        return render(self.volume, self.transfer, camera, self.march, **self.how)
 
     def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
         """A tile as `render` returns it."""
         width, height = self.state.size
         window, corner = grid.window(column, row, width / height), (column * SIDE, row * SIDE)
-        camera = self.state.orbit.camera((SIDE, SIDE), window, corner)
-        return render(self.volume, self.transfer, camera, self.march, **self.how).rgba
+        return self.rendered(self.camera(window, corner)).rgba
 
     def draw(self, pixels: Pixels, grid: Grid, column: int, row: int) -> None:
         """Draw a tile into its place in an image that holds all tiles whole."""
@@ -106,7 +121,7 @@ class TileRenderer:
     def coarse(self, most: int) -> Pixels:
         """An image of at most so many tiles."""
         grid = Grid.coarse(self.state.size, most)
-        pixels = np.empty((grid.rows * SIDE, grid.columns * SIDE, 3), np.uint8)
+        pixels = grid.empty()
         for column, row in grid.tiles():
             self.draw(pixels, grid, column, row)
         return pixels
@@ -115,6 +130,17 @@ class TileRenderer:
         """Linear colours of one tile that is stretched over the view."""
         rgba = np.asarray(self.rgba(Grid.coarse(self.state.size, 1), 0, 0))
         return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
+
+    def picked(self, across: float, down: float) -> Float[np.ndarray, "3"] | None:
+        """The world point that is seen at a fraction of the view's width and height, at the mean depth; None
+        where nothing is."""
+        (width, height), least = self.state.size, 1e-3
+        x, y = (2 * across - 1) * width / height, 1 - 2 * down
+        camera = self.camera((x - least, x + least, y - least, y + least))
+        depth = self.rendered(camera).details.depth
+        found = np.inf if depth is None else float(np.asarray(depth)[SIDE // 2, SIDE // 2])
+        point = camera.point(SIDE // 2, SIDE // 2, found) if np.isfinite(found) else None
+        return None if point is None else np.asarray(point, np.float64)
 
 
 def estimated_error(

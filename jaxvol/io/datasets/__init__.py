@@ -16,6 +16,7 @@ import numpy as np
 
 from ..._util.checks import described
 from ..._util.files import MOST_VOXELS, check_size
+from ..._util.texts import near
 from ...scene.volume import Volume
 from ..formats import load as load_file
 
@@ -98,15 +99,16 @@ def info(name: str | Any) -> Dataset:
     for dataset in registry().values():
         if wanted in (dataset.name, dataset.title.lower()):
             return dataset
-    raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.")
+    hint = near(name, registry()) if isinstance(name, str) else ""
+    raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.{hint}")
 
 
 def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Path:
     """The path of a dataset's raw file, which is fetched if it is not on this machine yet.
 
     It is looked for in the folder that the environment variable `JAXVOL_DATA` names, as `.raw` or as
-    `.raw.gz`, then in the cache. If it is in neither, it is downloaded (`pip install jaxvol[datasets]`), and
-    kept if its SHA-512 is the published one.
+    `.raw.gz`, then in the cache. If it is in neither, it is downloaded (`pip install "jaxvol[datasets]"`),
+    and kept if its SHA-512 is the published one.
 
     Args:
         name: one of `names()`; case is ignored. `info(name).nbytes` tells how much will be fetched.
@@ -131,7 +133,7 @@ def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, prog
     try:
         import pooch
     except ImportError as fault:
-        raise ImportError(f"fetching {dataset.name} needs pooch: pip install jaxvol[datasets]") from fault
+        raise ImportError(f"fetching {dataset.name} needs pooch: pip install 'jaxvol[datasets]'") from fault
     target = (Path(pooch.os_cache("jaxvol")) / "datasets" if folder is None else Path(folder)) / dataset.file
     if target.is_file():  # pooch would hash it each time, which takes minutes for many GB
         return _of_right_size(target, dataset)

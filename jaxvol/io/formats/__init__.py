@@ -68,7 +68,7 @@ def load(
     | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
     | `.mha`, `.mhd` | its own |
     | `.nii`, `.nii.gz` | its own: the sform if its code is positive, else the qform, else `pixdim`; in mm |
-    | `.nrrd`, `.nhdr` | its own; read by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nrrd`, `.nhdr` | its own; read by SimpleITK (`pip install "jaxvol[io]"`) |
     | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
     | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
     | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |

@@ -32,7 +32,7 @@ def simple_itk(path: Path) -> Any:
     try:
         import SimpleITK  # pyright: ignore[reportMissingImports]
     except ImportError as fault:
-        raise ImportError(f"{path} needs SimpleITK: pip install jaxvol[io]") from fault
+        raise ImportError(f"{path} needs SimpleITK: pip install 'jaxvol[io]'") from fault
     return SimpleITK
 
 

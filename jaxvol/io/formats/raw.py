@@ -46,7 +46,7 @@ def raw_header(
     if not {"shape", "dtype"} <= fields.keys():
         raise ValueError(
             f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
-            'and dtype="uint8" (--shape, --dtype), or name it name_XxYxZ_dtype.raw, or put '
+            'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put '
             f'{path.name}.json in its folder with {{"size": [nx, ny, nz], "type": "uint8"}}.'
         )
     shape, dtype = fields.pop("shape"), fields.pop("dtype")

@@ -24,7 +24,7 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     | ending | written |
     |---|---|
     | `.npz` | voxels, spacing, origin, direction, labels and their ids; compressed |
-    | `.nrrd`, `.mha` | voxels, spacing, origin, direction; by SimpleITK (`pip install jaxvol[io]`) |
+    | `.nrrd`, `.mha` | voxels, spacing, origin, direction; by SimpleITK (`pip install "jaxvol[io]"`) |
     | `.nii`, `.nii.gz` | the same, rounded to about 1e-7, as sform and, unless sheared, as qform |
 
     Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a

@@ -66,7 +66,7 @@ def _images(path: Path) -> tuple[np.ndarray, str, dict[str, Any]]:
     try:
         import tifffile  # pyright: ignore[reportMissingImports]
     except ImportError as fault:
-        raise ImportError(f"reading {path} needs tifffile: pip install jaxvol[io]") from fault
+        raise ImportError(f"reading {path} needs tifffile: pip install 'jaxvol[io]'") from fault
     file_size(path)
     try:
         with tifffile.TiffFile(path) as file:
@@ -102,7 +102,7 @@ def _images(path: Path) -> tuple[np.ndarray, str, dict[str, Any]]:
     except Exception as fault:
         if "imagecodecs" in str(fault):
             raise ImportError(
-                f"reading {path} needs imagecodecs ({fault}): pip install jaxvol[io]"
+                f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
             ) from fault
         if isinstance(fault, ValueError) and str(fault).startswith("path:"):
             raise

@@ -30,5 +30,5 @@ class Drawn:
 @pytest.fixture
 def drawn(monkeypatch):
     drawn = Drawn()
-    monkeypatch.setattr("jaxvol.app.commands.scene.render", drawn)
+    monkeypatch.setattr("jaxvol.app.picture.render", drawn)
     return drawn

@@ -45,11 +45,14 @@ BAD = [
     (["fit", "x.raw", "--images", "a.png"], "fit: error: the following arguments are required: --cameras (j"),
     (
         ["render", "x.raw", "--sise", "9", "9"],
-        "jaxvol render: error: unrecognized arguments: --sise 9 9 (jaxvol render -",
+        "jaxvol render: error: unrecognized arguments: --sise 9 9. Did you mean --size or",
     ),
     (["info", "x.raw", "y.raw"], "jaxvol info: error: unrecognized arguments: y.raw (jaxvol info --help"),
     (["datasets"], "datasets: error: the following arguments are required: action"),
     (["paint"], "error: argument COMMAND: invalid choice: 'paint' (choose from"),
+    (["rendr"], "'view'). Did you mean render? (jaxvol --help lists"),
+    (["render", "x.raw", "--compositing", "mip"], "invalid choice: 'mip' (choose from"),
+    (["render", "x.raw", "--compositing", "mip"], "'isosurface'). Did you mean maximum?"),
 ]
 
 
@@ -177,10 +180,11 @@ BUSY = """
 import signal, sys
 import jax, jax.numpy as jnp
 import jaxvol.app.cli
-from jaxvol.app.commands import animate, scene
+from jaxvol.app import picture
+from jaxvol.app.commands import animate
 from tests.app.commands.conftest import Drawn
 
-scene.render = Drawn()
+picture.render = Drawn()
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, however the tests are run
 def display(*_):
     print("under way", flush=True)

@@ -77,7 +77,7 @@ BAD = {
     "text": ('step = "long"', "argument --step: invalid float value: 'long'"),
     "no list": ("view-up = 3", "argument --view-up: expected 3 arguments"),
     "choice": ('compositing = "under"', "argument --compositing: invalid choice: 'under'"),
-    "excluded": ('preset = "engine"\ncmap = "gray"', "--cmap and --preset exclude each other"),
+    "excluded": ('preset = "engine"\ncmap = "gray"', "cmap and preset exclude each other"),
     "no TOML": ("step = ", "settings.toml cannot be read as TOML"),
 }
 

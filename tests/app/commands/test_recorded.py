@@ -17,7 +17,7 @@ from skimage.io import imread
 import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
-from jaxvol.app.commands.recorded import KEYWORD, checksum, text_of
+from jaxvol.app.recorded import KEYWORD, checksum, text_of_options
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
@@ -82,7 +82,7 @@ def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path
     assert like("c.png", "--preset", "engine") == 0
     assert "transfer" not in text_in("c.png")
     assert like("d.png", "--clim", "0", "1") == 2
-    assert "the transfer function in the picture and --clim exclude each other" in capsys.readouterr().err
+    assert "the transfer function in the picture and clim exclude each other" in capsys.readouterr().err
 
 
 def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypatch):
@@ -108,7 +108,7 @@ def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypat
     assert all(getattr(found(words), flag) for flag in flags)
     assert not any(getattr(found(words, *off), flag) for flag in flags)
     assert not hasattr(options("plan", "--like", "a.png"), "transparent")
-    with pytest.raises(ValueError, match="--cmap and --preset exclude each other"):
+    with pytest.raises(ValueError, match="cmap and preset exclude each other"):
         found("--preset=head --cmap=hot")
 
 
@@ -117,7 +117,7 @@ def test_every_option_is_recorded(volume_file, tmp_path):
     words += "--parallel --clip-plane 1 2 3 0 0 1 --clip-plane 4 5 6 1 0 0 --memory 2M --zoom 1.25"
     given = options("render", str(volume_file), *words.split())
     transfer = jv.colormap("red", (0, 1))
-    png(tmp_path / "a.png", text_of(given, transfer)[KEYWORD])
+    png(tmp_path / "a.png", text_of_options(given, transfer)[KEYWORD])
     again = vars(options("render", "--like", str(tmp_path / "a.png")))
     assert again.pop("like") == tmp_path / "a.png"
     assert again == {name: value for name, value in vars(given).items() if name != "like"}

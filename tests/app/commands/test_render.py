@@ -11,8 +11,8 @@ from skimage.io import imread
 
 import jaxvol as jv
 from jaxvol.app.cli import main
-from jaxvol.app.commands.render import why_empty
-from jaxvol.app.commands.scene import Scene
+from jaxvol.app.picture import Scene
+from jaxvol.app.show import why_empty
 from jaxvol.compositing.blending import Over
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import Phong
@@ -29,7 +29,7 @@ def of_voxel(cmap, clim=RANGE):
     return jv.colormap(cmap, clim, unit_distance=1.0)
 
 
-FAST = jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()
+FAST = jv.EmptySpaceJitter(seed=0), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination()
 
 
 def render(file, *words, step: str | None = "0.4"):
@@ -127,7 +127,8 @@ def test_options_of_the_look_make_the_scene(case, volume_file, tmp_path, monkeyp
     assert same(how["compositing"], compositing_of(mode))
     assert type(how["lighting"]) is type(lighting)
     assert same(how["lighting"], lighting)
-    assert same(camera, jv.Camera.looking_at(volume, size=(16, 16)))
+    near = jv.automatic_camera(volume, found, size=(16, 16), least=0.01)
+    assert same(camera, near if mode == "over" else jv.Camera.looking_at(volume, size=(16, 16)))
     assert same(march, jv.March(0.4, FAST, "midpoint"))
     rgba = drawn(volume, found, camera, march).rgba
     np.testing.assert_allclose(np.load("x.npy"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind, atol=1e-6)
@@ -159,6 +160,8 @@ def test_options_of_the_view_make_the_camera(volume_file, tmp_path, drawn):
     assert render(volume_file, "--parallel", "--direction", 0, 0, 1, "-o", output) == 0
     camera = drawn.scenes[-1][2]
     assert camera.parallel_scale is not None
+    assert render(volume_file, "--parallel", "--camera", 100, *[0] * 5, "-o", output) == 0
+    assert float(drawn.scenes[-1][2].parallel_scale) == pytest.approx(100 * np.tan(np.pi / 12))
     away = np.asarray(camera.focal_point - camera.position)
     np.testing.assert_allclose(away / np.linalg.norm(away), (0, 0, -1), atol=1e-6)
 
@@ -188,7 +191,7 @@ def plans(monkeypatch):
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
-    monkeypatch.setattr("jaxvol.app.commands.scene.plan", plan)
+    monkeypatch.setattr("jaxvol.app.picture.plan", plan)
     return made
 
 
@@ -196,21 +199,21 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
     words = ["--preset", "engine", *CUT]
     assert render(volume_file, *words, "-o", tmp_path / "x.png", step=None) == 0
     assert float(drawn.scenes[0][3].step) == np.float32(0.7)
-    printed = capsys.readouterr().out
-    assert "(reading and planning " in printed
-    assert "not proven to be within an RMSE of 0.0039; jaxvol plan tells more" in printed
+    printed = capsys.readouterr()
+    assert "(reading and planning " in printed.out
+    assert "not proven to be within an RMSE of 0.0039; jaxvol plan tells more" in printed.err
     assert render(volume_file, *words, "--tolerance", "0.01", "-o", tmp_path / "x.png", step=None) == 0
-    assert "not proven" not in capsys.readouterr().out
+    assert "not proven" not in capsys.readouterr().err
     assert main(["plan", str(volume_file), *map(str, words), "--tolerance", "0.01"]) == 0
     assert "step 0.7, left, Clip" in capsys.readouterr().out
     assert [tolerance for *_, tolerance, _ in plans] == [1 / 255, 0.01, 0.01]
     for *_, how in plans:
-        assert same(how["transforms"], (jv.Clip(CLIP, PLANES, inside_out=True),))
+        assert same(how["transforms"], (jv.Clip(CLIP, PLANES, inside_out=True), FAST[0]))
         assert isinstance(how["lighting"], Phong)
         assert how["once"]
     for bad in (["--tolerance", "0.1", "--step", "1"], ["--step", "1"]):
         assert main(["plan", str(volume_file), *bad]) == 2
-        assert "--step" in capsys.readouterr().err
+        assert "step" in capsys.readouterr().err
     # of an orbit, for four views, by the shortest step
     assert (
         main(
@@ -259,7 +262,7 @@ def test_a_picture_in_which_nothing_is_seen_says_why(tmp_path, capsys, drawn):
     assert render(tmp_path / "v.npy", *bone) == 0
     told = capsys.readouterr().out
     assert "hardly anything is visible: the opacity is at most" in told
-    assert "a shorter --unit-distance (voxels have the size 1)" in told
+    assert "a shorter unit_distance (voxels have the size 1)" in told
 
 
 DARK = np.full((3, 3), 0.5)
@@ -302,7 +305,7 @@ def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monk
             is_leaf=lambda leaf: leaf is None,
         )
 
-    monkeypatch.setattr("jaxvol.app.commands.scene.render_bricks", render_bricks)
+    monkeypatch.setattr("jaxvol.app.picture.render_bricks", render_bricks)
     words = ["--preset", "engine", "-o", tmp_path / "x.npy", "--memory"]
     assert render(volume_file, *words, "200K") == 0
     assert asked["memory"] == 200 * 2**10
@@ -342,32 +345,43 @@ BAD = {
     "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
     "clim of a file": (
         ["FILE", "--transfer", "t.json", "--clim", "0", "1"],
-        "--transfer and --clim exclude",
+        "transfer and clim exclude",
     ),
-    "parallel": (["FILE", "--parallel", "--camera", *"123456"], "--camera and --parallel exclude each other"),
+    "direction": (["FILE", "--camera", *"123456", "--direction", *"123"], "camera and direction exclude"),
     "no file": (["nowhere.raw"], "error: there is no file"),
     "cmap": (["FILE", "--cmap", "moon"], "cmap must be"),
     "background": (
-        ["nowhere.raw", "--background", "200", "0", "nan"],
-        "--background must be three numbers from 0 to 1 (linear RGB); got 200 0 nan.",
+        ["nowhere.raw", "--background", "200", "0", "0"],
+        "background must be three numbers from 0 to 1 (linear RGB); got 200 0 0. 8-bit",
     ),
+    "a colour's name": (
+        ["nowhere.raw", "--background", "whit"],
+        "--background must be a colour's name, such",
+    ),
+    "level": (["FILE", "--window", "3"], "window and level go together; one is missing"),
+    "window": (["FILE", "--window", "3", "--clim", "0", "1"], "clim and window exclude each other"),
+    "preset": (["FILE", "--preset", "CT-Bnes"], "got 'CT-Bnes'. Did you mean CT-Bones"),
+    "raw": (["DIR/headless.raw"], "not both known. Give --shape nx ny nz and --dtype uint8, or name it"),
+    "with": (["FILE", "--with", "FILE", "hot", "1"], "others are FILE, FILE CMAP or FILE CMAP LOW HIGH"),
+    "labels and memory": (["FILE", "--with", "FILE", "--memory", "1M"], "memory reads one volume, without"),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
     "size": (["FILE", "--size", "0", "5"], "size must be"),
     "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
     "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
-    "nothing to turn": (["FILE", "--clip-inside-out"], "--clip-inside-out goes with --clip-box or"),
+    "nothing to turn": (["FILE", "--clip-inside-out"], "clip_inside_out goes with clip_box or"),
     "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
-    "no isovalue": (["FILE", "--compositing", "isosurface"], "isosurface and --isovalue VALUE go together"),
-    "isovalue": (["FILE", "--isovalue", "9"], "isosurface and --isovalue VALUE go together; one is missing"),
-    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "--step and --tolerance exclude each other"),
+    "no isovalue": (["FILE", "--compositing", "isosurface"], "isosurface and isovalue go together"),
+    "isovalue": (["FILE", "--isovalue", "9"], "isosurface and isovalue go together; one is missing"),
+    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "step and tolerance exclude each other"),
 }
 
 
 @pytest.mark.parametrize("case", BAD)
 def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
     arguments, message = BAD[case]
-    arguments = [a.replace("FILE", str(volume_file)) for a in arguments]
-    monkeypatch.setattr("jaxvol.app.commands.scene.render", None)  # fails if it is called
+    arguments = [a.replace("FILE", str(volume_file)).replace("DIR", str(tmp_path)) for a in arguments]
+    (tmp_path / "headless.raw").write_bytes(bytes(8))
+    monkeypatch.setattr("jaxvol.app.picture.render", None)  # fails if it is called
     assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
     printed = capsys.readouterr()
     assert printed.err.count("\n") == 1

@@ -13,10 +13,11 @@ from jaxvol.app.viewer.editing import (
     MAX_POINTS,
     display_color,
     padded,
+    recolored,
     window_level,
     with_color,
     with_opacity,
-    with_point_after,
+    with_points_at,
     with_value,
     with_window_level,
     without_point,
@@ -79,16 +80,22 @@ def test_a_value_stays_between_its_neighbours():
 
 
 def test_a_point_that_is_added_changes_nothing():
-    split = with_point_after(GIVEN, 2)
+    split = with_points_at(GIVEN, [35])
     assert len(split.values) == 5
     assert_same_function(split, GIVEN)
     assert_same_function(without_point(split, 3), GIVEN)
-    with pytest.raises(ValueError, match="no room"):
-        with_point_after(GIVEN, 3)
     with pytest.raises(ValueError, match="at least 2"):
         without_point(without_point(without_point(GIVEN, 0), 0), 0)
     with pytest.raises(ValueError, match="no room for another"):
-        with_point_after(GIVEN, 1)
+        with_points_at(padded(GIVEN), [30])
+
+
+def test_a_colormap_leaves_the_opacity():
+    colored = padded(recolored(GIVEN, "gray"))
+    np.testing.assert_allclose(looked_up(colored)[:, 3], looked_up(padded(GIVEN))[:, 3], atol=1e-6)
+    grey = np.clip((np.asarray(colored.values) - 10) / 40, 0, 1)[:, None]
+    linear = np.where(grey < 0.04, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(colored.colors, linear * np.ones(3), atol=0.01)  # of 256 colours
 
 
 def test_a_step_alone_is_padded_and_moved():

@@ -104,7 +104,7 @@ class Face:
         assert extent(new) < 0.3 * old
 
     def check_switch(self, find: str) -> None:
-        """A transform that is turned off, for which another program is compiled. `find`: of its box."""
+        """Light that is turned on, for which another program is compiled. `find`: of its box."""
         self.page.evaluate(f"({find}).id = 'switch', 1")
         self.page.point_at("#switch", click=True)
         self.page.wait_for("document.body.innerText.includes('compil')", SECONDS)
@@ -142,11 +142,11 @@ def test_the_page(tmp_path):
         url = server.stdout.readline().split()[1]
         assert url == f"http://localhost:{port}"
         with opened(url, 1200, 800) as page:
-            page.wait_for("document.body.innerText.includes('march and light')", SECONDS)
+            page.wait_for("document.body.innerText.includes('slices')", SECONDS)
             face = Face(page, box_of(page, "canvas"))
             face.check_pointer()
             face.check_level(page_field("level"))
-            face.check_switch(page_field("EarlyTermination"))
+            face.check_switch(page_field("light"))
             assert page.faults == []
     finally:
         server.kill()
@@ -175,5 +175,5 @@ def test_the_notebook(tmp_path):
         face = Face(page, box_of(page, ".renderview-view", 2))
         face.check_pointer()
         face.check_level(notebook_field("level"))
-        face.check_switch(notebook_field("EarlyTermination"))
+        face.check_switch(notebook_field("light"))
         assert page.faults == []

@@ -1,17 +1,27 @@
 """Does a viewer draw what its state says: coarse at once, fine at rest, the image of `render`?"""
 
+import base64
+import io
 import math
+import re
+import threading
+import time
+from contextlib import suppress
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 import jaxvol as jv
 from jaxvol import to_srgb
+from jaxvol.app.cli import parser_of_all
+from jaxvol.app.recorded import recorded_in
 from jaxvol.app.viewer.controls import controls_of
-from jaxvol.app.viewer.editing import padded, with_color, with_point_after, with_window_level
+from jaxvol.app.viewer.editing import padded, with_color, with_opacity, with_points_at, with_window_level
 from jaxvol.app.viewer.model import BUDGET, LEVELS, Model, adapted
 from jaxvol.app.viewer.state import initial
 from jaxvol.app.viewer.tiles import Grid, TileRenderer, estimated_error
@@ -35,7 +45,10 @@ LABELS = jv.Volume(np.repeat(np.arange(3, dtype=np.uint8), 8)[:, None, None] * n
 HOW = {"lighting": None, "lit": False, "compositing": "over", "background": (0.2, 0.5, 0.8), "size": SIZE}
 
 
-def begun(volume=BALL, transfer: Any = LOOK, camera=None, march: jv.March | None = MARCH, **more):
+WHOLE = jv.Camera.looking_at(BALL, size=SIZE)
+
+
+def begun(volume=BALL, transfer: Any = LOOK, camera: Any = WHOLE, march: jv.March | None = MARCH, **more):
     return initial(volume, transfer, camera, march, **{**HOW, **more})
 
 
@@ -70,7 +83,7 @@ def test_a_coarse_image_is_followed_by_the_fine_one_of_render(shown, side, monke
     assert last.shape == (27, 38, 3)
     for left, top in ((0, 0), (38 - side, 27 - side)):  # by the program of a tile
         camera = state.orbit.camera(state.size).crop(left, top, side, side)
-        rendering = jv.render(BALL, padded(state.transfer), camera, scene.march(state), outputs="rgba")
+        rendering = jv.render(BALL, padded(state.transfer), camera, scene.march(state))
         expected = np.round(255 * np.asarray(to_srgb(rendering.image((0.2, 0.5, 0.8)))))
         difference = np.abs(last[top : top + side, left : left + side].astype(int) - expected)
         assert difference.max() <= 1
@@ -91,7 +104,7 @@ def test_changes_need_no_other_program(shown, side):
     """What a drag or a slider changes is traced: nothing is compiled again."""
     scene, state = shown.model.scene, shown.model.state
     changed = replace(state, step=state.step * 1.7, orbit=state.orbit.turned(0.1, 0.2).zoomed(1.3))
-    transfer = with_point_after(with_window_level(state.transfer, 90, 110), 1)
+    transfer = with_points_at(with_window_level(state.transfer, 90, 110), [120])
     changed = replace(changed, transfer=transfer, size=(67, 43))
     before, after = TileRenderer(scene, state), TileRenderer(scene, changed, 4.0)
     before.coarse(1)
@@ -144,6 +157,83 @@ def test_bad_input_and_faults_are_told_and_the_viewer_lives_on(shown):
     assert model.wait()
     assert shown.told[-1].startswith("not drawn:\nview_up")
     shown.after(lambda s: begun()[1])
+
+
+def test_what_is_picked_lies_where_the_ray_meets_the_ball(shown):
+    model = shown.model
+    shown.after(lambda s: replace(s, transfer=with_opacity(s.transfer, 1, 1.0, 1.0)))  # opaque from 90 on
+    orbit, center = model.state.orbit, np.asarray(BALL.center)
+    model.pick(0.5, 0.5)
+    voxels = np.linalg.norm((model.state.point - center) / BALL.spacing)
+    assert 9 < voxels < 10.1  # opaque soon after 60, which is (200 - 60) / 14 voxels from the middle
+    np.testing.assert_allclose(np.cross(model.state.point - center, orbit.toward), 0, atol=0.1)
+    assert (model.state.point - center) @ orbit.toward > 0
+    picked = model.state.point
+    model.pick(0.01, 0.01)
+    assert model.state.point is picked  # nothing is there
+    model.state = begun()[1]
+
+
+def test_a_saved_image_has_any_size_and_its_settings(tmp_path):
+    path, done = tmp_path / "saved.png", threading.Event()
+    drawn = Model(*begun(), lambda *_: None, lambda _: None, lambda png: path.write_bytes(png) and done.set())
+    state = drawn.state = replace(drawn.state, isovalue=7.0, background=(0.0, 0.5, 1.0))
+    drawn.save(2.5 * SIZE[0])
+    assert done.wait(600)
+    drawn.close()
+    image = np.asarray(Image.open(path))
+    assert image.shape == (68, 95, 3)
+    np.testing.assert_array_equal(image[0, 0], (0, 188, 255))
+    found = recorded_in(path)
+    np.testing.assert_allclose(found["transfer"].extinction, LOOK.extinction, rtol=1e-6)
+    options = parser_of_all().parse_args(["render", "volume.raw", *found["options"]])
+    assert (options.size, options.shade, options.clip_box) == ([95, 68], False, None)
+    place = [*state.orbit.position, *state.orbit.focal_point]
+    np.testing.assert_allclose([*options.camera, options.step], [*place, 0.4], rtol=1e-6)
+
+
+def until(condition):
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.001)
+
+
+def test_another_program_is_compiled_beside_the_old_image(monkeypatch):
+    """By a renderer that notes what it is asked for, and waits when it compiles."""
+    gate, drawn = threading.Semaphore(1), []
+
+    class Renderer(TileRenderer):
+        def overview(self):
+            assert gate.acquire(timeout=60)
+            gate.release()
+            return np.zeros((2, 2, 3))
+
+        def draw(self, pixels, grid, column, row):
+            drawn.append(self.state)
+            pixels[:] = 7
+
+    monkeypatch.setattr("jaxvol.app.viewer.model.TileRenderer", Renderer)
+    told: list[str] = []
+    model = Model(*begun(), lambda *_: None, told.append)
+    model.rest = 0
+    model.ask(model.state)
+    assert model.wait(60)
+    gate.acquire()
+    count, first = len(drawn), model.state
+    model.change(enabled=first.enabled | {"Jitter"}, lit=True)
+    until(lambda: "compiling for Jitter, light" in told[-1])
+    assert not model.wait(0.1)
+    assert len(drawn) == count  # the old image stays
+    model.change(orbit=first.orbit.turned(0.1, 0))
+    until(lambda: len(drawn) > count)
+    assert (drawn[-1].enabled, drawn[-1].lit) == (first.enabled, False)  # and follows by the old program
+    assert drawn[-1].orbit is model.state.orbit
+    gate.release()
+    assert model.wait(60)
+    assert drawn[-1] is model.state
+    assert "compiling" not in told[-1]
+    model.close()
 
 
 def test_a_view_has_2048_pixels_on_a_side_at_most(shown, monkeypatch):
@@ -223,26 +313,44 @@ def controlled(monkeypatch):
 
 
 def test_the_controls_change_the_points_that_they_show(controlled):
+    """By presses on the curve, of values from 22 to 200 and heights that are square roots of opacities."""
     model, controls = controlled()
-    controls["level"].set(150.0)
-    controls["point"].set("2: 110")
+    low, high = float(np.min(BALL.data)), float(np.max(BALL.data))
+
+    def press(gesture, part, value, opacity, *, twice="false"):
+        x, y = (value - low) / (high - low), 1 - math.sqrt(opacity) * 108 / 110
+        controls["curve"].set(f"{gesture},curve,{part},{twice},{x:.5f},{y:.5f}")
+
+    def values():
+        return model.state.transfer.values.tolist()
+
+    given = values()
+    press(1, "1", 95, 0.3)
+    assert values() == given  # it is only chosen
+    press(1, "1", 110.04, 0.3)
+    assert values() == [60, 110, 200]
     assert controls["value"].get() == 110
-    controls["opacity"].set(0.5)
+    assert controls["opacity"].get() == pytest.approx(0.3, abs=1e-3)
     controls["color"].set("#ff0000")
-    assert controls["opacity"].get() == pytest.approx(0.5)
     np.testing.assert_allclose(model.state.transfer.colors[1], (1, 0, 0))
-    controls["point"].set("3: 220")
-    controls["value"].set(260.0)
-    assert (controls["window"].get(), controls["level"].get()) == (180, 170)
-    assert controls["point"].get() == "3: 260"
-    controls["point"].set("2: 110")
-    controls["points"].set("add after")
-    assert controls["point"].choices() == ["1: 80", "2: 110", "3: 185", "4: 260"]
-    controls["point"].set("4: 260")
-    controls["points"].set("remove")
-    assert controls["point"].get() == "3: 185"
+    press(2, "", 150, 0.9)
+    assert values() == [60, 110, 150, 200]
+    np.testing.assert_allclose(model.state.transfer.colors[2], (1, 4 / 9, 4 / 9), atol=1e-6)
+    press(2, "", 160, 0.6)  # what was added is dragged on
+    assert values() == [60, 110, 160, 200]
+    for value in (160, 170):
+        press(3, "2", value, 0.6, twice="true")
+    assert values() == [60, 110, 200]
+    for message in ("", "4,curve,x,false,0,0", "4,curve,,false,nan,0"):
+        with suppress(ValueError):
+            controls["curve"].set(message)
+    assert values()[0] == 60
+    controls["level"].set(150.0)
+    assert values() == [80, 130, 220]
+    controls["preset"].set("as given")
+    assert values() == given
     many, controls = controlled(BALL, jv.colormap("gray", (0, 200), n_colors=40))
-    assert "point" not in controls
+    assert "value" not in controls
     controls["window"].set(100.0)
     assert float(many.state.transfer.values[0]) == pytest.approx(50)
 
@@ -258,14 +366,69 @@ def test_the_controls_change_march_and_light(controlled):
     for step, expected in ((0.5, 0.5), (0.0, 1 / 16), (1e9, 16)):
         controls["step (voxels)"].set(step)
         assert model.state.step == expected
-    assert "light" not in controlled(compositing="average")[1]
+    controls["look from"].set("+z")
+    np.testing.assert_allclose(model.state.orbit.toward, (0, 0, 1), atol=2e-3)
+    controls["background"].set("#ffffff")
+    for mode, background, lit in (("maximum", (0, 0, 0), False), ("isosurface", (1, 1, 1), True)):
+        controls["mode"].set(mode)
+        assert (model.state.background, model.state.lit) == (background, lit)
+    labels, controls = controlled(LABELS, None)
+    controls["mode"].set("average")  # which labels cannot be shown by
+    assert labels.state.mode == "over"
+
+
+def test_a_box_and_a_plane_clip_what_is_shown(controlled):
+    model, controls = controlled()
+    assert not model.state.clip
+    controls["x"].set((3.0, 9.0))
+    controls["cut from"].set("view")
+    orbit = model.state.orbit
+    clip = model.scene.march(model.state).transforms[0]
+    assert isinstance(clip, jv.Clip)
+    assert clip.box is not None
+    np.testing.assert_allclose(clip.box, (3, 9, *np.asarray(BALL.bounds)[2:]))
+    np.testing.assert_allclose((clip.origins[0], clip.normals[0]), (BALL.center, -orbit.toward), rtol=1e-5)
+    for depth in (-1.0, 1.0):  # from nothing to all
+        controls["depth"].set(depth)
+        origin, normal = model.scene.plane(model.state)
+        heights = (np.array(list(product(*np.asarray(BALL.bounds).reshape(3, 2)))) - origin) @ normal
+        assert np.all(np.sign(heights) == -depth)
+
+
+def test_slices_pass_through_the_point_and_move_it(controlled):
+    data = np.tensordot((1, 2, 4), np.indices((24, 24, 24)), 1).astype(np.uint8)
+    turned = jv.Volume(data, (1, 1.2, 0.8), (5, 6, 7), direction=[(0, 1, 0), (-1, 0, 0), (0, 0, 1)])
+    model, controls = controlled(turned)
+    pad = controls["slices"]
+
+    def at(*index):
+        return np.add((5, 6, 7), (1.2 * index[1], -index[0], 0.8 * index[2]))
+
+    pad.set("1,2,,false,0.25,1")  # across z: x of the data runs along -y of the world, and y along x
+    np.testing.assert_allclose(model.state.point, at(0.75 * 23, 0, 11.5), rtol=1e-6)
+    pad.set("2,0,,false,1,0")
+    with pytest.raises(ValueError, match="a press lies somewhere"):
+        pad.set("2,0,,false,nan,0")
+    np.testing.assert_allclose(model.state.point, at(0.75 * 23, 23, 23), rtol=1e-6)
+    told = re.search(r"at \((.*)\): (.*)</div>", pad.get())
+    assert told is not None
+    assert [float(each) for each in told[1].split(", ")] == pytest.approx(model.state.point, rel=1e-3)
+    assert float(told[2]) == float(data[17, 23, 23])
+    pictures = [Image.open(io.BytesIO(base64.b64decode(p))) for p in re.findall('base64,(.*?)"', pad.get())]
+    # x of the data is drawn to the right, and against the world's y; y upwards, as the world's x
+    for picture, expected in zip(
+        pictures, (data[17, :, ::-1], data[::-1, 23, ::-1], data[::-1, ::-1, 23]), strict=True
+    ):
+        seen, whole = np.asarray(picture), Image.fromarray(np.ascontiguousarray(expected.T))
+        grey = np.ptp(seen, axis=-1) == 0  # not the lines through the point
+        assert np.corrcoef(seen[grey][:, 0], np.asarray(whole.resize(picture.size))[grey])[0, 1] > 0.99
 
 
 def test_labels_are_shown_and_changed_by_their_controls(controlled):
     model, controls = controlled(LABELS, None)
     given = model.state.transfer
-    assert controls["label"].choices() == ["1", "2"]
-    assert "#1f77b4" in controls["html"].get()
+    assert controls["label"].choices == ["1", "2"]
+    assert "#1f77b4" in controls["pad"].get()
     controls["shown"].set(False)
     assert not controls["shown"].get()
     controls["label"].set("2")
@@ -282,26 +445,24 @@ def test_a_table_is_shown_and_not_edited(controlled):
     model, controls = controlled(BALL, given)
     assert padded(model.state.transfer) is given
     assert not {"window", "level", "point"} & controls.keys()
-    assert "not edited" in controls["html"].get()
+    assert "not edited" in controls["pad"].get()
 
 
 def test_a_transfer_function_is_found_where_none_is_given():
-    _, state = begun(transfer=None, march=None)
+    _, state = begun(transfer=None, camera=None, march=None)
     assert equal_arrays(state.transfer, jv.automatic_transfer(BALL))
 
 
 def test_what_the_viewer_does_not_show_is_refused():
-    parallel = jv.Camera.looking_at(BALL, parallel=True)
     bad = [
         ({"volume": np.zeros((3, 3, 3)), "transfer": None}, "volume must be a jaxvol Volume"),
         ({"transfer": MARCH}, "transfer must be"),
-        ({"camera": parallel}, "perspective"),
         ({"camera": MARCH}, "camera must be"),
         ({"march": jv.March(20.0)}, r"march must .* from 0\.05 to 12\.8, 0\.0625 to 16 voxels, .* got one"),
         ({"lighting": PHONG, "compositing": "average"}, "lighting must be None under Average"),
         ({"volume": LABELS, "transfer": None, "compositing": "average"}, "LabelTransferFunction reads more"),
     ]
-    bad += [({"background": each}, "background must") for each in ((1, 2), None, "white", (0, 0, math.inf))]
+    bad += [({"background": each}, "background must") for each in ((1, 2), None, "whit", (0, 0, math.inf))]
     for camera in (None, jv.Camera.looking_at(BALL)):
         bad += [({"size": size, "camera": camera}, "size must") for size in (None, (3,), (0, 5))]
     for given, message in bad:
@@ -321,8 +482,7 @@ def test_every_mode_is_shown_as_it_begins_and_lit_where_it_can_be(side):
             grid = Grid(1, 1, (side, side))
             tile = jax.eval_shape(lambda r=renderer, g=grid: r.rgba(g, 0, 0))  # compiles nothing
             assert tile.shape == (side, side, 4)
-        assert state.lit == (mode != "average")
-        assert (scene.light(replace(state, lit=True)) is not None) == (mode != "average")
+        assert (scene.light(state) is not None) == (mode != "average")
     for given in (None, PHONG):
         for lit in (True, False):
             scene, state = begun(lighting=given, lit=lit)

@@ -57,7 +57,12 @@ def test_a_drag_orbits_and_with_shift_or_the_right_button_it_moves(shown):
     shown._pointed(pointer("pointer_move", 31, 52, buttons=(1,), modifiers=("Shift",)))
     moved = turned.panned(0, 42 / 210)
     np.testing.assert_allclose(shown.model.state.orbit.focal_point, moved.focal_point)
+    picked: list[tuple[float, float]] = []
+    shown.model.pick = lambda *at: picked.append(at)
     shown._pointed(pointer("pointer_up", 31, 52))
+    shown._pointed(pointer("pointer_down", 150, 105, buttons=(1,)))
+    shown._pointed(pointer("pointer_up", 151, 105))
+    assert picked == [(151 / 300, 0.5)]
     shown._pointed(pointer("pointer_move", 90, 90, buttons=(1,)))
     np.testing.assert_allclose(shown.model.state.orbit.toward, moved.toward)
     shown._pointed(pointer("wheel", 0, 0, dy=-100))
@@ -69,12 +74,13 @@ def test_a_drag_orbits_and_with_shift_or_the_right_button_it_moves(shown):
 def test_what_is_drawn_and_told_is_shown(shown, monkeypatch):
     images, pixels = [], np.zeros((210, 300, 3), np.uint8)
     monkeypatch.setattr(shown.canvas, "show", lambda *image: images.append(image))
-    shown.model._show(pixels, "coarse", 0.1, 0.4)
+    shown.model._show(pixels, "coarse", 0.1, shown.model.state)
     shown.model._set_status("one\ntwo")
-    assert images == [(pixels, 85)]
+    assert images[0][0].shape == pixels.shape
+    assert images[0][1] == 85
     assert shown._status.value == "one<br>two"
     shown.model.close()
-    shown.model._show(pixels, "fine", 0.1, 0.4)
+    shown.model._show(pixels, "fine", 0.1, shown.model.state)
     shown.model._set_status("nothing more")
     assert (len(images), shown._status.value) == (1, "one<br>two")
 
@@ -92,27 +98,33 @@ def test_what_is_shown_can_be_rendered(shown):
 def widgets(view) -> dict[str, Any]:
     """The controls by their descriptions, and the buttons."""
     found = {control.label: widget for widget, control in view._widgets if control.label}
-    rows = [row.children for row in view.children[1].children if isinstance(row, ipywidgets.HBox)]
+    groups = [group.children[0].children for group in view.children[1].children[1:]]
+    rows = [row.children for group in groups for row in group if isinstance(row, ipywidgets.HBox)]
     return found | {button.description: button for row in rows for button in row}
 
 
 def test_the_widgets_change_the_model_and_show_what_it_has(shown):
-    found, plot = widgets(shown), shown._widgets[0][0]
+    found = widgets(shown)
+    plot = next(widget for widget, control in shown._widgets if control.kind == "pad")
     before = plot.value
     found["level"].value = 150.0
     assert window_level(shown.transfer)[1] == pytest.approx(150)
     assert plot.value != before
-    found["point"].value = "2: 110"
+    plot.sent = "1,curve,1,false,0.5,0.5"
     assert found["value"].value == 110
     found["color"].value = "#ff0000"
     np.testing.assert_allclose(shown.transfer.colors[1], (1, 0, 0))
-    found["point"].value = "3: 220"
+    plot.sent = "2,curve,2,false,0.5,0.5"
     found["value"].value = 260.0
-    assert (found["window"].value, found["point"].value) == (180, "3: 260")
-    assert found["point"].options == ("1: 80", "2: 110", "3: 260")
-    found["point"].value = "2: 110"
-    found["add after"].click()
-    assert len(shown.transfer.values) == len(found["point"].options) == 4
+    assert found["window"].value == 180
+    plot.sent = "3,curve,,false,0.5,0.5"
+    assert len(shown.transfer.values) == 4
+    found["mode"].value = "maximum"
+    assert isinstance(shown.compositing, jv.Maximum)
+    found["orthographic"].value = True
+    assert float(shown.camera.parallel_scale) == pytest.approx(shown.model.state.orbit.half_height)
+    found["-y"].click()
+    np.testing.assert_allclose(shown.model.state.orbit.toward, (0, -1, 0), atol=2e-3)
     found["step (voxels)"].value = 1.0
     assert shown.model.state.step == 1
     found["Jitter"].value = True
@@ -175,5 +187,5 @@ def test_without_the_extra_the_error_says_what_to_install(call, module, extra, m
     for own in ("notebook", "page"):
         monkeypatch.delitem(sys.modules, f"jaxvol.app.viewer.{own}", raising=False)
         monkeypatch.delattr(f"jaxvol.app.viewer.{own}", raising=False)
-    with pytest.raises(ImportError, match=rf"pip install jaxvol\[{extra}\]"):
+    with pytest.raises(ImportError, match=rf"pip install 'jaxvol\[{extra}\]'"):
         call(BALL)

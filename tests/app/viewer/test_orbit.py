@@ -1,13 +1,17 @@
 """Does the camera move as the pointer wants it to?"""
 
 import math
+from dataclasses import replace
 
 import jax
 import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.app.viewer.marks import AXES, MARGIN, PICKED, with_marks
 from jaxvol.app.viewer.state import STEEPEST, Orbit
+
+from .test_model import begun
 
 
 START = Orbit.at((5.0, -3.0, 2.0), (1.0, 2.0, 0.5), (0.0, 0.0, 2.0), 40.0)
@@ -78,3 +82,16 @@ def test_the_camera_is_that_of_the_renderer():
     # and so are the pixels of `pixel`
     x, y = pixel(orbit, origin + 3 * direction)
     np.testing.assert_allclose([x * HEIGHT, y * HEIGHT], [30.5 - HEIGHT / 2, 70.5 - HEIGHT / 2], atol=1e-2)
+
+
+def test_marks_lie_where_the_camera_sees_the_point_and_the_axes():
+    point, orbit = np.array([1.5, 1.0, 0.9]), START
+    state = replace(begun()[1], orbit=orbit, size=(600, HEIGHT), point=point)
+    image = with_marks(np.full((HEIGHT // 2, 300, 3), 255, np.uint8), state)  # of half the resolution
+    near = [np.abs(image.astype(int) - color).sum(-1) < 9 for color in (PICKED, AXES[0][1])]
+    yellow, red = (2 * np.argwhere(each).mean(axis=0)[::-1] for each in near)
+    np.testing.assert_allclose(yellow, np.array([300, HEIGHT / 2]) + HEIGHT * pixel(orbit, point), atol=1.5)
+    x_axis, along = pixel(orbit, np.add(orbit.focal_point, (1e-3, 0, 0))), red - (MARGIN, HEIGHT - MARGIN)
+    assert along @ x_axis > 0.95 * np.linalg.norm(along) * np.linalg.norm(x_axis)
+    small = replace(state, size=(300, 100))
+    assert np.all(with_marks(np.full((100, 300, 3), 255, np.uint8), small) == 255)

@@ -34,9 +34,10 @@ def page():
     served.close()
 
 
-def is_taken(page, origin: str) -> bool:
+def is_taken(page, origin: str, address: str | None = None) -> bool:
     """Whether a client from a page of this origin receives anything before it is sent away."""
-    with client.connect(f"ws://127.0.0.1:{page.port}", origin=origin, subprotocols=VISER) as connection:
+    address = f"ws://{address or f'127.0.0.1:{page.port}'}"
+    with client.connect(address, origin=origin, subprotocols=VISER) as connection:
         try:
             connection.recv(timeout=30)
         except exceptions.ConnectionClosed:
@@ -50,6 +51,22 @@ def test_only_its_own_pages_may_connect(page):
     assert is_taken(page, f"http://127.0.0.1:{page.port}")
     for origin in ("https://example.org", f"http://example.org:{page.port}", "http://localhost:1", "null"):
         assert not is_taken(page, origin)
+
+
+def test_another_machine_needs_the_token():
+    """Wherever a proxy shows the page."""
+    served = jv.serve(VOLUME, GRAY, port=18070, host="127.0.0.2", token="secret")
+    try:
+        place = f"127.0.0.2:{served.port}"
+        assert served.url == f"http://{place}/?websocket=ws://{place}/secret"
+        taken = [
+            is_taken(served, "https://example.org", place + path) for path in ("/a/secret", "/", "/secre")
+        ]
+        assert taken == [True, False, False]
+        with pytest.raises(ValueError, match="token must"):
+            jv.serve(VOLUME, GRAY, host="0.0.0.0", token="")
+    finally:
+        served.close()
 
 
 def handled(page, origin: str) -> int:
@@ -123,7 +140,7 @@ def test_nobody_else_reaches_it_and_it_serves_no_other_files(page):
 
 def test_the_camera_of_a_page_is_that_of_the_volume(page):
     """viser's scene has the size of 1, whatever the volume's."""
-    orbit = page._state.orbit
+    orbit = page.shown[1].orbit
     again = page._center + page._radius * page._to_viser(orbit.position)
     np.testing.assert_allclose(again, orbit.position)
     assert 1 < np.linalg.norm(page._to_viser(orbit.position)) < 10
@@ -137,8 +154,9 @@ def panel_of(*scene, **how) -> Iterator[tuple[Any, dict[str, Any]]]:
     page = jv.serve(*scene, port=18090, **how)
     try:
         gui = page._server.gui
-        client: Any = SimpleNamespace(gui=gui)
-        panel = _Panel(client, page._scene, page._state)
+        turned, client = [], SimpleNamespace(gui=gui)
+        panel: Any = _Panel(client, page, turned.append)  # pyright: ignore[reportArgumentType]
+        panel.turned = turned
         panel.model.close()
         yield panel, {handle.label: handle for handle in gui._gui_input_handle_from_uuid.values()}
     finally:
@@ -156,7 +174,6 @@ def test_the_controls_show_how_it_begins():
     with panel_of(VOLUME, GRAY, march=jv.March(16.0), compositing="average") as (_, found):
         assert found["step (voxels)"].value == found["step (voxels)"].max == 16
         assert "SpaceLeaping" in {name.replace("\u200b", "") for name in found}
-        assert "light" not in found
     step = jv.TransferFunction([9, 9], [(1, 0, 0), (0, 0, 1)], [0, 2])
     with panel_of(VOLUME, step) as (_, found):
         assert (found["window"].value, found["level"].value) == (0, 9)
@@ -171,16 +188,24 @@ def test_the_widgets_change_the_model_and_show_what_it_has():
         assert panel.model.state.transfer is given
         choose(found["level"], 20.0)
         assert found["value"].value == 7
-        choose(found["point"], found["point"].options[3])
+        press = "1,curve,3,false,1,0"
+        choose(found["curve"], press)
         assert (found["value"].value, found["color"].value) == (33, (255, 255, 255))
         choose(found["color"], (128, 64, 255))
         assert display_color(np.asarray(panel.model.state.transfer.colors)[3]) == "#8040ff"
         choose(found["value"], 39.0)
         assert found["window"].value == pytest.approx(32)
-        assert found["point"].value == "4: 39"
-        choose(found["points"], "remove")
-        assert len(panel.model.state.transfer.values) == len(found["point"].options) == 3
-        assert found["point"].value == found["point"].options[2]
+        choose(found["curve"], press.replace("1,", "2,", 1).replace("false", "true"))
+        assert len(panel.model.state.transfer.values) == 3
+        for message in ("", "3,curve,x,false,0,0", "5,curve,9,false,nan,0", "<b>"):
+            choose(found["curve"], message)
+        assert len(panel.model.state.transfer.values) == 3
+        assert panel.turned == []
+        choose(found["look from"], "-x")
+        np.testing.assert_allclose(panel.turned[0].toward, (-1, 0, 0), atol=2e-3)
+        choose(found["x"], (3.0, 3.0))
+        assert found["clip"].value
+        assert panel.model.state.box[0] < panel.model.state.box[1]
 
 
 def test_a_port_that_is_none_is_named():

@@ -142,7 +142,7 @@ def test_what_is_missing_is_told_with_what_to_do(server, tmp_path, monkeypatch):
         with pytest.raises(OSError, match=r"cannot be fetched: .*Connection refused.*noise_40.*\(0\.2 MB\)"):
             fetched(tmp_path)
     monkeypatch.setitem(sys.modules, "pooch", None)
-    with pytest.raises(ImportError, match=r"pip install jaxvol\[datasets\]"):
+    with pytest.raises(ImportError, match=r"pip install 'jaxvol\[datasets\]'"):
         fetched(tmp_path)
 
 

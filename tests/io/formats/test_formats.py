@@ -292,7 +292,7 @@ def test_neither_a_file_nor_a_header_takes_memory_that_the_other_does_not_back(t
 )
 def test_a_missing_library_says_how_to_install_it(tmp_path, monkeypatch, module, ending):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=r"pip install jaxvol\[io\]"):
+    with pytest.raises(ImportError, match=r"pip install 'jaxvol\[io\]'"):
         load(write(tmp_path / f"a{ending}", bytes(128) + b"DICM"))
 
 

@@ -78,7 +78,7 @@ def test_what_cannot_be_saved_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"volume must be a Volume; .* The volume comes first, as in save"):
         jv.save("a.npz", volume)
     monkeypatch.setitem(sys.modules, "SimpleITK", None)
-    with pytest.raises(ImportError, match=r"pip install jaxvol\[io\]"):
+    with pytest.raises(ImportError, match=r"pip install 'jaxvol\[io\]'"):
         jv.save(jv.Volume(ramp()), tmp_path / "deep" / "a.nrrd")
     assert not list(tmp_path.iterdir())
 

@@ -66,7 +66,7 @@ def test_what_imagecodecs_decompresses_is_read_and_without_it_named(tmp_path, mo
     program = tifffile.tifffile
     monkeypatch.setattr(program, "imagecodecs", importlib.import_module("tifffile._imagecodecs"))
     monkeypatch.setattr(program.TIFF, "DECOMPRESSORS", program.CompressionCodec(encode=False), raising=False)
-    with pytest.raises(ImportError, match=r"a\.tif needs imagecodecs .*pip install jaxvol\[io\]"):
+    with pytest.raises(ImportError, match=r"a\.tif needs imagecodecs .*pip install 'jaxvol\[io\]'"):
         jv.load(tmp_path / "a.tif")
 
 

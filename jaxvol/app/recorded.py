@@ -6,17 +6,19 @@ import hashlib
 import json
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ..._util.checks import shortened
-from ...bricks.opening import METADATA
-from ...fitting.files import transfer_fields, transfer_of_fields
-from ...io.formats import files_of
-from ...scene.transfer import Transfer, TransferFunction
+from .._util.checks import shortened
+from ..bricks.opening import METADATA
+from ..fitting.files import transfer_fields, transfer_of_fields
+from ..io.formats import files_of
+from ..scene.transfer import Transfer, TransferFunction
 
 
 KEYWORD = "jaxvol"  # of the text in a PNG
+NO_FILE = {"name": "a volume in memory", "bytes": 0, "sha256": 64 * "0"}
 
 
 def words_of(name: str, value: Any) -> list[str]:
@@ -30,21 +32,32 @@ def words_of(name: str, value: Any) -> list[str]:
     return [word for row in rows for word in (f"--{flag}", *map(str, row))]
 
 
-def text_of(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
-    """The text that a PNG carries, for `save_image`: the options that are not at their defaults, as words of
-    a command line, and the transfer function if a file or a picture held it."""
-    words: list[str] = []
-    for name, default in options.defaults.items():
-        value = getattr(options, name)
-        if value != default and not isinstance(value, Path):
-            words += words_of(name, value)
-    size = sum(file.stat().st_size for file in _files(options.file))
-    file = {"name": str(options.file), "bytes": size, "sha256": checksum(options.file)}
-    content: dict[str, Any] = {"options": words, "file": file}
-    from_file = options.transfer is not None or options.recorded_transfer is not None
-    if from_file and isinstance(transfer, TransferFunction):
+def text_of(settings: Mapping[str, Any], file: Path | None, transfer: Any = None) -> dict[str, str]:
+    """The text that a PNG carries, by its keyword: options, as words of a command line; the volume's file, if
+    it has one; and a transfer function of points, if it holds one."""
+    words = [word for name, value in settings.items() for word in words_of(name, value)]
+    content: dict[str, Any] = {"options": words, "file": NO_FILE if file is None else fields_of(file)}
+    if isinstance(transfer, TransferFunction):
         content["transfer"] = transfer_fields(transfer)
     return {KEYWORD: json.dumps(content, sort_keys=True)}
+
+
+def text_of_options(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
+    """That of the options that are not at their defaults, with a transfer function that a file or a picture
+    held. None of a picture with volumes of other files, which it may not name."""
+    if options.labels is not None or options.others:
+        return {}
+    given = {name: getattr(options, name) for name in options.defaults}
+    changed = {name: value for name, value in given.items() if value != options.defaults[name]}
+    settings = {name: value for name, value in changed.items() if not isinstance(value, Path)}
+    from_file = options.transfer is not None or options.recorded_transfer is not None
+    return text_of(settings, options.file, transfer if from_file else None)
+
+
+def fields_of(file: Path) -> dict[str, Any]:
+    """What a picture holds of its volume's file."""
+    size = sum(each.stat().st_size for each in _files(file))
+    return {"name": str(file), "bytes": size, "sha256": checksum(file)}
 
 
 def recorded_in(path: Path) -> dict[str, Any]:

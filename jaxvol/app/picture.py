@@ -1,0 +1,309 @@
+"""From options, of a command or of `show`, to images: what is looked at, how, from where, by which march."""
+
+import warnings
+from argparse import Namespace
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .._util.srgb import linear_color
+from ..bricks import VoxelSource, levels_of, render_bricks
+from ..compositing.blending import Compositing, Over
+from ..compositing.isosurface import Isosurface
+from ..compositing.modes import MODES, compositing_of
+from ..fitting import read_transfer
+from ..io.formats import load
+from ..lighting import Lighting, Phong
+from ..march.march import March, Transform
+from ..march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
+from ..planning import Plan, plan
+from ..planning.memory import IN_MEMORY
+from ..render import PLANNED, render
+from ..scene.camera import Camera
+from ..scene.presets import SHADED, colormap, fitted_range, preset, preset_name
+from ..scene.rendering import Rendering
+from ..scene.transfer import Transfer
+from ..scene.volume import Volume
+from .automatic import (
+    SAMPLED,
+    automatic_transfer,
+    labels_shown,
+    sampled,
+    stride_of,
+    thresholds,
+    transfer_by_copy,
+)
+from .framing import FAINT, VISIBLE, automatic_camera, framed, upright, visible_points
+
+
+FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
+
+OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
+OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
+OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
+DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))
+DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "others": []}
+DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
+"""Options of a picture, as they are where nothing is given."""
+
+OVERRIDES = {
+    "preset": {"cmap", "transfer", "recorded_transfer"},
+    "cmap": {"preset", "transfer", "recorded_transfer"},
+    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "window", "level", "unit_distance"},
+    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"},
+    "camera": {"direction"},
+    "direction": {"camera"},
+    "clim": {"window", "level"},
+    "window": {"clim"},
+    "level": {"clim"},
+    "step": {"tolerance"},
+    "tolerance": {"step"},
+}
+"""Options that exclude this one, which is an error, and that it overrides in a picture."""
+
+
+class Scene(NamedTuple):
+    """What is looked at, and how. Of a volume that is read in bricks from `source`, with so many bytes of
+    memory, `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image,
+    with their transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it
+    is known."""
+
+    volume: Volume
+    transfer: Transfer
+    camera: Camera
+    compositing: Compositing[Any]
+    lighting: Lighting | None
+    background: tuple[float, float, float]
+    transforms: tuple[Transform, ...]
+    source: VoxelSource | None = None
+    memory: int | None = None
+    march: Any = None
+    others: tuple[tuple[Volume, Transfer], ...] = ()
+
+    def render(self, camera: Camera) -> Rendering:
+        """An image by `march`."""
+        how = {"compositing": self.compositing, "lighting": self.lighting}
+        if self.others:
+            volumes, transfers = zip((self.volume, self.transfer), *self.others, strict=True)
+            found = render(volumes, transfers, camera, self.march, **how)
+        elif self.source is None:
+            found = render(self.volume, self.transfer, camera, self.march, **how)
+        else:
+            how["memory"] = self.memory
+            found = render_bricks(self.source, self.transfer, camera, self.march, **how)
+        return jax.block_until_ready(found)
+
+    def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
+        """The cheapest way to render the scene within a tolerance, for each camera."""
+        what: Any = self.volume if self.source is None else self.source
+        how: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
+        how |= {"compositing": self.compositing, "lighting": self.lighting}
+        if self.source is not None:
+            how["memory"] = self.memory
+        tolerance = PLANNED if tolerance is None else tolerance
+        return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
+
+
+def check_exclusive(settings: dict[str, Any]) -> None:
+    """Refuse options that exclude each other."""
+    on = {name for name, value in settings.items() if value is not None and value is not False}
+    for name in sorted(on):
+        for other in sorted(on & OVERRIDES.get(name, set())):
+            both = f"{name} and {other}".replace("recorded_transfer", "the transfer function in the picture")
+            raise ValueError(f"{both} exclude each other; leave one out.")
+
+
+def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
+    """The scene that the options describe, without a march.
+
+    Args:
+        options: those of `DEFAULTS`, `recorded_transfer`, and `file`, a path or a `Volume`. `transfer` may be
+            a `Transfer`, and entries of `others` what `_other` takes.
+        orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
+    """
+    is_surface, background = options.compositing == "isosurface", background_of(options)
+    if is_surface == (options.isovalue is None):
+        raise ValueError("compositing isosurface and isovalue go together; one is missing.")
+    mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
+    # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
+    transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
+    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    if options.clip_box is not None or planes:
+        transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
+    elif options.clip_inside_out:
+        raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
+
+    source, others = None, tuple(_other(*each) for each in options.others)
+    if options.memory is None:
+        volume, transfer = look_of(options)
+    else:
+        if options.labels is not None or others:
+            raise ValueError("memory reads one volume, without labels and others.")
+        header = {name: value for name, value in header_of(options).items() if value is not None}
+        if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
+            header["index"] = index
+        try:
+            source = levels_of(options.file, **header)[0]
+        except TypeError as fault:  # such as a shape of what is no raw file
+            raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
+        volume = copy_of(source, options.memory)
+        automatic = is_automatic(options)
+        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
+
+    lighting = _lighting(options, mode, alone=not others)
+    camera = _camera(options, volume, transfer, orbit).zoom(options.zoom)
+    how = mode, lighting, background, transforms, source, options.memory
+    return Scene(volume, transfer, camera, *how, others=others)
+
+
+def look_of(options: Namespace) -> tuple[Volume, Transfer]:
+    """The volume, which may be another one where labels are shown, and its transfer function."""
+    volume, automatic = volume_of(options), is_automatic(options)
+    transfer = None if automatic else transfer_of(options, volume)
+    if automatic or options.labels is not None:
+        volume, transfer = labels_shown(volume, transfer) or (volume, transfer)
+    return volume, automatic_transfer(volume) if transfer is None else transfer
+
+
+def _camera(
+    options: Namespace,
+    volume: Volume,
+    transfer: Transfer,
+    orbit: Callable[[Camera], Sequence[Camera]] | None,
+) -> Camera:
+    """That of the options; or else one as near as what is visible allows, or, under other modes than "over",
+    as the volume does."""
+    given = {"view_angle": options.view_angle, "size": options.size}
+    if options.camera is not None:
+        up, place = options.view_up, (options.camera[:3], options.camera[3:])
+        height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
+        scale = height if options.parallel else None  # as high at the focal point
+        return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
+    given["parallel"] = options.parallel
+    if options.compositing != "over":
+        side = upright(volume, transfer, options.direction, options.view_up)
+        return Camera.looking_at(volume, *side, **given)
+    given["least"] = least = VISIBLE if is_automatic(options) else FAINT
+    camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
+    return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
+
+
+def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
+    """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
+    and HIGH, or over what stands out of the background."""
+    volume = file if isinstance(file, Volume) else load(file)
+    if look and isinstance(look[0], Transfer):
+        return volume, look[0]
+    cmap, *clim = look or ("hot",)
+    if not clim:
+        values = sampled(volume).ravel().astype(np.float32)
+        low = thresholds(values)[0]
+        clim = low, np.percentile(values[values >= low], 99)
+    try:
+        low, high = map(float, clim)
+    except ValueError as fault:
+        got = " ".join(map(str, look))
+        raise ValueError(f"others are FILE, FILE CMAP or FILE CMAP LOW HIGH; got {got}.") from fault
+    return volume, colormap(cmap, (low, high))
+
+
+def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> Scene:
+    """The scene with the given step; without one, with the shortest of those planned for the cameras (of
+    several volumes, with half of their shortest spacing)."""
+    step = options.step
+    if step is None and scene.others:
+        step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
+    if step is not None:
+        return scene._replace(march=March(step, (*scene.transforms, *FAST), "midpoint"))
+    found = min(scene.plans(cameras, options.tolerance), key=lambda plan: float(plan.march.step))
+    if not found.within:
+        told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
+        warnings.warn(told, stacklevel=3)
+    source = None if found.bricks is None else found.source
+    return scene._replace(volume=found.volume, march=found.march, source=source)
+
+
+def volume_of(options: Namespace) -> Volume:
+    header = header_of(options) | {"labels": options.labels}
+    if not isinstance(options.file, Volume):
+        return load(options.file, **header)
+    if told := [name for name, value in header.items() if value is not None]:
+        raise ValueError(f"{told[0]} is of files; volume is a Volume.")
+    return options.file
+
+
+def header_of(options: Namespace) -> dict[str, Any]:
+    """What the options say of the file."""
+    return {name: getattr(options, name) for name in OF_FILES}
+
+
+def is_automatic(options: Namespace) -> bool:
+    """Whether nothing is said of the transfer function."""
+    given = (getattr(options, name) for name in (*OF_COLORS, "recorded_transfer"))
+    return options.compositing == "over" and all(each is None for each in given)
+
+
+def background_of(options: Namespace) -> tuple[float, float, float]:
+    """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
+    if options.background is None:
+        level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
+        return level, level, level
+    red, green, blue = np.asarray(linear_color("background", options.background), np.float64).tolist()
+    if not all(0 <= each <= 1 for each in (red, green, blue)):
+        got = f"{red:g} {green:g} {blue:g}"
+        hint = " 8-bit colours are written '#336699'." if max(red, green, blue) > 1 else ""
+        raise ValueError(f"background must be three numbers from 0 to 1 (linear RGB); got {got}.{hint}")
+    return red, green, blue
+
+
+def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
+    """The transfer function that the options ask for. `source`: of which `volume` is a copy with fewer
+    voxels."""
+    if options.recorded_transfer is not None:
+        return options.recorded_transfer
+    if options.transfer is not None:
+        given = options.transfer
+        return read_transfer(given) if isinstance(given, str | Path) else given
+    unit, clim = options.unit_distance, options.clim
+    if (options.window is None) != (options.level is None):
+        raise ValueError("window and level go together; one is missing.")
+    if options.window is not None:
+        clim = options.level - options.window / 2, options.level + options.window / 2
+    if options.preset is not None:
+        if clim is None:
+            clim, told = fitted_range(options.preset, sampled(volume))
+            if told:
+                warnings.warn(told, stacklevel=5)
+        return preset(options.preset, clim, 1.0 if unit is None else unit)
+    data = np.asarray(volume.data)
+    clim = clim or (float(data.min()), float(data.max()))
+    cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
+
+
+def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
+    """The automatic one, from a copy and the middle of the volume at full resolution."""
+    low = [max(0, (n - 128) // 2) for n in source.shape]
+    high = [min(n, begin + 128) for n, begin in zip(source.shape, low, strict=True)]
+    return transfer_by_copy(copy, np.asarray(source.read(low, high)))
+
+
+def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
+    """The light that the options ask for, or that is usual for what they show; none of several volumes."""
+    shade = options.shade
+    if shade is None:
+        shows_surfaces = is_automatic(options) or (options.preset and preset_name(options.preset) in SHADED)
+        shade = alone and ((shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface))
+    return Phong() if shade else None
+
+
+def copy_of(source: VoxelSource, memory: int) -> Volume:
+    """A copy of every n-th voxel, stretched to the bounds of the whole: of those by which colours are chosen
+    for the whole, if they fit into so many bytes, and of fewer if not."""
+    most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
+    copy = source.subsampled(min(stride_of(source.shape, most), min(source.shape) // 2))
+    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, source.spacing, copy.shape, strict=True)]
+    return Volume(copy.data, whole, copy.origin)

@@ -1,0 +1,119 @@
+"""One line from a volume to a picture, the one that `jaxvol render` makes."""
+
+import os
+import warnings
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._util.texts import near
+from .._util.vec3 import apart
+from ..compositing.isosurface import Isosurface
+from ..ray import check_arguments
+from ..scene.rendering import Rendering, in_notebook
+from ..scene.space import enter
+from ..scene.transfer import Transfer, TransferFunction, voxel_size
+from ..scene.volume import Volume
+from ..xla.persistent_cache import keep_programs_by_default
+from .picture import DEFAULTS, Scene, check_exclusive, scene_of, with_march
+
+
+FAINT = 0.01
+"""Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
+
+
+def show(
+    volume: Volume | str | os.PathLike[str] | Any, transfer: Transfer | Any | None = None, **options: Any
+) -> Rendering:
+    """Renders a volume, and shows it, as `jaxvol render FILE` does: framed, upright, lit, with colours for
+    labels, by a march that is planned for it.
+
+        jv.show("ct.nii.gz", preset="CT-Bone", direction=(0, -1, 0), size=800, background="black")
+        jv.show("mr.nii.gz", compositing="maximum", window=400, level=200)
+        jv.show("ct.nii.gz", others=[("pet.nii.gz", "hot", 1, 10)])
+
+    Args:
+        volume: a `Volume`, or the path of a file that `jv.load` reads.
+        transfer: a transfer function. By default that of `preset` or `cmap`, or else what suits the values;
+            or labels get a colour each.
+        options: those of `jaxvol render`, with _ for -. Colours: `preset`, `cmap`, `clim`, or `window` and
+            `level`, `unit_distance`, `labels` (a file). More volumes: `others`, each a file or `Volume`, and
+            its transfer function, or a colormap and maybe its range. Look: `compositing`, `isovalue`,
+            `shade`, `background`. Camera: `camera`, `direction`, `view_up`, `view_angle`, `parallel`, `zoom`,
+            `size`. What is cut away: `clip_box`, `clip_plane`, `clip_inside_out`. How it is computed: `step`
+            or `tolerance`, `memory`. Of a raw file: `shape`, `dtype`, `spacing`, `nan`, `time`, `channel`.
+            `jaxvol render --help` describes each.
+
+    Returns:
+        The `Rendering`. In a notebook it shows itself as the last line of a cell; elsewhere it has been shown
+        in a window.
+
+    Raises:
+        ValueError: for an unknown option, those that exclude each other, and as `jv.load` and `jv.render` do.
+
+    Warns of a preset whose values are others, and of an image in which hardly anything is visible.
+    """
+    known = DEFAULTS.keys() - {"transfer"}
+    for name in options.keys() - known:
+        told = f"show has no option {name!r}.{near(name, known)}"
+        raise ValueError(f"{told} jaxvol render --help has them.")
+    is_file = isinstance(volume, str | os.PathLike)
+    given = {} if is_file else {"volume": volume}
+    given |= {} if transfer is None else {"transfer": transfer}
+    check_arguments("show(volume, transfer)", **given)
+    options["transfer"] = transfer
+    check_exclusive(options)
+    keep_programs_by_default()
+    file = Path(volume) if is_file else volume
+    chosen = Namespace(**DEFAULTS | options, recorded_transfer=None, file=file)
+    scene = scene_of(chosen)
+    scene = with_march(scene, chosen, [scene.camera])
+    rendering = replace(scene.render(scene.camera), background=scene.background)
+    if why := why_empty(scene, rendering):
+        warnings.warn(why, stacklevel=2)
+    if not in_notebook():
+        rendering.show()
+    return rendering
+
+
+def why_empty(scene: Scene, rendering: Rendering) -> str | None:
+    """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`."""
+    volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
+    if opacity > FAINT or np.isnan(opacity):
+        return None
+    if opacity > 0:
+        size = f"voxels have the size {voxel_size(volume):.3g}"
+        change = f"a shorter unit_distance ({size}) or another clim"
+        return f"hardly anything is visible: the opacity is at most {opacity:.2g}. Use {change}."
+    return f"nothing is visible: {_why_nothing(scene)}"
+
+
+def _why_nothing(scene: Scene) -> str:
+    """Why all pixels are transparent."""
+    volume, transfer = scene.volume, scene.transfer
+    space, zero = scene.march.locate(volume), jnp.zeros((), jnp.int32)
+    lengths = jax.jit(jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)).length))
+    if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():
+        bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
+        return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
+    data = np.asarray(volume.data)
+    low, high = float(data.min()), float(data.max())
+    where = f"the volume's values run from {low:g} to {high:g}"
+    if isinstance(scene.compositing, Isosurface):
+        return f"{where}, and no ray crosses the isosurface's value, {float(scene.compositing.value):g}."
+    if not isinstance(transfer, TransferFunction):
+        return f"{where}, and the transfer function shows none of those that the rays meet."
+    shown = np.flatnonzero(np.asarray(transfer.extinction) > 0)
+    if not shown.size:
+        return f"{where}, and the transfer function's opacity is 0 everywhere."
+    # the opacity of a point extends to its neighbours, that of the first and the last to infinity
+    at = [-np.inf, *np.asarray(transfer.values), np.inf]
+    return (
+        f"{where}, and the transfer function shows values between {at[shown[0]]:g} and "
+        f"{at[shown[-1] + 2]:g}. A clim from {low:g} to {high:g} would show something."
+    )

@@ -1,0 +1,199 @@
+"""The controls of a viewer's transfer function: presets, its curve and points, or its labels."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+from jaxtyping import Float
+
+from ...scene.labels import LabelTransferFunction
+from ...scene.presets import PRESETS, fitted_range, preset
+from ...scene.transfer import TransferFunction
+from ...scene.volume import Volume
+from ..automatic import sampled
+from . import editing
+from .control import Control, press_of
+from .model import Model
+
+
+MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
+BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
+GIVEN = "as given"
+COLORMAPS = "gray", "viridis", "inferno", "magma", "cividis", "turbo", "jet", "hot", "bone", "coolwarm"
+
+
+def transfer_controls(model: Model) -> list[Control]:
+    """The controls of the transfer function that is shown at first, of its kind."""
+    if isinstance(model.state.transfer, LabelTransferFunction):
+        return _label_controls(model)
+    if isinstance(model.state.transfer, TransferFunction):
+        return _point_controls(model)
+    return [Control("pad", get=lambda: "of another kind, not edited here")]
+
+
+def edit(model: Model, change: Callable[..., Any], *arguments: Any) -> None:
+    """Replace the transfer function by `change(transfer, *arguments)`."""
+    model.apply(lambda state: replace(state, transfer=change(state.transfer, *arguments)))
+
+
+def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]:
+    """The least and the greatest value, and log(1 + count) of the bins between them, 1 at most."""
+    values = sampled(volume).ravel().astype(np.float64)
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
+    high = high if high > low else low + max(abs(low), 1.0)
+    counts = np.log1p(np.histogram(values, BINS, (low, high))[0])
+    return low, high, counts / max(counts.max(), 1)
+
+
+def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel: float, chosen: int) -> str:
+    """A pad with the histogram, and as a line the square root of the opacity, which shows thin materials; its
+    points, in their colours, are parts of the pad."""
+    at, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction)
+    across = WIDTH * np.clip((at - low) / (high - low), 0, 1)
+    colors = [editing.display_color(color) for color in np.asarray(transfer.colors)]
+
+    def height(extinction: Any) -> Any:
+        return HEIGHT - (HEIGHT - 2) * np.sqrt(-np.expm1(-np.asarray(extinction, np.float64) * voxel))
+
+    def points(down: Float[np.ndarray, " n"]) -> str:
+        across = np.linspace(0, WIDTH, len(down))
+        return " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down, strict=True))
+
+    dots = list(zip(across, height(extinction), colors, strict=True))
+    stops = ", ".join(f"{color} {x / WIDTH:.2%}" for x, _, color in dots)
+    circles = "".join(
+        f'<circle data-part="{i}" cx="{x:.1f}" cy="{y:.1f}" r="{7 if i == chosen else 5}" fill="{color}"'
+        f' stroke="currentColor" style="cursor: move" />'
+        for i, (x, y, color) in enumerate(dots)
+    )
+    line = height(np.interp(np.linspace(low, high, 4 * BINS), at, extinction))
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}"'
+        f' style="overflow: visible; touch-action: none; cursor: crosshair; width: 100%; display: block">'
+        f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#8882" />'
+        f'<polygon points="0,{HEIGHT} {points(HEIGHT * (1 - bars))} {WIDTH},{HEIGHT}" fill="#8888" />'
+        f'<polyline points="{points(line)}" fill="none" stroke="currentColor" />'
+        f"{circles if len(at) <= editing.MAX_POINTS else ''}</svg>"
+        f'<div style="height: 8px; background: linear-gradient(to right, {stops})"></div>'
+        f'<div style="display: flex; justify-content: space-between; font-size: 10px">'
+        f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
+    )
+
+
+def _point_controls(model: Model) -> list[Control]:
+    """Presets, the curve, window and level; and value, colour and opacity of the point that was pressed last,
+    the opacity that of a layer as thick as a voxel."""
+    low, high, bars = histogram(model.scene.volume)
+    voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
+    names = {"preset": GIVEN, "colors": GIVEN}
+
+    def transfer() -> TransferFunction:
+        return cast(TransferFunction, model.state.transfer)
+
+    def put(change: Callable[..., Any], *arguments: Any) -> None:
+        nonlocal chosen
+        edit(model, change, *arguments)
+        chosen = min(chosen, len(transfer().values) - 1)
+
+    def choose_preset(name: str) -> None:
+        nonlocal note
+        values = sampled(model.scene.volume)
+        clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
+        names.update(preset=name, colors=GIVEN)
+        note = f'<div style="font-size: 11px">{told or ""}</div>'
+        put(lambda _: given if name == GIVEN else preset(name, clim, voxel))
+
+    def choose_colors(name: str) -> None:
+        names["colors"] = name
+        if name != GIVEN:
+            put(editing.recolored, name)
+
+    def press(message: str) -> None:
+        nonlocal chosen, gesture
+        (number, _, part, twice, x, y), count = press_of(message), len(transfer().values)
+        height = min((1 - y) * HEIGHT / (HEIGHT - 2), 1.0)
+        value, opacity = editing.rounded(low + x * (high - low), high - low), round(height**2, 3)
+        if number != gesture:
+            gesture, chosen = number, min(int(part or 0), count - 1)
+            if twice:
+                put(editing.without_point, chosen)
+            elif not part:
+                put(editing.with_points_at, [value])
+                chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
+        elif not twice:
+            put(editing.with_value, chosen, value)
+            put(editing.with_opacity, chosen, opacity, voxel)
+
+    def of_range(label: str, index: int, limits: tuple[float, float, float]) -> Control:
+        def get() -> float:
+            return float(np.clip(editing.rounded(editing.window_level(transfer())[index], span), *limits[:2]))
+
+        def set_one(value: float) -> None:
+            both = [*editing.window_level(transfer())]
+            both[index] = value
+            put(editing.with_window_level, *both)
+
+        return Control("slider", label, get, set_one, limits)
+
+    def value() -> float:
+        return editing.rounded(float(transfer().values[chosen]), span)
+
+    def color() -> str:
+        return editing.display_color(np.asarray(transfer().colors)[chosen])
+
+    def opacity() -> float:
+        return round(float(transfer().opacity(voxel)[chosen]), 3)
+
+    window, level = editing.window_level(transfer())
+    first, last = min(low, level - window / 2), max(high, level + window / 2)
+    span = editing.rounded(last - first, last - first)
+    unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
+    presets, colors = (GIVEN, *PRESETS), (GIVEN, *COLORMAPS)
+    controls = [
+        Control("dropdown", "preset", lambda: names["preset"], choose_preset, choices=presets),
+        Control("dropdown", "colors", lambda: names["colors"], choose_colors, choices=colors),
+        Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen) + note, press),
+        of_range("window", 0, (min(unit, window), 2 * span, unit)),
+        of_range("level", 1, (middle - span, middle + span, unit)),
+        Control("number", "value", value, lambda to: put(editing.with_value, chosen, to)),
+        Control("color", "color", color, lambda to: put(editing.with_color, chosen, to)),
+        Control("slider", "opacity", opacity, lambda to: put(editing.with_opacity, chosen, to, voxel)),
+    ]
+    return controls if len(transfer().values) <= editing.MAX_POINTS else controls[:-3]
+
+
+def _label_controls(model: Model) -> list[Control]:
+    """A label that can be seen, its densest colour, whether it is shown, and the factor of its extinction."""
+    stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
+    extinction = np.asarray(stacked.extinction)
+    labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
+    colors = np.asarray(stacked.colors)[labels, extinction[labels].argmax(axis=1)]
+    names, chosen = [str(label) for label in labels], 0
+
+    def choose(name: str) -> None:
+        nonlocal chosen
+        chosen = names.index(name)
+
+    def swatch() -> str:
+        return f'<div style="background: {editing.display_color(colors[chosen])}; height: 14px"></div>'
+
+    def get(name: str) -> float:
+        return float(np.asarray(getattr(model.state.transfer, name))[labels[chosen]])
+
+    def show(on: bool) -> None:
+        edit(model, LabelTransferFunction.with_visibility, {labels[chosen]: on})
+
+    def set_opacity(opacity: float) -> None:
+        edit(model, LabelTransferFunction.with_opacity, {labels[chosen]: opacity})
+
+    def opacity() -> float:
+        return min(get("opacity"), MAX_LABEL_OPACITY)
+
+    return [
+        Control("dropdown", "label", lambda: names[chosen], choose, choices=names),
+        Control("pad", get=swatch),
+        Control("checkbox", "shown", lambda: bool(get("shown")), show),
+        Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),
+    ]
