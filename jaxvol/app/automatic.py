@@ -163,6 +163,14 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return float(first), float(second)
 
 
+def range_of_object(volume: Volume) -> tuple[float, float]:
+    """From the lower of the `thresholds` to what few values are above; of a single value, as far as that."""
+    values = sampled(volume).ravel().astype(np.float32)
+    low, least = thresholds(values)[0], float(values.min())
+    high = float(np.percentile(values[values >= low], 99.5))
+    return (low, high) if low < high else (least, least + max(abs(least), 1.0))
+
+
 def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:
     """Whether values between two thresholds fill a body, and are not only grain, or the borders of what is
     dense. Of a large volume, every n-th voxel is compared with its neighbours."""

@@ -13,7 +13,7 @@ from ..scene.camera import Camera, axes_of
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
-from .automatic import sampled, stride_of, unit_of
+from .automatic import automatic_transfer, sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
@@ -53,8 +53,8 @@ def automatic_camera(
         transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts.
         direction: from the volume to the camera; by default to the right, in front, and higher.
         view_up: by default z; of a volume that does not say where it lies (its origin is 0, its axes are the
-            world's, as of raw files), away from the face that cuts through most of what is visible, if the
-            opposite one does not: the neck, or the pot of a plant, is below.
+            world's, as of raw files), away from the face that cuts through most of what `automatic_transfer`
+            shows, if the opposite one does not: the neck, or the pot of a plant, is below.
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
@@ -86,8 +86,13 @@ def upright(
 def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     """The axis that points up, and whether it does so forward or backward."""
     known = volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
-    visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
-    for axis in () if known else (2, 1, 0):
+    found, most = (2, 1.0), CUT_FACE
+    if known:
+        return found
+    # of the volume's own, not what may be fog, or hide the neck
+    own = automatic_transfer(volume) if isinstance(transfer, TransferFunction) else transfer
+    visible = _visible(volume, own, FAINT)
+    for axis in (2, 1, 0):
         low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))
         cut, other, sign = (low, high, 1.0) if low >= high else (high, low, -1.0)
         if cut > most and other <= OTHER_FACE * cut:

@@ -31,12 +31,12 @@ from .automatic import (
     SAMPLED,
     automatic_transfer,
     labels_shown,
+    range_of_object,
     sampled,
     stride_of,
-    thresholds,
     transfer_by_copy,
 )
-from .framing import FAINT, VISIBLE, automatic_camera, framed, upright, visible_points
+from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points
 
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
@@ -174,8 +174,7 @@ def _camera(
     transfer: Transfer,
     orbit: Callable[[Camera], Sequence[Camera]] | None,
 ) -> Camera:
-    """That of the options; or else one as near as what is visible allows, or, under other modes than "over",
-    as the volume does."""
+    """That of the options; or else one as near as what is visible allows."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if options.camera is not None:
         up, place = options.view_up, (options.camera[:3], options.camera[3:])
@@ -183,9 +182,6 @@ def _camera(
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
     given["parallel"] = options.parallel
-    if options.compositing != "over":
-        side = upright(volume, transfer, options.direction, options.view_up)
-        return Camera.looking_at(volume, *side, **given)
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
     camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
     return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
@@ -199,9 +195,7 @@ def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
         return volume, look[0]
     cmap, *clim = look or ("hot",)
     if not clim:
-        values = sampled(volume).ravel().astype(np.float32)
-        low = thresholds(values)[0]
-        clim = low, np.percentile(values[values >= low], 99)
+        clim = range_of_object(volume)
     try:
         low, high = map(float, clim)
     except ValueError as fault:
@@ -278,8 +272,9 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
             if told:
                 warnings.warn(told, stacklevel=5)
         return preset(options.preset, clim, 1.0 if unit is None else unit)
-    data = np.asarray(volume.data)
-    clim = clim or (float(data.min()), float(data.max()))
+    if clim is None:  # what is around the object would be fog; a ray's value may be one of it
+        low, high = range_of_object(volume)
+        clim = (low if options.compositing == "over" else float(np.asarray(volume.data).min())), high
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 
