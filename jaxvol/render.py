@@ -24,7 +24,6 @@ from .scene.rendering import Rendering, pooled
 from .scene.several import together
 from .scene.transfer import Transfer
 from .scene.volume import Volume
-from .xla.memo import memoized_of
 from .xla.platform import is_traced
 from .xla.sharding import shard_number
 
@@ -153,18 +152,14 @@ def _warn_of_step(volume: Volume, march: March) -> None:
     """Say so if a step is longer than a volume that no transform bends, where both are known."""
     if is_traced(march.step, volume.spacing):
         return
-    # once, not for each image: the host waits for them
-    step, spacing = memoized_of((march.step, volume.spacing), _numbers)
+    # JAX keeps what it brought to the host, so that no later image waits for the device here
+    step, spacing = (np.asarray(array).tolist() for array in (march.step, volume.spacing))
     if step <= max(spacing) or march.overriding("locate"):
         return
     across = math.hypot(*((n - 1) * s for n, s in zip(volume.shape, spacing, strict=True)))
     if step > across:
         told = f"march.step is {step:.4g}, longer than the volume, which is {across:.4g} across"
         warnings.warn(f"{told}; half a voxel is {min(spacing) / 2:.4g}.", stacklevel=3)
-
-
-def _numbers(arrays: Any) -> Any:
-    return [np.asarray(array).tolist() for array in arrays]
 
 
 def render_rays(

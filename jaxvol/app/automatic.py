@@ -87,13 +87,18 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
     check_one_channel(volume, "automatic_transfer")
-    if is_traced(volume):
-        raise ValueError(
-            "volume is traced here, and its histogram is needed: call automatic_transfer outside of jax.jit, "
-            "jax.vmap and jax.grad, and pass what it returns."
-        )
+    check_known("automatic_transfer", volume)
     with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
         return transfer_by_copy(volume, np.asarray(volume.data))
+
+
+def check_known(caller: str, *values: Any) -> None:
+    """Refuse what is traced, where a function looks at all voxels, on the host."""
+    if is_traced(values):
+        raise ValueError(
+            f"{caller} needs the numbers of its arguments, and some are traced here: call it outside of "
+            "jax.jit, jax.vmap and jax.grad, and pass what it returns."
+        )
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
@@ -216,13 +221,14 @@ def labels_shown(
         to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
 
     Raises:
-        ValueError: for what is no volume.
+        ValueError: for what is no volume, or traced.
     """
     import matplotlib
     from matplotlib.colors import ListedColormap, hsv_to_rgb
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     check_arguments("labels_shown(volume)", volume=volume)
+    check_known("labels_shown", volume, around)
     own, data = volume.labels is not None, np.asarray(volume.data)
     given = np.asarray(volume.labels) if own else data
     if not own and (given.dtype.kind not in "iu" or not is_flat(given)):

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -13,7 +14,7 @@ from ..scene.camera import Camera, axes_of
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
-from .automatic import automatic_transfer, sampled, stride_of, unit_of
+from .automatic import automatic_transfer, check_known, sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
@@ -65,12 +66,14 @@ def automatic_camera(
         The `Camera`.
 
     Raises:
-        ValueError: as `Camera.looking_at` does.
+        ValueError: as `Camera.looking_at` does, and for what is traced.
     """
     check_arguments("automatic_camera(volume, transfer)", volume=volume, transfer=transfer)
-    side = upright(volume, transfer, direction, view_up)
-    camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
-    return framed(camera, visible_points(volume, transfer, least))
+    check_known("automatic_camera", volume, transfer, direction, view_up, view_angle)
+    with jax.ensure_compile_time_eval():  # also where something else is traced
+        side = upright(volume, transfer, direction, view_up)
+        camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
+        return framed(camera, visible_points(volume, transfer, least))
 
 
 def upright(

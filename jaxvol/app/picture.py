@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._util.checks import finite_array
 from .._util.srgb import linear_color
 from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
@@ -130,13 +131,14 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
     # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
     transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
-    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    planes = finite_array("clip_plane", options.clip_plane or np.empty((0, 6)), (..., 6)).reshape(-1, 6)
+    planes = [(plane[:3], plane[3:]) for plane in np.asarray(planes).tolist()]
     if options.clip_box is not None or planes:
         transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
     elif options.clip_inside_out:
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
-    source, others = None, tuple(_other(*each) for each in options.others)
+    source, others = None, tuple(map(_other, options.others))
     if options.memory is None:
         volume, transfer = look_of(options)
     else:
@@ -187,9 +189,10 @@ def _camera(
     return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
 
 
-def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
+def _other(each: Any) -> tuple[Volume, Transfer]:
     """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
     and HIGH, or over what stands out of the background."""
+    file, *look = each if isinstance(each, Sequence) and not isinstance(each, str) else (each,)
     volume = file if isinstance(file, Volume) else load(file)
     if look and isinstance(look[0], Transfer):
         return volume, look[0]
