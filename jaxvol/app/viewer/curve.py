@@ -1,5 +1,6 @@
 """The controls of a viewer's transfer function: presets, its curve and points, or its labels."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
@@ -137,14 +138,15 @@ def _point_controls(model: Model) -> list[Control]:
 
         return Control("slider", label, get, set_one, limits)
 
+    # in NumPy: another number of points would be another program, that waits for one that is being compiled
     def value() -> float:
-        return editing.rounded(float(transfer().values[chosen]), span)
+        return editing.rounded(float(np.asarray(transfer().values)[chosen]), span)
 
     def color() -> str:
         return editing.display_color(np.asarray(transfer().colors)[chosen])
 
     def opacity() -> float:
-        return round(float(transfer().opacity(voxel)[chosen]), 3)
+        return round(-math.expm1(-float(np.asarray(transfer().extinction)[chosen]) * voxel), 3)
 
     window, level = editing.window_level(transfer())
     first, last = min(low, level - window / 2), max(high, level + window / 2)
