@@ -131,14 +131,16 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
     # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
     transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
-    planes = finite_array("clip_plane", options.clip_plane or np.empty((0, 6)), (..., 6)).reshape(-1, 6)
+    given = np.atleast_2d(options.clip_plane) if len(options.clip_plane) else np.empty((0, 6))
+    planes = finite_array("clip_plane", given, (None, 6))
     planes = [(plane[:3], plane[3:]) for plane in np.asarray(planes).tolist()]
     if options.clip_box is not None or planes:
         transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
     elif options.clip_inside_out:
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
-    source, others = None, tuple(map(_other, options.others))
+    several = options.others if isinstance(options.others, list | tuple) else [options.others]
+    source, others = None, tuple(map(_other, several))
     if options.memory is None:
         volume, transfer = look_of(options)
     else:

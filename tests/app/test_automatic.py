@@ -108,8 +108,13 @@ def test_what_is_no_volume_or_a_traced_one_is_refused():
     with pytest.raises(ValueError, match="volume must be a jaxvol Volume"):
         jv.automatic_transfer(np.zeros((3, 3, 3)))
     volume = jv.phantom("head", 16)
+    transfer = jv.automatic_transfer(volume)
     with pytest.raises(ValueError, match="automatic_transfer needs the numbers of its arguments, and some"):
         jax.jit(jv.automatic_transfer)(volume)
+    with pytest.raises(ValueError, match="automatic_camera needs the numbers"):
+        jax.jit(lambda angle: jv.automatic_camera(volume, transfer, view_angle=angle))(30.0)
+    camera = jax.jit(lambda _: jv.automatic_camera(volume, transfer).position)(0.0)
+    np.testing.assert_allclose(camera, jv.automatic_camera(volume, transfer).position, rtol=1e-6)
     found, inside = jv.automatic_transfer(volume), jax.jit(lambda _: jv.automatic_transfer(volume))(0.0)
     np.testing.assert_array_equal(found.extinction, inside.extinction)
     np.testing.assert_array_equal(found.colors, inside.colors)
