@@ -407,7 +407,12 @@ def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -
     if hasattr(unit_distance, "spacing"):
         unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)
-    return _extinction(unit_interval("opacity", opacity, (None,)), unit_distance)
+    opacity = unit_interval("opacity", opacity, (None,))
+    if is_traced(opacity, unit_distance):
+        return _extinction(opacity, unit_distance)
+    # in NumPy: no program for each number of points, which would wait for one that is being compiled
+    found = -np.log1p(-np.minimum(np.asarray(opacity), 1 - 2.0**-24)) / np.asarray(unit_distance)
+    return jnp.asarray(found, opacity.dtype)
 
 
 @jax.jit  # one program, rather than one for each operation
