@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.colors import to_hex
 
 from ...scene.labels import LabelTransferFunction
 from ...scene.presets import PRESETS, fitted_range, preset
@@ -171,7 +172,7 @@ def _label_controls(model: Model) -> list[Control]:
     stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
-    colors = np.asarray(stacked.colors)[labels, extinction[labels].argmax(axis=1)]
+    colors = editing.colors_of(model.state.transfer)[labels]  # pyright: ignore[reportArgumentType]
     names, chosen = [str(label) for label in labels], 0
 
     def choose(name: str) -> None:
@@ -179,7 +180,7 @@ def _label_controls(model: Model) -> list[Control]:
         chosen = names.index(name)
 
     def swatch() -> str:
-        return f'<div style="background: {editing.display_color(colors[chosen])}; height: 14px"></div>'
+        return f'<div style="background: {to_hex(tuple(colors[chosen]))}; height: 14px"></div>'
 
     def get(name: str) -> float:
         return float(np.asarray(getattr(model.state.transfer, name))[labels[chosen]])
