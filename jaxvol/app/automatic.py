@@ -95,10 +95,8 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
 def check_known(caller: str, *values: Any) -> None:
     """Refuse what is traced, where a function looks at all voxels, on the host."""
     if is_traced(values):
-        raise ValueError(
-            f"{caller} needs the numbers of its arguments, and some are traced here: call it outside of "
-            "jax.jit, jax.vmap and jax.grad, and pass what it returns."
-        )
+        told = f"{caller} needs numbers, and some of its arguments are traced: call it outside of jax.jit,"
+        raise ValueError(f"{told} jax.vmap and jax.grad, and pass what it returns.")
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:

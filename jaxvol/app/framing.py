@@ -89,13 +89,10 @@ def upright(
 def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     """The axis that points up, and whether it does so forward or backward."""
     known = volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
-    found, most = (2, 1.0), CUT_FACE
-    if known:
-        return found
-    # of the volume's own, not what may be fog, or hide the neck
-    own = automatic_transfer(volume) if isinstance(transfer, TransferFunction) else transfer
-    visible = _visible(volume, own, FAINT)
-    for axis in (2, 1, 0):
+    if not known and isinstance(transfer, TransferFunction):  # what is given may be fog
+        transfer = automatic_transfer(volume)
+    visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
+    for axis in () if known else (2, 1, 0):
         low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))
         cut, other, sign = (low, high, 1.0) if low >= high else (high, low, -1.0)
         if cut > most and other <= OTHER_FACE * cut:

@@ -277,9 +277,10 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
             if told:
                 warnings.warn(told, stacklevel=5)
         return preset(options.preset, clim, 1.0 if unit is None else unit)
-    if clim is None:  # what is around the object would be fog; a ray's value may be one of it
-        low, high = range_of_object(volume)
-        clim = (low if options.compositing == "over" else float(np.asarray(volume.data).min())), high
+    if clim is None and options.compositing == "over":  # what is around the object would be fog
+        clim = range_of_object(volume)
+    data = np.asarray(volume.data)
+    clim = clim or (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 

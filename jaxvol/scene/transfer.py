@@ -408,11 +408,10 @@ def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -
         unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)
     opacity = unit_interval("opacity", opacity, (None,))
-    if is_traced(opacity, unit_distance):
-        return _extinction(opacity, unit_distance)
-    # in NumPy: no program for each number of points, which would wait for one that is being compiled
-    found = -np.log1p(-np.minimum(np.asarray(opacity), 1 - 2.0**-24)) / np.asarray(unit_distance)
-    return jnp.asarray(found, opacity.dtype)
+    if not is_traced(opacity, unit_distance):  # without a program for each number of points
+        opacity, unit_distance = np.asarray(opacity), np.asarray(unit_distance)
+        return jnp.asarray(-np.log1p(-np.minimum(opacity, 1 - 2.0**-24)) / unit_distance, opacity.dtype)
+    return _extinction(opacity, unit_distance)
 
 
 @jax.jit  # one program, rather than one for each operation

@@ -207,7 +207,7 @@ def add_transfer(parser: Parser) -> None:
     group.add_argument("--cmap", metavar="NAME", help=text)
     text = "a transfer function written by jaxvol fit"
     group.add_argument("--transfer", type=Path, metavar="JSON", help=text)
-    add_clim(group, "what stands out of the background; of projections, from the least value")
+    add_clim(group, "what stands out of the background; of projections, all")
     for name, text in (("window", "width of that range, with --level"), ("level", "middle of that range")):
         group.add_argument(f"--{name}", type=float, metavar="VALUE", help=text)
     text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"

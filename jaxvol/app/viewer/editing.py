@@ -49,8 +49,7 @@ def display_color(linear: Float[np.ndarray, "3"]) -> str:
 
 def colors_of(transfer: LabelTransferFunction) -> Float[np.ndarray, "labels 3"]:
     """The densest colour of each label, as sRGB."""
-    stacked: Any = transfer.stacked
-    colors, extinction = np.asarray(stacked.colors), np.asarray(stacked.extinction)
+    colors, extinction = (np.asarray(getattr(transfer.stacked, name)) for name in POINTS[1:])
     return np.asarray(to_srgb(colors[np.arange(len(colors)), extinction.argmax(axis=1)]))
 
 

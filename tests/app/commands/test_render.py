@@ -23,7 +23,7 @@ from jaxvol.scene.rendering import BrickReport
 
 ENGINE = np.asarray(jv.phantom("engine", 24).data)
 OBJECT = range_of_object(jv.Volume(ENGINE))
-RANGE = float(ENGINE.min()), OBJECT[1]
+RANGE = float(ENGINE.min()), float(ENGINE.max())
 
 
 def of_voxel(cmap, clim=RANGE):
