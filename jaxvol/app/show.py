@@ -25,8 +25,6 @@ from .picture import DEFAULTS, Scene, check_exclusive, scene_of, with_march
 
 
 ELSEWHERE = {"mode": "compositing", "blending": "compositing", "lighting": "shade", "colormap": "cmap"}
-"""What other programs call options."""
-
 FAINT = 0.01
 """Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
 

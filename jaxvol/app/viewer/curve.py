@@ -139,16 +139,12 @@ def _point_controls(model: Model) -> list[Control]:
 
         return Control("slider", label, get, set_one, limits)
 
-    # in NumPy: another number of points would be another program, that waits for one that is being compiled
-    def value() -> float:
-        return editing.rounded(float(np.asarray(transfer().values)[chosen]), span)
-
-    def color() -> str:
-        return editing.display_color(np.asarray(transfer().colors)[chosen])
-
-    def opacity() -> float:
-        return round(-math.expm1(-float(np.asarray(transfer().extinction)[chosen]) * voxel), 3)
-
+    # in NumPy: a program for another number of points would wait for one that is being compiled
+    value, color, opacity = (
+        lambda: editing.rounded(float(np.asarray(transfer().values)[chosen]), span),
+        lambda: editing.display_color(np.asarray(transfer().colors)[chosen]),
+        lambda: round(-math.expm1(-float(np.asarray(transfer().extinction)[chosen]) * voxel), 3),
+    )
     window, level = editing.window_level(transfer())
     first, last = min(low, level - window / 2), max(high, level + window / 2)
     span = editing.rounded(last - first, last - first)
