@@ -19,13 +19,18 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-SIZES: Any = {"axes.titlesize": 9, "axes.labelsize": 9, "figure.titlesize": 9, "legend.fontsize": 8}
-SIZES |= {"xtick.labelsize": 8, "ytick.labelsize": 8, "lines.markersize": 4}
+DPI = 90
+SHOWN, LETTER = 800, 12.5
+"""The width in which documents show a picture, and the size of the letters in it, pixels."""
+TEXTS = "axes.titlesize", "axes.labelsize", "figure.titlesize", "legend.fontsize"
+TEXTS += "xtick.labelsize", "ytick.labelsize", "font.size"
 
 
 def panels(rows: int, columns: int, width: float, height: float, **how: Any) -> tuple[Any, Any]:
-    """A figure of so many panels, (rows, columns); its size is in inches."""
-    plt.rcParams.update(SIZES)
+    """A figure of so many panels, (rows, columns); its size is in inches. The letters of a wide one are
+    larger, since documents shrink it."""
+    size = LETTER * 72 / DPI * max(1, width * DPI / SHOWN)
+    plt.rcParams.update({**dict.fromkeys(TEXTS, size), "lines.markersize": 4})
     return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **how)
 
 
@@ -78,5 +83,5 @@ def save(figure: Any, path: Path) -> None:
     with whole_file(path) as part:
         exactly: dict[str, Any] = {"pil_kwargs": {"lossless": True}}
         how = exactly if path.suffix == ".webp" else {"metadata": {"Software": None}}
-        figure.savefig(part, dpi=90, **how)
+        figure.savefig(part, dpi=DPI, **how)
     plt.close(figure)
