@@ -257,6 +257,10 @@ LEE = {
     "Table 3, material B": (0.22145, 0.17421, 0.17500, 0.17120, 0.04829, 0.04805, 0.04728, 0.01339),
 }
 """Intensities as printed. 0.00945, 0.48284 and 0.48282 lack a zero: 0.000945, 0.048284, 0.048282."""
+LEVELS = "01 2 3 4 5 6 7 8", "01 0 0 0 1 1 1 2", "01 01 0 0 1 1 2 2", "01 0 0 0 1 1 1 2"
+"""Of each table's rows: how often its photon was refracted before; of both, where one landed on another."""
+LEAST = (1 - 1 / templates.INDEX**2) ** 0.5
+"""cos θ' at the critical angle."""
 
 
 PHOTONS = dict.fromkeys(("Table 1", "Table 2"), "*56 to 63 photons*")
@@ -265,17 +269,25 @@ PHOTONS = dict.fromkeys(("Table 1", "Table 2"), "*56 to 63 photons*")
 
 def lee_tables(result: dict[str, Any]) -> str:
     """All three tables as one Markdown table. In brackets, the fewest and most photons of many templates."""
-    lines = ["| | x | y | z | intensity | *paper* |", "|---|---|---|---|---|---|"]
-    for name, found in result["tables"].items():
-        for row, paper in enumerate(LEE[name.split(":")[0]]):
+    heads = "", "x", "y", "z", "intensity", "*paper*", "*level*", "light of this level"
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for (name, found), levels in zip(result["tables"].items(), LEVELS, strict=True):
+        table, (opacity, packets) = name.split(":")[0], templates.TABLES[name]
+        for row, (paper, level) in enumerate(zip(LEE[table], levels.split(), strict=True)):
             cells = ["–"] * 4
             if row < len(found["photons"]):
                 *offset, light = found["photons"][row]
                 cells = [*(f"{c:.2f}" for c in offset), f"{light:.5f}"]
-            lines.append(f"| {'' if row else name} | {' | '.join(cells)} | *{paper:.5f}* |")
+            least, most = (
+                sum(opacity * ((1 - opacity) * cosine) ** int(k) for k in level) / packets
+                for cosine in (LEAST, 1)
+            )
+            cells += [f"*{paper:.5f}*", f"*{' + '.join(level)}*"]
+            cells.append(f"{least:.5f}" if least == most else f"{least:.5f} to {most:.5f}")
+            lines.append(f"| {'' if row else name} | {' | '.join(cells)} |")
         fewest, most = found["counts of many"]
         counts = f"*{found['count']} photons ({fewest} to {most})*"
-        lines.append(f"| {counts} | | | | {found['energy']:.5f} | {PHOTONS.get(name.split(':')[0], '')} |")
+        lines.append(f"| {counts} | | | | {found['energy']:.5f} | {PHOTONS.get(table, '')} | | |")
     return "\n".join(lines) + "\n"
 
 
