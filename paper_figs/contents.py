@@ -267,8 +267,8 @@ ENTRIES = (
         "Photographs of a body (Visible Korean), unlit and lit: 42 to 56 frames a second without, 20 to 24 "
         "with templates, about 2.2 times the time of a frame.",
         "A head and a frog, as phantoms, and CT and labels below each, in place of Visible Korean. The noise "
-        "of the middle column comes from one template for each pixel; blending removes it. Time, under the paper's conditions: "
-        "3.8 times the unlit frame (`experiments/published_light.py`).",
+        "of the middle column comes from one template for each pixel; blending removes it. Time, under the "
+        "paper's conditions: 3.8 times the unlit frame (`experiments/published_light.py`).",
         data=True,
     ),
     Entry(
