@@ -22,15 +22,14 @@ import matplotlib.pyplot as plt
 DPI = 90
 SHOWN, LETTER = 800, 12.5
 """The width in which documents show a picture, and the size of the letters in it, pixels."""
-TEXTS = "axes.titlesize", "axes.labelsize", "figure.titlesize", "legend.fontsize"
-TEXTS += "xtick.labelsize", "ytick.labelsize", "font.size"
+SIZES: Any = {"font.size": LETTER * 72 / DPI, "axes.titlesize": "medium", "figure.titlesize": "medium"}
+SIZES |= {"lines.markersize": 4}
 
 
 def panels(rows: int, columns: int, width: float, height: float, **how: Any) -> tuple[Any, Any]:
-    """A figure of so many panels, (rows, columns); its size is in inches. The letters of a wide one are
-    larger, since documents shrink it."""
-    size = LETTER * 72 / DPI * max(1, width * DPI / SHOWN)
-    plt.rcParams.update({**dict.fromkeys(TEXTS, size), "lines.markersize": 4})
+    """A figure of so many panels, (rows, columns); its size is in inches. Documents shrink those that are
+    wider than `SHOWN`, with their letters."""
+    plt.rcParams.update(SIZES)
     return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **how)
 
 

@@ -71,7 +71,7 @@ def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
 
 def draw(result: dict[str, Any]) -> Any:
     sweeps = result["sweeps"]
-    figure, (axes,) = charts.panels(1, len(sweeps), 3.7 * len(sweeps), 3.6, sharey=True)
+    figure, (axes,) = charts.panels(1, len(sweeps), 3 * len(sweeps), 3.8, sharey=True)
     for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
         for (method, found), style in zip(methods.items(), ("C7o-", "C0s-"), strict=True):
             sizes = np.array([int(size) for size in found["sizes"]], float)

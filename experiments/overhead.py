@@ -61,9 +61,7 @@ def draw(result: dict[str, Any]) -> Any:
         panel.set_title(f"{said}, {pixels} x {pixels} pixels; dotted: goal, {goal}")
         panel.set_yticks(range(volumes), list(measured))
     axes[0, 0].invert_yaxis()
-    figure.supxlabel(
-        "time of a frame / that of ray casting: median of paired ratios, 95 % interval", fontsize=9
-    )
+    figure.supxlabel("time of a frame / that of ray casting: median of paired ratios, 95 % interval")
     figure.legend(loc="outside upper center", ncols=3)
     return figure
 

@@ -118,7 +118,7 @@ def draw(result: dict[str, Any]) -> Any:
     figure.suptitle(
         "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid"
     )
-    axes[0].legend(fontsize=7)
+    axes[0].legend()
     return figure
 
 

@@ -32,7 +32,7 @@ from .harness import experiment, recorded, some_of
 
 
 ABOUT = ("question", "method", "regime", "metric", "judged", "limit", "outcome", "does", "shows", "size")
-COLUMNS = 4
+COLUMNS = 2
 OUTCOMES = {"detected and said": "C0", "documented": "C1", "fails": "C3"}
 
 
@@ -40,7 +40,7 @@ def draw(result: dict[str, Any]) -> Any:
     """A panel for each entry."""
     entries = result["entries"]
     rows = -(-len(entries) // COLUMNS)
-    figure, axes = charts.panels(rows, COLUMNS, 3.6 * COLUMNS, 2.9 * rows)
+    figure, axes = charts.panels(rows, COLUMNS, 4.4 * COLUMNS, 3 * rows)
     for panel in axes.flat[len(entries) :]:
         panel.set_axis_off()
     for panel, (name, found) in zip(axes.flat, entries.items(), strict=False):
@@ -74,10 +74,9 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     if beyond is not None:
         panel.axvspan(beyond if within is None else within, beyond, color=OUTCOMES[entry.outcome], alpha=0.35)
     panel.set_title(entry.name)
-    panel.set_xlabel(entry.regime, fontsize=7)
-    panel.set_ylabel(textwrap.fill(entry.metric, 36), fontsize=7)
-    panel.tick_params(labelsize=7, which="both")
-    panel.legend(fontsize=6, framealpha=0.7)
+    panel.set_xlabel(textwrap.fill(entry.regime, 48))
+    panel.set_ylabel(textwrap.fill(entry.metric, 30))
+    panel.legend(framealpha=0.7)
 
 
 def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None:
