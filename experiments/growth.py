@@ -84,9 +84,9 @@ def draw(result: dict[str, Any]) -> Any:
             panel.plot(upper, fitted, "k:", linewidth=1)
             charts.numbered(panel, sizes, [f"{size:g}" for size in sizes])
         panel.set(yscale="log", xlabel=LABELS[along])
-        panel.legend()
+        panel.legend(loc="upper left")
         panel.grid(alpha=0.3)
-    axes[0].set_ylabel("time of a frame, seconds")
+    axes[0].set(ylabel="time of a frame, seconds", ylim=(None, 8 * axes[0].get_ylim()[1]))
     axes[0].yaxis.set_major_formatter("{x:g}")
     figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes")
     return figure
