@@ -144,7 +144,7 @@ def draw(result: dict[str, Any]) -> Any:
         cost.plot(error, ratio, STYLES[kind], label=kind, markersize=6)
         for row, x, y in zip(rows, error, ratio, strict=True):
             if row["number"]:
-                cost.annotate(str(row["number"]), (x, y), (4, 4), textcoords="offset points")
+                cost.annotate(str(row["number"]), (x, y), (4, 4), textcoords="offset points", fontsize=8)
     for name, goal in GOALS.items():
         cost.axhline(goal, color="k", linewidth=0.8, linestyle=":")
         how = {"ha": "right", "va": "bottom", "transform": cost.get_yaxis_transform()}

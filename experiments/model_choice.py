@@ -173,9 +173,9 @@ def draw(result: dict[str, Any]) -> Any:
             right_, more = ([count[key] for count in counts.values()] for key in ("truth", "more"))
             right.bar(at, right_, width, color=color, label=noise)
             right.bar(at, more, width, right_, color="none", edgecolor=color, hatch="////")
-        right.set(xticks=range(len(RULES)), xticklabels=["choose", "BIC", "least held-out loss"])
+        right.set(xticks=range(len(RULES)), xticklabels=["choose", "BIC", "least\nheld-out loss"])
         right.set(ylabel="trials", title="filled: truth chosen; hatched: too many")
-        right.set_ylim(0, 1.25 * right.get_ylim()[1])
+        right.set_ylim(0, 1.5 * right.get_ylim()[1])
         right.legend(title="noise", loc="upper center", ncols=2)
     return figure
 

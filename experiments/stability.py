@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
 import jaxvol as jv
@@ -49,8 +49,8 @@ def draw(result: dict[str, Any]) -> Any:
     labels = [f"edge; beyond it: {outcome}" for outcome in OUTCOMES]
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
     figure.suptitle(
-        "From left to right a regime becomes harmful; upwards: an error. Black: the curve that finds the "
-        "edge. Dashed: the limit. Crosses: not finite."
+        "From left to right a regime becomes harmful; upwards: an error.\n"
+        "Black: the curve that finds the edge. Dashed: the limit. Crosses: not finite."
     )
     return figure
 
@@ -69,12 +69,13 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     _scale(panel, "y", numbers)
     if values[0] > values[-1]:  # from harmless to harmful, from left to right
         panel.invert_xaxis()
+    charts.plain_numbers(panel)
     panel.axhline(entry.limit, color="0.6", linewidth=0.8, linestyle="--")
     within, beyond = found["edge"]["within"], found["edge"]["beyond"]
     if beyond is not None:
         panel.axvspan(beyond if within is None else within, beyond, color=OUTCOMES[entry.outcome], alpha=0.35)
     panel.set_title(entry.name)
-    panel.set_xlabel(textwrap.fill(entry.regime, 48))
+    panel.set_xlabel(textwrap.fill(entry.regime, 42))
     panel.set_ylabel(textwrap.fill(entry.metric, 30))
     panel.legend(framealpha=0.7)
 
@@ -95,8 +96,7 @@ def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None
     else:
         setter("log", nonpositive="mask")
         axis.set_major_locator(LogLocator(numticks=6))
-    few = np.ptp(powers) <= 1  # ticks at powers of ten alone would be too few
-    axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)) if few else NullFormatter())
+    axis.set_minor_formatter(NullFormatter())
 
 
 def keep(entry: Entry, values: tuple[float, float], size: int, folder: Path) -> None:
