@@ -32,7 +32,7 @@ def chae_fig6(chosen: Namespace) -> Panels:
 
 def under_cells(scene: Scene, middle: tuple[float, float], name: str) -> Panels:
     """Two rows: images, and the whole one with those whose wrong pixels are green."""
-    size = scene.camera.width
+    size = scene.camera.size[0]
     side = size // WHOLE
     left, top = (round(at * size - side / 2) for at in middle)
     part = slice(top, top + side), slice(left, left + side)
