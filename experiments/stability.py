@@ -69,7 +69,6 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     _scale(panel, "y", numbers)
     if values[0] > values[-1]:  # from harmless to harmful, from left to right
         panel.invert_xaxis()
-    charts.plain_numbers(panel)
     panel.axhline(entry.limit, color="0.6", linewidth=0.8, linestyle="--")
     within, beyond = found["edge"]["within"], found["edge"]["beyond"]
     if beyond is not None:
@@ -78,6 +77,7 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     panel.set_xlabel(textwrap.fill(entry.regime, 42))
     panel.set_ylabel(textwrap.fill(entry.metric, 30))
     panel.legend(framealpha=0.7)
+    charts.plain_numbers(panel)
 
 
 def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None:
