@@ -104,7 +104,7 @@ def page(panels: Panels, title: str, path: Path) -> None:
         height = tops[-1] + side + tall(panel.below for panel in row) + 2 * GAP
     height = math.ceil(height)
     figure = plt.figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-    how = {"fontsize": letter * 72 / DPI, "linespacing": 1.1}
+    how: dict[str, Any] = {"fontsize": letter * 72 / DPI, "linespacing": 1.1}
     figure.text(GAP / width, 1 - GAP / height, title, va="top", weight="bold", **how)
     for row, top in zip(rows, tops, strict=True):
         bottom = height - round(top) - side
