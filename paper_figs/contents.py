@@ -230,7 +230,8 @@ ENTRIES = (
         "lee",
         "The six steps of shading",
         "The lit side; occlusion; brightness; the colour from inside; other materials; the cut-off.",
-        "One column for each step: a scene above, and what one change makes of it below.",
+        "One column for each step, 1 to 3 and then 4 to 6: a scene above, and what one change makes of it "
+        "below.",
     ),
     Entry(
         "lee_printed",
