@@ -217,7 +217,7 @@ ENTRIES = (
         "lee_tables",
         "lee",
         "Tables 1 to 3: the photons of templates",
-        "Intensities of the brightest photons (column *paper*). First photons are α/4 of four packets; some "
+        "Intensities of the brightest photons, in italics. First photons are α/4 of four packets; some "
         "are brighter, where light landed on another photon. 0.00945, 0.48284 and 0.48282 lack a zero.",
         "Every row of the paper lies within the last column, what photons of its level hold in ours, but for "
         "four first photons that are 0.4 to 2.2 % fainter, and what lacks a zero. Both are sorted by "
