@@ -234,7 +234,7 @@ def draw(result: dict[str, Any]) -> Any:
     errors.yaxis.set_major_formatter("{x:g}")
     times.axhline(1.3, color="0.4", linewidth=0.8, linestyle=":")
     times.set_ylabel("time / that of the fastest march found")
-    times.text(2.45, 1.49, "goal", color="0.4", ha="right", va="top")
+    times.text(2.45, 1.29, "goal", color="0.4", ha="right", va="top")
     for panel in (errors, times):
         panel.set_xticks(range(len(TOLERANCES)), [f"{t:g}" for t in TOLERANCES])
         panel.set(xlabel="tolerance (RMSE of the image)", xlim=(-0.5, len(TOLERANCES) - 0.5))
