@@ -1,6 +1,6 @@
 """Takes a picture from each notebook for `docs/notebooks.md`: `python docs/from_notebooks.py [NAME ...]`.
 
-A notebook is executed up to the cell that shows the picture. Run it again when a notebook shows something else.
+A notebook is executed up to the cell that shows the picture. Run it again when that shows something else.
 """
 
 import base64
