@@ -150,13 +150,16 @@ def render(
 
 def _warn_of_step(volume: Volume, march: March) -> None:
     """Say so if a step is longer than a volume that no transform bends, where both are known."""
-    if is_traced(march.step, volume.spacing) or march.overriding("locate"):
+    if is_traced(march.step, volume.spacing):
         return
-    spacing = np.asarray(volume.spacing)
-    across = float(np.linalg.norm((np.array(volume.shape) - 1) * spacing))
-    if float(march.step) > across:
-        told = f"march.step is {float(march.step):.4g}, longer than the volume, which is {across:.4g} across"
-        warnings.warn(f"{told}; half a voxel is {float(spacing.min()) / 2:.4g}.", stacklevel=3)
+    # JAX keeps what it brought to the host, so that no later image waits for the device here
+    step, spacing = (np.asarray(array).tolist() for array in (march.step, volume.spacing))
+    if step <= max(spacing) or march.overriding("locate"):
+        return
+    across = math.hypot(*((n - 1) * s for n, s in zip(volume.shape, spacing, strict=True)))
+    if step > across:
+        told = f"march.step is {step:.4g}, longer than the volume, which is {across:.4g} across"
+        warnings.warn(f"{told}; half a voxel is {min(spacing) / 2:.4g}.", stacklevel=3)
 
 
 def render_rays(

@@ -87,13 +87,16 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
     if not isinstance(volume, Volume):
         raise ValueError(f"volume must be a jaxvol Volume; got {described(volume)}.")
     check_one_channel(volume, "automatic_transfer")
-    if is_traced(volume):
-        raise ValueError(
-            "volume is traced here, and its histogram is needed: call automatic_transfer outside of jax.jit, "
-            "jax.vmap and jax.grad, and pass what it returns."
-        )
+    check_known("automatic_transfer", volume)
     with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
         return transfer_by_copy(volume, np.asarray(volume.data))
+
+
+def check_known(caller: str, *values: Any) -> None:
+    """Refuse what is traced, where a function looks at all voxels, on the host."""
+    if is_traced(values):
+        told = f"{caller} needs numbers, and some of its arguments are traced: call it outside of jax.jit,"
+        raise ValueError(f"{told} jax.vmap and jax.grad, and pass what it returns.")
 
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
@@ -163,6 +166,14 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return float(first), float(second)
 
 
+def range_of_object(volume: Volume) -> tuple[float, float]:
+    """From the lower of the `thresholds` to what few values are above; of a single value, as far as that."""
+    values = sampled(volume).ravel().astype(np.float32)
+    low, least = thresholds(values)[0], float(values.min())
+    high = float(np.percentile(values[values >= low], 99.5))
+    return (low, high) if low < high else (least, least + max(abs(least), 1.0))
+
+
 def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:
     """Whether values between two thresholds fill a body, and are not only grain, or the borders of what is
     dense. Of a large volume, every n-th voxel is compared with its neighbours."""
@@ -208,13 +219,14 @@ def labels_shown(
         to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
 
     Raises:
-        ValueError: for what is no volume.
+        ValueError: for what is no volume, or traced.
     """
     import matplotlib
     from matplotlib.colors import ListedColormap, hsv_to_rgb
     from scipy.ndimage import gaussian_filter, maximum_filter
 
     check_arguments("labels_shown(volume)", volume=volume)
+    check_known("labels_shown", volume, around)
     own, data = volume.labels is not None, np.asarray(volume.data)
     given = np.asarray(volume.labels) if own else data
     if not own and (given.dtype.kind not in "iu" or not is_flat(given)):

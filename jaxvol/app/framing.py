@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -13,7 +14,7 @@ from ..scene.camera import Camera, axes_of
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
-from .automatic import sampled, stride_of, unit_of
+from .automatic import automatic_transfer, check_known, sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
@@ -53,8 +54,8 @@ def automatic_camera(
         transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts.
         direction: from the volume to the camera; by default to the right, in front, and higher.
         view_up: by default z; of a volume that does not say where it lies (its origin is 0, its axes are the
-            world's, as of raw files), away from the face that cuts through most of what is visible, if the
-            opposite one does not: the neck, or the pot of a plant, is below.
+            world's, as of raw files), away from the face that cuts through most of what `automatic_transfer`
+            shows, if the opposite one does not: the neck, or the pot of a plant, is below.
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
@@ -65,12 +66,14 @@ def automatic_camera(
         The `Camera`.
 
     Raises:
-        ValueError: as `Camera.looking_at` does.
+        ValueError: as `Camera.looking_at` does, and for what is traced.
     """
     check_arguments("automatic_camera(volume, transfer)", volume=volume, transfer=transfer)
-    side = upright(volume, transfer, direction, view_up)
-    camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
-    return framed(camera, visible_points(volume, transfer, least))
+    check_known("automatic_camera", volume, transfer, direction, view_up, view_angle)
+    with jax.ensure_compile_time_eval():  # also where something else is traced
+        side = upright(volume, transfer, direction, view_up)
+        camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
+        return framed(camera, visible_points(volume, transfer, least))
 
 
 def upright(
@@ -86,6 +89,8 @@ def upright(
 def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     """The axis that points up, and whether it does so forward or backward."""
     known = volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
+    if not known and isinstance(transfer, TransferFunction):  # what is given may be fog
+        transfer = automatic_transfer(volume)
     visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
     for axis in () if known else (2, 1, 0):
         low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))

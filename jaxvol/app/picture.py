@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from .._util.checks import finite_array
 from .._util.srgb import linear_color
 from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
@@ -31,12 +32,12 @@ from .automatic import (
     SAMPLED,
     automatic_transfer,
     labels_shown,
+    range_of_object,
     sampled,
     stride_of,
-    thresholds,
     transfer_by_copy,
 )
-from .framing import FAINT, VISIBLE, automatic_camera, framed, upright, visible_points
+from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points
 
 
 FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
@@ -130,13 +131,16 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
     # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
     transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
-    planes = [(plane[:3], plane[3:]) for plane in options.clip_plane]
+    given = np.atleast_2d(options.clip_plane) if len(options.clip_plane) else np.empty((0, 6))
+    planes = finite_array("clip_plane", given, (None, 6))
+    planes = [(plane[:3], plane[3:]) for plane in np.asarray(planes).tolist()]
     if options.clip_box is not None or planes:
         transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
     elif options.clip_inside_out:
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
-    source, others = None, tuple(_other(*each) for each in options.others)
+    several = options.others if isinstance(options.others, list | tuple) else [options.others]
+    source, others = None, tuple(map(_other, several))
     if options.memory is None:
         volume, transfer = look_of(options)
     else:
@@ -174,8 +178,7 @@ def _camera(
     transfer: Transfer,
     orbit: Callable[[Camera], Sequence[Camera]] | None,
 ) -> Camera:
-    """That of the options; or else one as near as what is visible allows, or, under other modes than "over",
-    as the volume does."""
+    """That of the options; or else one as near as what is visible allows."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if options.camera is not None:
         up, place = options.view_up, (options.camera[:3], options.camera[3:])
@@ -183,25 +186,21 @@ def _camera(
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
     given["parallel"] = options.parallel
-    if options.compositing != "over":
-        side = upright(volume, transfer, options.direction, options.view_up)
-        return Camera.looking_at(volume, *side, **given)
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
     camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
     return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
 
 
-def _other(file: str | Volume, *look: Any) -> tuple[Volume, Transfer]:
+def _other(each: Any) -> tuple[Volume, Transfer]:
     """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
     and HIGH, or over what stands out of the background."""
+    file, *look = each if isinstance(each, Sequence) and not isinstance(each, str) else (each,)
     volume = file if isinstance(file, Volume) else load(file)
     if look and isinstance(look[0], Transfer):
         return volume, look[0]
     cmap, *clim = look or ("hot",)
     if not clim:
-        values = sampled(volume).ravel().astype(np.float32)
-        low = thresholds(values)[0]
-        clim = low, np.percentile(values[values >= low], 99)
+        clim = range_of_object(volume)
     try:
         low, high = map(float, clim)
     except ValueError as fault:
@@ -278,6 +277,8 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
             if told:
                 warnings.warn(told, stacklevel=5)
         return preset(options.preset, clim, 1.0 if unit is None else unit)
+    if clim is None and options.compositing == "over":  # what is around the object would be fog
+        clim = range_of_object(volume)
     data = np.asarray(volume.data)
     clim = clim or (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")

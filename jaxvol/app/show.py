@@ -20,9 +20,11 @@ from ..scene.space import enter
 from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
+from .automatic import check_known
 from .picture import DEFAULTS, Scene, check_exclusive, scene_of, with_march
 
 
+ELSEWHERE = {"mode": "compositing", "blending": "compositing", "lighting": "shade", "colormap": "cmap"}
 FAINT = 0.01
 """Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
 
@@ -60,12 +62,13 @@ def show(
     """
     known = DEFAULTS.keys() - {"transfer"}
     for name in options.keys() - known:
-        told = f"show has no option {name!r}.{near(name, known)}"
+        told = f"show has no option {name!r}.{near(ELSEWHERE.get(name, name), known)}"
         raise ValueError(f"{told} jaxvol render --help has them.")
     is_file = isinstance(volume, str | os.PathLike)
     given = {} if is_file else {"volume": volume}
     given |= {} if transfer is None else {"transfer": transfer}
     check_arguments("show(volume, transfer)", **given)
+    check_known("show", given, options)
     options["transfer"] = transfer
     check_exclusive(options)
     keep_programs_by_default()

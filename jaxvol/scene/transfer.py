@@ -407,7 +407,11 @@ def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -
     if hasattr(unit_distance, "spacing"):
         unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)
-    return _extinction(unit_interval("opacity", opacity, (None,)), unit_distance)
+    opacity = unit_interval("opacity", opacity, (None,))
+    if not is_traced(opacity, unit_distance):  # without a program for each number of points
+        opacity, unit_distance = np.asarray(opacity), np.asarray(unit_distance)
+        return jnp.asarray(-np.log1p(-np.minimum(opacity, 1 - 2.0**-24)) / unit_distance, opacity.dtype)
+    return _extinction(opacity, unit_distance)
 
 
 @jax.jit  # one program, rather than one for each operation

@@ -108,8 +108,13 @@ def test_what_is_no_volume_or_a_traced_one_is_refused():
     with pytest.raises(ValueError, match="volume must be a jaxvol Volume"):
         jv.automatic_transfer(np.zeros((3, 3, 3)))
     volume = jv.phantom("head", 16)
-    with pytest.raises(ValueError, match="volume is traced here, and its histogram is needed"):
+    transfer = jv.automatic_transfer(volume)
+    with pytest.raises(ValueError, match="automatic_transfer needs numbers, and some"):
         jax.jit(jv.automatic_transfer)(volume)
+    with pytest.raises(ValueError, match="automatic_camera needs numbers"):
+        jax.jit(lambda angle: jv.automatic_camera(volume, transfer, view_angle=angle))(30.0)
+    camera = jax.jit(lambda _: jv.automatic_camera(volume, transfer).position)(0.0)
+    np.testing.assert_allclose(camera, jv.automatic_camera(volume, transfer).position, rtol=1e-6)
     found, inside = jv.automatic_transfer(volume), jax.jit(lambda _: jv.automatic_transfer(volume))(0.0)
     np.testing.assert_array_equal(found.extinction, inside.extinction)
     np.testing.assert_array_equal(found.colors, inside.colors)
@@ -250,6 +255,9 @@ def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows()
         assert away @ np.asarray(camera.view_up) > 0.3 * np.linalg.norm(away)  # from above
         seen = in_picture(camera, visible_points(volume, transfer))
         assert np.abs(seen).max() == pytest.approx(1 / MARGIN, abs=1e-4)
+        # also where what is around hides it
+        camera = jv.automatic_camera(volume, jv.colormap("gray", (0, 255)), size=(32, 32))
+        np.testing.assert_array_equal(camera.view_up, sign * np.eye(3)[axis])
     # a file that says where it lies, and a user who says what is up
     for volume, up in ((jv.Volume(stand, origin=(0, 0, 1)), None), (jv.Volume(stand), (0, 0, 1))):
         camera = jv.automatic_camera(volume, transfer, (1, 2, 0.5), up, size=(32, 32))

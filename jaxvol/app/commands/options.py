@@ -192,8 +192,9 @@ def add_sampling(parser: Parser) -> None:
     add_vector(parser, "--background", "R G B", text)
 
 
-def add_clim(group: Any) -> None:
-    add_vector(group, "--clim", "LOW HIGH", "range of values of the transfer function (default: all)")
+def add_clim(group: Any, default: str = "all") -> None:
+    text = f"range of values of the transfer function (default: {default})"
+    add_vector(group, "--clim", "LOW HIGH", text)
 
 
 def add_transfer(parser: Parser) -> None:
@@ -206,7 +207,7 @@ def add_transfer(parser: Parser) -> None:
     group.add_argument("--cmap", metavar="NAME", help=text)
     text = "a transfer function written by jaxvol fit"
     group.add_argument("--transfer", type=Path, metavar="JSON", help=text)
-    add_clim(group)
+    add_clim(group, "what stands out of the background; of projections, all")
     for name, text in (("window", "width of that range, with --level"), ("level", "middle of that range")):
         group.add_argument(f"--{name}", type=float, metavar="VALUE", help=text)
     text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"

@@ -1,11 +1,13 @@
 """The controls of a viewer's transfer function: presets, its curve and points, or its labels."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.colors import to_hex
 
 from ...scene.labels import LabelTransferFunction
 from ...scene.presets import PRESETS, fitted_range, preset
@@ -137,15 +139,12 @@ def _point_controls(model: Model) -> list[Control]:
 
         return Control("slider", label, get, set_one, limits)
 
-    def value() -> float:
-        return editing.rounded(float(transfer().values[chosen]), span)
-
-    def color() -> str:
-        return editing.display_color(np.asarray(transfer().colors)[chosen])
-
-    def opacity() -> float:
-        return round(float(transfer().opacity(voxel)[chosen]), 3)
-
+    # in NumPy: a program for another number of points would wait for one that is being compiled
+    value, color, opacity = (
+        lambda: editing.rounded(float(np.asarray(transfer().values)[chosen]), span),
+        lambda: editing.display_color(np.asarray(transfer().colors)[chosen]),
+        lambda: round(-math.expm1(-float(np.asarray(transfer().extinction)[chosen]) * voxel), 3),
+    )
     window, level = editing.window_level(transfer())
     first, last = min(low, level - window / 2), max(high, level + window / 2)
     span = editing.rounded(last - first, last - first)
@@ -169,7 +168,7 @@ def _label_controls(model: Model) -> list[Control]:
     stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
-    colors = np.asarray(stacked.colors)[labels, extinction[labels].argmax(axis=1)]
+    colors = editing.colors_of(model.state.transfer)[labels]  # pyright: ignore[reportArgumentType]
     names, chosen = [str(label) for label in labels], 0
 
     def choose(name: str) -> None:
@@ -177,7 +176,7 @@ def _label_controls(model: Model) -> list[Control]:
         chosen = names.index(name)
 
     def swatch() -> str:
-        return f'<div style="background: {editing.display_color(colors[chosen])}; height: 14px"></div>'
+        return f'<div style="background: {to_hex(tuple(colors[chosen]))}; height: 14px"></div>'
 
     def get(name: str) -> float:
         return float(np.asarray(getattr(model.state.transfer, name))[labels[chosen]])

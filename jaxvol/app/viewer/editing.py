@@ -9,6 +9,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
 from ..._util.srgb import from_srgb, to_srgb
+from ...scene.labels import LabelTransferFunction
 from ...scene.transfer import TransferFunction, extinction_of
 
 
@@ -44,6 +45,12 @@ def display_color(linear: Float[np.ndarray, "3"]) -> str:
     """A linear colour as sRGB, `#rrggbb`."""
     r, g, b = np.clip(to_srgb(linear), 0, 1).tolist()
     return to_hex((r, g, b))
+
+
+def colors_of(transfer: LabelTransferFunction) -> Float[np.ndarray, "labels 3"]:
+    """The densest colour of each label, as sRGB."""
+    colors, extinction = (np.asarray(getattr(transfer.stacked, name)) for name in POINTS[1:])
+    return np.asarray(to_srgb(colors[np.arange(len(colors)), extinction.argmax(axis=1)]))
 
 
 def with_value(transfer: TransferFunction, index: int, value: float) -> TransferFunction:

@@ -7,8 +7,10 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from ..._util.srgb import png_of
+from ...scene.labels import LabelTransferFunction
 from ..automatic import sampled
 from .control import Control, press_of
+from .editing import colors_of
 from .marks import AXES
 from .model import Model
 
@@ -31,6 +33,8 @@ def slice_controls(model: Model) -> list[Control]:
     # axes that run down or to the left
     down = np.where(np.abs(upward) > 0.7, upward, turn[np.abs(turn).argmax(axis=0), range(3)]) < 0
     shown: tuple[Any, str] = (), ""
+    labels, look = np.asarray(volume.labels), model.first.transfer
+    palette = colors_of(look) if isinstance(look, LabelTransferFunction) else None
 
     def indices() -> np.ndarray:
         """Of the point, or of the middle of the volume, in voxels."""
@@ -40,9 +44,12 @@ def slice_controls(model: Model) -> list[Control]:
     def one(axis: int, at: np.ndarray) -> str:
         a, b = (each for each in range(3) if each != axis)
         data = np.asarray(volume.data).take(round(at[axis]), axis).astype(np.float32)
-        grey = (255 * np.clip((data - low) / ((high - low) or 1.0), 0, 1)).astype(np.uint8)
-        grey = Image.fromarray(np.ascontiguousarray(grey[:: -1 if down[a] else 1, :: 1 if down[b] else -1].T))
-        picture = grey.resize((pixels[a], pixels[b])).convert("RGB")
+        rgb = np.clip((data - low) / ((high - low) or 1.0), 0, 1)[..., None].repeat(3, axis=2)
+        if palette is not None:
+            kinds = labels.take(round(at[axis]), axis)
+            rgb = np.where((kinds > 0)[..., None], rgb * palette[kinds], rgb)
+        rgb = rgb[:: -1 if down[a] else 1, :: 1 if down[b] else -1].swapaxes(0, 1)
+        picture = Image.fromarray((255 * rgb).astype(np.uint8)).resize((pixels[a], pixels[b]))
         x, y = (1 - at[a] / last[a] if down[a] else at[a] / last[a]), at[b] / last[b]
         x, y = x * pixels[a], (y if down[b] else 1 - y) * pixels[b]
         drawing = ImageDraw.Draw(picture)
@@ -57,11 +64,13 @@ def slice_controls(model: Model) -> list[Control]:
         nonlocal shown
         at = indices()
         if shown[0] != tuple(at):
-            value = np.asarray(volume.data)[tuple(np.round(at).astype(int))]
+            here = tuple(np.round(at).astype(int))
+            value = f"{float(np.asarray(volume.data)[here]):.5g}"
+            value += "" if palette is None else f", label {labels[here]}"
             where = ", ".join(f"{each:.4g}" for each in origin + turn @ (at * spacing))
             slices = "".join(one(axis, at) for axis in range(3))
             text = f'<div style="display: flex; gap: 6px; align-items: flex-end; margin: 4px">{slices}</div>'
-            text += f'<div style="font-size: 11px; margin: 0 4px">at ({where}): {float(value):.5g}</div>'
+            text += f'<div style="font-size: 11px; margin: 0 4px">at ({where}): {value}</div>'
             shown = tuple(at), text
         return shown[1]
 

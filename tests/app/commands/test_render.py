@@ -10,6 +10,7 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
+from jaxvol.app.automatic import range_of_object
 from jaxvol.app.cli import main
 from jaxvol.app.picture import Scene
 from jaxvol.app.show import why_empty
@@ -21,6 +22,7 @@ from jaxvol.scene.rendering import BrickReport
 
 
 ENGINE = np.asarray(jv.phantom("engine", 24).data)
+OBJECT = range_of_object(jv.Volume(ENGINE))
 RANGE = float(ENGINE.min()), float(ENGINE.max())
 
 
@@ -89,6 +91,7 @@ SCENES = {
         jv.colormap("gray", (-100, 255), unit_distance=20),
         *("maximum", None, 0),
     ),
+    "a colormap": (["--cmap", "hot"], of_voxel("hot", OBJECT), "over", None, 1),
     "of all values": (
         ["--compositing", "average"],
         of_voxel("gray"),
@@ -127,8 +130,7 @@ def test_options_of_the_look_make_the_scene(case, volume_file, tmp_path, monkeyp
     assert same(how["compositing"], compositing_of(mode))
     assert type(how["lighting"]) is type(lighting)
     assert same(how["lighting"], lighting)
-    near = jv.automatic_camera(volume, found, size=(16, 16), least=0.01)
-    assert same(camera, near if mode == "over" else jv.Camera.looking_at(volume, size=(16, 16)))
+    assert same(camera, jv.automatic_camera(volume, found, size=(16, 16), least=0.01))
     assert same(march, jv.March(0.4, FAST, "midpoint"))
     rgba = drawn(volume, found, camera, march).rgba
     np.testing.assert_allclose(np.load("x.npy"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind, atol=1e-6)

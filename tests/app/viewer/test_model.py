@@ -429,6 +429,9 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
     given = model.state.transfer
     assert controls["label"].choices == ["1", "2"]
     assert "#1f77b4" in controls["pad"].get()
+    middle = tuple(np.array(model.scene.volume.shape) // 2)
+    model.state = replace(model.state, point=np.asarray(model.scene.volume.origin) + middle)
+    assert controls["slices"].get().endswith(f", label {np.asarray(model.scene.volume.labels)[middle]}</div>")
     controls["shown"].set(False)
     assert not controls["shown"].get()
     controls["label"].set("2")
