@@ -40,6 +40,9 @@ OUTSIDE = (
 )
 """Files outside `docs/` that become part of the site."""
 
+SMALL = ("features.md",)
+"""Pages of many pictures, which are shown small."""
+
 SECTION = re.compile(r"^<!-- section (\S+): (.+?) -->$", re.MULTILINE)
 TABLE = re.compile(r"^<!-- table (\w+) -->$", re.MULTILINE)
 LINK = re.compile(r"(!?\[((?:[^\[\]]|!\[[^\]]*\]\([^)]*\))*)\])\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")
@@ -74,7 +77,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     names = {file.src_uri for file in files}
     markdown = relinked(markdown, here if outside else f"{DOCS}/{here}", here, names)
     markdown = SECTION.sub(lambda m: relinked(section(m[1], m[2]), m[1], here, names), markdown)
-    markdown = PICTURE.sub(r"[\1](\2)", markdown)  # a click shows it in full size
+    size = "{ .small }" if here in SMALL else ""
+    markdown = PICTURE.sub(rf"[\1](\2){size}", markdown)  # a click shows it in full size
     return TABLE.sub(lambda m: TABLES[m[1]](), markdown)
 
 
@@ -103,7 +107,7 @@ def relinked(text: str, source: str, page: str, names: set[str]) -> str:
             return f"{shown}({posixpath.relpath(name, posixpath.dirname(page) or '.')}{anchor})"
         if not (ROOT / path).exists():
             return found[0]
-        return label if label.strip("`") == path else f"{label} (`{path}`)"
+        return label if label.strip("`").rstrip("/") == path else f"{label} (`{path}`)"
 
     parts = FENCE.split(text)
     parts[::2] = [LINK.sub(link, part) for part in parts[::2]]

@@ -60,25 +60,25 @@ def measure(scene: Scene, there: dict[str, str], repetitions: int) -> Rows:
 def draw(result: dict[str, Any]) -> Any:
     """Time against error, a panel for each scene; and errors under a narrow peak."""
     scenes = result["scenes"]
-    figure, axes = charts.panels(2, len(scenes), 3.4 * len(scenes), 6.4)
-    for (times, errors), (name, rows) in zip(axes.T, scenes.items(), strict=True):
+    figure, axes = charts.panels(len(scenes), 2, 8.8, 2.9 * len(scenes) + 0.6)
+    for (times, errors), (name, rows) in zip(axes, scenes.items(), strict=True):
         for of, by_step in rows.items():
             error = [row["rmse"] for row in by_step.values()]
             times.plot(error, [row["seconds"] * 1e3 for row in by_step.values()], STYLES[of], label=of)
         for quadrature, by_step in result["peaks"][name].items():
             errors.plot([float(s) for s in by_step], list(by_step.values()), STYLES[quadrature])
         times.set(xscale="log", yscale="log", title=name, xlabel="RMSE of the image")
+        times.set_ylabel(f"time of {result['pixels']}² pixels, ms")
         errors.set(yscale="log", title=f"{name}, narrow peak", xlabel="step, voxels")
+        errors.set_ylabel("RMSE of the image")
         charts.plain_numbers(times)
         charts.plain_numbers(errors)
         charts.numbered(errors, STEPS, [f"{s:g}" for s in STEPS])
     figure.suptitle(
-        "Above: each point is a length of steps, the shorter the slower; below and to the left is better. "
-        "Below: a transfer function whose peak is 1 % of the range of values"
+        "Left: each point is a length of steps, the shorter the slower; below and to the left is better.\n"
+        "Right: a transfer function whose peak is 1 % of the range of values"
     )
-    axes[0, 0].set_ylabel(f"time of a frame of {result['pixels']}² pixels, ms")
-    axes[1, 0].set_ylabel("RMSE of the image")
-    charts.legend_below(figure, axes[0, 0], min(6, 2 * len(scenes)))
+    charts.legend_below(figure, axes[0, 0], 3)
     return figure
 
 

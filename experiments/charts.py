@@ -19,12 +19,16 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 
-SIZES: Any = {"axes.titlesize": 9, "axes.labelsize": 9, "figure.titlesize": 9, "legend.fontsize": 8}
-SIZES |= {"xtick.labelsize": 8, "ytick.labelsize": 8, "lines.markersize": 4}
+DPI = 90
+SHOWN, LETTER = 800, 12.5
+"""The width in which documents show a picture, and the size of the letters in it, pixels."""
+SIZES: Any = {"font.size": LETTER * 72 / DPI, "axes.titlesize": "medium", "figure.titlesize": "medium"}
+SIZES |= {"figure.labelsize": "medium", "lines.markersize": 4}
 
 
 def panels(rows: int, columns: int, width: float, height: float, **how: Any) -> tuple[Any, Any]:
-    """A figure of so many panels, (rows, columns); its size is in inches."""
+    """A figure of so many panels, (rows, columns); its size is in inches. Documents shrink those that are
+    wider than `SHOWN`, with their letters."""
     plt.rcParams.update(SIZES)
     return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **how)
 
@@ -50,7 +54,8 @@ def numbered(panel: Any, x: Any, names: Sequence[str] | None = None) -> None:
 def plain_numbers(panel: Any) -> None:
     """Label logarithmic axes by numbers such as 0.002 and 20, not by powers of ten; on axes of few decades
     also between these."""
-    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+    for axis, ends in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+        low, high = sorted(ends)
         if axis.get_scale() == "log" and low > 0:
             axis.set_major_formatter("{x:g}")
             leads = (2, 3, 5, 7) if high / low < 6 else (2, 5) if high / low < 30 else ()
@@ -78,5 +83,5 @@ def save(figure: Any, path: Path) -> None:
     with whole_file(path) as part:
         exactly: dict[str, Any] = {"pil_kwargs": {"lossless": True}}
         how = exactly if path.suffix == ".webp" else {"metadata": {"Software": None}}
-        figure.savefig(part, dpi=90, **how)
+        figure.savefig(part, dpi=DPI, **how)
     plt.close(figure)

@@ -68,7 +68,7 @@ def draw(result: dict[str, Any]) -> Any:
     right.axvline(GOALS["degrees"], color="k", linestyle=":", linewidth=0.8)
     right.axhline(GOALS["shift"], color="k", linestyle=":", linewidth=0.8)
     right.set(xlabel="rotation left, degrees", ylabel="shift left / distance to focal point")
-    right.set_title("after the last step; star: the start, dotted: what counts as led back")
+    right.set_title("after the last step; star: the start,\ndotted: what counts as led back")
     return figure
 
 

@@ -114,10 +114,10 @@ def draw(result: dict[str, Any]) -> Any:
         for name, style in ((KNOWN, "C0.-"), (EVEN, "C3.-")):
             row = rows[name]
             left.plot(range(1, row["steps"] + 1), -10 * np.log10(2 * np.asarray(row["losses"])), style)
-            label = f"{name}: held out ≥ {min(row['psnr held out']):.1f} dB"
+            label = f"{name}:\nheld out ≥ {min(row['psnr held out']):.1f} dB"
             right.plot(row["values"], row["extinction"], style, label=label)
         left.axhline(GOAL, color="k", linestyle=":", linewidth=0.8)
-        how: dict[str, Any] = {"ha": "right", "va": "top", "fontsize": 8}
+        how: dict[str, Any] = {"ha": "right", "va": "top"}
         left.text(0.99, GOAL, f"goal, {GOAL:g} dB", transform=left.get_yaxis_transform(), **how)
         left.set(xlabel="step of the fit", ylabel=f"{scene}\nPSNR of the views seen, dB")
         right.set(xlabel="value", ylabel="extinction, 1/length")

@@ -151,7 +151,7 @@ def draw(result: dict[str, Any]) -> Any:
             errors = np.array([[rows[name].get(leaf, unknown)[number] for leaf in leaves] for name in names])
             panel.imshow(errors, norm=LogNorm(1e-4, 1, clip=True), cmap="YlOrRd", aspect="auto")
             for row, column in np.argwhere(errors >= WRONG):
-                how: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 7, "color": "white"}
+                how: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 8, "color": "white"}
                 panel.text(column, row, f"{errors[row, column]:.1f}", **how)
             panel.set_title(f"{quadrature} rule, moves of ± {width:g} step")
             panel.set_xticks(range(len(leaves)), leaves, rotation=40, ha="right")

@@ -71,7 +71,7 @@ def slope(sizes: Sequence[int], rows: dict[str, Any]) -> float:
 
 def draw(result: dict[str, Any]) -> Any:
     sweeps = result["sweeps"]
-    figure, (axes,) = charts.panels(1, len(sweeps), 3.7 * len(sweeps), 3.6, sharey=True)
+    figure, (axes,) = charts.panels(1, len(sweeps), 3 * len(sweeps), 3.8, sharey=True)
     for panel, (along, methods) in zip(axes, sweeps.items(), strict=True):
         for (method, found), style in zip(methods.items(), ("C7o-", "C0s-"), strict=True):
             sizes = np.array([int(size) for size in found["sizes"]], float)
@@ -84,9 +84,9 @@ def draw(result: dict[str, Any]) -> Any:
             panel.plot(upper, fitted, "k:", linewidth=1)
             charts.numbered(panel, sizes, [f"{size:g}" for size in sizes])
         panel.set(yscale="log", xlabel=LABELS[along])
-        panel.legend()
+        panel.legend(loc="upper left")
         panel.grid(alpha=0.3)
-    axes[0].set_ylabel("time of a frame, seconds")
+    axes[0].set(ylabel="time of a frame, seconds", ylim=(None, 8 * axes[0].get_ylim()[1]))
     axes[0].yaxis.set_major_formatter("{x:g}")
     figure.suptitle("Medians; bars: least to most. Dotted: the power of the last three sizes")
     return figure

@@ -10,6 +10,7 @@ that of ray casting. On the face, where the first sample of every ray lies at it
 plain jitter can be nearer to the truth in the mean, or farther; it is noisier in any case.
 """
 
+import textwrap
 from argparse import Namespace
 from collections.abc import Callable
 from functools import partial
@@ -124,9 +125,10 @@ def draw(result: dict[str, Any]) -> Any:
             panel.set(title=label, xlabel="step, voxels", xscale="log")
             if key != "time":
                 panel.set_yscale("log", nonpositive="mask")
+                charts.plain_numbers(panel)
             charts.numbered(panel, STEPS, [f"{step:g}" for step in STEPS])
         line[0].set_ylabel(scene)
-    figure.suptitle(result["note"])
+    figure.suptitle(textwrap.fill(result["note"], 120))
     charts.legend_below(figure, axes[0, 0], 5)
     return figure
 

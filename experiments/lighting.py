@@ -132,7 +132,7 @@ def picture(templates: int, seed: int, path: Path, size: int, resolution: int) -
     figure, (axes,) = charts.panels(1, 2, 2 * size / 90, size / 90 + 0.4)
     for panel, title, lighting in zip(axes, titles, (None, lit), strict=True):
         panel.imshow(jv.to_srgb(frame(scene, lighting, seed).image((0.0, 0.0, 0.0))))
-        panel.set_title(title, fontsize=11)
+        panel.set_title(title)
         panel.axis("off")
     charts.save(figure, path)
 
@@ -144,10 +144,10 @@ def draw(result: dict[str, Any]) -> Any:
         cost.plot(error, ratio, STYLES[kind], label=kind, markersize=6)
         for row, x, y in zip(rows, error, ratio, strict=True):
             if row["number"]:
-                cost.annotate(str(row["number"]), (x, y), (4, 4), textcoords="offset points", fontsize=7)
+                cost.annotate(str(row["number"]), (x, y), (4, 4), textcoords="offset points", fontsize=8)
     for name, goal in GOALS.items():
         cost.axhline(goal, color="k", linewidth=0.8, linestyle=":")
-        how = {"fontsize": 7, "ha": "right", "va": "bottom", "transform": cost.get_yaxis_transform()}
+        how = {"ha": "right", "va": "bottom", "transform": cost.get_yaxis_transform()}
         cost.text(1, goal, f"goal, {name}", **how)
     cost.set(xscale="log", yscale="log", xlabel="RMSE against many templates blended")
     cost.set_ylabel("time / that of an unlit frame")

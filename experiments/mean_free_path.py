@@ -283,7 +283,7 @@ def draw(result: dict[str, Any]) -> Any:
         panel.set_xlabel("optical thickness, diameter / λ")
     panels[0].set_yscale("log")
     charts.plain_numbers(panels[0])
-    charts.legend_below(figure, panels[0], 3)
+    charts.legend_below(figure, panels[0], 2)
     return figure
 
 

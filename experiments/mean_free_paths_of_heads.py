@@ -39,7 +39,7 @@ def draw(result: dict[str, Any]) -> Any:
     told = [f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts]
     panel.set_xticks(range(len(parts)), told)
     charts.plain_numbers(panel)
-    charts.legend_below(figure, panel, 2)
+    charts.legend_below(figure, panel, 1)
     return figure
 
 

@@ -105,7 +105,7 @@ def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, d
 def draw(result: dict[str, Any]) -> Any:
     """Time, wrong pixels and RMSE against R; the methods without cells are lines."""
     scenes, cells = result["scenes"], result["cells"]
-    figure, axes = charts.panels(len(scenes), 3, 11.5, 2.8 * len(scenes) + 0.4)
+    figure, axes = charts.panels(len(scenes), 3, 13, 3.2 * len(scenes) + 0.6, sharey="col")
     labels = "time / that by the distance map", "wrong pixels (> 1/255), %", "RMSE of the image"
     for row, (scene, rows) in zip(axes, scenes.items(), strict=True):
         times, wrongs, errors = row
@@ -120,7 +120,8 @@ def draw(result: dict[str, Any]) -> Any:
         for panel, label in zip(row, labels, strict=True):
             charts.numbered(panel, cells)
             panel.set(xlabel="R, side of the grid's cells, pixels", title=f"{scene}: {label}")
-            panel.set_ylim(0, max(1.1 * panel.get_ylim()[1], 1e-3))
+    for panel in axes[0]:
+        panel.set_ylim(0, max(1.1 * panel.get_ylim()[1], 1e-3))
     charts.legend_below(figure, axes[0, 0], 5)
     return figure
 

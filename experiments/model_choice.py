@@ -166,17 +166,17 @@ def draw(result: dict[str, Any]) -> Any:
             panel.set(xlabel=f"{name} of the fitted model", ylabel="loss in held-out views")
         for truth, label in enumerate(labels[:TRUTHS]):
             left.plot([], [], f"C{truth}o-", label=f"truth {label}")
-        left.legend(fontsize=7, title="marker: chosen\n(a cross: not the truth)", title_fontsize=7)
+        left.legend(title="marker: chosen\n(a cross: not the truth)")
         width = 0.35
         for number, (noise, counts) in enumerate(problem["summary"].items()):
             at, color = np.arange(len(RULES)) + (number - 0.5) * width, f"C{number + 4}"
             right_, more = ([count[key] for count in counts.values()] for key in ("truth", "more"))
             right.bar(at, right_, width, color=color, label=noise)
             right.bar(at, more, width, right_, color="none", edgecolor=color, hatch="////")
-        right.set(xticks=range(len(RULES)), xticklabels=["choose", "BIC", "least held-out loss"])
+        right.set(xticks=range(len(RULES)), xticklabels=["choose", "BIC", "least\nheld-out loss"])
         right.set(ylabel="trials", title="filled: truth chosen; hatched: too many")
-        right.set_ylim(0, 1.25 * right.get_ylim()[1])
-        right.legend(fontsize=7, title="noise", title_fontsize=7, loc="upper center", ncols=2)
+        right.set_ylim(0, 1.5 * right.get_ylim()[1])
+        right.legend(title="noise", loc="upper center", ncols=2)
     return figure
 
 

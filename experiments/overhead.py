@@ -58,12 +58,10 @@ def draw(result: dict[str, Any]) -> Any:
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(goal, color="k", linewidth=0.8, linestyle=":")
         said = SHOWN.get(condition, condition)
-        panel.set_title(f"{said}, {pixels} x {pixels} pixels; dotted: goal, {goal}")
+        panel.set_title(f"{said},\n{pixels} x {pixels} pixels; dotted: goal, {goal}")
         panel.set_yticks(range(volumes), list(measured))
     axes[0, 0].invert_yaxis()
-    figure.supxlabel(
-        "time of a frame / that of ray casting: median of paired ratios, 95 % interval", fontsize=9
-    )
+    figure.supxlabel("time of a frame / that of ray casting: median of paired ratios, 95 % interval")
     figure.legend(loc="outside upper center", ncols=3)
     return figure
 

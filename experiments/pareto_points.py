@@ -125,10 +125,15 @@ NOT_ALIGNED: Any = {"without": (jv.AlphaCorrection,)}
 NO_LEAPING: Any = {"without": (jv.SpaceLeaping,)}
 
 
-def unlit() -> Settings:
+def uniform() -> Settings:
     found = {BASE: Setting("midpoint", ours(), True)}
     for quadrature in QUADRATURES:
         found |= sweep(quadrature, quadrature, STEPS, quadrature=quadrature)
+    return found
+
+
+def unlit() -> Settings:
+    found = uniform()
     for name, (jitter, toroidal) in JITTERS.items():
         found |= sweep("jitter", name, (1.0, 2.0), jitter, toroidal=toroidal)
     found |= sweep("alignment", "not aligned", (0.5, 1.0, 2.0), **NOT_ALIGNED)
@@ -199,6 +204,7 @@ def whole_and_in_bricks() -> Settings:
 
 SETTINGS: dict[Kind, Settings] = {
     "unlit": unlit(),
+    "uniform": uniform(),
     "lit": of_templates(),
     "shaded": shaded(),
     "surface": surface(),
@@ -218,7 +224,7 @@ def of(row: Row, there: dict[str, str]) -> Settings:
     found = {n: s for n, s in SETTINGS[row.kind].items() if s.toroidal or not row.toroidal}
     if row.peers is None and programs.is_here(there, VTK):
         found |= OF_VTK
-    if row.peers is None and row.kind == "unlit" and programs.is_here(there, DRJIT):
+    if row.peers is None and row.kind in ("unlit", "uniform") and programs.is_here(there, DRJIT):
         found |= OF_DRJIT
     return found
 

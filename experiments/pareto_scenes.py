@@ -18,8 +18,9 @@ from .programs import Case, Quadrature
 from .scenes import AIRWAY, ANEURISM, BONSAI, ENGINE, PHANTOM, SCENES, Scene, inside, peaked, skin_head
 
 
-Kind: TypeAlias = Literal["unlit", "lit", "shaded", "surface", "bricks"]
-"""Of a scene: what is lit by templates, shaded by `Phong`, an isosurface, or rendered whole and in bricks."""
+Kind: TypeAlias = Literal["unlit", "uniform", "lit", "shaded", "surface", "bricks"]
+"""Of a scene: unlit, under all settings or with uniform steps only; lit by templates, shaded by `Phong`, an
+isosurface, or rendered whole and in bricks."""
 
 Make: TypeAlias = Callable[[Path | None, int, int], Case]
 """From the folder of real volumes, the pixels along a side, and the voxels along an axis of a phantom."""
@@ -108,6 +109,7 @@ UNBENT = "the ray casters of VTK and Dr.Jit that are compared here have no toroi
 SCAN: Any = {"peers": UNBENT, "toroidal": True, "finer": 8, "part": 0.25}
 LIT: Any = {"peers": "VTK and Dr.Jit have no templates of light", "kind": "lit", "finer": 4}
 WHOLE = "VTK and Dr.Jit are compared on whole volumes"
+LARGE: Any = {"kind": "uniform", "part": 2.0}
 SURFACES = "VTK and Dr.Jit are compared where samples are composited"
 
 ROWS: dict[str, Row] = {
@@ -122,6 +124,11 @@ ROWS: dict[str, Row] = {
     "lidc0314_airway": Row(of("lidc0314_airway"), AIRWAY),
     "lidc0314_airway, inside": Row(of("lidc0314_airway", opaque_airway, inside), AIRWAY),
     "aneurism": Row(of("aneurism"), ANEURISM),
+    f"{PHANTOM}, large": Row(of(PHANTOM), **LARGE),
+    "engine, large": Row(of("engine"), ENGINE, **LARGE),
+    "bonsai, large": Row(of("bonsai"), BONSAI, **LARGE),
+    "lidc0314_airway, large": Row(of("lidc0314_airway"), AIRWAY, **LARGE),
+    "aneurism, large": Row(of("aneurism"), ANEURISM, **LARGE),
     "fetus phantom": Row(scan("fetus phantom"), **SCAN),
     "us_aplio_convex": Row(scan("us_aplio_convex"), scan_conversion.APLIO, **SCAN),
     f"{PHANTOM}, lit": Row(lit_head, part=0.5, **LIT),

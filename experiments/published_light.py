@@ -90,7 +90,7 @@ def draw(result: dict[str, Any]) -> Any:
     panel.set_yticks(-np.arange(len(ticks)), ticks)
     panel.set(xlim=(1, None), xlabel="time / that of the unlit frame")
     panel.xaxis.set_major_locator(MultipleLocator(1))
-    panel.legend(loc="upper right")
+    panel.legend(loc="center right")
     return figure
 
 

@@ -112,13 +112,14 @@ def draw(result: dict[str, Any]) -> Any:
             if key == "seconds":
                 both = [row[key] + row["convert seconds"] for row in at.values()]
                 panel.plot(list(at), both, f"C{number}:")
-        panel.set(yscale="log", xlabel="spacing of the grid / distance between samples", title=label)
+        panel.set(yscale="log", title=label)
         panel.yaxis.set_major_formatter("{x:g}")
         charts.numbered(panel, SPACINGS, [f"{spacing:g}" for spacing in SPACINGS])
     figure.suptitle(
         "Solid: volumes converted to Cartesian grids. Dashed: rendered as acquired, which has no grid"
     )
-    axes[0].legend(fontsize=7)
+    figure.supxlabel("spacing of the grid / distance between samples")
+    axes[0].legend()
     return figure
 
 

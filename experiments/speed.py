@@ -164,8 +164,8 @@ def first_image(size: int, resolution: int, repetitions: int) -> dict[str, Any]:
 def draw(result: dict[str, Any]) -> Any:
     """Each program's time over ours, scene by scene."""
     sizes, volumes = result["sizes"], result["volumes"]
-    figure, (axes,) = charts.panels(1, len(sizes), 6 * len(sizes), 0.75 * len(volumes) + 1.5)
-    for panel, pixels in zip(axes, sizes, strict=True):
+    figure, axes = charts.panels(len(sizes), 1, 8.8, (0.75 * len(volumes) + 1.3) * len(sizes))
+    for (panel,), pixels in zip(axes, sizes, strict=True):
         for number, rows in enumerate(of_size[str(pixels)] for of_size in volumes.values()):
             for shift, (name, color) in enumerate(COLORS.items()):
                 if name in rows:
@@ -177,8 +177,8 @@ def draw(result: dict[str, Any]) -> Any:
         labels = [f"{name}\n{row['seconds'] * 1e3:.0f} ms, RMSE {row['rmse']:.4f}" for name, row in ours]
         panel.set_yticks(range(len(volumes)), labels)
         panel.set_ylim(len(volumes) - 0.5, -0.6)
-        panel.set_xlabel(f"time of an image / that of jaxvol, {pixels} x {pixels} pixels", fontsize=9)
-        panel.text(GOAL, -0.55, " goal", va="top", fontsize=8)
+        panel.set_xlabel(f"time of an image / that of jaxvol, {pixels} x {pixels} pixels")
+        panel.text(GOAL, -0.55, " goal", va="top")
         panel.set_title(
             "Right of 1: slower than jaxvol, whose own time and error\n"
             "stand below a scene; bars: 95 % intervals"

@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import LogFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
 import jaxvol as jv
@@ -32,7 +32,7 @@ from .harness import experiment, recorded, some_of
 
 
 ABOUT = ("question", "method", "regime", "metric", "judged", "limit", "outcome", "does", "shows", "size")
-COLUMNS = 4
+COLUMNS = 2
 OUTCOMES = {"detected and said": "C0", "documented": "C1", "fails": "C3"}
 
 
@@ -40,7 +40,7 @@ def draw(result: dict[str, Any]) -> Any:
     """A panel for each entry."""
     entries = result["entries"]
     rows = -(-len(entries) // COLUMNS)
-    figure, axes = charts.panels(rows, COLUMNS, 3.6 * COLUMNS, 2.9 * rows)
+    figure, axes = charts.panels(rows, COLUMNS, 4.4 * COLUMNS, 3 * rows)
     for panel in axes.flat[len(entries) :]:
         panel.set_axis_off()
     for panel, (name, found) in zip(axes.flat, entries.items(), strict=False):
@@ -49,8 +49,8 @@ def draw(result: dict[str, Any]) -> Any:
     labels = [f"edge; beyond it: {outcome}" for outcome in OUTCOMES]
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
     figure.suptitle(
-        "From left to right a regime becomes harmful; upwards: an error. Black: the curve that finds the "
-        "edge. Dashed: the limit. Crosses: not finite."
+        "From left to right a regime becomes harmful; upwards: an error.\n"
+        "Black: the curve that finds the edge. Dashed: the limit. Crosses: not finite."
     )
     return figure
 
@@ -74,10 +74,10 @@ def draw_panel(panel: Any, entry: Entry, found: dict[str, Any]) -> None:
     if beyond is not None:
         panel.axvspan(beyond if within is None else within, beyond, color=OUTCOMES[entry.outcome], alpha=0.35)
     panel.set_title(entry.name)
-    panel.set_xlabel(entry.regime, fontsize=7)
-    panel.set_ylabel(textwrap.fill(entry.metric, 36), fontsize=7)
-    panel.tick_params(labelsize=7, which="both")
-    panel.legend(fontsize=6, framealpha=0.7)
+    panel.set_xlabel(textwrap.fill(entry.regime, 42))
+    panel.set_ylabel(textwrap.fill(entry.metric, 30))
+    panel.legend(framealpha=0.7)
+    charts.plain_numbers(panel)
 
 
 def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None:
@@ -96,8 +96,7 @@ def _scale(panel: Any, name: Literal["x", "y"], values: Sequence[float]) -> None
     else:
         setter("log", nonpositive="mask")
         axis.set_major_locator(LogLocator(numticks=6))
-    few = np.ptp(powers) <= 1  # ticks at powers of ten alone would be too few
-    axis.set_minor_formatter(LogFormatter(minor_thresholds=(2, 0.5)) if few else NullFormatter())
+    axis.set_minor_formatter(NullFormatter())
 
 
 def keep(entry: Entry, values: tuple[float, float], size: int, folder: Path) -> None:

@@ -69,9 +69,7 @@ def draw(result: dict[str, Any]) -> Any:
     """Photons seen along z; the area of a dot is the photon's intensity. The cross marks the sample that they
     light, and the ring the centre of their light."""
     figure, (axes,) = charts.panels(1, 2, 9, 4.6)
-    figure.suptitle(
-        "Discs: photons, as large as their light; +: the sample; red ring: the centre of light", fontsize=9
-    )
+    figure.suptitle("Discs: photons, as large as their light; +: the sample; red ring: the centre of light")
     dots = None
     for panel, (packets, found) in zip(axes, result["grown"].items(), strict=True):
         x, y, z, intensity = np.array(found["photons"]).T
@@ -83,8 +81,7 @@ def draw(result: dict[str, Any]) -> Any:
         panel.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", xlabel="x / λ", ylabel="y / λ")
         panel.set_title(
             f"{packets}: centre of light {np.linalg.norm(found['centre']):.2f} λ aside,\n"
-            f"{found['aside, mean']:.2f} λ in the mean of {MANY} of them",
-            fontsize=10,
+            f"{found['aside, mean']:.2f} λ in the mean of {MANY} of them"
         )
     figure.colorbar(dots, ax=axes, label="z / λ")
     return figure

@@ -195,7 +195,7 @@ def pictures(result: dict[str, dict[str, Any]], truth: Density, path: Path) -> N
             panel.axhline(rows[FBP]["rmse"], color="0.5", linestyle=line, label=f"{FBP}, {photons}")
     by_count.set(xlabel="sweep (SART), evaluation (jaxvol)", ylabel="RMSE of the density, 1/voxel")
     by_time.set(xlabel="seconds, compilation left out")
-    by_count.legend(fontsize=7)
+    by_count.legend()
     charts.save(figure, path)
 
 

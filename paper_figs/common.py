@@ -3,27 +3,28 @@
 Pages keep their pixels: one pixel of a picture is one ray, since resampling would smooth the artefacts.
 """
 
+import math
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
-import numpy as np
 from matplotlib.patches import Rectangle
-from PIL import Image
 
-from experiments import record
+from experiments import charts, record
 from experiments.charts import plt, whole_file
 from experiments.harness import QUICK, Main, command
 from experiments.pictures import Panel, Panels
 
 
 OUTPUT = Path(__file__).parent / "output"
-DATA = {"type": Path, "metavar": "FOLDER", "help": "real volumes, in place of phantoms"}
+DATA = {"type": Path, "metavar": "FOLDER", "help": "real volumes, beside phantoms"}
 RECORDS = {"type": Path, "default": record.RESULTS, "metavar": "FOLDER", "help": "that of the records"}
 
 DPI = 100
-GAP, HEAD, TEXT = 4, 40, 54  # pixels: gap between images, height of the title and of the text under an image
+GAP = 4
+"""Pixels between images."""
 
 
 def pictures(
@@ -81,30 +82,46 @@ def table_from_record(name: str, experiment: str, table: Callable[[Any], str]) -
 
 
 def page(panels: Panels, title: str, path: Path) -> None:
-    """Write a page of square pictures, down to the last line that is not white."""
-    side, columns = panels[0][0].image.shape[0], max(map(len, panels))
-    width, height = columns * (side + GAP) + GAP, HEAD + len(panels) * (side + TEXT) + GAP
+    """Write a page of square pictures, with letters that can be read where a browser shrinks it."""
+    side = panels[0][0].image.shape[0]
+    width = max(map(len, panels)) * (side + GAP) + GAP
+    letter = charts.LETTER * max(1, width / charts.SHOWN)
+
+    def fitted(text: str, across: float) -> str:
+        lines = (wrap(line, int(across / (0.6 * letter))) or [""] for line in text.split("\n"))
+        return "\n".join(each for line in lines for each in line)
+
+    def tall(texts: Iterable[str]) -> float:
+        return max(text.count("\n") + bool(text) for text in texts) * 1.2 * letter + GAP
+
+    title = fitted(title, 0.9 * width)
+    rows = [
+        [p._replace(above=fitted(p.above, side), below=fitted(p.below, side)) for p in row] for row in panels
+    ]
+    tops, height = [], GAP + tall([title])
+    for row in rows:
+        tops.append(height + tall(panel.above for panel in row))
+        height = tops[-1] + side + tall(panel.below for panel in row) + 2 * GAP
+    height = math.ceil(height)
     figure = plt.figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-    figure.text(GAP / width, 1 - 5 / height, title, va="top", fontsize=8, weight="bold")
-    for row, line in enumerate(panels):
-        for column, panel in enumerate(line):
-            left, bottom = GAP + column * (side + GAP), height - HEAD - row * (side + TEXT) - side
-            _draw(figure.add_axes((left / width, bottom / height, side / width, side / height)), panel, side)
-    figure.canvas.draw()
-    pixels = np.asarray(figure.canvas.buffer_rgba())[..., :3]  # pyright: ignore[reportAttributeAccessIssue]
-    plt.close(figure)
-    last = np.flatnonzero((pixels < 255).any(axis=(1, 2)))[-1]
+    how: dict[str, Any] = {"fontsize": letter * 72 / DPI, "linespacing": 1.1}
+    figure.text(GAP / width, 1 - GAP / height, title, va="top", weight="bold", **how)
+    for row, top in zip(rows, tops, strict=True):
+        bottom = height - round(top) - side
+        for column, panel in enumerate(row):
+            left = GAP + column * (side + GAP)
+            _draw(figure.add_axes((left / width, bottom / height, side / width, side / height)), panel, **how)
     with whole_file(path) as part:
-        Image.fromarray(pixels[: last + 1 + GAP]).save(part, "WEBP", quality=95, method=6)
+        figure.savefig(part, dpi=DPI, pil_kwargs={"quality": 95, "method": 6})
+    plt.close(figure)
     print(path)
 
 
-def _draw(axes: Any, panel: Panel, side: int) -> None:
+def _draw(axes: Any, panel: Panel, **how: Any) -> None:
     axes.imshow(panel.image, interpolation="none")
     axes.axis("off")
-    how = {"transform": axes.transAxes}
-    axes.text(0, -4 / side, panel.below, va="top", fontsize=7.5, linespacing=1.1, **how)
-    axes.text(0, 1 + 3 / side, panel.above, va="bottom", fontsize=8, **how)
+    for text, y, va in ((panel.above, 1, "bottom"), (panel.below, 0, "top")):
+        axes.annotate(text, (0, y), (0, GAP if y else -GAP), "axes fraction", "offset pixels", va=va, **how)
     if panel.square is not None:
         x, y, of = panel.square
         axes.add_patch(Rectangle((x, y), of, of, fill=False, edgecolor="white", linewidth=0.8))

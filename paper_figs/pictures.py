@@ -14,11 +14,7 @@ from experiments.pictures.kim import kim_fig8, order_of_bricks
 from .common import OUTPUT, pictures
 
 
-def chae_fig6(chosen: Namespace) -> str:
-    size = chosen.size * chae.WHOLE
-    return f"Chae and Shin, Fig. 6: part of an image of {size} x {size} pixels"
-
-
+CHAE = "Chae and Shin, Fig. 6: part of an image of twice the size; wrong pixels are green"
 FIG01 = "Fig. 1: wood grain, and noise on the cut face; phantom, and CT of a head"
 FIG09 = "Fig. 9: the head, phantom and CT; boundary noise is that of the cut face"
 FIG10 = "Fig. 10: a cut engine in place of the heart, and CT of a heart; boundary noise: of the cut faces"
@@ -42,24 +38,21 @@ def kim_fig6(chosen: Namespace) -> None:
     curved face and comes back to it (the paper's Fig. 4); K reaches to the dashed chord of that face."""
     found = order_of_bricks()
     figure, ((axes,),) = charts.panels(1, 1, 6.4, 4.4)
-    blues, text = charts.plt.get_cmap("Blues"), {"textcoords": "offset points", "fontsize": 9}
+    blues, text = charts.plt.get_cmap("Blues"), {"textcoords": "offset points"}
     for turn, (edge, middle) in enumerate(zip(found.edges, found.middles, strict=True), 1):
         axes.fill(*edge.T, facecolor=blues(0.65 - 0.09 * turn), edgecolor="k", linewidth=1)
         axes.plot(*zip(found.eye, middle, strict=True), color="0.5", linewidth=0.7, linestyle=":")
         axes.plot(*middle, "k.", markersize=4)
-        axes.annotate(str(turn), tuple(middle), (4, 4), **text | {"fontsize": 13, "weight": "bold"})
+        axes.annotate(str(turn), tuple(middle), (4, 4), **text | {"fontsize": "x-large", "weight": "bold"})
     axes.plot(*found.eye, "ks", markersize=8)
     axes.annotate("camera", tuple(found.eye), (0, 9), ha="center", **text)
     axes.plot(*found.chord[[0, 2]].T, "k--", linewidth=0.8)
     axes.plot(*found.ray.T, "C3-", linewidth=1.2)
-    axes.annotate("ray", tuple(found.ray[1]), (4, 0), color="C3", **text)
+    axes.annotate("ray", tuple(found.ray[1]), (-24, 6), color="C3", **text)
     axes.plot(0, 0, "k+", markersize=9)
     axes.annotate("motor axis", (0, 0), (6, -3), **text)
     axes.set_aspect("equal")
-    axes.set_xlabel("y, mm", fontsize=8)
-    axes.set_ylabel("z, mm", fontsize=8)
-    axes.tick_params(labelsize=8)
-    axes.set_title("Kim, Kwon and Shin, Fig. 6: bricks in the order of their centres' depth", fontsize=9)
+    axes.set(xlabel="y, mm", ylabel="z, mm", title="Fig. 6: bricks in the order of their centres' depth")
     charts.save(figure, chosen.output / "kim_fig6.webp")
 
 
@@ -83,14 +76,12 @@ def lee_fig5(chosen: Namespace) -> None:
         panel.axvspan(plane, 1, color="0.93", zorder=0)
         panel.plot(0, 0, "k+", markersize=10)
         panel.set(xlim=(-0.55, 0.75), ylim=(-0.65, 0.65), aspect="equal", xlabel="x", ylabel="y")
-        panel.text(-0.5, -0.6, f"A: n = {lee_wave.INDICES[0]:g}", fontsize=9)
-        panel.text(0.74, -0.6, f"B: n = {lee_wave.INDICES[1]:g}", fontsize=9, ha="right")
+        panel.text(-0.5, -0.6, f"A: n = {lee_wave.INDICES[0]:g}", backgroundcolor="w")
+        panel.text(0.74, -0.6, f"B: n = {lee_wave.INDICES[1]:g}", ha="right")
         panel.set_title(title)
     photons.legend(loc="upper left")
     ratio = lee_wave.INDICES[0] / lee_wave.INDICES[1]
-    figure.suptitle(
-        f"Lee, Kwon and Shin, Fig. 5: in B light travels {ratio:.4f} times as far as in A", fontsize=9
-    )
+    figure.suptitle(f"Lee, Kwon and Shin, Fig. 5: in B light travels {ratio:.4f} times as far as in A")
     charts.save(figure, chosen.output / "lee_fig5.webp")
 
 
@@ -100,16 +91,16 @@ PICTURES: dict[str, Main] = {
     "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart"), data=True),
     "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney"), data=True),
     "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left), data=True),
-    "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13),
-    "chae_fig6": pictures("chae_fig6", chae_fig6, chae.chae_fig6, resolution=256),
+    "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13, data=True),
+    "chae_fig6": pictures("chae_fig6", CHAE, chae.chae_fig6, resolution=256, data=True),
     "kim_fig6": kim_fig6,
     "kim_fig8": pictures("kim_fig8", KIM, kim_fig8, resolution=360),
-    "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, size=320, data=True),
+    "kisti_fig": pictures("kisti_fig", KISTI, kisti.kisti_fig, resolution=192, data=True),
     "lee_fig_steps": pictures("lee_fig_steps", STEPS, lee_steps.lee_fig_steps, resolution=96),
     "lee_printed": pictures("lee_printed", PRINTED, lee_steps.lee_printed, resolution=96, size=320),
     "lee_fig4": pictures("lee_fig4", EAR, lee.lee_fig4, resolution=96, size=384, data=True),
     "lee_fig5": lee_fig5,
-    "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=512, data=True),
+    "lee_fig6": pictures("lee_fig6", LIT, lee.lee_fig6, resolution=128, size=384, data=True),
     "lee_hand": pictures("lee_hand", HAND, lee.lee_hand, size=512),
     "gallery": pictures("gallery", "Kinds of light", lee.gallery, resolution=128, data=True),
 }

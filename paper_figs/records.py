@@ -4,6 +4,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
+
 from experiments import charts, templates
 from experiments.harness import Main
 from experiments.kisti import (
@@ -69,28 +71,25 @@ CHAE = 8, 0.47  # R, time over that of the distance map
 def chae_fig5(result: dict[str, Any], path: Path) -> None:
     """A panel for each scene; below the points of the published method, their shares of wrong pixels."""
     scenes, cells = result["scenes"], result["cells"]
-    figure, (axes,) = charts.panels(1, len(scenes), 4.2 * len(scenes) + 0.4, 3.6)
+    figure, (axes,) = charts.panels(1, len(scenes), 4.4 * len(scenes), 4.4, sharey=True)
     for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for method, style in ((PUBLISHED, "C3o-"), (OF_VOXELS, "C1^-"), (PROVEN, "C0s-")):
             ratios = [rows[named(method, cell)]["ratio"] for cell in cells]
-            low, high = ([r[end] for r in ratios] for end in ("low", "high"))
-            panel.plot(cells, [r["median"] for r in ratios], style, markersize=5, label=method)
-            panel.fill_between(cells, low, high, color=style[:2], alpha=0.2, linewidth=0)
+            median = np.array([r["median"] for r in ratios])
+            ends = abs(np.array([[r[end] for r in ratios] for end in ("low", "high")]) - median)
+            panel.errorbar(cells, median, ends, fmt=style, markersize=4, capsize=3, label=method)
         for cell in cells:
-            wrong = rows[named(PUBLISHED, cell)]["wrong"]
-            panel.text(cell, 0.02, f"{wrong:.2%}", ha="center", fontsize=7, color="C3")
+            wrong = 100 * rows[named(PUBLISHED, cell)]["wrong"]
+            panel.text(cell, 0.03, f"{wrong:.2g} %", ha="center", color="C3")
         for method, color, line in ((MAP, "k", "--"), (VOXELS, "C1", "--"), (HIERARCHY, "C2", "-.")):
             panel.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
         off = rows[VOXELS]["ratio"]["median"] * CHAE[1]  # the paper's map is one of voxels
-        panel.plot(CHAE[0], off, "kx", markersize=8, label="the paper, off the distance map of voxels")
-        panel.set_xscale("log", base=2)
-        panel.set_xticks(cells, cells)
-        panel.set_ylim(bottom=0)
-        panel.set_xlabel("R, side of the grid's cells, pixels", fontsize=9)
-        panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map", fontsize=9)
-        panel.tick_params(labelsize=8)
-    axes[0].set_ylabel("time / that by the distance map", fontsize=9)
-    figure.suptitle("Bands: 95 % intervals. Red numbers: wrong pixels under min_distance", fontsize=9)
+        panel.plot(CHAE[0], off, "kx", markersize=8, label="the paper, off the map of voxels")
+        charts.numbered(panel, cells)
+        panel.set(xlim=(2.7, 95), ylim=(0, 1.25), xlabel="R, side of the grid's cells, pixels")
+        panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map")
+    axes[0].set_ylabel("time / that by the distance map")
+    figure.suptitle("Bars: 95 % intervals. Red numbers: wrong pixels under min_distance")
     charts.legend_below(figure, axes[0], 3)
     charts.save(figure, path)
 
@@ -164,7 +163,7 @@ def kim_fig9(result: dict[str, Any], path: Path) -> None:
     (theirs,), *ours = axes
     theirs.plot(at, [rows[n]["paper"]["proposed"] for n in names], "C0o-", label="proposed (overlap)")
     theirs.plot(at, [rows[n]["paper"]["reload"] for n in names], "C1s-", label="reload")
-    theirs.set_title("the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels", fontsize=9)
+    theirs.set_title("the paper: 1280 x 490 x 325 voxels, 375 x 375 pixels")
     for (panel,), (condition, found) in zip(ours, conditions.items(), strict=True):
         rows, image = found["splits"], found["image"]
         here = [(x, rows[n]) for x, n in zip(at, names, strict=True) if n in rows]
@@ -176,17 +175,17 @@ def kim_fig9(result: dict[str, Any], path: Path) -> None:
         whole = median(1 / row["whole"]["seconds"] for _, row in here)
         panel.axhline(whole, color="0.5", linestyle="--", label="the whole volume at once")
         voxels = " x ".join(map(str, found["voxels"][::-1]))
-        panel.set_title(f"{condition}: {voxels} voxels, {image[0]} x {image[1]} pixels", fontsize=9)
+        panel.set_title(f"{condition}: {voxels} voxels, {image[0]} x {image[1]} pixels")
     for (panel,) in axes:
         panel.set_yscale("log")
-        panel.set_ylabel("frames per second", fontsize=8)
-        panel.legend(fontsize=7)
-        panel.tick_params(labelsize=7)
+        panel.set_ylabel("frames per second")
+        panel.legend()
+        charts.plain_numbers(panel)
         if BEST in names:
             panel.axvline(names.index(BEST), color="0.8", linewidth=6, zorder=0)
     last, bricks = axes[-1][0], conditions[next(iter(conditions))]["splits"]
-    last.set_xticks(at, [f"{n}\n{bricks[n]['bricks']}" for n in names], fontsize=7)
-    last.set_xlabel("split β,σ,γ and number of bricks; grey: the paper's best", fontsize=8)
+    last.set_xticks(at, [f"{n}: {bricks[n]['bricks']}" for n in names], rotation=60, ha="right")
+    last.set_xlabel("split β,σ,γ: number of bricks; grey: the paper's best")
     charts.save(figure, path)
 
 
@@ -258,6 +257,10 @@ LEE = {
     "Table 3, material B": (0.22145, 0.17421, 0.17500, 0.17120, 0.04829, 0.04805, 0.04728, 0.01339),
 }
 """Intensities as printed. 0.00945, 0.48284 and 0.48282 lack a zero: 0.000945, 0.048284, 0.048282."""
+LEVELS = "01 2 3 4 5 6 7 8", "01 0 0 0 1 1 1 2", "01 01 0 0 1 1 2 2", "01 0 0 0 1 1 1 2"
+"""Of each table's rows: how often its photon was refracted before; of both, where one landed on another."""
+LEAST = (1 - 1 / templates.INDEX**2) ** 0.5
+"""cos θ' at the critical angle."""
 
 
 PHOTONS = dict.fromkeys(("Table 1", "Table 2"), "*56 to 63 photons*")
@@ -266,17 +269,25 @@ PHOTONS = dict.fromkeys(("Table 1", "Table 2"), "*56 to 63 photons*")
 
 def lee_tables(result: dict[str, Any]) -> str:
     """All three tables as one Markdown table. In brackets, the fewest and most photons of many templates."""
-    lines = ["| | x | y | z | intensity | *paper* |", "|---|---|---|---|---|---|"]
-    for name, found in result["tables"].items():
-        for row, paper in enumerate(LEE[name.split(":")[0]]):
+    heads = "", "x", "y", "z", "intensity", "*paper*", "*level*", "light of this level"
+    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for (name, found), levels in zip(result["tables"].items(), LEVELS, strict=True):
+        table, (opacity, packets) = name.split(":")[0], templates.TABLES[name]
+        for row, (paper, level) in enumerate(zip(LEE[table], levels.split(), strict=True)):
             cells = ["–"] * 4
             if row < len(found["photons"]):
                 *offset, light = found["photons"][row]
                 cells = [*(f"{c:.2f}" for c in offset), f"{light:.5f}"]
-            lines.append(f"| {'' if row else name} | {' | '.join(cells)} | *{paper:.5f}* |")
+            least, most = (
+                sum(opacity * ((1 - opacity) * cosine) ** int(k) for k in level) / packets
+                for cosine in (LEAST, 1)
+            )
+            cells += [f"*{paper:.5f}*", f"*{' + '.join(level)}*"]
+            cells.append(f"{least:.5f}" if least == most else f"{least:.5f} to {most:.5f}")
+            lines.append(f"| {'' if row else name} | {' | '.join(cells)} |")
         fewest, most = found["counts of many"]
         counts = f"*{found['count']} photons ({fewest} to {most})*"
-        lines.append(f"| {counts} | | | | {found['energy']:.5f} | {PHOTONS.get(name.split(':')[0], '')} |")
+        lines.append(f"| {counts} | | | | {found['energy']:.5f} | {PHOTONS.get(table, '')} | | |")
     return "\n".join(lines) + "\n"
 
 

@@ -8,7 +8,7 @@ from paper_figs.pictures import PICTURES
 
 
 ROOT = Path(__file__).parent.parent
-DRAWN = "docs", "paper_figs/output", "experiments/results"
+DRAWN = "docs", "docs/pictures", "paper_figs/output", "experiments/results"
 LEAST = 256
 
 PANELS = {

@@ -10,16 +10,17 @@ from . import BLACK, Panels, panel
 
 
 def kisti_fig(chosen: Namespace) -> Panels:
-    """A head and an engine, shaded."""
+    """A head and an engine, shaded: phantoms, and CT beside them. 1: low values translucent; 2: all that is
+    visible opaque."""
     rows: Panels = []
-    for name, make in (kisti.REAL if chosen.data else kisti.PHANTOMS).items():
-        scene, row = make(chosen.data, chosen.size, chosen.resolution), []
-        titles = ("low values translucent", "all visible values opaque")
-        for number, seen in enumerate((scene, kisti.opaque(scene))):
+    kinds = {"phantom": kisti.PHANTOMS} | ({"CT": kisti.REAL} if chosen.data else {})
+    for name in kisti.PHANTOMS:
+        row = []
+        for kind, makes in kinds.items():
+            scene = makes[name](chosen.data, chosen.size, chosen.resolution)
             march = jv.March(scene.step / 2, (jv.AlphaCorrection(),), "midpoint")
-            image = jv.render(*seen[:3], march, lighting=Phong(), outputs="rgba").image(BLACK)
-            row.append(
-                panel(image, f"{name}, transfer function {number + 1}", "" if rows else titles[number])
-            )
+            for number, seen in enumerate((scene, kisti.opaque(scene)), 1):
+                image = jv.render(*seen[:3], march, lighting=Phong(), outputs="rgba").image(BLACK)
+                row.append(panel(image, f"{name}, {kind}", "" if rows else f"transfer function {number}"))
         rows.append(row)
     return rows

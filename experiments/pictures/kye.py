@@ -159,12 +159,15 @@ def measured(image: np.ndarray, truth: np.ndarray, region: np.ndarray) -> str:
 
 def fig13(chosen: Namespace) -> Panels:
     """The pixels that alignment changes, in green."""
-    view, row = VIEWS["vessels"], []
-    side = chosen.size / view.factor
-    x, y = (middle * chosen.size - side / 2 for middle in view.middle)
-    for name, scene in view.scenes(chosen).items():
-        aligned = left(scene)
-        image = np.where(aligned[..., None], GREEN, rendered(scene, jv.March(scene.step, transforms(BOTH))))
-        caption = f"{aligned.sum()} of {aligned.size} pixels, {aligned.mean():.1%}"
-        row.append(panel(image, caption, name, (x, y, side) if name == "whole" else None))
+    row = []
+    for view in (VIEWS["vessels"], *([REAL["vessels"]] if chosen.data else [])):
+        side = chosen.size / view.factor
+        x, y = (middle * chosen.size - side / 2 for middle in view.middle)
+        for name, scene in view.scenes(chosen).items():
+            aligned = left(scene)
+            march = jv.March(scene.step, transforms(BOTH))
+            image = np.where(aligned[..., None], GREEN, rendered(scene, march))
+            title = f"{'CT lung' if view.spacing else 'phantom'}, {name}"
+            square = (x, y, side) if name == "whole" else None
+            row.append(panel(image, f"{aligned.mean():.1%} of the pixels", title, square))
     return [row]

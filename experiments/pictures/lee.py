@@ -66,8 +66,6 @@ def ear(resolution: int, *, head: bool) -> jv.Volume:
 
 def lee_fig4(chosen: Namespace) -> Panels:
     """The light comes from behind the head. Below, the mean brightness of the ear's pixels."""
-    if chosen.data is not None:
-        return ear_of_ct(chosen.data, chosen.size)
     whole, alone = (ear(chosen.resolution, head=head) for head in (True, False))
     points = [(0.1, (0.8, 0.5, 0.38), 0.0), (0.9, (0.8, 0.5, 0.38), 0.9)]
     transfer = jv.TransferFunction.from_points(points, unit_distance=0.05)
@@ -76,17 +74,19 @@ def lee_fig4(chosen: Namespace) -> Panels:
     seen = np.asarray(jv.render(alone, transfer, camera, march(scene)).rgba[..., 3] > 0.9)
     lights = DirectionalLight((0.0, -1.0, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
     flesh = jv.Material(0.5, 0.045, 1.4)
-    return [ear_row(scene, flesh, lights, seen)]
+    rows = [ear_row("phantom", scene, flesh, lights, seen)]
+    return rows if chosen.data is None else [*rows, ear_of_ct(chosen.data, chosen.size)]
 
 
-def ear_row(scene: Scene, materials: Any, lights: Any, ear: np.ndarray) -> list[Panel]:
+def ear_row(name: str, scene: Scene, materials: Any, lights: Any, ear: np.ndarray) -> list[Panel]:
     """Unlit; by photons alone; and with photons tested at multiples of their distance."""
     how: dict[str, Any] = {"occlusion": "hard", "templates": 8, "blend": True, "packets": 8, "cutoff": 0.001}
     row = []
     for title, reach in {"unlit": None, "photons alone": (), "tested at 2, 4, 8 times": REACH}.items():
         lighting = None if reach is None else ScattererTemplates(materials, lights, reach=reach, **how)
         image = lit(scene, lighting)
-        row.append(panel(image, f"brightness of the ear {(image[ear] @ LUMINANCE).mean():.3f}", title))
+        bright = (image[ear] @ LUMINANCE).mean()
+        row.append(panel(image, f"{name}: brightness of the ear {bright:.3f}", title))
     return row
 
 
@@ -95,7 +95,7 @@ EAR_PART = (0.72, 0.5, 0.46), (0.77, 0.68, 0.7)
 """Where the left ear of the CT head is, mm, and the part of the volume that holds it."""
 
 
-def ear_of_ct(folder: Path, size: int) -> Panels:
+def ear_of_ct(folder: Path, size: int) -> list[Panel]:
     """The ear is turned to the camera; the light comes from the other side of the head."""
     (volume, transfer, _, step), _, _ = ct_head(folder, size)
     place = tuple(x + 400 * d for x, d in zip(EAR_OF_CT, (0.94, -0.33, 0.0), strict=True))
@@ -103,7 +103,7 @@ def ear_of_ct(folder: Path, size: int) -> Panels:
     scene = Scene(volume, transfer, camera, step)
     ear = jv.render(cropped(volume, *EAR_PART), transfer, camera, march(scene)).rgba[..., 3]
     lights = DirectionalLight((1.0, 0.1, 0.0), (50.0, 50.0, 50.0)), ConstantLight((0.4, 0.4, 0.4))
-    return [ear_row(scene, jv.Material(0.5, 1.5, 1.4), lights, np.asarray(ear > 0.3))]
+    return ear_row("CT", scene, jv.Material(0.5, 1.5, 1.4), lights, np.asarray(ear > 0.3))
 
 
 FINGERS = (  # joints from knuckle to tip, radius
@@ -199,10 +199,12 @@ def ct_head(folder: Path, size: int) -> Subject:
 
 def lee_fig6(chosen: Namespace) -> Panels:
     sizes = chosen.size, chosen.resolution
-    subjects = {"the head phantom": head(*sizes), "a frog": frog(*sizes)}
-    if chosen.data is not None:
-        folder = chosen.data
-        subjects = {"a head (CT)": ct_head(folder, sizes[0]), "a frog (labels)": tissues(folder, sizes[0])}
+    subjects = {"the head phantom": head(*sizes)}
+    if folder := chosen.data:
+        subjects["a head (CT)"] = ct_head(folder, sizes[0])
+    subjects["a frog phantom"] = frog(*sizes)
+    if folder:
+        subjects["a frog (labels)"] = tissues(folder, sizes[0])
     columns: dict[str, Any] = {
         "unlit": None,
         "hard, one of 8 for each pixel": {"occlusion": "hard"},
@@ -239,9 +241,9 @@ def tissues(folder: Path, size: int) -> Subject:
 
 
 def subjects(folder: Path | None, size: int, resolution: int) -> Iterator[tuple[str, Subject]]:
+    yield "the head phantom", head(size, resolution)
+    yield "a frog phantom", frog(size, resolution)
     if folder is None:
-        yield "the head phantom", head(size, resolution)
-        yield "a frog phantom", frog(size, resolution)
         return
     bonsai = SCENES["bonsai"](folder, size)  # with up and down exchanged
     bonsai = bonsai._replace(camera=replace(bonsai.camera, view_up=-bonsai.camera.view_up))

@@ -8,6 +8,7 @@ each image is the mean of its visible pixels, as linear red, green and blue.
 
 from argparse import Namespace
 from collections.abc import Callable
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -145,10 +146,15 @@ def lee_printed(chosen: Namespace) -> Panels:
 
 
 def lee_fig_steps(chosen: Namespace) -> Panels:
-    rows: Panels = [[], []]
-    for title, setups in STEPS.items():
-        for row, setup in zip(rows, setups, strict=True):
+    """Three steps side by side, and below them three more."""
+    rows: Panels = []
+    titles = list(STEPS)
+    for some, after in product((titles[:3], titles[3:]), (False, True)):
+        row = []
+        for title in some:
+            setup = STEPS[title][after]
             image, visible = render(setup, chosen.resolution, chosen.size)
             mean = " ".join(f"{part:.2f}" for part in image[visible].mean(axis=0))
-            row.append(panel(image, f"{setup.caption}\n{mean}", title if row is rows[0] else ""))
+            row.append(panel(image, f"{setup.caption}\n{mean}", "" if after else title))
+        rows.append(row)
     return rows

@@ -147,9 +147,10 @@ def plan(
     with steps of two voxels, one, a half, and so on, until some are within the tolerance, compared with steps
     of half of theirs. Then:
 
-    - **step**: the longest within the tolerance, between two of these.
-    - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule
-      takes more than 8 steps of a voxel; it is kept where it is faster, by what a sample costs on CPU.
+    - **step**: the longest within the tolerance, between two of these, or up to four voxels.
+    - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule is
+      not within the tolerance at an eighth of a voxel, or seems not to get there; it is kept where it is
+      faster, by what a sample costs on CPU.
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
       0 have no gradient from what is leapt over. `fastest_leaping` measures which of its methods is the
       fastest.
@@ -218,18 +219,18 @@ def plan(
     over = isinstance(scene.compositing, Over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
 
-    def search(ends: float, goal: float, images: Any) -> Search:
+    def search(ends: float, goal: float, rendered: Any) -> Search:
         own = (EarlyTermination(ends),) if over else ()
-        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own), images)
+        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own), rendered)
 
     # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
     # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
     first = search(ends, tolerance, {})
-    seen = first.image(COARSEST, "midpoint")
+    seen = first.render(COARSEST, "midpoint").image
     opaque = probe.mean(np.asarray(seen.rgba)[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     brightest = brightest_of(seen)
-    within = search(ends / brightest, MARGIN * tolerance - share, first.images if brightest == 1 else {})
+    within = search(ends / brightest, MARGIN * tolerance - share, first.rendered if brightest == 1 else {})
     chosen, truth, tried = within.cheapest(once=once)
     ending = EarlyTermination(ends / brightest_of(truth.image))
     kept = (*given, *proven, *((ending,) if share else ()))

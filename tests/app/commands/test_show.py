@@ -73,11 +73,11 @@ def test_several_volumes_are_in_one_picture(volume_file, tmp_path, drawn):
     assert drawn.how[0]["lighting"] is None
     assert float(march.step) == 0.5
     assert same(transfers[1], jv.colormap("viridis", (20, 90)))
-    jv.show(volume_file, size=16, step=0.4, others=volume_file, clip_plane=(0, 0, 5, 0, 0, 1))
-    assert len(drawn.scenes[1][0]) == 2
-    assert drawn.scenes[1][3].transforms[0].origins.tolist() == [[0, 0, 5]]
     jv.show(volume_file, others=[(jv.load(volume_file), transfers[1])], size=16)
     assert same(drawn.scenes[1][1], transfers[:2])
+    jv.show(volume_file, size=16, step=0.4, others=volume_file, clip_plane=(0, 0, 5, 0, 0, 1))
+    assert len(drawn.scenes[2][0]) == 2
+    assert drawn.scenes[2][3].transforms[0].origins.tolist() == [[0, 0, 5]]
 
 
 def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
