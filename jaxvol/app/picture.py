@@ -122,7 +122,7 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
 
     Args:
         options: those of `DEFAULTS`, `recorded_transfer`, and `file`, a path or a `Volume`. `transfer` may be
-            a `Transfer`, and entries of `others` what `_other` takes.
+            a `Transfer`, and entries of `others` what `other_of` takes.
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
     is_surface, background = options.compositing == "isosurface", background_of(options)
@@ -140,7 +140,7 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
     several = options.others if isinstance(options.others, list | tuple) else [options.others]
-    source, others = None, tuple(map(_other, several))
+    source, others = None, tuple(map(other_of, several))
     if options.memory is None:
         volume, transfer = look_of(options)
     else:
@@ -191,7 +191,7 @@ def _camera(
     return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
 
 
-def _other(each: Any) -> tuple[Volume, Transfer]:
+def other_of(each: Any) -> tuple[Volume, Transfer]:
     """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
     and HIGH, or over what stands out of the background."""
     file, *look = each if isinstance(each, Sequence) and not isinstance(each, str) else (each,)

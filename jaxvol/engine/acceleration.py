@@ -47,9 +47,9 @@ class VolumeAcceleration(eqx.Module):
     """What is computed before the image: a packed copy of the voxels for fetching, the slopes of nodes, and
     the ranges of blocks; None where the image has no use for it. Made once for each array of voxels."""
 
-    words: list[UInt32[Array, " voxels"] | None]
+    words: list[UInt32[Array, " _"] | None]
     """Of each of the volume's `grids`."""
-    slopes: list[UInt32[Array, " voxels"] | None]
+    slopes: list[UInt32[Array, " _"] | None]
     blocks: Any
     """`Blocks`, or, of several volumes, `SeveralBlocks`."""
     occupancy: Occupancy | None = None

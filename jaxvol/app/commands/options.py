@@ -214,17 +214,21 @@ def add_transfer(parser: Parser) -> None:
     group.add_argument("--unit-distance", type=float, metavar="LENGTH", help=text)
 
 
-def add_scene(parser: Parser) -> None:
-    """Add a volume that is looked at through a camera."""
-    add_volume(parser, nargs="?")
-    add_sampling(parser)
-    add_size(parser)
+def add_others(parser: Parser) -> None:
     text = (
         "one more volume in the same image, such as PET in CT; by a colormap (default: hot) over LOW and "
         "HIGH (default: what stands out); may be given several times; without shading"
     )
     how: dict[str, Any] = {"nargs": "+", "action": "append", "metavar": ("FILE", "CMAP LOW HIGH")}
     parser.add_argument("--with", "--others", dest="others", help=text, **how)
+
+
+def add_scene(parser: Parser) -> None:
+    """Add a volume that is looked at through a camera."""
+    add_volume(parser, nargs="?")
+    add_sampling(parser)
+    add_size(parser)
+    add_others(parser)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
     text = "options by their names, such as size = [640, 480]; those of the command line override them"

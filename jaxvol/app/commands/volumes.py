@@ -12,9 +12,9 @@ import numpy as np
 from ...io import datasets
 from ...io.formats import read
 from ...scene.volume import Volume
-from ..picture import header_of, is_automatic, look_of, volume_of
+from ..picture import header_of, is_automatic, look_of, other_of, volume_of
 from ..viewer import serve
-from .options import SWITCH, add_command, add_transfer, add_volume
+from .options import SWITCH, add_command, add_others, add_transfer, add_volume
 
 
 def _datasets(options: argparse.Namespace) -> None:
@@ -88,9 +88,10 @@ def add_info(commands: Any) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     how = {name: getattr(options, name) for name in ("port", "host", "token")}
-    file = options.file if options.labels is None else None  # a picture names no other file
+    others = tuple(map(other_of, options.others or ()))
+    file = None if options.labels or others else options.file  # a picture names no other file
     look = (volume_of(options),) if is_automatic(options) else look_of(options)
-    page = serve(*look, lit=options.shade, title=options.file.name, file=file, **how)
+    page = serve(*look, lit=options.shade, title=options.file.name, file=file, others=others, **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)
@@ -102,6 +103,7 @@ def add_view(commands: Any) -> None:
     parser = add_command(commands, "view", text, _view)
     add_volume(parser)
     add_transfer(parser)
+    add_others(parser)
     parser.add_argument("--shade", action=SWITCH, default=True, help="with light at first")
     text = "of the page (default: 8080, or the next free)"
     parser.add_argument("--port", type=int, default=8080, help=text)

@@ -6,6 +6,7 @@ One `model`, whose `state` a thread draws in `tiles`, and one list of its `contr
 
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,6 +38,7 @@ def view(
     compositing: Mode | Compositing[Any] | Any = "over",
     background: Any = (1.0, 1.0, 1.0),
     size: tuple[int, int] | Any = (640, 480),
+    others: Sequence[tuple[Volume, Transfer]] | Any = (),
 ) -> "NotebookView":
     """Shows a volume in a notebook, to be turned and changed by the pointer.
 
@@ -63,6 +65,8 @@ def view(
         compositing: as for `render`.
         background: linear RGB, or a name.
         size: (width, height) of the image in the notebook's pixels.
+        others: pairs of a volume and its transfer function, shown in the same image, without light, by
+            "over" or "integral". The controls are those of `volume`.
 
     Returns:
         A widget `v`. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting,
@@ -78,7 +82,7 @@ def view(
         raise ImportError(f"view needs {fault.name}: pip install 'jaxvol[notebooks]'") from fault
     keep_programs_by_default()
     how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
-    return NotebookView(*initial(volume, transfer, camera, march, size=size, **how))
+    return NotebookView(*initial(volume, transfer, camera, march, size=size, others=others, **how))
 
 
 def serve(
@@ -111,7 +115,7 @@ def serve(
             a token, which is made if none is given; what is sent is not encrypted.
         token: what a browser must tell, as part of `Page.url`, from 1 to 200 letters, digits, "-" and "_".
         file: the volume's, which saved pictures name.
-        how: `lighting`, `lit`, `compositing` and `background`, as for `view`.
+        how: `lighting`, `lit`, `compositing`, `background` and `others`, as for `view`.
 
     Returns:
         The `Page`, with its `url`. It is served until `Page.close`, or the end of the process.

@@ -5,15 +5,18 @@ view's height, to the right and down, as the pointer moved.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from ..._util.checks import described
 from ..._util.srgb import linear_color
-from ...compositing.blending import Compositing
+from ...compositing.blending import Compositing, Over
 from ...compositing.isosurface import Isosurface
+from ...compositing.line_integral import LineIntegral
 from ...compositing.modes import MODES, Mode, compositing_of
 from ...lighting import Phong
 from ...lighting.shading import Lighting
@@ -29,6 +32,7 @@ from ...march.transforms import (
 from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.occupancy import BLOCK
+from ...scene.several import together
 from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
@@ -38,6 +42,7 @@ from ..framing import FAINT, VISIBLE, automatic_camera
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
 ISOSURFACE = "isosurface"
+SEVERAL = Over, LineIntegral  # modes that show several volumes
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 STEEPEST = math.radians(89.9)  # elevation of a camera, at most: from straight above, nothing says what is up
 
@@ -154,7 +159,8 @@ class Scene:
     given: March  # whose quadrature and `max_samples` are kept
     lighting: Lighting  # that can be turned on
     voxel: float  # world length of a step of 1
-    modes: dict[str, Compositing[Any]]  # besides isosurfaces
+    modes: dict[str, Compositing[Any]]  # besides isosurfaces, which are of a single volume
+    others: tuple[tuple[Volume, Transfer], ...] = ()  # volumes in the same image, which are not changed
 
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with steps that are so many times as long."""
@@ -176,8 +182,9 @@ class Scene:
         return Isosurface(state.isovalue) if state.mode == ISOSURFACE else self.modes[state.mode]
 
     def light(self, state: State) -> Lighting | None:
-        """The light, if it is on, and the mode can be lit."""
-        return self.lighting if state.lit and self.compositing(state).can_be_lit else None
+        """The light, if it is on, and the mode can be lit; none of several volumes."""
+        lit = state.lit and self.compositing(state).can_be_lit and not self.others
+        return self.lighting if lit else None
 
     def settings(self, state: State) -> dict[str, Any]:
         """Options of `jaxvol render` that draw a state."""
@@ -202,6 +209,17 @@ class Scene:
         return changed
 
 
+def checked_others(others: Any) -> tuple[tuple[Volume, Transfer], ...]:
+    """Pairs of a volume and its transfer function. **Raises** `ValueError` for anything else."""
+    pairs = tuple(others) if isinstance(others, list | tuple) else (others,)
+    for each in pairs:
+        if not isinstance(each, tuple) or tuple(map(type, each))[:1] != (Volume,) or len(each) != 2:
+            raise ValueError(
+                f"others must be pairs of a Volume and its transfer function; got {described(each)}."
+            )
+    return tuple((volume, sized(transfer, volume)) for volume, transfer in pairs)
+
+
 def initial(
     volume: Volume | Any,
     transfer: Transfer | Any | None = None,
@@ -213,8 +231,10 @@ def initial(
     compositing: Mode | Compositing[Any] | Any = "over",
     background: Any = (1.0, 1.0, 1.0),
     size: tuple[int, int] | Any = (640, 480),
+    others: Sequence[tuple[Volume, Transfer]] | Any = (),
 ) -> tuple[Scene, State]:
     """What is viewed, and how at first. Arguments and errors as for `view`."""
+    others = checked_others(others)
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
     least = VISIBLE if transfer is None else FAINT
     if transfer is None:
@@ -226,12 +246,19 @@ def initial(
     check_arguments("view(volume, transfer, camera, march)", **names)
     mode = compositing_of(compositing)
     mode.marched(shown, given, volume)  # refuses what it cannot show
+    if others:
+        together(*map(list, zip((volume, shown), *others, strict=True)))  # as well
+        if not isinstance(mode, SEVERAL) or lighting is not None:
+            raise ValueError(
+                'of several volumes, compositing must be "over" or "integral", without lighting.'
+            )
     if lighting is not None and not mode.can_be_lit:
         raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
     r, g, b = np.asarray(linear_color("background", background)).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
     voxel = float(median_node_distance(given.locate(volume), blocks))
-    step = 0.5 if march is None else float(given.step) / voxel
+    finest = min([voxel, *(float(np.min(each.spacing)) for each, _ in others)])
+    step = max(0.5 * finest / voxel, MIN_STEP) if march is None else float(given.step) / voxel
     if not MIN_STEP <= step <= MAX_STEP:
         raise ValueError(
             f"march must have a step from {MIN_STEP * voxel:.4g} to {MAX_STEP * voxel:.4g}, {MIN_STEP:g} to "
@@ -241,11 +268,13 @@ def initial(
     offered = EmptySpaceJitter(seed=0), Jitter(seed=0)
     default = AlphaCorrection(), SpaceLeaping(), EarlyTermination(1 / 256)
     own = {type(transform) for transform in given.transforms}
-    others = (each for each in (*offered, *default) if type(each) not in own)
-    modes: dict[str, Compositing[Any]] = {name: kind() for name, kind in MODES.items()}
+    more = (each for each in (*offered, *default) if type(each) not in own)
+    modes: dict[str, Compositing[Any]] = {
+        name: kind() for name, kind in MODES.items() if not others or issubclass(kind, SEVERAL)
+    }
     name = next((n for n, kind in MODES.items() if type(mode) is kind), type(mode).__name__.lower())
     modes |= {} if isinstance(mode, Isosurface) else {name: mode}
-    scene = Scene(volume, (*given.transforms, *others), given, lighting or Phong(), voxel, modes)
+    scene = Scene(volume, (*given.transforms, *more), given, lighting or Phong(), voxel, modes, others)
     enabled = frozenset(type(t).__name__ for t in (default if march is None else given.transforms))
     data = np.asarray(volume.data)
     between = (float(data.min()) + float(data.max())) / 2

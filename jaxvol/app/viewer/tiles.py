@@ -90,6 +90,7 @@ class TileRenderer:
     def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
         self.volume, self.state, self.march = scene.volume, state, scene.march(state, step_factor)
         self.transfer = padded(state.transfer)
+        self.others = scene.others
         self.background = np.asarray(state.background, np.float32)
         self.how = {"compositing": scene.compositing(state), "lighting": scene.light(state)}
 
@@ -105,7 +106,10 @@ class TileRenderer:
 
     def rendered(self, camera: Camera) -> Rendering:
         """What `render` returns for a camera of a tile's size."""
-        return render(self.volume, self.transfer, camera, self.march, **self.how)
+        volume, transfer = self.volume, self.transfer
+        if self.others:
+            volume, transfer = map(list, zip((volume, transfer), *self.others, strict=True))
+        return render(volume, transfer, camera, self.march, **self.how)
 
     def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
         """A tile as `render` returns it."""

@@ -494,6 +494,27 @@ def test_every_mode_is_shown_as_it_begins_and_lit_where_it_can_be(side):
             assert (scene.light(state) is not None) is lit
 
 
+def test_another_volume_is_in_the_image(side):
+    small = jv.Volume(np.full((5, 5, 5), 9, np.uint8), (0.5,) * 3, np.asarray(BALL.center) - (1, 14, 1))
+    other = small, jv.TransferFunction([0, 9], np.array([[1.0, 0, 0]] * 2), [2.0, 2.0])
+    scene, state = begun(march=None, lit=True, others=[other])
+    assert set(scene.modes) == {"over", "integral"}
+    assert scene.light(state) is None
+    assert state.step * scene.voxel == pytest.approx(0.25)
+    red = TileRenderer(scene, state).rgba(Grid(1, 1, (side, side)), 0, 0)[..., 0]
+    volumes, transfers = zip((BALL, padded(LOOK)), other, strict=True)
+    camera = state.orbit.camera((side, side), (-SIZE[0] / SIZE[1], SIZE[0] / SIZE[1], -1, 1))
+    expected = jv.render(volumes, transfers, camera, scene.march(state)).rgba[..., 0]
+    np.testing.assert_allclose(red, expected, atol=1e-5)
+    for given, message in (
+        ({"others": [small]}, "others must be pairs"),
+        ({"others": other}, "others must be pairs"),
+        ({"others": [other], "compositing": "maximum"}, 'must be "over" or "integral"'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            begun(**given)
+
+
 def test_without_a_march_the_defaults_are_on_and_all_others_are_offered():
     scene, state = begun(transfer=None, march=None, lit=True)
     assert state.enabled == {"AlphaCorrection", "SpaceLeaping", "EarlyTermination"}
