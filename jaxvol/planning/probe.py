@@ -137,8 +137,8 @@ class Truth(NamedTuple):
             that grew.
         ratio: by which errors shrink for each halving of the step.
         alike: correlation of errors of different steps, 0 where it is negative: 1 where all point the same
-            way, as of smooth functions, some 0.4 to 0.8 by integrated cells, and mostly 0 by the midpoint rule,
-            whose steps miss details at random.
+            way, as of smooth functions, some 0.4 to 0.8 by integrated cells, and mostly 0 by the midpoint
+            rule, whose steps miss details at random.
     """
 
     probe: Probe
