@@ -33,8 +33,8 @@ POINTS, NEAR = 256, 2
 """Points of the middle ray that are looked at, and blocks around each."""
 
 CONFIDENT = 3.0
-"""Standard errors that are added to a mean square from some of the pixels. A few patches hold most of an error:
-with 1.5, 202 of 210 images held their tolerance, since patches that err most were not among those chosen."""
+"""Standard errors that are added to a mean square from some of the pixels. A few patches hold most of an
+error: with 1.5, 202 of 210 images held their tolerance, where patches that err most were not chosen."""
 
 FASTEST, SLOWEST = 0.25, 0.7
 """By what errors are taken to shrink for each halving of the step: a quarter where the order is 2; never

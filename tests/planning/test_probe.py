@@ -140,7 +140,7 @@ def probe():
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("alike", [True, False])
 def test_the_error_of_the_last_image_follows_from_the_halvings(probe, order, alike):
-    """Where errors point the same way as where each step has one of its own; of those no more than a bound."""
+    """Where errors point the same way; where each step has one of its own, roughly."""
     limit = at_pixels(probe, 0 * PATTERN)
     patterns = [PATTERN] * 3 if alike else np.random.default_rng(1).normal(size=(3, *PATTERN.shape))
     images = [at_pixels(probe, 0.01 * 2.0 ** (-order * k) * each) for k, each in enumerate(patterns)]
