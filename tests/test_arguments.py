@@ -19,7 +19,7 @@ MARCH = jv.March(0.1)
 LIGHT = ConstantLight()
 RAY = [0.0, 0.0, -5.0], [0.0, 0.0, 1.0]
 RAYS = [RAY[0]], [RAY[1]]
-LIGHTINGS = r"Pass jv\.lighting\.Phong\(lights\) or jv\.lighting\.ScattererTemplates\(materials, lights\)"
+LIGHTINGS = r"Pass jv\.lighting\.Phong\(\) or jv\.lighting\.ScattererTemplates\(materials, lights\)"
 
 
 class Denser(jv.Volume):

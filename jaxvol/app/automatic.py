@@ -208,7 +208,8 @@ def labels_shown(
     volume has, or its values, if they seem to be labels.
 
     In and near labels the values that are returned are smooth, from the least to, inside of labels, the
-    greatest; and labels reach two voxels beyond.
+    greatest; and labels reach two voxels beyond. They are counted from 1 on: label k stands for
+    `volume.label_ids[k]`.
 
     Args:
         volume: the `Volume`.
@@ -256,4 +257,6 @@ def labels_shown(
     }
     if own:
         functions[0] = automatic_transfer(volume) if around is None else around
-    return Volume(shown, *place, beyond, direction=volume.direction), LabelTransferFunction(functions)
+    ids = kinds.tolist() if volume.label_ids is None else [volume.label_ids[kind] for kind in kinds]
+    how: Any = {"direction": volume.direction, "label_ids": ids}
+    return Volume(shown, *place, beyond, **how), LabelTransferFunction(functions)

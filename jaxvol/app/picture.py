@@ -40,7 +40,11 @@ from .automatic import (
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points
 
 
-FAST = SpaceLeaping(), AlphaCorrection(), EarlyTermination()  # of a march whose step is given
+def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
+    """Of a step that is given."""
+    fast = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
+    return March(step, (*transforms, *fast), "midpoint")
+
 
 OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
 OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
@@ -181,6 +185,7 @@ def _camera(
     """That of the options; or else one as near as what is visible allows."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if options.camera is not None:
+        finite_array("camera", options.camera, (6,))  # and no `Camera`
         up, place = options.view_up, (options.camera[:3], options.camera[3:])
         height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
         scale = height if options.parallel else None  # as high at the focal point
@@ -203,7 +208,7 @@ def other_of(each: Any) -> tuple[Volume, Transfer]:
         clim = range_of_object(volume)
     try:
         low, high = map(float, clim)
-    except ValueError as fault:
+    except (TypeError, ValueError) as fault:
         got = " ".join(map(str, look))
         raise ValueError(f"others are FILE, FILE CMAP or FILE CMAP LOW HIGH; got {got}.") from fault
     return volume, colormap(cmap, (low, high))
@@ -216,7 +221,7 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
     if step is None and scene.others:
         step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
     if step is not None:
-        return scene._replace(march=March(step, (*scene.transforms, *FAST), "midpoint"))
+        return scene._replace(march=quick_march(step, scene.transforms))
     found = min(scene.plans(cameras, options.tolerance), key=lambda plan: float(plan.march.step))
     if not found.within:
         told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
@@ -277,10 +282,10 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
             if told:
                 warnings.warn(told, stacklevel=5)
         return preset(options.preset, clim, 1.0 if unit is None else unit)
-    if clim is None and options.compositing == "over":  # what is around the object would be fog
-        clim = range_of_object(volume)
-    data = np.asarray(volume.data)
-    clim = clim or (float(data.min()), float(data.max()))
+    if clim is None:
+        data, over = np.asarray(volume.data), options.compositing == "over"
+        # what is around the object would be fog
+        clim = range_of_object(volume) if over else (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 

@@ -58,7 +58,7 @@ class Plan(NamedTuple):
         volume: where `bricks` is given, only the copy that was planned with.
         lighting: as given.
         tolerance: as given.
-        error: predicted, on the safe side; just above the tolerance where nothing could be proven.
+        error: predicted, on the safe side; above the tolerance where nothing could be proven.
         samples: predicted for each pixel.
         parts: what was kept or left out, and why.
         probed: seconds that planning took, compilation included.

@@ -162,7 +162,7 @@ class Search:
             return beyond
         for _ in range(REFINED):
             step = math.sqrt(within.step * beyond.step)
-            if within.error < beyond.error < math.inf:  # as a power of the step, not too near to either
+            if 0 < within.error < beyond.error < math.inf:  # as a power of the step, not too near to either
                 power = math.log(beyond.error / within.error) / math.log(beyond.step / within.step)
                 sought = within.step * (AIM * self.goal / within.error) ** (1 / power)
                 step = min(max(sought, math.sqrt(within.step * step)), math.sqrt(step * beyond.step))

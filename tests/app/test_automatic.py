@@ -216,7 +216,7 @@ def test_labels_are_shown_in_colours_of_their_own():
     more = np.kron(np.arange(144).reshape(12, 12), np.ones((2, 2)))
     data = labels()
     data[21:] = np.where(more < 114, 100 + more, 0)
-    shown = labels_shown(jv.Volume(data, (1, 2, 3), (4, 5, 6)))
+    shown = labels_shown(jv.Volume(given := data, (1, 2, 3), (4, 5, 6)))
     assert shown is not None
     volume, transfer = shown
     np.testing.assert_array_equal(volume.spacing, (1, 2, 3))
@@ -226,6 +226,7 @@ def test_labels_are_shown_in_colours_of_their_own():
     assert data[8, 12, 12] == data[16, 12, 12] == INSIDE
     assert 0 < data[3, 12, 12] < data[4, 12, 12] < INSIDE
     assert kinds[[1, 2, 8, 16, 12], 12, [12, 12, 12, 12, 1]].tolist() == [0, 1, 1, 2, 3]
+    assert volume.label_ids == tuple(np.unique(given))
     colors = np.asarray(transfer.stacked.colors)[1:-1, 0]
     apart = np.abs(colors[:, None] - colors[None]).max(axis=-1)[np.triu_indices(117, 1)]
     assert apart[[0, 1, 116]].min() > 0.3  # of the first three labels

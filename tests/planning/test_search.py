@@ -107,6 +107,12 @@ CASES: dict[str, tuple[Known, dict, str, str]] = {
     "one image only": (Known(*FAST), {"once": True}, "midpoint", "not tried for one image"),
     "integration is no better": (Known(square(0.04)), {}, "midpoint", "not within the tolerance where"),
     "another mode": (Known(*FAST), {"mode": Average()}, "midpoint", "these cells cannot be integrated"),
+    "no error up to two voxels": (
+        Known(lambda step: 0.0 if step <= 2 else 0.3),
+        {"mode": Average()},
+        "midpoint",
+        "cannot be integrated",
+    ),
     "a peak between samples": (
         Known(peak, square(1e-3)),
         {},

@@ -8,8 +8,7 @@ from typing import Any
 
 from ..._util.checks import output_file
 from ...fitting import ImageResidual, fit, flat_grey, read_views, write_transfer
-from ...march.march import March
-from ..picture import FAST, background_of, volume_of
+from ..picture import background_of, quick_march, volume_of
 from .options import add_clim, add_command, add_output, add_sampling, add_volume, refuse_to_replace
 
 
@@ -21,7 +20,7 @@ def _fit(options: argparse.Namespace) -> None:
     background = background_of(options)
     volume = volume_of(options)
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
-    march = March(step, FAST, "midpoint")
+    march = quick_march(step)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
         result = fit(

@@ -188,7 +188,7 @@ def add_sampling(parser: Parser) -> None:
     """Add the step and the background of images."""
     text = "distance between samples, world length (default: half a voxel for fit; as planned for render)"
     parser.add_argument("--step", type=float, help=text)
-    text = "linear RGB, or a name (default: white; black behind maximum, minimum and average)"
+    text = "linear RGB, or a name (default: white; black behind projections)"
     add_vector(parser, "--background", "R G B", text)
 
 
@@ -242,7 +242,8 @@ def add_scene(parser: Parser) -> None:
     group = parser.add_argument_group("appearance")
     text = (
         "how samples become a pixel: over (default), by emission and absorption; maximum, minimum, average: "
-        "that value of the ray, as classified; isosurface: where --isovalue is first crossed"
+        "that value of the ray, as classified; integral: an X-ray image; isosurface: where --isovalue is "
+        "first crossed"
     )
     group.add_argument("--compositing", choices=(*MODES, "isosurface"), help=text)
     text = "with --compositing isosurface: the value on it"

@@ -123,7 +123,8 @@ def _point_controls(model: Model) -> list[Control]:
                 put(editing.without_point, chosen)
             elif not part:
                 put(editing.with_points_at, [value])
-                chosen = int(np.searchsorted(np.asarray(transfer().values), np.float32(value)))
+                values = np.asarray(transfer().values)
+                chosen = min(int(np.searchsorted(values, np.float32(value))), len(values) - 1)
         elif not twice:
             put(editing.with_value, chosen, value)
             put(editing.with_opacity, chosen, opacity, voxel)
@@ -169,7 +170,8 @@ def _label_controls(model: Model) -> list[Control]:
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
     colors = editing.colors_of(model.state.transfer)[labels]  # pyright: ignore[reportArgumentType]
-    names, chosen = [str(label) for label in labels], 0
+    ids = dict(enumerate(model.scene.volume.label_ids or ()))
+    names, chosen = [str(ids.get(label, label)) for label in labels], 0
 
     def choose(name: str) -> None:
         nonlocal chosen

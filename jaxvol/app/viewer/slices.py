@@ -34,6 +34,7 @@ def slice_controls(model: Model) -> list[Control]:
     down = np.where(np.abs(upward) > 0.7, upward, turn[np.abs(turn).argmax(axis=0), range(3)]) < 0
     shown: tuple[Any, str] = (), ""
     labels, look = np.asarray(volume.labels), model.first.transfer
+    ids = dict(enumerate(volume.label_ids or ()))
     palette = colors_of(look) if isinstance(look, LabelTransferFunction) else None
 
     def indices() -> np.ndarray:
@@ -66,7 +67,8 @@ def slice_controls(model: Model) -> list[Control]:
         if shown[0] != tuple(at):
             here = tuple(np.round(at).astype(int))
             value = f"{float(np.asarray(volume.data)[here]):.5g}"
-            value += "" if palette is None else f", label {labels[here]}"
+            kind = 0 if palette is None else int(labels[here])
+            value += "" if palette is None else f", label {ids.get(kind, kind)}"
             where = ", ".join(f"{each:.4g}" for each in origin + turn @ (at * spacing))
             slices = "".join(one(axis, at) for axis in range(3))
             text = f'<div style="display: flex; gap: 6px; align-items: flex-end; margin: 4px">{slices}</div>'

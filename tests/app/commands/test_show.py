@@ -19,6 +19,7 @@ CASES = {
     "nothing is said": ({}, []),
     "a preset": ({"preset": "ct aaa", "shade": False}, ["--preset", "CT_AAA", "--no-shade"]),
     "window and level": ({"window": 100, "level": 80}, ["--clim", 30, 130]),
+    "a range as an array": ({"clim": np.array([30, 130])}, ["--clim", 30, 130]),
     "a view": ({"direction": (0, 0, 1), "zoom": 2}, ["--direction", 0, 0, 1, "--zoom", 2]),
     "a projection": ({"compositing": "maximum"}, ["--compositing", "maximum"]),
     "names of colours": ({"background": "#336699"}, ["--background", "#336699"]),
@@ -88,6 +89,8 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
         (volume, {"dtype": "uint8"}, "dtype is of files; volume is a Volume"),
         (5, {}, "volume must be a jaxvol Volume; got 5"),
         (volume, {"transfer": "hot"}, "transfer must be .*; got 'hot'"),
+        (volume, {"camera": jv.Camera.looking_at(volume)}, r"camera must be numbers of shape \(6,\)"),
+        (volume, {"others": [(volume, "hot", (1, 10))]}, r"others are FILE, .*; got hot \(1, 10\)"),
     ):
         with pytest.raises(ValueError, match=message):
             jv.show(what, step=0.4, **options)

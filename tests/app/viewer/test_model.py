@@ -349,6 +349,10 @@ def test_the_controls_change_the_points_that_they_show(controlled):
     assert values() == [80, 130, 220]
     controls["preset"].set("as given")
     assert values() == given
+    full, controls = controlled(BALL, jv.colormap("gray", (0, 150), n_colors=16))
+    press(4, "", 190, 0.5)  # past the last point, where there is no room for another
+    assert len(full.state.transfer.values) == 16
+    assert controls["value"].get() == 150
     many, controls = controlled(BALL, jv.colormap("gray", (0, 200), n_colors=40))
     assert "value" not in controls
     controls["window"].set(100.0)
@@ -441,6 +445,9 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
     assert equal_arrays(model.state.transfer, expected)
     controls["opacity"].set(math.nan)
     assert equal_arrays(model.state.transfer, expected)
+    data = np.asarray(LABELS.data)
+    _, controls = controlled(jv.Volume(np.where(data == 2, np.uint8(9), data)), None)
+    assert controls["label"].choices == ["1", "9"]  # as in the file
 
 
 def test_a_table_is_shown_and_not_edited(controlled):
@@ -506,11 +513,12 @@ def test_another_volume_is_in_the_image(side):
     camera = state.orbit.camera((side, side), (-SIZE[0] / SIZE[1], SIZE[0] / SIZE[1], -1, 1))
     expected = jv.render(volumes, transfers, camera, scene.march(state)).rgba[..., 0]
     np.testing.assert_allclose(red, expected, atol=1e-5)
-    for given, message in (
+    bad: list[tuple[dict[str, Any], str]] = [
         ({"others": [small]}, "others must be pairs"),
         ({"others": other}, "others must be pairs"),
         ({"others": [other], "compositing": "maximum"}, 'must be "over" or "integral"'),
-    ):
+    ]
+    for given, message in bad:
         with pytest.raises(ValueError, match=message):
             begun(**given)
 
