@@ -43,7 +43,7 @@ def test_points_of_peers_ahead_of_ours_are_found_with_what_we_miss():
 
 
 def test_names_are_unique_as_files_and_settings_begin_with_the_base():
-    assert SETTINGS["uniform"].items() <= SETTINGS["unlit"].items()
+    assert SETTINGS["uniform"].keys() <= SETTINGS["unlit"].keys()
     others = [settings for kind, settings in SETTINGS.items() if kind != "uniform"]
     for names in (ROWS, [name for settings in others for name in settings]):
         assert len({pareto_measure.slug(name) for name in names}) == len(names)

@@ -72,7 +72,8 @@ def recorded_in(path: Path) -> dict[str, Any]:
     except Exception as fault:  # of Pillow's many kinds
         raise ValueError(f"{path} cannot be read as a PNG: {shortened(str(fault))}") from fault
     if not isinstance(text, str):
-        raise ValueError(f"{path} holds no settings of jaxvol; another program may have saved it again.")
+        why = "it shows labels or volumes of further files, or another program saved it"
+        raise ValueError(f"{path} holds no settings of jaxvol: {why}.")
     content: Any = None
     try:
         content = json.loads(text)

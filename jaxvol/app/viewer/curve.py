@@ -105,7 +105,7 @@ def _point_controls(model: Model) -> list[Control]:
         clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
         names.update(preset=name, colors=GIVEN)
         note = f'<div style="font-size: 11px">{told or ""}</div>'
-        put(lambda _: given if name == GIVEN else preset(name, clim, voxel))
+        put(lambda _: given if name == GIVEN else preset(name, clim))
 
     def choose_colors(name: str) -> None:
         names["colors"] = name

@@ -155,7 +155,8 @@ class Model:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
-        text = text_of(self.scene.settings(state), self._file, state.transfer)
+        # one of several files names none, as of `jaxvol render`
+        text = {} if self.scene.others else text_of(self.scene.settings(state), self._file, state.transfer)
         self._set_status(f"saved {width} x {height}\n")
         self._deliver(png_of(pixels[:height, :width], text))
 
