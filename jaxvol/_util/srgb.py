@@ -1,6 +1,7 @@
 """The sRGB curve: linear colour to display values, and back."""
 
 import io
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,6 +12,10 @@ from jaxtyping import Array, Float, UInt8
 
 from ..xla.platform import is_traced
 from .checks import Arrayable, described, finite_array
+
+
+BRIGHTEST = 8.0
+"""Of colours, above which they are hardly meant as linear RGB."""
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
@@ -55,6 +60,13 @@ def linear_color(name: str, color: Any, shape: Any = (3,)) -> Any:
             return from_srgb(display)
     # a traced one may be NaN, which then shows in the image
     return color if is_traced(color) else finite_array(name, color, shape)
+
+
+def warn_of_8_bits(name: str, colors: Any, stacklevel: int = 4) -> None:
+    """Warn of colours that are hardly meant as linear RGB, where they are known."""
+    if not is_traced(colors) and (most := float(np.asarray(colors).max())) > BRIGHTEST:
+        told = f"{name} must be linear RGB, where white is 1; got up to {most:g}"
+        warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb({name} / 255).", stacklevel=stacklevel)
 
 
 def displayed(

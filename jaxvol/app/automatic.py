@@ -12,7 +12,7 @@ from .._util.srgb import from_srgb
 from .._util.voxels import is_flat
 from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
-from ..scene.transfer import TransferFunction, extinction_of
+from ..scene.transfer import Transfer, TransferFunction, extinction_of, voxel_size
 from ..scene.volume import Volume, check_one_channel
 from ..xla.platform import is_traced
 
@@ -36,6 +36,7 @@ MOST_LABELS = 256
 """Whole numbers are labels if most equal their neighbour, and no more than so many differ, the lowest among
 them: a `LabelTransferFunction` has no more."""
 
+SMALL = 0.1  # voxels for which presets, made for some 0.5 to 3 mm, would be nearly transparent
 INSIDE = 255  # value of what has a label, in the volume that is shown
 
 EDGE, SKIN, TISSUE = (70, 30, 18), (214, 130, 92), (190, 92, 62)
@@ -62,6 +63,13 @@ def unit_of(volume: Volume) -> float:
     its diagonal."""
     low, high = (np.asarray(corner) for corner in volume.corners)
     return float(np.linalg.norm(high - low)) / 100
+
+
+def preset_unit(volume: Any) -> float:
+    """Length to which a preset's opacities refer: a millimetre; for voxels that are smaller by far, of
+    phantoms or micro-CT, as long as these."""
+    size = float(voxel_size(volume))
+    return size if size < SMALL else 1.0
 
 
 def automatic_transfer(volume: Volume | Any) -> TransferFunction:
@@ -203,7 +211,7 @@ def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -
 
 def labels_shown(
     volume: Volume | Any, around: TransferFunction | Any | None = None
-) -> tuple[Volume, LabelTransferFunction] | None:
+) -> tuple[Volume, LabelTransferFunction]:
     """A volume and a transfer function that show labels, each in a colour of its own and lit: those that the
     volume has, or its values, if they seem to be labels.
 
@@ -216,18 +224,27 @@ def labels_shown(
         around: what is shown where a volume's own labels are 0; by default by `automatic_transfer`.
 
     Returns:
-        The two; None if the volume has no labels, or more than 256, and its values are not whole numbers of 3
-        to 256 kinds, most of which equal their neighbour. The lowest one is not shown.
+        The two. Of values, the lowest one is not shown.
 
     Raises:
-        ValueError: for what is no volume, or traced.
+        ValueError: for what is no volume, or traced; and if the volume has no labels, or more than 256, and
+            its values are not whole numbers of 3 to 256 kinds, most of which equal their neighbour.
     """
+    check_arguments("labels_shown(volume)", volume=volume)
+    check_known("labels_shown", volume, around)
+    if (found := labels_if_any(volume, around)) is None:
+        raise ValueError("volume must have up to 256 labels, or values that seem to be labels; it has none.")
+    return found
+
+
+def labels_if_any(
+    volume: Volume, around: Transfer | None = None
+) -> tuple[Volume, LabelTransferFunction] | None:
+    """As `labels_shown`; None where that raises."""
     import matplotlib
     from matplotlib.colors import ListedColormap, hsv_to_rgb
     from scipy.ndimage import gaussian_filter, maximum_filter
 
-    check_arguments("labels_shown(volume)", volume=volume)
-    check_known("labels_shown", volume, around)
     own, data = volume.labels is not None, np.asarray(volume.data)
     given = np.asarray(volume.labels) if own else data
     if not own and (given.dtype.kind not in "iu" or not is_flat(given)):

@@ -1,5 +1,6 @@
 """Where is what a transfer function shows, and from how far does a camera see all of it?"""
 
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
@@ -9,9 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._util.checks import Arrayable
+from .._util.texts import pasted
 from ..ray import check_arguments
 from ..scene.camera import Camera, axes_of
 from ..scene.labels import LabelTransferFunction
+from ..scene.several import pairs_of
 from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
 from .automatic import automatic_transfer, check_known, sampled, stride_of, unit_of
@@ -50,8 +53,9 @@ def automatic_camera(
     """A camera as near as what a transfer function shows allows, specks left out, and upright.
 
     Args:
-        volume: what is seen.
-        transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts.
+        volume: what is seen; or a list of several volumes, as for `render`, the first of which is upright.
+        transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts. Of
+            several volumes, a list of one for each.
         direction: from the volume to the camera; by default to the right, in front, and higher.
         view_up: by default z; of a volume that does not say where it lies (its origin is 0, its axes are the
             world's, as of raw files), away from the face that cuts through most of what `automatic_transfer`
@@ -68,12 +72,14 @@ def automatic_camera(
     Raises:
         ValueError: as `Camera.looking_at` does, and for what is traced.
     """
+    pairs = pairs_of(volume, transfer) or [(volume, transfer)]
+    volume, transfer = pairs[0]
     check_arguments("automatic_camera(volume, transfer)", volume=volume, transfer=transfer)
-    check_known("automatic_camera", volume, transfer, direction, view_up, view_angle)
+    check_known("automatic_camera", pairs, direction, view_up, view_angle)
     with jax.ensure_compile_time_eval():  # also where something else is traced
         side = upright(volume, transfer, direction, view_up)
         camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
-        return framed(camera, visible_points(volume, transfer, least))
+        return framed(camera, np.concatenate([visible_points(*pair, least) for pair in pairs]))
 
 
 def upright(
@@ -139,6 +145,17 @@ def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarra
     else:
         return np.ones(data.shape[:3], bool)
     return -np.expm1(-extinction * unit_of(volume)) > least
+
+
+def warn_of_distance(volume: Volume, others: Sequence[tuple[Volume, Transfer]]) -> None:
+    """Say so of a volume that does not meet the first one: mostly a file does not say where it lies."""
+    low, high = map(np.asarray, volume.corners)
+    for number, (other, _) in enumerate(others):
+        first, last = map(np.asarray, other.corners)
+        if (last < low).any() or (first > high).any():
+            ends = (f"{pasted(a)} to {pasted(b)}" for a, b in ((first, last), (low, high)))
+            told = f"others[{number}], from {next(ends)}, does not meet the volume, from {next(ends)}"
+            warnings.warn(f"{told}: do spacing and origin suit?", stacklevel=4)
 
 
 def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:

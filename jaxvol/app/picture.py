@@ -26,18 +26,20 @@ from ..render import PLANNED, render
 from ..scene.camera import Camera
 from ..scene.presets import SHADED, colormap, fitted_range, preset, preset_name
 from ..scene.rendering import Rendering
+from ..scene.several import with_others
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume
 from .automatic import (
     SAMPLED,
     automatic_transfer,
-    labels_shown,
+    labels_if_any,
+    preset_unit,
     range_of_object,
     sampled,
     stride_of,
     transfer_by_copy,
 )
-from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points
+from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
 
 
 def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
@@ -53,6 +55,9 @@ DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "lab
 DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "others": []}
 DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
 """Options of a picture, as they are where nothing is given."""
+
+ELSEWHERE = {"mode": "compositing", "blending": "compositing", "lighting": "shade", "colormap": "cmap"}
+"""What other programs call options."""
 
 OVERRIDES = {
     "preset": {"cmap", "transfer", "recorded_transfer"},
@@ -91,11 +96,9 @@ class Scene(NamedTuple):
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
         how = {"compositing": self.compositing, "lighting": self.lighting}
-        if self.others:
-            volumes, transfers = zip((self.volume, self.transfer), *self.others, strict=True)
-            found = render(volumes, transfers, camera, self.march, **how)
-        elif self.source is None:
-            found = render(self.volume, self.transfer, camera, self.march, **how)
+        if self.source is None:
+            what = with_others(self.volume, self.transfer, self.others)
+            found = render(*what, camera, self.march, **how)
         else:
             how["memory"] = self.memory
             found = render_bricks(self.source, self.transfer, camera, self.march, **how)
@@ -161,8 +164,9 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         automatic = is_automatic(options)
         transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
 
+    warn_of_distance(volume, others)
     lighting = _lighting(options, mode, alone=not others)
-    camera = _camera(options, volume, transfer, orbit).zoom(options.zoom)
+    camera = _camera(options, volume, transfer, others, orbit).zoom(options.zoom)
     how = mode, lighting, background, transforms, source, options.memory
     return Scene(volume, transfer, camera, *how, others=others)
 
@@ -172,7 +176,7 @@ def look_of(options: Namespace) -> tuple[Volume, Transfer]:
     volume, automatic = volume_of(options), is_automatic(options)
     transfer = None if automatic else transfer_of(options, volume)
     if automatic or options.labels is not None:
-        volume, transfer = labels_shown(volume, transfer) or (volume, transfer)
+        volume, transfer = labels_if_any(volume, transfer) or (volume, transfer)
     return volume, automatic_transfer(volume) if transfer is None else transfer
 
 
@@ -180,20 +184,27 @@ def _camera(
     options: Namespace,
     volume: Volume,
     transfer: Transfer,
+    others: Sequence[tuple[Volume, Transfer]],
     orbit: Callable[[Camera], Sequence[Camera]] | None,
 ) -> Camera:
     """That of the options; or else one as near as what is visible allows."""
     given = {"view_angle": options.view_angle, "size": options.size}
+    if isinstance(options.camera, Camera):
+        return options.camera
     if options.camera is not None:
-        finite_array("camera", options.camera, (6,))  # and no `Camera`
+        finite_array("camera", options.camera, (6,))
         up, place = options.view_up, (options.camera[:3], options.camera[3:])
         height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
     given["parallel"] = options.parallel
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
-    camera = automatic_camera(volume, transfer, options.direction, options.view_up, **given)
-    return framed(camera, visible_points(volume, transfer, least), orbit(camera)) if orbit else camera
+    what = with_others(volume, transfer, others)
+    camera = automatic_camera(*what, options.direction, options.view_up, **given)
+    if orbit is None:
+        return camera
+    points = [visible_points(*pair, least) for pair in ((volume, transfer), *others)]
+    return framed(camera, np.concatenate(points), orbit(camera))
 
 
 def other_of(each: Any) -> tuple[Volume, Transfer]:
@@ -222,8 +233,9 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
         step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
     if step is not None:
         return scene._replace(march=quick_march(step, scene.transforms))
-    found = min(scene.plans(cameras, options.tolerance), key=lambda plan: float(plan.march.step))
-    if not found.within:
+    plans = scene.plans(cameras, options.tolerance)
+    found = min(plans, key=lambda plan: float(plan.march.step))
+    if not all(plan.within for plan in plans):
         told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
         warnings.warn(told, stacklevel=3)
     source = None if found.bricks is None else found.source
@@ -275,13 +287,15 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
     if (options.window is None) != (options.level is None):
         raise ValueError("window and level go together; one is missing.")
     if options.window is not None:
+        if not options.window > 0:
+            raise ValueError(f"window must be above 0; got {options.window}.")
         clim = options.level - options.window / 2, options.level + options.window / 2
     if options.preset is not None:
         if clim is None:
             clim, told = fitted_range(options.preset, sampled(volume))
             if told:
                 warnings.warn(told, stacklevel=5)
-        return preset(options.preset, clim, 1.0 if unit is None else unit)
+        return preset(options.preset, clim, preset_unit(source or volume) if unit is None else unit)
     if clim is None:
         data, over = np.asarray(volume.data), options.compositing == "over"
         # what is around the object would be fog

@@ -15,16 +15,17 @@ from .._util.texts import near
 from .._util.vec3 import apart
 from ..compositing.isosurface import Isosurface
 from ..ray import check_arguments
+from ..scene.camera import Camera
 from ..scene.rendering import Rendering, in_notebook
 from ..scene.space import enter
 from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
 from .automatic import check_known
-from .picture import DEFAULTS, Scene, check_exclusive, scene_of, with_march
+from .picture import DEFAULTS, ELSEWHERE, Scene, check_exclusive, scene_of, with_march
 
 
-ELSEWHERE = {"mode": "compositing", "blending": "compositing", "lighting": "shade", "colormap": "cmap"}
+OF_CAMERAS = {"direction", "view_up", "view_angle", "parallel", "size"}
 FAINT = 0.01
 """Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
 
@@ -46,9 +47,10 @@ def show(
         options: those of `jaxvol render`, with _ for -. Colours: `preset`, `cmap`, `clim`, or `window` and
             `level`, `unit_distance`, `labels` (a file). More volumes: `others`, each a file or `Volume`, and
             its transfer function, or a colormap and maybe its range. Look: `compositing`, `isovalue`,
-            `shade`, `background`. Camera: `camera`, `direction`, `view_up`, `view_angle`, `parallel`, `zoom`,
-            `size`. What is cut away: `clip_box`, `clip_plane`, `clip_inside_out`. How it is computed: `step`
-            or `tolerance`, `memory`. Of a raw file: `shape`, `dtype`, `spacing`, `nan`, `time`, `channel`.
+            `shade`, `background`. Camera: `camera`, a `Camera` or six numbers, `direction`, `view_up`,
+            `view_angle`, `parallel`, `zoom`, `size`. What is cut away: `clip_box`, `clip_plane`,
+            `clip_inside_out`. How it is computed: `step` or `tolerance`, `memory`. Of a raw file: `shape`,
+            `dtype`, `spacing`, `nan`, `time`, `channel`.
             `jaxvol render --help` describes each.
 
     Returns:
@@ -69,6 +71,9 @@ def show(
     given |= {} if transfer is None else {"transfer": transfer}
     check_arguments("show(volume, transfer)", **given)
     check_known("show", given, options)
+    if isinstance(options.get("camera"), Camera):
+        for name in options.keys() & OF_CAMERAS:
+            raise ValueError(f"camera is a Camera, which has its own {name}; leave {name} out.")
     options["transfer"] = transfer
     check_exclusive(options)
     keep_programs_by_default()

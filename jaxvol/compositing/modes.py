@@ -24,9 +24,9 @@ MODES: dict[str, type[Compositing[Any]]] = {
 }
 
 
-ELSEWHERE = {"composite": "over", "dvr": "over", "mip": "maximum", "max": "maximum", "minip": "minimum"}
-ELSEWHERE |= {"min": "minimum", "aip": "average", "mean": "average", "additive": "integral"}
-ELSEWHERE |= {"xray": "integral", "x-ray": "integral", "drr": "integral", "iso": "isosurface"}
+MODES_ELSEWHERE = {"composite": "over", "dvr": "over", "mip": "maximum", "max": "maximum", "minip": "minimum"}
+MODES_ELSEWHERE |= {"min": "minimum", "aip": "average", "mean": "average", "additive": "integral"}
+MODES_ELSEWHERE |= {"xray": "integral", "x-ray": "integral", "drr": "integral", "iso": "isosurface"}
 """What other programs call them."""
 
 
@@ -43,7 +43,7 @@ def compositing_of(given: Mode | Any) -> Compositing[Any]:
     if isinstance(given, str) and given in MODES:
         return MODES[given]()
     names = ", ".join(f'"{name}"' for name in MODES)
-    hint = near(ELSEWHERE.get(given.lower(), given), MODES) if isinstance(given, str) else ""
+    hint = near(MODES_ELSEWHERE.get(given.lower(), given), MODES) if isinstance(given, str) else ""
     raise ValueError(
         f"compositing must be one of {names}, a jaxvol.Isosurface, or another Weighting or Selection; "
         f"got {described(given)}.{hint}"

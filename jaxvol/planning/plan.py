@@ -28,7 +28,7 @@ from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .memory import read_within, with_bricks
-from .probe import Probe
+from .probe import Candidates, Probe, rendered
 from .search import COARSEST, Part, Search
 
 
@@ -212,7 +212,7 @@ def plan(
     if mode.resolves:
         shown, _ = mode.marched(transfer, March(1.0, given), volume)
     visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
-    probe = Probe.of(camera, space, visible, integer("seed", seed, 0))
+    candidates, seed = Candidates.of(camera, space, visible), integer("seed", seed, 0)
     proven, parts = proven_transforms(visible, space, given, copy=stride > 1)
     voxel = float(median_node_distance(space, visible.shape))
 
@@ -225,8 +225,14 @@ def plan(
 
     # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
     # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
+    probe = Probe.of(candidates, seed)
     first = search(ends, tolerance, {})
     seen = first.render(COARSEST, "midpoint").image
+    if not np.asarray(seen.rgba).any() and candidates.likely.any():  # what is visible lies in other patches
+        march = first.render(COARSEST, "midpoint").march
+        probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, march)), seed)
+        first = search(ends, tolerance, {})
+        seen = first.render(COARSEST, "midpoint").image
     opaque = probe.mean(np.asarray(seen.rgba)[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     brightest = brightest_of(seen)

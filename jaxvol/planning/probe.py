@@ -1,6 +1,7 @@
 """How far is an image from the converged one, and what does it cost? Found out from some of its pixels."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -44,6 +45,55 @@ ROUNDING = 1e-6
 """Differences of images that may be due to rounding."""
 
 
+class Candidates(NamedTuple):
+    """Patches of a camera's image, which of them meet the volume, and which are likely to show anything."""
+
+    camera: Camera
+    hit: Bool[np.ndarray, " patches"]
+    likely: Bool[np.ndarray, " patches"]
+
+    @classmethod
+    def of(cls, camera: Camera, space: Space, visible: Bool[Array, "bx by bz"]) -> "Candidates":
+        """`visible`: blocks that may hold anything visible."""
+        from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
+
+        (width, height), (across, down) = camera.size, _patches(camera)
+        hit = np.asarray(_hits(camera, space))
+        hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
+        hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
+        near = jnp.asarray(maximum_filter(np.asarray(visible), 2 * NEAR + 1, mode="constant"))
+        likely = hit & np.asarray(_passes(camera, space, near)).reshape(-1)
+        hit[0] |= not hit.any()
+        return cls(camera, hit, likely)
+
+    @property
+    def wanted(self) -> int:
+        """Patches of a probe."""
+        return PATCHES if self.hit.size >= SMALL else FEW
+
+    def pixels(self, chosen: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n m"]]:
+        """Columns and rows of patches' pixels."""
+        y, x = np.divmod(np.arange(SIDE**2), SIDE)
+        row, column = np.divmod(chosen, _patches(self.camera)[0])
+        return column[:, None] * SIDE + x, row[:, None] * SIDE + y
+
+    def rays(self, column: Int[np.ndarray, "*n"], row: Int[np.ndarray, "*n"]) -> GivenRays:
+        """Those of pixels; past the edges of the image, of the last ones."""
+        places = (np.minimum(each, n - 1) for each, n in zip((column, row), self.camera.size, strict=True))
+        return _rays(self.camera, *(jnp.asarray(each.reshape(-1), jnp.int32) for each in places))
+
+    def narrowed(self, render: Callable[[GivenRays], Rendering]) -> "Candidates":
+        """Likely are those that show anything in pixels which are spread evenly over the likely ones, as many
+        as a probe has."""
+        patches = np.flatnonzero(self.likely)
+        spread = np.linspace(0, patches.size * SIDE**2 - 1, self.wanted * SIDE**2).astype(int)
+        column, row = (each.reshape(-1)[spread] for each in self.pixels(patches))
+        shown = np.asarray(render(self.rays(column, row)).rgba).any(axis=-1)
+        likely = np.zeros_like(self.likely)
+        likely[patches[spread[shown] // SIDE**2]] = True
+        return self._replace(likely=likely)
+
+
 class Probe(NamedTuple):
     """Patches of an image: one of each stratum of neighbours, of those that may show anything.
 
@@ -62,40 +112,26 @@ class Probe(NamedTuple):
     pixels: int
 
     @classmethod
-    def of(cls, camera: Camera, space: Space, visible: Bool[Array, "bx by bz"], seed: int) -> "Probe":
+    def of(cls, candidates: Candidates, seed: int) -> "Probe":
         """Some patches of a camera's image; all, if they are few. Without any ray that meets the volume,
-        the first one. `visible`: blocks that may hold anything visible."""
-        from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
-
-        width, height = camera.size
-        across, down = -(-width // SIDE), -(-height // SIDE)
-        hit = np.asarray(_hits(camera, space))
-        hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
-        hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
-        near = jnp.asarray(maximum_filter(np.asarray(visible), 2 * NEAR + 1, mode="constant"))
-        likely = hit & np.asarray(_passes(camera, space, near)).reshape(-1)
-        hit[0] |= not hit.any()
-        groups = np.flatnonzero(likely), np.flatnonzero(hit & ~likely)
-        patches = PATCHES if hit.size >= SMALL else FEW
-        reserved = min(groups[1].size, round(patches * (1 - LIKELY)))
-        first = min(groups[0].size, patches - reserved)
+        the first one."""
+        groups = np.flatnonzero(candidates.likely), np.flatnonzero(candidates.hit & ~candidates.likely)
+        reserved = min(groups[1].size, round(candidates.wanted * (1 - LIKELY)))
+        first = min(groups[0].size, candidates.wanted - reserved)
+        rest = min(groups[1].size, candidates.wanted - first)
         random, chosen, strata = np.random.default_rng(seed), [], []
-        for group, count in zip(groups, (first, min(groups[1].size, patches - first)), strict=True):
+        for group, count in zip(groups, (first, rest), strict=True):
             edges = np.linspace(0, group.size, count + 1).astype(int)
             chosen.append(group[random.integers(edges[:-1], edges[1:])])
             strata.append(np.diff(edges))
         chosen, strata = np.concatenate(chosen), np.concatenate(strata).astype(float)
-        more = patches - chosen.size  # one of two numbers of rays, so that images of all sizes share programs
+        # one of two numbers of rays, so that images of all sizes share programs
+        more = candidates.wanted - chosen.size
         chosen, strata = np.pad(chosen, (0, more), mode="edge"), np.pad(strata, (0, more))
-        y, x = np.divmod(np.arange(SIDE**2), SIDE)
-        column, row = (chosen % across)[:, None] * SIDE + x, (chosen // across)[:, None] * SIDE + y
+        likely, (width, height) = np.arange(candidates.wanted) < first, candidates.camera.size
+        column, row = candidates.pixels(chosen)
         inside = ((column < width) & (row < height)).astype(float)
-        column, row = (
-            jnp.asarray(np.minimum(part, last).reshape(-1), jnp.int32)
-            for part, last in ((column, width - 1), (row, height - 1))
-        )
-        rays = _rays(camera, column, row)
-        return cls(rays, strata, np.arange(patches) < first, inside, width * height)
+        return cls(candidates.rays(column, row), strata, likely, inside, width * height)
 
     def mean(self, of_pixels: Any) -> float:
         """Of a number of each pixel, over the whole image; 0 where nothing can be seen."""
@@ -106,7 +142,7 @@ class Probe(NamedTuple):
 
     def render(self, scene: Scene, march: March) -> Rendering:
         """These pixels of the scene's image under another march."""
-        return render_scene(scene._replace(source=self.source, march=march), "all", "replay")
+        return rendered(self.source, scene, march)
 
     def mean_square(self, difference: Float[np.ndarray, "pixels 3"]) -> tuple[float, float]:
         """Over the whole image, and its standard error, since only some pixels are known: of one patch of
@@ -118,6 +154,11 @@ class Probe(NamedTuple):
                 strata = self.strata[group]
                 error += totals[group].var(ddof=1) * np.sum(strata * np.maximum(strata - 1, 0))
         return self.mean(square), float(np.sqrt(error)) / self.pixels
+
+
+def rendered(rays: GivenRays, scene: Scene, march: March) -> Rendering:
+    """As many rays as a probe has, of the scene's image under another march."""
+    return render_scene(scene._replace(source=rays, march=march), "all", "replay")
 
 
 def differences(image: Rendering, other: Rendering) -> list[Float[np.ndarray, "pixels 3"]]:
@@ -178,6 +219,12 @@ class Truth(NamedTuple):
         return math.sqrt(max(squares)) if np.isfinite(squares).all() and not ended else math.inf
 
 
+def _patches(camera: Camera) -> tuple[int, int]:
+    """How many lie across and down an image."""
+    width, height = camera.size
+    return -(-width // SIDE), -(-height // SIDE)
+
+
 @jax.jit
 def _hits(camera: Camera, space: Space) -> Bool[Array, "height width"]:
     """Which pixels' rays meet the volume."""
@@ -212,8 +259,7 @@ def _passes(camera: Camera, space: Space, blocks: Bool[Array, "bx by bz"]) -> Bo
 
         return (leave > entry) & jnp.any(jax.vmap(at)(depths))
 
-    width, height = camera.size
-    columns, rows = jnp.meshgrid(jnp.arange(-(-width // SIDE)), jnp.arange(-(-height // SIDE)))
+    columns, rows = jnp.meshgrid(*map(jnp.arange, _patches(camera)))
     return jax.vmap(jax.vmap(passes))(columns, rows)
 
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.srgb import displayed, linear_color, png_of
+from .._util.checks import described
+from .._util.srgb import displayed, linear_color, png_of, warn_of_8_bits
 from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 
@@ -107,9 +108,13 @@ class Rendering(eqx.Module):
 
         Raises:
             ValueError: for a background of another shape, or that is not finite, and an unknown name.
+
+        Warns of 8-bit colours.
         """
         given = self.background if background is None else background
-        background = jnp.asarray(linear_color("background", given, (..., 3)), self.rgba.dtype)
+        background = linear_color("background", given, (..., 3))
+        warn_of_8_bits("background", background, stacklevel=3)
+        background = jnp.asarray(background, self.rgba.dtype)
         if background.shape not in ((3,), shape := (*self.rgba.shape[:-1], 3)):
             expected = f"one colour (3,) or an image {shape}"
             raise ValueError(f"background must be {expected}; got shape {background.shape}.")
@@ -117,7 +122,13 @@ class Rendering(eqx.Module):
 
     def show(self) -> None:
         """Shows the image over its background: under the cell of a notebook, at once, or else in a window of
-        matplotlib, until that is closed."""
+        matplotlib, until that is closed.
+
+        Raises:
+            ValueError: for what is traced, or no image.
+        """
+        if self.rgba.ndim != 3 or is_traced(self.rgba):
+            raise ValueError(f"show needs an image whose numbers are known; got {described(self.rgba)}.")
         if in_notebook():
             sys.modules["IPython"].display.display(self)
             return

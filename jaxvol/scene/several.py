@@ -33,9 +33,20 @@ def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
     Raises:
         ValueError: for lists of other things, or of different lengths.
     """
+    if (pairs := pairs_of(volume, transfer)) is None:
+        return volume, sized(transfer, volume)
+    volume, transfer = zip(*pairs, strict=True)
+    if len(volume) == 1:
+        return volume[0], transfer[0]
+    grid = _holding(max(volume, key=lambda each: math.prod(each.shape)), volume)
+    return grid, Together(transfer, tuple(each.channels for each in volume))
+
+
+def pairs_of(volume: Any, transfer: Any) -> list[tuple[Volume, Transfer]] | None:
+    """Each volume with its transfer function, as `together` has them; None if they are no lists."""
     listed = isinstance(volume, list | tuple), isinstance(transfer, list | tuple)
     if not any(listed):
-        return volume, sized(transfer, volume)
+        return None
     kinds = (("volume", volume, Volume), ("transfer", transfer, Transfer))
     for (name, given, kind), is_list in zip(kinds, listed, strict=True):
         expected = f"{name} must be a list of a {kind.__name__} for each volume, where either is a list"
@@ -54,11 +65,14 @@ def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
             raise ValueError(
                 f"transfer[{number}] reads {own.channels} channels; volume[{number}] has {each.channels}."
             )
-    transfer = tuple(sized(own, each) for own, each in zip(transfer, volume, strict=True))
-    if len(volume) == 1:
-        return volume[0], transfer[0]
-    grid = _holding(max(volume, key=lambda each: math.prod(each.shape)), volume)
-    return grid, Together(transfer, tuple(each.channels for each in volume))
+    return [(each, sized(own, each)) for own, each in zip(transfer, volume, strict=True)]
+
+
+def with_others(
+    volume: Volume, transfer: Transfer, others: Sequence[tuple[Volume, Transfer]]
+) -> tuple[Any, Any]:
+    """What `together` takes: a volume and its transfer function, or lists, if there are others."""
+    return tuple(map(list, zip((volume, transfer), *others, strict=True))) if others else (volume, transfer)
 
 
 def _holding(largest: Volume, volumes: Sequence[Volume]) -> Volume:

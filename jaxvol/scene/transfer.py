@@ -4,7 +4,6 @@ A transfer function says what it reads at a place besides the value (`attributes
 and extinction (`classifier`), and how great the extinction can be in a block of the volume (`majorant`).
 """
 
-import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -19,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util import piecewise_linear as linear
 from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
+from .._util.srgb import warn_of_8_bits
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
@@ -168,9 +168,6 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
     return Classification(measure, attributes, transfer.classifier(), transfer.search(), integrate)
 
 
-BRIGHTEST = 8.0
-"""Of colours, above which they are hardly meant as linear RGB."""
-
 MOST_WRITTEN = 16
 """Points that the text of a transfer function holds."""
 
@@ -210,9 +207,7 @@ class TransferFunction(Transfer):
         self.values = increasing("values", values)
         n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
-        if not is_traced(self.colors) and (most := float(np.asarray(self.colors).max())) > BRIGHTEST:
-            told = f"colors reach {most:g}; in linear RGB, white is 1"
-            warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb(colors / 255).", stacklevel=3)
+        warn_of_8_bits("colors", self.colors)
         extinction = finite_array("extinction", extinction, (n,))
         self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
 

@@ -160,8 +160,10 @@ class Volume(eqx.Module):
             The `Volume`, of whole voxels.
 
         Raises:
-            ValueError: for a box outside of it, and as slices are.
+            ValueError: for a box outside of it, what is traced, and as slices are.
         """
+        if is_traced(box, self.origin, self.spacing, self.direction):
+            raise ValueError("crop needs numbers; box or place is traced: call it outside of jax.jit.")
         ends = np.asarray(finite_array("box", box, (6,)), np.float64).reshape(3, 2)
         turn = np.eye(3) if self.direction is None else np.asarray(self.direction, np.float64)
         corners = np.array(np.meshgrid(*ends)).reshape(3, -1) - np.asarray(self.origin, np.float64)[:, None]
@@ -169,7 +171,8 @@ class Volume(eqx.Module):
         first, end = np.floor(at.min(1) + PLACE), np.ceil(at.max(1) - PLACE) + 1
         if (end < 1).any() or (first > np.array(self.shape) - 1).any() or (ends[:, 0] >= ends[:, 1]).any():
             bounds = pasted(self.bounds)
-            raise ValueError(f"box must be one that meets the volume, {bounds}; got {pasted(ends.ravel())}.")
+            expected = f"(x_min, x_max, y_min, …) that meets the volume, {bounds}"
+            raise ValueError(f"box must be {expected}; got {pasted(ends.ravel())}.")
         low = np.clip(first, 0, np.array(self.shape) - 2).astype(int)
         high = np.maximum(end.astype(int), low + 2)
         return self[tuple(map(slice, low.tolist(), high.tolist()))]

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
-from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_shown, thresholds
+from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_if_any, thresholds
 from jaxvol.app.commands.animate import turned
 from jaxvol.app.framing import MARGIN, framed, visible_points
 from jaxvol.app.picture import _transfer_of_bricks, copy_of
@@ -216,9 +216,7 @@ def test_labels_are_shown_in_colours_of_their_own():
     more = np.kron(np.arange(144).reshape(12, 12), np.ones((2, 2)))
     data = labels()
     data[21:] = np.where(more < 114, 100 + more, 0)
-    shown = labels_shown(jv.Volume(given := data, (1, 2, 3), (4, 5, 6)))
-    assert shown is not None
-    volume, transfer = shown
+    volume, transfer = jv.labels_shown(jv.Volume(given := data, (1, 2, 3), (4, 5, 6)))
     np.testing.assert_array_equal(volume.spacing, (1, 2, 3))
     np.testing.assert_array_equal(volume.origin, (4, 5, 6))
     # voxels are smooth, and opaque inside; labels, counted from 1 on, reach two voxels beyond
@@ -237,11 +235,13 @@ def test_labels_are_shown_in_colours_of_their_own():
 
 def test_other_volumes_are_not_taken_for_labels():
     for name in ("head", "engine", "colon", "vessels"):
-        assert labels_shown(jv.phantom(name, 24)) is None
+        assert labels_if_any(jv.phantom(name, 24)) is None
     floats, two = labels().astype(np.float32), (labels() > 0).astype(np.uint8)
     many = np.repeat(np.arange(128, dtype=np.uint8), 8).reshape(32, 8, 4)
     for data in (floats, two, many):
-        assert labels_shown(jv.Volume(data)) is None
+        assert labels_if_any(jv.Volume(data)) is None
+    with pytest.raises(ValueError, match="volume must have up to 256 labels"):
+        jv.labels_shown(jv.Volume(floats))
 
 
 def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows():
@@ -265,6 +265,14 @@ def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows()
         np.testing.assert_array_equal(camera.view_up, (0, 0, 1))
         away = np.asarray(camera.position - camera.focal_point)
         np.testing.assert_allclose(away / away[2], (2, 4, 1), rtol=1e-3)
+
+
+def test_the_automatic_camera_shows_all_of_several_volumes():
+    near = ball(0.8, 0.35)
+    volumes, transfers = [near, jv.Volume(near.data, origin=(60, 0, 0))], [jv.automatic_transfer(near)] * 2
+    camera = jv.automatic_camera(volumes, transfers, size=(32, 32))
+    points = np.concatenate([*map(visible_points, volumes, transfers)])
+    assert np.abs(in_picture(camera, points)).max() == pytest.approx(1 / MARGIN, abs=1e-4)
 
 
 def test_what_is_thin_is_dense_and_what_hides_is_not():

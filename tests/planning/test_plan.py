@@ -56,6 +56,16 @@ def planned():
     return plan_of()
 
 
+def test_something_that_lies_beside_all_patches_is_found():
+    """A single voxel, in an image of which two thirds of the patches are known: with another seed, too."""
+    data = np.zeros(SPHERE.shape, np.float32)
+    data[14, 9, 14] = 1
+    volume, camera = jv.Volume(data, SPHERE.spacing, SPHERE.origin), CAMERA.zoom(1.8)
+    found = jv.plan(volume, soft_transfer(), camera, 0.001, seed=1)
+    assert 0 < found.error <= 0.001
+    assert error_of(found, volume=volume, camera=camera) <= 0.001
+
+
 def test_it_is_within_its_tolerance(planned):
     assert planned.within
     error = error_of(planned, finer=32)

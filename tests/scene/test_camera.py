@@ -302,5 +302,5 @@ def test_texts_can_be_pasted():
         assert all(map(np.array_equal, jax.tree.leaves(again), jax.tree.leaves(made)))
     long = jv.TransferFunction(np.arange(20), np.ones((20, 3)), np.arange(20))
     assert "values=f32[20]" in repr(long)
-    with pytest.warns(UserWarning, match="colors reach 255; in linear RGB, white is 1"):
+    with pytest.warns(UserWarning, match="colors must be linear RGB, where white is 1; got up to 255"):
         jv.TransferFunction([0, 0.1], [[255, 0, 0]] * 2, [0, 3])

@@ -226,7 +226,7 @@ def test_parts_and_crops_stay_where_they_are():
     for wrong in (3, slice(1, 2), slice(None, None, -1), (slice(None),) * 4):
         with pytest.raises(ValueError, match=r"volume\[a:b, c:d, e:f\] takes"):
             whole[wrong]
-    with pytest.raises(ValueError, match="box must be one that meets the volume"):
+    with pytest.raises(ValueError, match=r"box must be .* that meets the volume"):
         whole.crop((0, 1, 90, 91, 0, 1))
     assert repr(part) == (
         "<Volume shape=(5, 3, 5), dtype=uint16, spacing=(1.0, 6.0, 0.5), origin=(10.0, -1.4, 2.7), "

@@ -13,10 +13,10 @@ from typing import Any, NoReturn
 from ..._util.checks import shortened
 from ..._util.srgb import linear_color
 from ..._util.texts import near
-from ...compositing.modes import ELSEWHERE, MODES
+from ...compositing.modes import MODES, MODES_ELSEWHERE
 from ...io.formats import files_of
 from ...scene.presets import PRESETS, SLICER
-from ..picture import DEFAULTS, OVERRIDES, check_exclusive
+from ..picture import DEFAULTS, ELSEWHERE, OVERRIDES, check_exclusive
 from ..recorded import recorded_in, volume_of_picture, words_of
 
 
@@ -32,9 +32,12 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
-            message += "." + near(ELSEWHERE.get(wrong[1].lower(), wrong[1]), re.split("[', ]+", wrong[2]))
-        if wrong := re.search("unrecognized arguments: (--[a-z-]+)", message):
-            message += "." + near(wrong[1], self._option_string_actions)
+            message += "." + near(
+                MODES_ELSEWHERE.get(wrong[1].lower(), wrong[1]), re.split("[', ]+", wrong[2])
+            )
+        if wrong := re.search("unrecognized arguments: --([a-z-]+)", message):
+            meant = ELSEWHERE.get(wrong[1], wrong[1])
+            message += "." + near(f"--{meant}", self._option_string_actions)
         raise ValueError(f"{message} ({self.prog} --help lists the options)")
 
     def defaults(self) -> dict[str, Any]:
@@ -71,10 +74,13 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
 
 
 def in_full(words: Sequence[str]) -> list[str]:
-    """Words in which `--size 512` is that of a square, and `--background white` is in linear RGB."""
+    """Words in which `--size 512` is that of a square, `--size 640x480` is two words, and
+    `--background white` is in linear RGB."""
     found = [*words]
     for number, (name, value) in reversed([*enumerate(pairwise(words))]):
-        if name == "--size" and not "".join(words[number + 2 : number + 3]).isdecimal():
+        if name == "--size" and (both := re.fullmatch(r"(\d+)x(\d+)", value)):
+            found[number + 1 : number + 2] = both.groups()
+        elif name == "--size" and not "".join(words[number + 2 : number + 3]).isdecimal():
             found.insert(number + 1, value)
         elif name == "--background" and not re.match(r"[-+.\d]", value):
             found[number + 1 : number + 2] = map(str, linear_color(name, value).tolist())
@@ -210,7 +216,7 @@ def add_transfer(parser: Parser) -> None:
     add_clim(group, "what stands out of the background; of projections, all")
     for name, text in (("window", "width of that range, with --level"), ("level", "middle of that range")):
         group.add_argument(f"--{name}", type=float, metavar="VALUE", help=text)
-    text = "length to which opacities refer (default: the size of a voxel; of presets, 1)"
+    text = "length to which opacities refer (default: a voxel's size; of presets, 1 if voxels are above 0.1)"
     group.add_argument("--unit-distance", type=float, metavar="LENGTH", help=text)
 
 

@@ -9,7 +9,7 @@ from matplotlib.colors import to_rgb
 from ..._util.srgb import from_srgb
 from .control import Control
 from .curve import transfer_controls
-from .editing import display_color
+from .editing import display_color, rounded
 from .model import Model
 from .slices import slice_controls
 from .state import ISOSURFACE, MAX_STEP, MIN_STEP
@@ -45,13 +45,15 @@ def _view_controls(model: Model) -> list[Control]:
     )
     low, high = float(data.min()), float(data.max())
     span = high - low or max(abs(low), 1.0)
+    isovalue = lambda: rounded(model.state.isovalue, span), lambda to: model.change(isovalue=to)
+    unit = rounded(span / 1000, span / 1000)
 
     def look(side: str) -> None:
-        orbit = replace(model.first.orbit, view_angle=model.state.orbit.view_angle)
-        if side != "reset":
+        if side == "reset":
+            model.change(orbit=replace(model.first.orbit, view_angle=model.state.orbit.view_angle))
+        else:
             axis, sign = SIDES[side]
-            orbit = replace(orbit, toward=sign * np.eye(3)[axis]).turned(0, 0)
-        model.change(orbit=orbit)
+            model.change(orbit=model.scene.seen_from(model.state, sign * np.eye(3)[axis]))
 
     def set_background(color: str) -> None:
         model.change(background=tuple(np.asarray(from_srgb(np.asarray(to_rgb(color)))).tolist()))
@@ -64,7 +66,7 @@ def _view_controls(model: Model) -> list[Control]:
         Control("buttons", "look from", set=look, choices=(*SIDES, "reset")),
         _bound(model, "checkbox", "orthographic", "parallel"),
         Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=modes),
-        _bound(model, "slider", "isovalue", "isovalue", limits=(low, low + span, span / 1000)),
+        Control("slider", "isovalue", *isovalue, (low, low + span, unit)),
         _bound(model, "checkbox", "light", "lit"),
         Control("color", "background", *background),
     ]

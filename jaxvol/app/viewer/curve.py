@@ -13,7 +13,7 @@ from ...scene.labels import LabelTransferFunction
 from ...scene.presets import PRESETS, fitted_range, preset
 from ...scene.transfer import TransferFunction
 from ...scene.volume import Volume
-from ..automatic import sampled
+from ..automatic import preset_unit, sampled
 from . import editing
 from .control import Control, press_of
 from .model import Model
@@ -89,7 +89,7 @@ def _point_controls(model: Model) -> list[Control]:
     the opacity that of a layer as thick as a voxel."""
     low, high, bars = histogram(model.scene.volume)
     voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
-    names = {"preset": GIVEN, "colors": GIVEN}
+    names, base = {"preset": GIVEN, "colors": GIVEN}, given
 
     def transfer() -> TransferFunction:
         return cast(TransferFunction, model.state.transfer)
@@ -100,17 +100,17 @@ def _point_controls(model: Model) -> list[Control]:
         chosen = min(chosen, len(transfer().values) - 1)
 
     def choose_preset(name: str) -> None:
-        nonlocal note
+        nonlocal note, base
         values = sampled(model.scene.volume)
         clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
         names.update(preset=name, colors=GIVEN)
         note = f'<div style="font-size: 11px">{told or ""}</div>'
-        put(lambda _: given if name == GIVEN else preset(name, clim))
+        base = given if name == GIVEN else preset(name, clim, preset_unit(model.scene.volume))
+        put(lambda _: base)
 
     def choose_colors(name: str) -> None:
         names["colors"] = name
-        if name != GIVEN:
-            put(editing.recolored, name)
+        put(*(editing.colored_as, base) if name == GIVEN else (editing.recolored, name))
 
     def press(message: str) -> None:
         nonlocal chosen, gesture
@@ -165,7 +165,8 @@ def _point_controls(model: Model) -> list[Control]:
 
 
 def _label_controls(model: Model) -> list[Control]:
-    """A label that can be seen, its densest colour, whether it is shown, and the factor of its extinction."""
+    """A label that can be seen, by name or densest colour, whether it is shown, and the factor of its
+    extinction."""
     stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
@@ -177,8 +178,19 @@ def _label_controls(model: Model) -> list[Control]:
         nonlocal chosen
         chosen = names.index(name)
 
-    def swatch() -> str:
-        return f'<div style="background: {to_hex(tuple(colors[chosen]))}; height: 14px"></div>'
+    def legend() -> str:
+        style = "padding: 0 5px; border-radius: 3px; color: #fff; text-shadow: 0 0 3px #000; cursor: pointer"
+        entries = "".join(
+            f'<span data-part="{i}" style="{style}; background: {to_hex(tuple(color))}; '
+            f'outline: {2 * (i == chosen)}px solid currentColor">{name}</span>'
+            for i, (name, color) in enumerate(zip(names, colors, strict=True))
+        )
+        style = "display: flex; flex-wrap: wrap; gap: 4px; max-height: 130px; overflow: auto; padding: 3px"
+        return f'<div data-pad="labels" style="{style}">{entries}</div>'
+
+    def press(message: str) -> None:
+        if (part := press_of(message)[2]) in map(str, range(len(names))):
+            choose(names[int(part)])
 
     def get(name: str) -> float:
         return float(np.asarray(getattr(model.state.transfer, name))[labels[chosen]])
@@ -194,7 +206,7 @@ def _label_controls(model: Model) -> list[Control]:
 
     return [
         Control("dropdown", "label", lambda: names[chosen], choose, choices=names),
-        Control("pad", get=swatch),
+        Control("pad", "labels", legend, press),
         Control("checkbox", "shown", lambda: bool(get("shown")), show),
         Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),
     ]

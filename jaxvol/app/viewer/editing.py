@@ -109,6 +109,16 @@ def recolored(transfer: TransferFunction, cmap: str) -> TransferFunction:
     return TransferFunction(values, from_srgb(display[:, :3]), transfer.extinction)
 
 
+def colored_as(transfer: TransferFunction, other: TransferFunction) -> TransferFunction:
+    """With the colours of another function, stretched to the range of its values, and the same opacities."""
+    values, its = (np.asarray(each.values, np.float64) for each in (transfer, other))
+    colors = np.asarray(other.colors)
+    if len(values) != len(its):  # two points at a value, a step, would become one colour
+        at = np.interp(values, values[[0, -1]], its[[0, -1]])
+        colors = np.stack([np.interp(at, its, each) for each in colors.T], axis=1)
+    return TransferFunction(values, colors, transfer.extinction)
+
+
 def padded(transfer: Any) -> Any:
     """The same function by `MAX_POINTS` points where there are fewer: beyond the last one it is constant."""
     if not isinstance(transfer, TransferFunction) or len(transfer.values) > MAX_POINTS:

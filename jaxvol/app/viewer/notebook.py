@@ -108,7 +108,7 @@ class NotebookView(ipywidgets.HBox):
         super().close()
 
     def _deliver(self, png: bytes) -> None:
-        path = Path(f"jaxvol-{int(time.time())}.png")
+        path = Path(f"jaxvol-{time.time_ns() // 10**6}.png")
         path.write_bytes(png)
         self._set_status(f"saved in the notebook's folder:\n{path}")
 

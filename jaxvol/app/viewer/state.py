@@ -32,12 +32,12 @@ from ...march.transforms import (
 from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.occupancy import BLOCK
-from ...scene.several import together
+from ...scene.several import together, with_others
 from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
-from ..automatic import automatic_transfer, labels_shown
-from ..framing import FAINT, VISIBLE, automatic_camera
+from ..automatic import automatic_transfer, labels_if_any
+from ..framing import FAINT, VISIBLE, automatic_camera, warn_of_distance
 
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
@@ -74,6 +74,15 @@ class Orbit:
         offset = position - focal
         distance, length = float(np.linalg.norm(offset)), float(np.linalg.norm(up))
         return cls(focal, offset / distance, distance, up / length, view_angle).turned(0, 0)
+
+    @classmethod
+    def of(cls, camera: Camera) -> "Orbit":
+        """That of a camera; of an orthographic one, from as far as shows the same height."""
+        place = camera.position, camera.focal_point, camera.view_up
+        orbit = cls.at(*place, float(camera.view_angle))
+        if camera.parallel_scale is None:
+            return orbit
+        return orbit.zoomed(orbit.half_height / float(camera.parallel_scale))
 
     def turned(self, right: float, down: float) -> "Orbit":
         """After a drag that turns what is seen, as if the pointer held its front: by half a turn for a drag
@@ -186,6 +195,13 @@ class Scene:
         lit = state.lit and self.compositing(state).can_be_lit and not self.others
         return self.lighting if lit else None
 
+    def seen_from(self, state: State, toward: Vector) -> Orbit:
+        """An orbit in this direction, as near as what is visible allows."""
+        orbit = replace(state.orbit, toward=toward).turned(0, 0)  # not straight from above
+        what = with_others(self.volume, state.transfer, self.others)
+        side: Any = orbit.toward, orbit.view_up, orbit.view_angle
+        return Orbit.of(automatic_camera(*what, *side, parallel=state.parallel, size=state.size, least=FAINT))
+
     def settings(self, state: State) -> dict[str, Any]:
         """Options of `jaxvol render` that draw a state."""
         orbit = state.orbit
@@ -238,8 +254,10 @@ def initial(
     whole = Camera.looking_at(volume, size=size)  # checks volume and size
     least = VISIBLE if transfer is None else FAINT
     if transfer is None:
-        volume, transfer = labels_shown(volume) or (volume, automatic_transfer(volume))
-    chosen: Any = automatic_camera(volume, transfer, size=size, least=least) if camera is None else camera
+        volume, transfer = labels_if_any(volume) or (volume, automatic_transfer(volume))
+    if (chosen := camera) is None:
+        chosen = automatic_camera(*with_others(volume, transfer, others), size=size, least=least)
+    warn_of_distance(volume, others)
     given = March(1.0, (), "midpoint") if march is None else march
     shown: Any = sized(transfer, volume)
     names = {"volume": volume, "transfer": shown, "camera": chosen, "march": given, "lighting": lighting}
@@ -247,7 +265,7 @@ def initial(
     mode = compositing_of(compositing)
     mode.marched(shown, given, volume)  # refuses what it cannot show
     if others:
-        together(*map(list, zip((volume, shown), *others, strict=True)))  # as well
+        together(*with_others(volume, shown, others))  # as well
         if not isinstance(mode, SEVERAL) or lighting is not None:
             raise ValueError(
                 'of several volumes, compositing must be "over" or "integral", without lighting.'
@@ -279,10 +297,6 @@ def initial(
     data = np.asarray(volume.data)
     between = (float(data.min()) + float(data.max())) / 2
     isovalue = float(mode.value) if isinstance(mode, Isosurface) else between
-    angle, parallel = float(chosen.view_angle), chosen.parallel_scale is not None
-    orbit = Orbit.at(chosen.position, chosen.focal_point, chosen.view_up, angle)
-    if parallel:  # from as far as shows the same height
-        orbit = orbit.zoomed(orbit.half_height / float(chosen.parallel_scale))
     box, color = tuple(np.asarray(volume.bounds).tolist()), (r, g, b)
-    how = step, enabled, lit, name, isovalue, color, parallel, False, box
-    return scene, State(orbit, whole.size, shown, *how)
+    how = step, enabled, lit, name, isovalue, color, chosen.parallel_scale is not None, False, box
+    return scene, State(Orbit.of(chosen), whole.size, shown, *how)

@@ -19,6 +19,7 @@ from ...metrics import rmse
 from ...render import render
 from ...scene.camera import Camera
 from ...scene.rendering import Rendering
+from ...scene.several import with_others
 from .editing import padded
 from .state import PROGRAM, Scene, State
 
@@ -106,10 +107,7 @@ class TileRenderer:
 
     def rendered(self, camera: Camera) -> Rendering:
         """What `render` returns for a camera of a tile's size."""
-        volume, transfer = self.volume, self.transfer
-        if self.others:
-            volume, transfer = map(list, zip((volume, transfer), *self.others, strict=True))
-        return render(volume, transfer, camera, self.march, **self.how)
+        return render(*with_others(self.volume, self.transfer, self.others), camera, self.march, **self.how)
 
     def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
         """A tile as `render` returns it."""

@@ -76,24 +76,33 @@ def test_several_volumes_are_in_one_picture(volume_file, tmp_path, drawn):
     assert same(transfers[1], jv.colormap("viridis", (20, 90)))
     jv.show(volume_file, others=[(jv.load(volume_file), transfers[1])], size=16)
     assert same(drawn.scenes[1][1], transfers[:2])
+    assert same(drawn.scenes[1][2], jv.automatic_camera(*drawn.scenes[1][:2], size=16))
     jv.show(volume_file, size=16, step=0.4, others=volume_file, clip_plane=(0, 0, 5, 0, 0, 1))
     assert len(drawn.scenes[2][0]) == 2
     assert drawn.scenes[2][3].transforms[0].origins.tolist() == [[0, 0, 5]]
+    far = jv.Volume(jv.load(volume_file).data, origin=(300, 0, 0))
+    with pytest.warns(UserWarning, match=r"others\[0\], from \(300.* does not meet the volume, from \(0"):
+        jv.show(volume_file, size=16, step=0.4, others=far)
 
 
 def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
     volume = jv.load(volume_file)
+    camera = jv.Camera.looking_at(volume, size=8)
     for what, options, message in (
         (volume_file, {"presets": "engine"}, "show has no option 'presets'. Did you mean preset"),
         (volume_file, {"clim": (0, 1), "window": 3, "level": 2}, "^clim and (window|level) exclude"),
         (volume, {"dtype": "uint8"}, "dtype is of files; volume is a Volume"),
         (5, {}, "volume must be a jaxvol Volume; got 5"),
         (volume, {"transfer": "hot"}, "transfer must be .*; got 'hot'"),
-        (volume, {"camera": jv.Camera.looking_at(volume)}, r"camera must be numbers of shape \(6,\)"),
+        (volume, {"camera": (1, 2, 3)}, r"camera must have shape \(6,\)"),
+        (volume, {"camera": camera, "size": 9}, "camera is a Camera, which has its own size; leave size out"),
+        (volume, {"window": -3, "level": 2}, "window must be above 0; got -3"),
         (volume, {"others": [(volume, "hot", (1, 10))]}, r"others are FILE, .*; got hot \(1, 10\)"),
     ):
         with pytest.raises(ValueError, match=message):
             jv.show(what, step=0.4, **options)
+    jv.show(volume, camera=camera, step=0.4)
+    assert same(drawn.scenes[-1][2], camera)
     drawn.level = 0.0
     with pytest.warns(UserWarning, match="nothing is visible: the volume's values run .* A clim from"):
         jv.show(volume, jv.preset("engine", (500, 900)), size=8, step=0.4)

@@ -11,6 +11,7 @@ import pytest
 import jaxvol as jv
 from jaxvol.app.viewer.editing import (
     MAX_POINTS,
+    colored_as,
     display_color,
     padded,
     recolored,
@@ -96,6 +97,10 @@ def test_a_colormap_leaves_the_opacity():
     grey = np.clip((np.asarray(colored.values) - 10) / 40, 0, 1)[:, None]
     linear = np.where(grey < 0.04, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
     np.testing.assert_allclose(colored.colors, linear * np.ones(3), atol=0.01)  # of 256 colours
+    plain = without_point(GIVEN, 2)
+    for one in (GIVEN, plain):
+        assert_same_function(colored_as(with_color(one, 1, "#8040ff"), one), one)
+    assert_same_function(colored_as(recolored(plain, "gray"), plain), plain)
 
 
 def test_a_step_alone_is_padded_and_moved():

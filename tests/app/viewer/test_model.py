@@ -432,13 +432,15 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
     model, controls = controlled(LABELS, None)
     given = model.state.transfer
     assert controls["label"].choices == ["1", "2"]
-    assert "#1f77b4" in controls["pad"].get()
+    assert "#1f77b4" in controls["labels"].get()
     middle = tuple(np.array(model.scene.volume.shape) // 2)
     model.state = replace(model.state, point=np.asarray(model.scene.volume.origin) + middle)
     assert controls["slices"].get().endswith(f", label {np.asarray(model.scene.volume.labels)[middle]}</div>")
     controls["shown"].set(False)
     assert not controls["shown"].get()
-    controls["label"].set("2")
+    controls["labels"].set("1,labels,9,false,0.5,0.5")  # which there is not
+    controls["labels"].set("1,labels,1,false,0.5,0.5")
+    assert controls["label"].get() == "2"
     assert controls["shown"].get()
     controls["opacity"].set(0.02)
     expected = given.with_visibility({1: False}).with_opacity({2: 0.02})
