@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._util.checks import Arrayable
+from .._util.checks import Arrayable, flag
 from .._util.texts import pasted
 from ..ray import check_arguments
 from ..scene.camera import Camera, axes_of
@@ -49,6 +49,7 @@ def automatic_camera(
     parallel: bool | Any = False,
     size: tuple[int, int] | int | Any = (512, 512),
     least: float = VISIBLE,
+    centered: bool | Any = False,
 ) -> Camera:
     """A camera as near as what a transfer function shows allows, specks left out, and upright.
 
@@ -65,6 +66,9 @@ def automatic_camera(
         size: (width, height) of the image in pixels.
         least: opacity along a hundredth of the volume's diagonal from which on a voxel counts; 0.01 where
             what is visible may be fog.
+        centered: whether the focal point is the middle of what is seen, as to turn the camera about it. The
+            camera is then farther away (by 1.03 to 1.3 in eight scans), since perspective shows the near part
+            larger.
 
     Returns:
         The `Camera`.
@@ -79,7 +83,8 @@ def automatic_camera(
     with jax.ensure_compile_time_eval():  # also where something else is traced
         side = upright(volume, transfer, direction, view_up)
         camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
-        return framed(camera, np.concatenate([visible_points(*pair, least) for pair in pairs]))
+        points = np.concatenate([visible_points(*pair, least) for pair in pairs])
+        return framed(camera, points, centered=flag("centered", centered))
 
 
 def upright(
@@ -158,9 +163,16 @@ def warn_of_distance(volume: Volume, others: Sequence[tuple[Volume, Transfer]]) 
             warnings.warn(f"{told}: do spacing and origin suit?", stacklevel=4)
 
 
-def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = ()) -> Camera:
+def framed(
+    camera: Camera,
+    points: Float[np.ndarray, "n 3"],
+    views: Sequence[Camera] = (),
+    *,
+    centered: bool = False,
+) -> Camera:
     """A camera with the directions, the angle and the size of another, placed so that the points just fill
-    its picture, the whole window; or those of all `views` of it, turned about the middle of the points.
+    its picture, the whole window, their middle in its middle if `centered`; or those of all `views` of it,
+    turned about that.
 
     From a distance D, a point that lies x across from the focal point, and z nearer, is in the picture if
     |x| <= t (D - z), where t is the tangent of half the angle. For parallel rays, z does not count, and D is
@@ -171,7 +183,7 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
         seen = (across - shift) / depth  # 0 where as much is free on both sides
         return float(seen.max() + seen.min())
 
-    views = views or [camera]
+    centered, views = centered or len(views) > 1, views or [camera]
     width, height = camera.size
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     perspective = camera.parallel_scale is None
@@ -184,9 +196,9 @@ def framed(camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Cam
         axes = np.stack([right, up], axis=1)
         across, nearer = (points - middle) @ axes / t, -(points - middle) @ forward * perspective
         one, other = ((nearer[:, None] + side * across).max(axis=0) for side in (1, -1))
-        needed = (one + other) / 2 if len(views) == 1 else np.maximum(one, other)
+        needed = np.maximum(one, other) if centered else (one + other) / 2
         distance = max(distance, float(nearer.max()) + free, *needed.tolist())
-        if len(views) == 1:
+        if not centered:
             depth = distance - nearer if perspective else np.ones(len(points))
             shifts = [brentq(excess, x.min(), x.max(), (x, depth)) for x in across.T]
             focal = middle + axes @ (t * np.array(shifts))

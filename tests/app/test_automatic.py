@@ -273,6 +273,9 @@ def test_the_automatic_camera_shows_all_of_several_volumes():
     camera = jv.automatic_camera(volumes, transfers, size=(32, 32))
     points = np.concatenate([*map(visible_points, volumes, transfers)])
     assert np.abs(in_picture(camera, points)).max() == pytest.approx(1 / MARGIN, abs=1e-4)
+    camera = jv.automatic_camera(volumes, transfers, size=(32, 32), centered=True)
+    np.testing.assert_allclose(camera.focal_point, (points.min(axis=0) + points.max(axis=0)) / 2, rtol=1e-5)
+    assert np.abs(in_picture(camera, points)).max() == pytest.approx(1 / MARGIN, abs=1e-4)
 
 
 def test_what_is_thin_is_dense_and_what_hides_is_not():

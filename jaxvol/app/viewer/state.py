@@ -199,8 +199,8 @@ class Scene:
         """An orbit in this direction, as near as what is visible allows."""
         orbit = replace(state.orbit, toward=toward).turned(0, 0)  # not straight from above
         what = with_others(self.volume, state.transfer, self.others)
-        side: Any = orbit.toward, orbit.view_up, orbit.view_angle
-        return Orbit.of(automatic_camera(*what, *side, parallel=state.parallel, size=state.size, least=FAINT))
+        how: Any = {"parallel": state.parallel, "size": state.size, "least": FAINT, "centered": True}
+        return Orbit.of(automatic_camera(*what, orbit.toward, orbit.view_up, orbit.view_angle, **how))
 
     def settings(self, state: State) -> dict[str, Any]:
         """Options of `jaxvol render` that draw a state."""
@@ -256,7 +256,8 @@ def initial(
     if transfer is None:
         volume, transfer = labels_if_any(volume) or (volume, automatic_transfer(volume))
     if (chosen := camera) is None:
-        chosen = automatic_camera(*with_others(volume, transfer, others), size=size, least=least)
+        what = with_others(volume, transfer, others)
+        chosen = automatic_camera(*what, size=size, least=least, centered=True)
     warn_of_distance(volume, others)
     given = March(1.0, (), "midpoint") if march is None else march
     shown: Any = sized(transfer, volume)
