@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol._util.checks import check_answer
 from jaxvol.lighting import ConstantLight, HeadLight, Material, Phong, ScattererTemplates
+
+from .scenes import in_float64
 
 
 VOLUME = jv.phantom("sphere", 8)
@@ -158,3 +161,11 @@ def test_rays_of_any_type_of_numbers_see_the_same():
         ray = [convert(part) for part in RAY]
         one = jax.eval_shape(lambda ray=ray: jv.render_ray_reference(VOLUME, TRANSFER, *ray, march=MARCH))
         assert (one.rgba.shape, one.rgba.dtype) == ((4,), jnp.float32)
+
+
+def test_numbers_of_two_lengths_are_told_of_x64():
+    with (
+        in_float64(),
+        pytest.raises(ValueError, match="TransferFunction.add must return .* jax_enable_x64 was"),
+    ):
+        check_answer(TRANSFER, "add", np.float64(1), np.float32(1))

@@ -218,6 +218,11 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
     return path
 
 
+MIXED = (
+    " Were some of the step, the camera and the volume made before jax_enable_x64 was set? Make all after."
+)
+
+
 def check_answer(owner: Any, method: str, answer: PyTree, expected: PyTree) -> None:
     """Raise a `ValueError` if a method of a user's class returned other shapes or types than expected."""
 
@@ -230,4 +235,6 @@ def check_answer(owner: Any, method: str, answer: PyTree, expected: PyTree) -> N
         same = False
     if not same:
         found, wanted = (eqx.tree_pformat(tree) for tree in (answer, expected))
-        raise ValueError(f"{type(owner).__name__}.{method} must return {wanted}; got {found}.")
+        mixed = {leaf.dtype.name for leaf in jax.tree.leaves((answer, expected)) if hasattr(leaf, "dtype")}
+        hint = "" if not mixed >= {"float32", "float64"} else MIXED
+        raise ValueError(f"{type(owner).__name__}.{method} must return {wanted}; got {found}.{hint}")
