@@ -166,6 +166,6 @@ def test_rays_of_any_type_of_numbers_see_the_same():
 def test_numbers_of_two_lengths_are_told_of_x64():
     with (
         in_float64(),
-        pytest.raises(ValueError, match="TransferFunction.add must return .* jax_enable_x64 was"),
+        pytest.raises(ValueError, match="made before jax_enable_x64 was set"),
     ):
         check_answer(TRANSFER, "add", np.float64(1), np.float32(1))
