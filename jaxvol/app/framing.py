@@ -154,9 +154,9 @@ def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarra
 
 def warn_of_distance(volume: Volume, others: Sequence[tuple[Volume, Transfer]]) -> None:
     """Say so of a volume that does not meet the first one: mostly a file does not say where it lies."""
-    low, high = map(np.asarray, volume.corners)
+    low, high = np.asarray(volume.bounds).reshape(3, 2).T
     for number, (other, _) in enumerate(others):
-        first, last = map(np.asarray, other.corners)
+        first, last = np.asarray(other.bounds).reshape(3, 2).T
         if (last < low).any() or (first > high).any():
             ends = (f"{pasted(a)} to {pasted(b)}" for a, b in ((first, last), (low, high)))
             told = f"others[{number}], from {next(ends)}, does not meet the volume, from {next(ends)}"
@@ -190,21 +190,24 @@ def framed(
     tangent = np.tan(np.deg2rad(float(camera.view_angle)) / 2) if perspective else 1.0
     t = tangent / MARGIN * np.array([width / height, 1])
     focal, distance = middle, 0.0
-    free = NEAREST * float(np.linalg.norm(np.ptp(points, axis=0))) * perspective
+    free, front = NEAREST * float(np.linalg.norm(np.ptp(points, axis=0))), 0.0
     for view in views:
         right, up, forward = (np.asarray(axis, np.float64) for axis in axes_of(view))
         axes = np.stack([right, up], axis=1)
-        across, nearer = (points - middle) @ axes / t, -(points - middle) @ forward * perspective
+        across, depth = (points - middle) @ axes / t, -(points - middle) @ forward
+        nearer, front = depth * perspective, max(front, float(depth.max()))
         one, other = ((nearer[:, None] + side * across).max(axis=0) for side in (1, -1))
         needed = np.maximum(one, other) if centered else (one + other) / 2
-        distance = max(distance, float(nearer.max()) + free, *needed.tolist())
+        distance = max(distance, float(nearer.max()) + free * perspective, *needed.tolist())
         if not centered:
-            depth = distance - nearer if perspective else np.ones(len(points))
-            shifts = [brentq(excess, x.min(), x.max(), (x, depth)) for x in across.T]
+            away = distance - nearer if perspective else np.ones(len(points))
+            shifts = [brentq(excess, x.min(), x.max(), (x, away)) for x in across.T]
             focal = middle + axes @ (t * np.array(shifts))
     away = np.asarray(camera.position - camera.focal_point, np.float64)
+    # an orthographic camera shows what is before it, too
+    length = distance if perspective else max(float(np.linalg.norm(away)), front + free)
     return Camera(
-        focal + (away * (distance / np.linalg.norm(away)) if perspective else away),
+        focal + away * (length / np.linalg.norm(away)),
         focal,
         camera.view_up,
         camera.view_angle,

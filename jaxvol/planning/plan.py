@@ -28,7 +28,7 @@ from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .memory import read_within, with_bricks
-from .probe import Candidates, Probe, rendered
+from .probe import UNSEEN, Candidates, Probe, is_empty, rendered
 from .search import COARSEST, Part, Search
 
 
@@ -219,25 +219,34 @@ def plan(
     over = isinstance(scene.compositing, Over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
 
-    def search(ends: float, goal: float, rendered: Any) -> Search:
+    def search(ends: float, goal: float, known: Any) -> Search:
         own = (EarlyTermination(ends),) if over else ()
-        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own), rendered)
+        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own), known)
 
     # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
     # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
     probe = Probe.of(candidates, seed)
     first = search(ends, tolerance, {})
     seen = first.render(COARSEST, "midpoint").image
-    if not np.asarray(seen.rgba).any() and candidates.likely.any():  # what is visible lies in other patches
-        march = first.render(COARSEST, "midpoint").march
-        probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, march)), seed)
+    shows = bool(np.asarray(visible).any())
+    if shows and is_empty(seen):  # what is visible lies in other patches, or between samples
+        quadrature = "preintegrated" if first.integrable else "midpoint"
+        coarse = March(COARSEST * voxel, first.transforms, quadrature)
+        probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, coarse)), seed)
         first = search(ends, tolerance, {})
         seen = first.render(COARSEST, "midpoint").image
+    between = shows and is_empty(seen)
     opaque = probe.mean(np.asarray(seen.rgba)[:, 3] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     brightest = brightest_of(seen)
     within = search(ends / brightest, MARGIN * tolerance - share, first.rendered if brightest == 1 else {})
-    chosen, truth, tried = within.cheapest(once=once)
+    chosen, truth, tried = within.cheapest(once=once, between=between)
+    unseen = 0.0
+    if shows and is_empty(truth.image):
+        unseen = math.sqrt(UNSEEN / probe.source.origins[..., 0].size)
+        tried.append(
+            Part("visible", False, "nothing in the pixels looked at, though some blocks may show any")
+        )
     ending = EarlyTermination(ends / brightest_of(truth.image))
     kept = (*given, *proven, *((ending,) if share else ()))
     march = March(chosen.march.step, kept, chosen.march.quadrature)
@@ -253,7 +262,7 @@ def plan(
         volume=volume,
         lighting=lighting,
         tolerance=tolerance,
-        error=chosen.error + share,
+        error=max(chosen.error + share, unseen),
         samples=chosen.samples,
         parts=tuple(parts),
         probed=time.perf_counter() - begun,

@@ -76,15 +76,21 @@ class Search:
     rendered: dict[tuple[float, Quadrature], Trial] = field(default_factory=dict)
     """By step in voxels and quadrature."""
 
-    def cheapest(self, *, once: bool) -> tuple[Trial, Truth, list[Part]]:
+    @property
+    def integrable(self) -> bool:
+        """Whether cells can be integrated between their ends."""
+        return isinstance(self.scene.compositing, Over) and integrates(self.scene.transfer)
+
+    def cheapest(self, *, once: bool, between: bool = False) -> tuple[Trial, Truth, list[Part]]:
         """The cheapest march within the goal, what images were compared with, and what was tried. `once`: as
-        for `plan`."""
-        integrable = isinstance(self.scene.compositing, Over) and integrates(self.scene.transfer)
-        found, truth = self._longest("midpoint", last=not integrable)
-        if found.error > self.goal and integrable and math.isfinite(found.error):
+        for `plan`. `between`: what is visible may lie between samples, so that cells must be integrated."""
+        integrable, between = self.integrable, between and self.integrable
+        first: Quadrature = "preintegrated" if between else "midpoint"
+        found, truth = self._longest(first, last=between or not integrable)
+        if first == "midpoint" and found.error > self.goal and integrable and math.isfinite(found.error):
             found, truth = self._longest("preintegrated", last=True)
-            if found.error <= self.goal:
-                found = min(found, self._midpoint(found, truth), key=lambda trial: trial.cost)
+        if found.march.quadrature == "preintegrated" and found.error <= self.goal:
+            found = min(found, self._midpoint(found, truth), key=lambda trial: trial.cost)
         if not math.isfinite(found.error):
             why = "the image is not finite, or rays use up their samples"
         elif found.error > self.goal:

@@ -64,6 +64,10 @@ def test_something_that_lies_beside_all_patches_is_found():
     found = jv.plan(volume, soft_transfer(), camera, 0.001, seed=1)
     assert 0 < found.error <= 0.001
     assert error_of(found, volume=volume, camera=camera) <= 0.001
+    # outside of the picture
+    found = jv.plan(volume, soft_transfer(), CAMERA.zoom(9, (0.9, 0.9)), 0.001)
+    assert not found.within
+    assert any(part.name == "visible" for part in found.parts)
 
 
 def test_it_is_within_its_tolerance(planned):
@@ -189,7 +193,8 @@ def test_a_clipped_scene_is_within_its_tolerance():
     clip = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
     found = plan_of(transforms=(clip,))
     assert {"Clip", "AlphaCorrection"} <= transforms_of(found)
-    assert error_of(found, clip=(clip,)) <= found.error <= TOLERANCE
+    assert error_of(found, clip=(clip,)) <= TOLERANCE
+    assert found.within
 
 
 @pytest.mark.slow
@@ -198,7 +203,7 @@ def test_rays_end_early_where_some_become_opaque_and_later_under_colours_above_1
     thick = plan_of(THICK)
     assert "EarlyTermination" in transforms_of(thick)
     assert error_of(thick, THICK) <= TOLERANCE
-    bright = jv.TransferFunction(THICK.values, 50 * THICK.colors, THICK.extinction)
+    bright = jv.TransferFunction(THICK.values, 7 * THICK.colors, THICK.extinction)
     found = plan_of(bright)
     assert found.within
     assert error_of(found, bright) <= TOLERANCE
@@ -209,13 +214,14 @@ def test_rays_end_early_where_some_become_opaque_and_later_under_colours_above_1
 @pytest.mark.slow
 def test_a_narrow_peak_is_integrated():
     """For one image, no other program is tried where the midpoint rule is within the tolerance."""
-    narrow, wide = (
+    thin, narrow, wide = (
         jv.TransferFunction([0.0, 0.4 - w, 0.4, 0.4 + w, 1.0], np.full((5, 3), 0.8), [0, 0, most, 0, 0])
-        for w, most in ((0.005, 300.0), (0.1, 60.0))
+        for w, most in ((1e-5, 1.5e5), (0.005, 300.0), (0.2, 20.0))
     )
-    found = plan_of(narrow)
-    assert found.march.quadrature == "preintegrated"
-    assert error_of(found, narrow) <= TOLERANCE
+    for each in (thin, narrow):  # between all samples, and between some
+        found = plan_of(each)
+        assert found.march.quadrature == "preintegrated"
+        assert 0 < error_of(found, each) <= TOLERANCE
     found = plan_of(wide, once=True)
     assert found.within
     assert found.march.quadrature == "midpoint"

@@ -86,8 +86,8 @@ def test_the_longest_step_within_the_goal_is_found(exponent, power):
         assert longest < 4 * search.FINEST
 
 
-def marched(known: Known, *, goal: float = 1e-2, once=False, mode: Any = None):
-    chosen, _, parts = search_of(known, goal, mode).cheapest(once=once)
+def marched(known: Known, *, goal: float = 1e-2, mode: Any = None, once=False, between=False):
+    chosen, _, parts = search_of(known, goal, mode).cheapest(once=once, between=between)
     return chosen, parts
 
 
@@ -116,6 +116,12 @@ CASES: dict[str, tuple[Known, dict, str, str]] = {
     "a peak between samples": (
         Known(peak, square(1e-3)),
         {},
+        "preintegrated",
+        "the midpoint rule would be slower",
+    ),
+    "a peak between all samples": (
+        Known(lambda step: 0.3, square(1e-3)),
+        {"between": True},
         "preintegrated",
         "the midpoint rule would be slower",
     ),

@@ -132,12 +132,15 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
 
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
-    """Refuse to write a file (an option of these names) that is the volume, one of its slices, or another."""
-    used = [options.file, *(files_of(options.file) if options.file.is_dir() else [])]
+    """Refuse to write a file (an option of these names) that is read, such as a slice of the volume, or
+    another one."""
+    read = [getattr(options, name, None) for name in ("file", "labels", "transfer", "config")]
+    read += [Path(row[0]) for row in getattr(options, "others", [])]
+    used = [path for each in read if each for path in (each, *(files_of(each) if each.is_dir() else []))]
     for name in names:
         path = getattr(options, name)
         if path is not None and realpath(path) in map(realpath, used):
-            raise ValueError(f"--{name}: {path} is the volume, or written by another option; write another.")
+            raise ValueError(f"--{name}: {path} is read, or written by another option; write another.")
         used += [] if path is None else [path]
 
 
@@ -256,7 +259,7 @@ def add_scene(parser: Parser) -> None:
     group.add_argument("--isovalue", type=float, metavar="VALUE", help=text)
     text = (
         "shade by the gradient of the values, under a light at the camera; by default isosurfaces, the "
-        "automatic transfer function, and presets but mr_head"
+        "automatic transfer function, and presets of surfaces"
     )
     group.add_argument("--shade", action=SWITCH, help=text)
 

@@ -405,7 +405,7 @@ def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, mo
         ([name, "-o", "a.png", "--depth", name], f"--depth: {name} is the volume"),
         (
             [name, "-o", "a.npy", "--depth", "./a.npy"],
-            "--depth: a.npy is the volume, or written by another option",
+            "--depth: a.npy is read, or written by another option",
         ),
         (["stack", "-o", "stack/1.tif"], "--output: stack/1.tif is the volume, or"),
     ):
