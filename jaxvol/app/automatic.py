@@ -12,6 +12,7 @@ from .._util.srgb import from_srgb
 from .._util.voxels import is_flat
 from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
+from ..scene.presets import colormap
 from ..scene.transfer import Transfer, TransferFunction, extinction_of, voxel_size
 from ..scene.volume import Volume, check_one_channel
 from ..xla.platform import is_traced
@@ -180,6 +181,17 @@ def range_of_object(volume: Volume) -> tuple[float, float]:
     low, least = thresholds(values)[0], float(values.min())
     high = float(np.percentile(values[values >= low], 99.5))
     return (low, high) if low < high else (least, least + max(abs(least), 1.0))
+
+
+def xray_transfer(volume: Volume, cmap: Any, clim: tuple[float, float]) -> TransferFunction:
+    """Of an extinction that grows with the values of a range, so that the line integral is 1 where it is the
+    greatest along an axis, but for a thousandth of the rays."""
+    colors, (low, high) = colormap(cmap, clim), clim
+    steps = np.asarray(volume.spacing) * stride_of(volume.shape)
+    relative = np.clip((sampled(volume).astype(np.float32) - low) / (high - low), 0, 1)
+    densest = max(np.percentile(step * relative.sum(axis), 99.9) for axis, step in enumerate(steps))
+    slope = np.linspace(0, 1 / (float(densest) or 1.0), len(colors.values))
+    return TransferFunction(colors.values, colors.colors, slope)
 
 
 def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:

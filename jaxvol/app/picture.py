@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .._util.checks import finite_array
+from .._util.checks import finite_array, flag, integer, number
 from .._util.srgb import linear_color
 from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
@@ -27,7 +27,7 @@ from ..scene.camera import Camera
 from ..scene.presets import SHADED, colormap, fitted_range, preset, preset_name
 from ..scene.rendering import Rendering
 from ..scene.several import with_others
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, TransferFunction
 from ..scene.volume import Volume
 from .automatic import (
     SAMPLED,
@@ -38,6 +38,8 @@ from .automatic import (
     sampled,
     stride_of,
     transfer_by_copy,
+    unit_of,
+    xray_transfer,
 )
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
 
@@ -155,6 +157,9 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     else:
         if options.labels is not None or others:
             raise ValueError("memory reads one volume, without labels and others.")
+        if isinstance(options.file, Volume):
+            raise ValueError("memory is of files; volume is a Volume.")
+        integer("memory", options.memory, 1)
         header = {name: value for name, value in header_of(options).items() if value is not None}
         if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
             header["index"] = index
@@ -199,6 +204,9 @@ def _camera(
         height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
+    if options.compositing == "isosurface":  # seen is what lies within
+        step = np.full(2, options.isovalue)
+        transfer = TransferFunction(step, np.ones((2, 3)), [0.0, 1e6 / unit_of(volume)])
     given["parallel"] = options.parallel
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
     what = with_others(volume, transfer, others)
@@ -292,9 +300,9 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
     if (options.window is None) != (options.level is None):
         raise ValueError("window and level go together; one is missing.")
     if options.window is not None:
-        if not options.window > 0:
-            raise ValueError(f"window must be above 0; got {options.window}.")
-        clim = options.level - options.window / 2, options.level + options.window / 2
+        window = float(number("window", options.window, above=0))
+        level = float(number("level", options.level))
+        clim = level - window / 2, level + window / 2
     if options.preset is not None:
         if clim is None:
             clim, told = fitted_range(options.preset, sampled(volume))
@@ -306,6 +314,8 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
         # what is around the object would be fog
         clim = range_of_object(volume) if over else (float(data.min()), float(data.max()))
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    if options.compositing == "integral" and unit is None:
+        return xray_transfer(volume, cmap, clim)
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 
 
@@ -318,7 +328,7 @@ def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
 
 def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
     """The light that the options ask for, or that is usual for what they show; none of several volumes."""
-    shade = options.shade
+    shade = None if options.shade is None else flag("shade", options.shade)
     if shade is None:
         shows_surfaces = is_automatic(options) or (options.preset and preset_name(options.preset) in SHADED)
         shade = alone and ((shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._util.checks import described
 from .._util.texts import near
 from .._util.vec3 import apart
 from ..compositing.isosurface import Isosurface
@@ -71,6 +72,11 @@ def show(
     given |= {} if transfer is None else {"transfer": transfer}
     check_arguments("show(volume, transfer)", **given)
     check_known("show", given, options)
+    mode = options.get("compositing", "over")
+    if isinstance(mode, Isosurface) and options.get("isovalue") is None:
+        options |= {"compositing": "isosurface", "isovalue": float(mode.value)}
+    elif not isinstance(mode, str):
+        raise ValueError(f"compositing must be a name; got {described(mode)}, which jaxvol.render takes.")
     if isinstance(options.get("camera"), Camera):
         for name in options.keys() & OF_CAMERAS:
             raise ValueError(f"camera is a Camera, which has its own {name}; leave {name} out.")
@@ -92,8 +98,12 @@ def show(
 def why_empty(scene: Scene, rendering: Rendering) -> str | None:
     """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`."""
     volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
-    if opacity > FAINT or np.isnan(opacity):
+    if np.isnan(opacity):
         return None
+    if opacity > FAINT:
+        differs = float(np.abs(np.asarray(rendering.image(scene.background)) - scene.background).max())
+        low = f"hardly anything is visible: no pixel differs from the background by more than {differs:.2g}"
+        return None if differs > FAINT / 2 else f"{low}. Use another clim, background or mode."
     if opacity > 0:
         size = f"voxels have the size {voxel_size(volume):.3g}"
         change = f"a shorter unit_distance ({size}) or another clim"
@@ -108,7 +118,8 @@ def _why_nothing(scene: Scene) -> str:
     lengths = jax.jit(jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)).length))
     if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():
         bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
-        return f"no ray of the camera meets the volume, {bounds}, or what the clip leaves of it."
+        what = f"the volume, {bounds}, or what the clip leaves of it, which may be thinner than a pixel"
+        return f"no ray of the camera meets {what}."
     data = np.asarray(volume.data)
     low, high = float(data.min()), float(data.max())
     where = f"the volume's values run from {low:g} to {high:g}"
@@ -121,7 +132,6 @@ def _why_nothing(scene: Scene) -> str:
         return f"{where}, and the transfer function's opacity is 0 everywhere."
     # the opacity of a point extends to its neighbours, that of the first and the last to infinity
     at = [-np.inf, *np.asarray(transfer.values), np.inf]
-    return (
-        f"{where}, and the transfer function shows values between {at[shown[0]]:g} and "
-        f"{at[shown[-1] + 2]:g}. A clim from {low:g} to {high:g} would show something."
-    )
+    first, last = float(at[shown[0]]), float(at[shown[-1] + 2])
+    advice = f" A clim from {low:g} to {high:g} would show something." if first > low or last < high else ""
+    return f"{where}, and the transfer function shows values between {first:g} and {last:g}.{advice}"

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._util.checks import Arrayable, described, integer, output_file
-from .._util.srgb import displayed, png_of, to_srgb
+from .._util.srgb import displayed, png_of, to_srgb, warn_of_8_bits
 from .._util.whole_files import whole_file
 
 
@@ -55,6 +55,8 @@ def save_image(
         raise ValueError(
             f"linear must not be infinite; {np.isinf(image).sum()} of its {image.size} values are."
         )
+    if channels and ending not in (".npy", ".tif", ".tiff"):
+        warn_of_8_bits("linear", image, stacklevel=3)
     with whole_file(path) as part:
         if ending == ".npy":
             np.save(part, image)

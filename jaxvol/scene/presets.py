@@ -190,7 +190,7 @@ def fitted_range(
     and a word where that does not fit. Values of MR have no unit, those of CT are Hounsfield units."""
     name, low, high = preset_name(name), float(values.min()), float(np.percentile(values, 99.9))
     first, last = PRESETS[name][1]
-    if name.upper().startswith("MR") and not last / 2 <= high <= 2 * last:
+    if name.upper().startswith("MR") and high > 0 and not last / 2 <= high <= 2 * last:
         told = f"{name} is for values from {first:g} to {last:g}; it was stretched to 0 to {high:g}"
         return (0.0, high), f"{told}. Another clim stretches it otherwise."
     if name.upper().startswith("CT") and (low >= 0 or high < 200):

@@ -4,6 +4,7 @@ Grid coordinates count voxels: node `data[i, j, k]` lies at (i, j, k), so that n
 Values are interpolated trilinearly; outside the grid they are those of its nearest point.
 """
 
+import operator
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any
@@ -124,19 +125,30 @@ class Volume(eqx.Module):
         return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(told)}>"
 
     def __getitem__(self, part: Any) -> "Volume":
-        """The part with these voxels, such as `volume[10:90, :, ::2]`, at its place in the world.
+        """The part with these voxels, such as `volume[10:90, :, ::2]` or `volume[..., :50]`, at its place in
+        the world.
 
         Raises:
             ValueError: for what is no slice with a step above 0, fewer than two voxels along an axis, and a
                 volume with a `field`.
         """
-        given = part if isinstance(part, tuple) else (part,)
-        slices = (*given, *[slice(None)] * (3 - len(given)))
-        taken = all(isinstance(each, slice) for each in given) and len(slices) == 3 and self.field is None
-        ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)] if taken else []
-        if not ranges or any(len(each) < 2 or each.step < 1 for each in ranges):
-            expected = "takes up to three slices that leave 2 voxels along each axis, of no field"
-            raise ValueError(f"volume[a:b, c:d, e:f] {expected}; got {shortened(part)} of {self.shape}.")
+        given = list(part) if isinstance(part, tuple) else [part]
+        at = next((k for k, each in enumerate(given) if each is ...), len(given))
+        given[at : at + 1] = [slice(None)] * (3 - len(given) + (at < len(given)))
+        if self.field is not None:
+            raise ValueError("volume[a:b, c:d, e:f] is of voxels; this volume has a field.")
+        try:
+            slices = tuple(slice(*map(_index, (s.start, s.stop, s.step))) for s in given)
+            ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)]
+        except (AttributeError, TypeError, ValueError) as fault:
+            expected = "takes up to three slices of integers, with steps above 0, and an Ellipsis"
+            raise ValueError(f"volume[a:b, c:d, e:f] {expected}; got {shortened(part)}.") from fault
+        if any(len(each) < 2 or each.step < 1 for each in ranges):
+            left = tuple(len(each) if each.step > 0 else 0 for each in ranges)
+            raise ValueError(
+                f"volume[a:b, c:d, e:f] must leave 2 voxels or more along each axis, in order; "
+                f"{shortened(part)} of {self.shape} leaves {left}."
+            )
         # in NumPy where numbers are known, which compiles nothing
         own = self.data, self.spacing, self.origin, self.direction, self.labels
         known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in own]
@@ -169,7 +181,8 @@ class Volume(eqx.Module):
         corners = np.array(np.meshgrid(*ends)).reshape(3, -1) - np.asarray(self.origin, np.float64)[:, None]
         at = np.linalg.solve(turn * np.asarray(self.spacing, np.float64), corners)
         first, end = np.floor(at.min(1) + PLACE), np.ceil(at.max(1) - PLACE) + 1
-        if (end < 1).any() or (first > np.array(self.shape) - 1).any() or (ends[:, 0] >= ends[:, 1]).any():
+        beside = (at.max(1) < -PLACE) | (at.min(1) > np.array(self.shape) - 1 + PLACE)
+        if beside.any() or (ends[:, 0] >= ends[:, 1]).any():
             bounds = pasted(self.bounds)
             expected = f"(x_min, x_max, y_min, …) that meets the volume, {bounds}"
             raise ValueError(f"box must be {expected}; got {pasted(ends.ravel())}.")
@@ -397,3 +410,7 @@ def with_fetches(volume: Volume, fetches: list[Fetch]) -> Volume:
 
 def fetches_of(volume: Volume) -> list[Fetch]:
     return [grid.fetch for grid in grids(volume)]
+
+
+def _index(each: Any) -> int | None:
+    return None if each is None else operator.index(each)

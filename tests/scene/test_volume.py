@@ -223,8 +223,16 @@ def test_parts_and_crops_stay_where_they_are():
     crop = whole.crop(box)
     assert data[2, 1, 2] in np.asarray(crop.data)
     assert data[4, 3, 3] in np.asarray(crop.data)
-    for wrong in (3, slice(1, 2), slice(None, None, -1), (slice(None),) * 4):
-        with pytest.raises(ValueError, match=r"volume\[a:b, c:d, e:f\] takes"):
+    np.testing.assert_array_equal(whole[2:7, ..., 1:].data, data[2:7, ..., 1:])
+    np.testing.assert_array_equal(whole[..., :4].data, data[..., :4])
+    for wrong, said in (
+        (3, "takes up to three slices"),
+        (slice(0.5, 3), "takes up to three slices of integers"),
+        ((slice(None),) * 4, "takes up to three"),
+        (slice(1, 2), r"must leave 2 voxels .* leaves \(1, "),
+        (slice(None, None, -1), r"leaves \(0, "),
+    ):
+        with pytest.raises(ValueError, match=said):
             whole[wrong]
     with pytest.raises(ValueError, match=r"box must be .* that meets the volume"):
         whole.crop((0, 1, 90, 91, 0, 1))

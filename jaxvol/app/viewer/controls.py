@@ -66,7 +66,7 @@ def _view_controls(model: Model) -> list[Control]:
         Control("buttons", "look from", set=look, choices=(*SIDES, "reset")),
         _bound(model, "checkbox", "orthographic", "parallel"),
         Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=modes),
-        Control("slider", "isovalue", *isovalue, (low, low + span, unit)),
+        Control("slider", "isovalue", *isovalue, (low, rounded(low + span, span), unit)),
         _bound(model, "checkbox", "light", "lit"),
         Control("color", "background", *background),
     ]

@@ -117,14 +117,17 @@ def _point_controls(model: Model) -> list[Control]:
         (number, _, part, twice, x, y), count = press_of(message), len(transfer().values)
         height = min((1 - y) * HEIGHT / (HEIGHT - 2), 1.0)
         value, opacity = editing.rounded(low + x * (high - low), high - low), round(height**2, 3)
+        if count > editing.MAX_POINTS:
+            return
         if number != gesture:
-            gesture, chosen = number, min(int(part or 0), count - 1)
+            gesture, chosen = number, min(max(int(part or 0), 0), count - 1)
             if twice:
                 put(editing.without_point, chosen)
             elif not part:
                 put(editing.with_points_at, [value])
                 values = np.asarray(transfer().values)
                 chosen = min(int(np.searchsorted(values, np.float32(value))), len(values) - 1)
+                gesture = number if len(values) > count else ""  # where there was no room, nothing is dragged
         elif not twice:
             put(editing.with_value, chosen, value)
             put(editing.with_opacity, chosen, opacity, voxel)
@@ -204,6 +207,8 @@ def _label_controls(model: Model) -> list[Control]:
     def opacity() -> float:
         return min(get("opacity"), MAX_LABEL_OPACITY)
 
+    if not names:
+        return [Control("pad", get=lambda: "no label can be seen")]
     return [
         Control("dropdown", "label", lambda: names[chosen], choose, choices=names),
         Control("pad", "labels", legend, press),

@@ -1,5 +1,6 @@
 """A viewer without a face: its state, and a thread that draws it, coarse at once and fine at rest."""
 
+import logging
 import math
 import threading
 import time
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..._util.srgb import png_of
+from ...scene.transfer import TransferFunction
 from ..recorded import text_of
 from .marks import with_marks
 from .state import PROGRAM, Scene, State, Vector
@@ -72,19 +74,21 @@ class Model:
         self._face, self._deliver, self._file = (show, set_status), deliver, file
         self._status, self._compiling, self._begun = "", "", 0.0
         self._last: State | None = None
-        self._shown: tuple[State, Pixels] | None = None
+        self._shown: tuple[State, Pixels, Stage] | None = None
         self._level = 2
         self._compiled: set[Any] = set()
         self._changed = threading.Condition()
         self._next: State | None = None
-        self._idle, self._closed = True, False
-        self._thread = threading.Thread(target=self._run, daemon=True, name="jaxvol viewer")
-        self._thread.start()
+        self._idle, self._closed, self._marked = True, False, False
+        self._thread: threading.Thread | None = None
 
     def ask(self, request: State) -> None:
         """Ask for an image, in place of all that was asked for before."""
         with self._changed:
             self._next, self._idle = request, False
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, daemon=True, name="jaxvol viewer")
+                self._thread.start()
             self._changed.notify_all()
 
     def close(self, *, wait: bool = True) -> None:
@@ -92,7 +96,7 @@ class Model:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
-        if wait and threading.current_thread() is not self._thread:
+        if wait and self._thread is not None and threading.current_thread() is not self._thread:
             self._thread.join()
 
     def wait(self, seconds: float = 600) -> bool:
@@ -126,6 +130,9 @@ class Model:
 
     def pick(self, across: float, down: float) -> None:
         """Mark the point that is seen at a fraction of the view's width and height, if there is one."""
+        self._told("picked", self._pick, across, down)
+
+    def _pick(self, across: float, down: float) -> None:
         if self._last is not None:  # whose program is compiled
             point = TileRenderer(self.scene, self._last).picked(across, down)
             if point is not None:
@@ -135,9 +142,9 @@ class Model:
         """Mark a point of the world in the image that is shown."""
         self.state = replace(self.state, point=point)
         self.marked()
-        if self._shown is not None and not self._closed:
-            request, pixels = self._shown
-            self._face[0](with_marks(pixels, replace(request, point=point)), "drawing")
+        with self._changed:
+            self._marked = True
+            self._changed.notify_all()
 
     def save(self, width: float) -> None:
         """Render an image that is so many pixels wide, by a thread of its own, and deliver it as a PNG, which
@@ -155,8 +162,9 @@ class Model:
                 return
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
-        # one of several files names none, as of `jaxvol render`
-        text = {} if self.scene.others else text_of(self.scene.settings(state), self._file, state.transfer)
+        # of several files, or of labels, none, as of `jaxvol render`: another picture would come back
+        whole = not self.scene.others and isinstance(state.transfer, TransferFunction)
+        text = text_of(self.scene.settings(state), self._file, state.transfer) if whole else {}
         self._set_status(f"saved {width} x {height}\n")
         self._deliver(png_of(pixels[:height, :width], text))
 
@@ -171,9 +179,8 @@ class Model:
 
     def _show(self, pixels: Pixels, stage: Stage, seconds: float, request: State, factor: float = 1) -> str:
         """Show an image of a state, with steps that are longer by a factor. Returns what there is to say."""
-        self._shown = request, pixels
-        if not self._closed:
-            self._face[0](with_marks(pixels, replace(request, point=self.state.point)), stage)
+        self._shown = request, pixels, stage
+        self._tell(0, with_marks(pixels, replace(request, point=self.state.point)), stage)
         height, width, _ = pixels.shape
         step = request.step * factor
         return f"{stage}: {width} x {height}, step {step:.3g} voxels\n{1e3 * seconds:.0f} ms"
@@ -182,8 +189,15 @@ class Model:
         self._status, compiling = text, self._compiling
         if compiling:
             text += f"\ncompiling for {compiling}: {time.monotonic() - self._begun:.0f} s"
+        self._tell(1, text)
+
+    def _tell(self, which: int, *what: Any) -> None:
+        """Tell the face. What fails there, as after a page was closed, does not end this thread."""
         if not self._closed:
-            self._face[1](text)
+            try:
+                self._face[which](*what)
+            except Exception:
+                logging.getLogger("jaxvol").exception("a viewer's page or widget failed")
 
     def _newer(self) -> bool:
         return self._next is not None or self._closed
@@ -196,12 +210,16 @@ class Model:
     def _run(self) -> None:
         while True:
             with self._changed:
-                while not self._changed.wait_for(self._newer, 1 if self._compiling else None):
-                    self._set_status(self._status)
+                self._changed.wait_for(lambda: self._newer() or self._marked, 1 if self._compiling else None)
                 if self._closed:
                     return
-                assert self._next is not None
-                request, self._next = self._next, None
+                (request, self._next), marked, self._marked = (self._next, None), self._marked, False
+            if request is None:
+                self._set_status(self._status)
+                if marked and self._shown is not None:
+                    old, pixels, stage = self._shown
+                    self._tell(0, with_marks(pixels, replace(old, point=self.state.point)), stage)
+                continue
             self._told("drawn", self._draw_parts, request)
             with self._changed:
                 self._idle = self._next is None
@@ -220,6 +238,7 @@ class Model:
             self._compiling = ""
             if done:
                 self._compiled.add(renderer.program_key)
+            if done or self.state is not request:
                 self._next, self._idle = self.state, False
             self._changed.notify_all()
 

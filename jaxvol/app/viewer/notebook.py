@@ -78,7 +78,7 @@ class NotebookView(ipywidgets.HBox):
     @property
     def camera(self) -> Camera:
         """The camera, with the size of the image."""
-        return self.model.state.orbit.camera(self.model.state.size, parallel=self.model.state.parallel)
+        return self.model.scene.camera(self.model.state, self.model.state.size)
 
     @property
     def transfer(self) -> Transfer:

@@ -8,6 +8,7 @@ import logging
 import math
 import re
 import secrets
+import socket
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +30,8 @@ from .tiles import Pixels
 
 HOST = "127.0.0.1"
 OWN_NAMES = {HOST, "localhost"}
+ANY = {"0.0.0.0", "::", ""}
+"""Hosts that mean all addresses of this machine, which a browser is told by its name."""
 
 PAD = """<style>.mantine-Flex-root:has(> div label[for="{field}"]) {{ position: absolute; height: 0; width: 0;
 opacity: 0; overflow: hidden }}</style><div onpointerdown="({pressed})(event, text => {{
@@ -75,6 +78,7 @@ class Page:
     ):
         self.shown, self.file = (scene, state), file
         is_local = host in OWN_NAMES
+        _check_host(host)
         self._token = secrets.token_urlsafe() if token is None and not is_local else token
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
         # viser's cameras have limits that suit scenes of about this size
@@ -86,7 +90,8 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self._server = _Server(host=host, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
-        place = f"{'localhost' if is_local else host}:{self.port}"
+        known = "localhost" if is_local else socket.gethostname() if host in ANY else host
+        place = f"{known}:{self.port}"
         told = "" if self._token is None else f"/?websocket=ws://{place}/{self._token}"
         self.url = f"http://{place}{told}"
         self._server._websock_server.on_client_connect(self._only_own_pages)
@@ -146,13 +151,28 @@ class Page:
             model.resize(camera.image_width, camera.image_height, orbit=orbit)
 
         client.camera.on_update(turned)
-        client.scene.on_click()(lambda event: model.pick(*event.screen_pos))
+
+        async def picked(event: Any) -> Any:  # beside the others, in turn
+            model.pick(*event.screen_pos)
+
+        client.scene.on_click()(picked)  # pyright: ignore[reportArgumentType]
         await turned(client.camera)
 
     async def _closed(self, client: viser.ClientHandle) -> None:
         model = self.models.pop(client.client_id, None)
         if model is not None:
             model.close(wait=False)  # viser's loop must not wait
+
+
+def _check_host(host: str) -> None:
+    """Raise a `ValueError` unless this machine can listen there; viser would wait for ever."""
+    try:
+        found = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        with socket.socket(found[0][0], socket.SOCK_STREAM) as tried:
+            tried.bind(found[0][4])
+    except (OSError, UnicodeError) as fault:
+        told = getattr(fault, "strerror", None) or fault
+        raise ValueError(f"host must be an address of this machine; got {host!r} ({told}).") from fault
 
 
 def _in_one_line(record: logging.LogRecord) -> bool:

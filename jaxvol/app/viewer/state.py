@@ -118,6 +118,13 @@ class Orbit:
         """Of what is seen at the focal point's distance, world length."""
         return self.distance * math.tan(math.radians(self.view_angle) / 2)
 
+    def withdrawn(self, least: float) -> "Orbit":
+        """From at least so far, by an angle that shows as much at the focal point."""
+        distance = max(self.distance, least)
+        return replace(
+            self, distance=distance, view_angle=math.degrees(2 * math.atan(self.half_height / distance))
+        )
+
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """Unit vectors to the right and up in the image, and forward."""
         right = np.cross(-self.toward, self.view_up)
@@ -186,6 +193,19 @@ class Scene:
         # a little farther than half the diagonal, so that nothing is cut away at -1
         return (low + high) / 2 + 0.501 * state.offset * np.linalg.norm(high - low) * normal, normal
 
+    def orbit(self, state: State) -> Orbit:
+        """That of the state; of an orthographic camera, from before all that it shows."""
+        if not state.parallel:
+            return state.orbit
+        bounds = np.stack([np.asarray(v.bounds) for v in (self.volume, *(each for each, _ in self.others))])
+        low, high = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
+        far = np.abs(np.stack([low, high]) - state.orbit.focal_point).max(axis=0)
+        return state.orbit.withdrawn(1.1 * float(np.linalg.norm(far)))
+
+    def camera(self, state: State, size: tuple[int, int], window: Any = None, corner: Any = None) -> Camera:
+        """The camera of a state, for an image of this size in pixels, or a part of it."""
+        return self.orbit(state).camera(size, window, corner, parallel=state.parallel)
+
     def compositing(self, state: State) -> Compositing[Any]:
         """How cells become a pixel."""
         return Isosurface(state.isovalue) if state.mode == ISOSURFACE else self.modes[state.mode]
@@ -204,7 +224,7 @@ class Scene:
 
     def settings(self, state: State) -> dict[str, Any]:
         """Options of `jaxvol render` that draw a state."""
-        orbit = state.orbit
+        orbit = self.orbit(state)
         options = {"size": state.size, "step": state.step * self.voxel, "background": state.background}
         options |= {"camera": [*orbit.position.tolist(), *orbit.focal_point.tolist()]}
         options |= {"view_up": orbit.view_up.tolist(), "view_angle": orbit.view_angle}

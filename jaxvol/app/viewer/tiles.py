@@ -89,7 +89,8 @@ class TileRenderer:
     """Draws tiles of one state of a viewer, with steps that are `step_factor` times as long."""
 
     def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
-        self.volume, self.state, self.march = scene.volume, state, scene.march(state, step_factor)
+        self.scene, self.volume, self.state = scene, scene.volume, state
+        self.march = scene.march(state, step_factor)
         self.transfer = padded(state.transfer)
         self.others = scene.others
         self.background = np.asarray(state.background, np.float32)
@@ -103,7 +104,7 @@ class TileRenderer:
 
     def camera(self, window: object, corner: object = None) -> Camera:
         """That of a tile."""
-        return self.state.orbit.camera((SIDE, SIDE), window, corner, parallel=self.state.parallel)
+        return self.scene.camera(self.state, (SIDE, SIDE), window, corner)
 
     def rendered(self, camera: Camera) -> Rendering:
         """What `render` returns for a camera of a tile's size."""

@@ -10,7 +10,7 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
-from jaxvol.app.automatic import range_of_object
+from jaxvol.app.automatic import range_of_object, xray_transfer
 from jaxvol.app.cli import main
 from jaxvol.app.picture import Scene
 from jaxvol.app.show import why_empty
@@ -99,6 +99,13 @@ SCENES = {
         None,
         0,
     ),
+    "X-rays": (
+        ["--compositing", "integral"],
+        xray_transfer(jv.Volume(ENGINE), "gray", RANGE),
+        "integral",
+        None,
+        0,
+    ),
     "an isosurface": (
         SURFACE,
         of_voxel("white"),
@@ -130,10 +137,21 @@ def test_options_of_the_look_make_the_scene(case, volume_file, tmp_path, monkeyp
     assert same(how["compositing"], compositing_of(mode))
     assert type(how["lighting"]) is type(lighting)
     assert same(how["lighting"], lighting)
-    assert same(camera, jv.automatic_camera(volume, found, size=(16, 16), least=0.01))
+    # of an isosurface, what lies within is seen
+    seen = jv.TransferFunction([30, 30], np.ones((2, 3)), [0, 9]) if "isosurface" in words else found
+    assert same(camera, jv.automatic_camera(volume, seen, size=(16, 16), least=0.01))
     assert same(march, jv.March(0.4, FAST, "midpoint"))
     rgba = drawn(volume, found, camera, march).rgba
     np.testing.assert_allclose(np.load("x.npy"), rgba[..., :3] + (1 - rgba[..., 3:]) * behind, atol=1e-6)
+
+
+def test_x_rays_are_as_bright_as_white_where_most_is_passed(volume_file):
+    volume = jv.load(volume_file)
+    found = xray_transfer(volume, "gray", RANGE)
+    along = [
+        np.interp(np.asarray(volume.data), found.values, found.extinction).sum(axis) for axis in range(3)
+    ]
+    assert max(np.percentile(each, 99.9) for each in along) == pytest.approx(1, rel=1e-4)
 
 
 def test_opacities_of_a_colormap_are_those_of_a_voxel_whatever_its_unit(volume_file, tmp_path, drawn):
@@ -397,17 +415,20 @@ def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     before = volume_file.read_bytes()
     (tmp_path / "link.npy").symlink_to(volume_file)
+    (tmp_path / "other.npy").write_bytes(before)
     (tmp_path / "stack").mkdir()
     (tmp_path / "stack" / "1.tif").write_bytes(b"a slice")
     there, name = sorted(tmp_path.iterdir()), volume_file.name
     for words, message in (
-        ([name, "-o", "link.npy"], "--output: link.npy is the volume"),
-        ([name, "-o", "a.png", "--depth", name], f"--depth: {name} is the volume"),
+        ([name, "-o", "link.npy"], "--output: link.npy is read"),
+        ([name, "-o", "a.png", "--depth", name], f"--depth: {name} is read"),
         (
             [name, "-o", "a.npy", "--depth", "./a.npy"],
             "--depth: a.npy is read, or written by another option",
         ),
-        (["stack", "-o", "stack/1.tif"], "--output: stack/1.tif is the volume, or"),
+        ([name, "--with", "other.npy", "-o", "other.npy"], "--output: other.npy is read"),
+        ([name, "--labels", "other.npy", "-o", "other.npy"], "--output: other.npy is read"),
+        (["stack", "-o", "stack/1.tif"], "--output: stack/1.tif is read, or"),
     ):
         assert main(["render", *words]) == 2
         assert message in capsys.readouterr().err

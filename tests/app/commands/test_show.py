@@ -96,7 +96,7 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
         (volume, {"transfer": "hot"}, "transfer must be .*; got 'hot'"),
         (volume, {"camera": (1, 2, 3)}, r"camera must have shape \(6,\)"),
         (volume, {"camera": camera, "size": 9}, "camera is a Camera, which has its own size; leave size out"),
-        (volume, {"window": -3, "level": 2}, "window must be above 0; got -3"),
+        (volume, {"window": -3, "level": 2}, "window must be greater than 0; got -3"),
         (volume, {"others": [(volume, "hot", (1, 10))]}, r"others are FILE, .*; got hot \(1, 10\)"),
     ):
         with pytest.raises(ValueError, match=message):
