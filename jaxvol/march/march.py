@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import check_answer, described, integer, number
+from .._util.texts import pasted
 from .._util.vec3 import Scalar
 from ..scene.occupancy import BLOCK, Occupancy
 from ..scene.space import Affine, Ray, Space
@@ -147,6 +148,11 @@ class March(eqx.Module):
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
         self.quadrature = quadrature
         self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**24)
+
+    def __repr__(self) -> str:
+        told = [f"step={pasted(self.step)}", f"transforms={self.transforms}", f"quadrature={self.quadrature!r}"]
+        told += [] if self.max_samples is None else [f"max_samples={self.max_samples}"]
+        return f"March({', '.join(told)})"
 
     @property
     def most_samples(self) -> int:

@@ -273,6 +273,8 @@ def test_the_automatic_camera_shows_all_of_several_volumes():
     camera = jv.automatic_camera(volumes, transfers, size=(32, 32))
     points = np.concatenate([*map(visible_points, volumes, transfers)])
     assert np.abs(in_picture(camera, points)).max() == pytest.approx(1 / MARGIN, abs=1e-4)
+    camera = jv.automatic_camera(volumes[::-1], transfers, (-1, 0, 0), size=(32, 32), parallel=True)
+    assert (points @ (1, 0, 0) > float(camera.position[0])).all()
     camera = jv.automatic_camera(volumes, transfers, size=(32, 32), centered=True)
     np.testing.assert_allclose(camera.focal_point, (points.min(axis=0) + points.max(axis=0)) / 2, rtol=1e-5)
     assert np.abs(in_picture(camera, points)).max() == pytest.approx(1 / MARGIN, abs=1e-4)

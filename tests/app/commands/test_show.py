@@ -83,6 +83,8 @@ def test_several_volumes_are_in_one_picture(volume_file, tmp_path, drawn):
     far = jv.Volume(jv.load(volume_file).data, origin=(300, 0, 0))
     with pytest.warns(UserWarning, match=r"others\[0\], from \(300.* does not meet the volume, from \(0"):
         jv.show(volume_file, size=16, step=0.4, others=far)
+    turned = jv.Volume(far.data, direction=np.diag([-1.0, -1.0, 1.0]))  # as in many files
+    jv.show(turned, size=16, step=0.4, others=turned)
 
 
 def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
@@ -96,13 +98,19 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
         (volume, {"transfer": "hot"}, "transfer must be .*; got 'hot'"),
         (volume, {"camera": (1, 2, 3)}, r"camera must have shape \(6,\)"),
         (volume, {"camera": camera, "size": 9}, "camera is a Camera, which has its own size; leave size out"),
+        (volume, {"shade": "no"}, "shade must be True or False; got 'no'"),
+        (volume, {"memory": "512M"}, "memory is of files; volume is a Volume"),
+        (volume, {"compositing": jv.lighting.Phong()}, "compositing must be a name; got a Phong"),
+        (volume, {"others": [volume], "tolerance": 0.1, "step": None}, "tolerance is for one volume"),
         (volume, {"window": -3, "level": 2}, "window must be greater than 0; got -3"),
         (volume, {"others": [(volume, "hot", (1, 10))]}, r"others are FILE, .*; got hot \(1, 10\)"),
     ):
         with pytest.raises(ValueError, match=message):
-            jv.show(what, step=0.4, **options)
+            jv.show(what, **{"step": 0.4} | options)
     jv.show(volume, camera=camera, step=0.4)
     assert same(drawn.scenes[-1][2], camera)
+    jv.show(volume, compositing=jv.Isosurface(30.0), step=0.4)
+    assert same(drawn.how[-1]["compositing"], jv.Isosurface(30.0))
     drawn.level = 0.0
     with pytest.warns(UserWarning, match="nothing is visible: the volume's values run .* A clim from"):
         jv.show(volume, jv.preset("engine", (500, 900)), size=8, step=0.4)

@@ -42,6 +42,8 @@ MARCH = jv.March(0.4, (jv.AlphaCorrection(), jv.SpaceLeaping()), "midpoint")
 LABELS = jv.Volume(np.repeat(np.arange(3, dtype=np.uint8), 8)[:, None, None] * np.ones((1, 24, 24), np.uint8))
 """Slabs of the labels 0, 1 and 2."""
 
+LABELS_OF_ONES = jv.Volume(LABELS.data, labels=np.ones(LABELS.shape, np.uint8))
+
 HOW = {"lighting": None, "lit": False, "compositing": "over", "background": (0.2, 0.5, 0.8), "size": SIZE}
 
 
@@ -351,12 +353,44 @@ def test_the_controls_change_the_points_that_they_show(controlled):
     assert values() == given
     full, controls = controlled(BALL, jv.colormap("gray", (0, 150), n_colors=16))
     press(4, "", 190, 0.5)  # past the last point, where there is no room for another
+    press(4, "", 170, 0.7)
     assert len(full.state.transfer.values) == 16
+    assert equal_arrays(full.state.transfer, full.first.transfer)
     assert controls["value"].get() == 150
     many, controls = controlled(BALL, jv.colormap("gray", (0, 200), n_colors=40))
     assert "value" not in controls
+    for opacity in (0.5, 0.7):
+        press(5, "", 100, opacity)
+    assert equal_arrays(many.state.transfer, many.first.transfer)
     controls["window"].set(100.0)
     assert float(many.state.transfer.values[0]) == pytest.approx(50)
+
+
+def test_a_face_that_fails_does_not_end_the_thread(shown, monkeypatch, caplog):
+    def fails(*_):
+        raise RuntimeError("the page was closed")
+
+    monkeypatch.setattr(shown.model, "_face", (fails, fails))
+    shown.model.change(step=1.3 * shown.model.state.step)
+    assert shown.model.wait()
+    assert "a viewer's page or widget failed" in caplog.text
+    monkeypatch.undo()
+    shown.after(lambda s: s)
+
+
+def test_an_orthographic_view_stands_before_all_that_it_shows(controlled):
+    """Of a long volume along its axis, from as near as its narrow side allows."""
+    long = jv.Volume(np.full((4, 4, 100), 200, np.uint8))
+    model, controls = controlled(long, jv.colormap("gray", (0, 255)), None)
+    controls["orthographic"].set(True)
+    controls["look from"].set("+z")
+    camera = model.scene.camera(model.state, (8, 8))
+    assert float(camera.position[2]) > 99
+    assert float(camera.parallel_scale) < 4
+    options = model.scene.settings(model.state)
+    assert options["camera"][2] > 99
+    height = np.tan(np.deg2rad(options["view_angle"]) / 2) * (options["camera"][2] - options["camera"][5])
+    assert height == pytest.approx(float(camera.parallel_scale), rel=1e-3)
 
 
 def test_the_controls_change_march_and_light(controlled):
@@ -448,6 +482,8 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
     controls["opacity"].set(math.nan)
     assert equal_arrays(model.state.transfer, expected)
     data = np.asarray(LABELS.data)
+    unseen = jv.LabelTransferFunction({1: jv.TransferFunction([0, 1], np.ones((2, 3)), [0, 0])})
+    assert "label" not in controlled(LABELS_OF_ONES, unseen)[1]
     _, controls = controlled(jv.Volume(np.where(data == 2, np.uint8(9), data)), None)
     assert controls["label"].choices == ["1", "9"]  # as in the file
 
