@@ -150,7 +150,11 @@ class March(eqx.Module):
         self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**24)
 
     def __repr__(self) -> str:
-        told = [f"step={pasted(self.step)}", f"transforms={self.transforms}", f"quadrature={self.quadrature!r}"]
+        told = [
+            f"step={pasted(self.step)}",
+            f"transforms={self.transforms}",
+            f"quadrature={self.quadrature!r}",
+        ]
         told += [] if self.max_samples is None else [f"max_samples={self.max_samples}"]
         return f"March({', '.join(told)})"
 
