@@ -65,7 +65,7 @@ def test_another_machine_needs_the_token():
         assert taken == [True, False, False]
         with pytest.raises(ValueError, match="token must"):
             jv.serve(VOLUME, GRAY, host="0.0.0.0", token="")
-        with pytest.raises(ValueError, match="host must be an address of this machine; got 'nohost.invalid'"):
+        with pytest.raises(ValueError, match=r"host must be .*; got 'nohost.invalid'"):
             jv.serve(VOLUME, GRAY, host="nohost.invalid")
     finally:
         served.close()
