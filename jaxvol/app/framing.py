@@ -154,8 +154,8 @@ def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarra
 
 def warn_of_distance(volume: Volume, others: Sequence[tuple[Volume, Transfer]]) -> None:
     """Say so of a volume that does not meet the first one: mostly a file does not say where it lies."""
-    low, high = np.asarray(volume.bounds).reshape(3, 2).T
     for number, (other, _) in enumerate(others):
+        low, high = np.asarray(volume.bounds).reshape(3, 2).T
         first, last = np.asarray(other.bounds).reshape(3, 2).T
         if (last < low).any() or (first > high).any():
             ends = (f"{pasted(a)} to {pasted(b)}" for a, b in ((first, last), (low, high)))

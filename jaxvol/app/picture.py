@@ -246,13 +246,17 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
     if step is not None:
         return scene._replace(march=quick_march(step, scene.transforms))
     plans = scene.plans(cameras, options.tolerance)
-    # the shortest step is longer where cells are integrated than where they are not
-    found = min(plans, key=lambda plan: (plan.march.quadrature == "midpoint", float(plan.march.step)))
+    found = min(plans, key=lambda plan: float(plan.march.step))
+    # a view in which cells must be integrated needs that at any step
+    integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)
+    march = found.march
+    if integrated:
+        march = March(march.step, march.transforms, "preintegrated")
     if not all(plan.within for plan in plans):
         told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
         warnings.warn(told, stacklevel=3)
     source = None if found.bricks is None else found.source
-    return scene._replace(volume=found.volume, march=found.march, source=source)
+    return scene._replace(volume=found.volume, march=march, source=source)
 
 
 def volume_of(options: Namespace) -> Volume:

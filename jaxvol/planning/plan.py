@@ -185,8 +185,8 @@ def plan(
         seed: of the choice of patches. With it, the plan depends on nothing but the scene.
 
     Returns:
-        A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
-        False and `Plan.parts` says so.
+        A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, or nothing is seen
+        although blocks may show something, `Plan.within` is False and `Plan.parts` says so.
 
     Raises:
         ValueError: for arguments of another kind, a tolerance out of range, arrays that are traced (plan

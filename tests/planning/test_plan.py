@@ -193,7 +193,8 @@ def test_a_clipped_scene_is_within_its_tolerance():
     clip = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
     found = plan_of(transforms=(clip,))
     assert {"Clip", "AlphaCorrection"} <= transforms_of(found)
-    assert error_of(found, clip=(clip,)) <= TOLERANCE
+    # all pixels are known, but what the shortest step errs by is an estimate
+    assert error_of(found, clip=(clip,)) <= min(1.02 * found.error, TOLERANCE)
     assert found.within
 
 

@@ -7,6 +7,7 @@ view's height, to the right and down, as the pointer moved.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -197,10 +198,14 @@ class Scene:
         """That of the state; of an orthographic camera, from before all that it shows."""
         if not state.parallel:
             return state.orbit
-        bounds = np.stack([np.asarray(v.bounds) for v in (self.volume, *(each for each, _ in self.others))])
-        low, high = bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)
-        far = np.abs(np.stack([low, high]) - state.orbit.focal_point).max(axis=0)
+        far = np.abs(self.ends - state.orbit.focal_point).max(axis=0)
         return state.orbit.withdrawn(1.1 * float(np.linalg.norm(far)))
+
+    @cached_property
+    def ends(self) -> Float[np.ndarray, "2 3"]:
+        """The lowest and the highest corner of the world box around all volumes."""
+        bounds = np.stack([np.asarray(v.bounds) for v in (self.volume, *(each for each, _ in self.others))])
+        return np.stack([bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)])
 
     def camera(self, state: State, size: tuple[int, int], window: Any = None, corner: Any = None) -> Camera:
         """The camera of a state, for an image of this size in pixels, or a part of it."""

@@ -206,7 +206,10 @@ def plans(monkeypatch):
     made = []
 
     def plan(volume, transfer, camera, tolerance, **how):
-        march, parts = jv.March(0.7, how["transforms"]), (Part("leaps", False, "nothing is empty"),)
+        # of several views, one is integrated at a longer step
+        longer = not how["once"] and len(made) % 2
+        step = (0.9, how["transforms"], "preintegrated") if longer else (0.7, how["transforms"])
+        march, parts = jv.March(*step), (Part("leaps", False, "nothing is empty"),)
         found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 9.0, parts, 1.0)
         made.append((volume, transfer, camera, tolerance, how))
         return found
@@ -234,7 +237,7 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
     for bad in (["--tolerance", "0.1", "--step", "1"], ["--step", "1"]):
         assert main(["plan", str(volume_file), *bad]) == 2
         assert "step" in capsys.readouterr().err
-    # of an orbit, for four views, by the shortest step
+    # of an orbit, for four views, by the shortest step, and integrated if one of them is
     assert (
         main(
             ["animate", str(volume_file), "--frames", "2", "--size", "8", "8", "-o", str(tmp_path / "a.gif")]
@@ -243,6 +246,8 @@ def test_without_a_step_one_is_planned(volume_file, tmp_path, capsys, drawn, pla
     )
     assert len(plans) == 3 + 4
     assert not plans[-1][-1]["once"]
+    march = drawn.scenes[-1][3]
+    assert (float(march.step), march.quadrature) == (np.float32(0.7), "preintegrated")
 
 
 @pytest.mark.slow
