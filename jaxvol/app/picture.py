@@ -42,6 +42,7 @@ from .automatic import (
     xray_transfer,
 )
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
+from .padding import padded
 
 
 def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
@@ -49,6 +50,9 @@ def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
     fast = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
     return March(step, (*transforms, *fast), "midpoint")
 
+
+POINTS = 8, 16
+"""Those that the transfer functions of pictures are padded to: most presets have up to 8."""
 
 OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
 OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
@@ -58,7 +62,20 @@ DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (51
 DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
 """Options of a picture, as they are where nothing is given."""
 
-ELSEWHERE = {"mode": "compositing", "blending": "compositing", "lighting": "shade", "colormap": "cmap"}
+ELSEWHERE = {
+    "mode": "compositing",
+    "blending": "compositing",
+    "colormap": "cmap",
+    "lut": "cmap",
+    "color": "cmap",
+}
+ELSEWHERE |= {
+    "lighting": "shade",
+    "shading": "shade",
+    "bg": "background",
+    "cpos": "camera",
+    "opacity": "transfer",
+}
 """What other programs call options."""
 
 OVERRIDES = {
@@ -98,12 +115,13 @@ class Scene(NamedTuple):
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
         how = {"compositing": self.compositing, "lighting": self.lighting}
+        transfer = padded(self.transfer, *POINTS)
         if self.source is None:
-            what = with_others(self.volume, self.transfer, self.others)
+            what = with_others(self.volume, transfer, self.others)
             found = render(*what, camera, self.march, **how)
         else:
             how["memory"] = self.memory
-            found = render_bricks(self.source, self.transfer, camera, self.march, **how)
+            found = render_bricks(self.source, transfer, camera, self.march, **how)
         return jax.block_until_ready(found)
 
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
@@ -116,7 +134,8 @@ class Scene(NamedTuple):
         if self.source is not None:
             how["memory"] = self.memory
         tolerance = PLANNED if tolerance is None else tolerance
-        return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
+        transfer = padded(self.transfer, *POINTS)
+        return [plan(what, transfer, camera, tolerance, **how) for camera in cameras]
 
 
 def check_exclusive(settings: dict[str, Any]) -> None:
@@ -264,7 +283,8 @@ def volume_of(options: Namespace) -> Volume:
     if not isinstance(options.file, Volume):
         return load(options.file, **header)
     if told := [name for name, value in header.items() if value is not None]:
-        raise ValueError(f"{told[0]} is of files; volume is a Volume.")
+        hint = " Give it labels: jv.Volume(data, labels=...)." if told[0] == "labels" else ""
+        raise ValueError(f"{told[0]} is of files; volume is a Volume.{hint}")
     return options.file
 
 
@@ -311,7 +331,7 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
         if clim is None:
             clim, told = fitted_range(options.preset, sampled(volume))
             if told:
-                warnings.warn(told, stacklevel=5)
+                warnings.warn(told, stacklevel=5 if source is None else 4)
         return preset(options.preset, clim, preset_unit(source or volume) if unit is None else unit)
     if clim is None:
         data, over = np.asarray(volume.data), options.compositing == "over"
@@ -333,6 +353,8 @@ def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
 def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
     """The light that the options ask for, or that is usual for what they show; none of several volumes."""
     shade = None if options.shade is None else flag("shade", options.shade)
+    if shade and not alone:
+        raise ValueError("shade: several volumes are shown without light; leave it out.")
     if shade is None:
         shows_surfaces = is_automatic(options) or (options.preset and preset_name(options.preset) in SHADED)
         shade = alone and ((shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface))

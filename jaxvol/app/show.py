@@ -17,7 +17,7 @@ from .._util.vec3 import apart
 from ..compositing.isosurface import Isosurface
 from ..ray import check_arguments
 from ..scene.camera import Camera
-from ..scene.rendering import Rendering, in_notebook
+from ..scene.rendering import Rendering, in_notebook, open_window
 from ..scene.space import enter
 from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
@@ -65,7 +65,7 @@ def show(
     """
     known = DEFAULTS.keys() - {"transfer"}
     for name in options.keys() - known:
-        told = f"show has no option {name!r}.{near(ELSEWHERE.get(name, name), known)}"
+        told = f"show has no option {name!r}.{near(ELSEWHERE.get(name, name), DEFAULTS)}"
         raise ValueError(f"{told} jaxvol render --help has them.")
     is_file = isinstance(volume, str | os.PathLike)
     given = {} if is_file else {"volume": volume}
@@ -91,7 +91,7 @@ def show(
     if why := why_empty(scene, rendering):
         warnings.warn(why, stacklevel=2)
     if not in_notebook():
-        rendering.show()
+        open_window(rendering)
     return rendering
 
 

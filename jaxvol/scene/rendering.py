@@ -1,6 +1,7 @@
 """What does a render return?"""
 
 import sys
+import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -126,25 +127,40 @@ class Rendering(eqx.Module):
 
         Raises:
             ValueError: for what is traced, or no image.
+
+        Warns of an image in which nothing is visible.
         """
         if self.rgba.ndim != 3 or is_traced(self.rgba):
             raise ValueError(f"show needs an image whose numbers are known; got {described(self.rgba)}.")
         if in_notebook():
             sys.modules["IPython"].display.display(self)
             return
-        import matplotlib.pyplot as plt
-
-        pixels = displayed(np.asarray(self.image(), np.float32))
-        figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)
-        figure.figimage(pixels)
-        plt.show()
-        plt.close(figure)
+        self._warn_if_empty(stacklevel=3)
+        open_window(self)
 
     def _repr_png_(self) -> bytes | None:
         """What notebooks show: the image as a PNG, if it is one."""
         if self.rgba.ndim != 3 or is_traced(self.rgba):
             return None
+        self._warn_if_empty(stacklevel=2)
         return png_of(displayed(np.asarray(self.image(), np.float32)))
+
+    def _warn_if_empty(self, stacklevel: int) -> None:
+        if not np.asarray(self.rgba)[..., 3].any():  # NaN is not nothing
+            what = "does the camera see the volume, and the transfer function show its values?"
+            told = f"nothing is visible, all pixels are transparent: {what} jaxvol.show says why."
+            warnings.warn(told, stacklevel=stacklevel)
+
+
+def open_window(rendering: Rendering) -> None:
+    """Shows an image over its background in a window of matplotlib, until that is closed."""
+    import matplotlib.pyplot as plt
+
+    pixels = displayed(np.asarray(rendering.image(), np.float32))
+    figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)
+    figure.figimage(pixels)
+    plt.show()
+    plt.close(figure)
 
 
 def in_notebook() -> bool:

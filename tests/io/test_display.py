@@ -102,6 +102,10 @@ def test_image_over_a_background():
     ):
         with pytest.raises(ValueError, match=message):
             rendering.image(wrong)
+    empty = jv.Rendering(jnp.zeros((2, 3, 4)), rendering.exhausted)
+    with pytest.warns(UserWarning, match="nothing is visible, .* jaxvol.show says why"):
+        empty._repr_png_()
+    assert rendering._repr_png_() is not None  # without a warning
 
 
 def test_images_are_shown_side_by_side_pixel_by_pixel(monkeypatch):

@@ -14,8 +14,7 @@ from ...scene.transfer import TransferFunction, extinction_of
 
 
 MAX_POINTS = 16
-"""Control points that a viewer edits. All transfer functions of so many points or fewer are padded to it, so
-that one program renders them all."""
+"""Control points that a viewer edits."""
 
 COLOR_POINTS = 7
 """Control points that are added to show the colours of a colormap."""
@@ -117,20 +116,6 @@ def colored_as(transfer: TransferFunction, other: TransferFunction) -> TransferF
         at = np.interp(values, values[[0, -1]], its[[0, -1]])
         colors = np.stack([np.interp(at, its, each) for each in colors.T], axis=1)
     return TransferFunction(values, colors, transfer.extinction)
-
-
-def padded(transfer: Any) -> Any:
-    """The same function by `MAX_POINTS` points where there are fewer: beyond the last one it is constant."""
-    if not isinstance(transfer, TransferFunction) or len(transfer.values) > MAX_POINTS:
-        return transfer
-    missing = MAX_POINTS - len(transfer.values)
-    values, colors, extinction = (np.asarray(getattr(transfer, name)) for name in POINTS)
-    step = max(window_level(transfer)[0] or 1.0, 1e-3 * abs(float(values[-1])))
-    return TransferFunction(
-        np.append(values, values[-1] + step * np.arange(1, missing + 1)),
-        np.append(colors, np.repeat(colors[-1:], missing, axis=0), axis=0),
-        np.append(extinction, np.repeat(extinction[-1], missing)),
-    )
 
 
 def _with_point(transfer: TransferFunction, index: int, **changed: Any) -> TransferFunction:

@@ -20,7 +20,8 @@ from ...render import render
 from ...scene.camera import Camera
 from ...scene.rendering import Rendering
 from ...scene.several import with_others
-from .editing import padded
+from ..padding import padded
+from .editing import MAX_POINTS
 from .state import PROGRAM, Scene, State
 
 
@@ -91,7 +92,7 @@ class TileRenderer:
     def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
         self.scene, self.volume, self.state = scene, scene.volume, state
         self.march = scene.march(state, step_factor)
-        self.transfer = padded(state.transfer)
+        self.transfer = padded(state.transfer, MAX_POINTS)
         self.others = scene.others
         self.background = np.asarray(state.background, np.float32)
         self.how = {"compositing": scene.compositing(state), "lighting": scene.light(state)}
