@@ -32,10 +32,10 @@ REST = "document.body.innerText.includes('(estimate)')"
 
 
 def scene(folder: Path) -> tuple[Path, Path]:
-    """Files of a volume and a transfer function: a light ball, and a small blue one on its front, left of the
-    middle of the view."""
+    """Files of a volume and a transfer function: a light ball, and a small blue one on its front as the first
+    camera sees it, a little left of the middle, where a turn hardly moves it up or down."""
     x, y, z = np.mgrid[:40, :40, :40] - 19.5
-    small = np.sqrt((x + 7) ** 2 + (y + 12) ** 2 + z**2) < 6
+    small = np.sqrt((x - 1.6) ** 2 + (y + 13) ** 2 + z**2) < 6
     body = np.clip(150 - 8 * np.sqrt(x**2 + y**2 + z**2), 0, 255)
     np.savez(folder / "balls.npz", data=np.where(small, 220, body).astype(np.uint8))
     points = [(30, (0.9, 0.7, 0.4), 0.0), (50, (0.9, 0.7, 0.4), 0.1), (150, (0.9, 0.7, 0.4), 0.1)]
