@@ -184,14 +184,21 @@ def range_of_object(volume: Volume) -> tuple[float, float]:
 
 
 def xray_transfer(volume: Volume, cmap: Any, clim: tuple[float, float]) -> TransferFunction:
-    """Of an extinction that grows with the values of a range, so that the line integral is 1 where it is the
-    greatest along an axis, but for a thousandth of the rays."""
-    colors, (low, high) = colormap(cmap, clim), clim
+    """Of an extinction that grows with the values of a range, so that a pixel's brightest channel is 1 where
+    it is the greatest along an axis, but for a thousandth of the rays."""
+    colors = colormap(cmap, clim)
+    slope, brightest = np.linspace(0, 1, len(colors.values)), np.max(colors.colors, axis=1)
+    emitted = np.interp(sampled(volume), colors.values, slope * brightest)
     steps = np.asarray(volume.spacing) * stride_of(volume.shape)
-    relative = np.clip((sampled(volume).astype(np.float32) - low) / (high - low), 0, 1)
-    densest = max(np.percentile(step * relative.sum(axis), 99.9) for axis, step in enumerate(steps))
-    slope = np.linspace(0, 1 / (float(densest) or 1.0), len(colors.values))
-    return TransferFunction(colors.values, colors.colors, slope)
+    most = max(np.percentile(step * emitted.sum(axis), 99.9) for axis, step in enumerate(steps))
+    return TransferFunction(colors.values, colors.colors, slope / (float(most) or 1.0))
+
+
+def brightest_mean(volume: Volume, low: float) -> float:
+    """The greatest mean of the values along an axis, but for a thousandth of the rays; above `low`."""
+    data = sampled(volume)
+    highest = max(float(np.percentile(data.mean(axis, dtype=np.float64), 99.9)) for axis in range(3))
+    return highest if highest > low else low + 1
 
 
 def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:
@@ -245,7 +252,9 @@ def labels_shown(
     check_arguments("labels_shown(volume)", volume=volume)
     check_known("labels_shown", volume, around)
     if (found := labels_if_any(volume, around)) is None:
-        raise ValueError("volume must have up to 256 labels, or values that seem to be labels; it has none.")
+        told = "volume must have up to 256 labels, or values that seem to be labels; it has "
+        many = 0 if volume.labels is None else len(np.unique(np.asarray(volume.labels)))
+        raise ValueError(f"{told}{many or 'none'}.")
     return found
 
 

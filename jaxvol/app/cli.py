@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = argparse.Namespace()
     try:
         raise_again()
-        options = parsed(parser_of_all(), words)
+        options = parsed(parser_of_all(), words or ["--help"])
         jax.config.update("jax_compilation_cache_dir", str(default_programs()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         with warnings.catch_warnings():

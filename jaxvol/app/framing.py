@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .._util.checks import Arrayable, flag
+from .._util.checks import Arrayable, finite_array, flag
 from .._util.texts import pasted
 from ..ray import check_arguments
 from ..scene.camera import Camera, axes_of
@@ -58,7 +58,8 @@ def automatic_camera(
         transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts. Of
             several volumes, a list of one for each.
         direction: from the volume to the camera; by default to the right, in front, and higher.
-        view_up: by default z; of a volume that does not say where it lies (its origin is 0, its axes are the
+        view_up: by default z (from straight above or below, in the world of patients, the front is up); of a
+            volume that does not say where it lies (its origin is 0, its axes are the
             world's, as of raw files), away from the face that cuts through most of what `automatic_transfer`
             shows, if the opposite one does not: the neck, or the pot of a plant, is below.
         view_angle: degrees.
@@ -74,7 +75,7 @@ def automatic_camera(
         The `Camera`.
 
     Raises:
-        ValueError: as `Camera.looking_at` does, and for what is traced.
+        ValueError: as `Camera.looking_at` does, for a `view_up` along `direction`, and for what is traced.
     """
     pairs = pairs_of(volume, transfer) or [(volume, transfer)]
     volume, transfer = pairs[0]
@@ -94,12 +95,24 @@ def upright(
     axis, sign = (2, 1.0) if view_up is not None else _up(volume, transfer)
     front = np.roll(FRONT, axis + 1)  # so that what is above lies along this axis
     front[axis] *= sign
-    return front if direction is None else direction, sign * np.eye(3)[axis] if view_up is None else view_up
+    toward = np.asarray(finite_array("direction", front if direction is None else direction, (3,)))
+    up = np.asarray(finite_array("view_up", sign * np.eye(3)[axis] if view_up is None else view_up, (3,)))
+    if np.linalg.norm(np.cross(toward, up)) <= 1e-3 * np.linalg.norm(toward) * np.linalg.norm(up):
+        if view_up is not None and np.any(up) and np.any(toward):
+            raise ValueError(f"view_up must not point along direction, {pasted(toward)}; got {pasted(up)}.")
+        up = (-1 if is_placed(volume) else 1) * np.eye(3)[1]  # a patient's front lies at -y
+        up = -np.eye(3)[2] if toward[1] else up
+    return toward, up
+
+
+def is_placed(volume: Volume) -> bool:
+    """Whether a volume says where it lies, as those of scanners do."""
+    return volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
 
 
 def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     """The axis that points up, and whether it does so forward or backward."""
-    known = volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
+    known = is_placed(volume)
     if not known and isinstance(transfer, TransferFunction):  # what is given may be fog
         transfer = automatic_transfer(volume)
     visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE

@@ -3,20 +3,21 @@
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from .._util.checks import finite_array, flag, integer, number
+from .._util.checks import described, finite_array, flag, integer, number
 from .._util.srgb import linear_color
 from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
 from ..compositing.isosurface import Isosurface
 from ..compositing.modes import MODES, compositing_of
 from ..fitting import read_transfer
-from ..io.formats import load
+from ..io.formats import labelled, load
 from ..lighting import Lighting, Phong
 from ..march.march import March, Transform
 from ..march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
@@ -32,7 +33,9 @@ from ..scene.volume import Volume
 from .automatic import (
     SAMPLED,
     automatic_transfer,
+    brightest_mean,
     labels_if_any,
+    labels_shown,
     preset_unit,
     range_of_object,
     sampled,
@@ -41,7 +44,7 @@ from .automatic import (
     unit_of,
     xray_transfer,
 )
-from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
+from .framing import FAINT, VISIBLE, automatic_camera, framed, upright, visible_points, warn_of_distance
 from .padding import padded
 
 
@@ -70,6 +73,11 @@ ELSEWHERE = {
     "color": "cmap",
 }
 ELSEWHERE |= {
+    "camera_position": "camera",
+    "window_size": "size",
+    "resolution": "size",
+    "parallel_projection": "parallel",
+    "isosurface": "isovalue",
     "lighting": "shade",
     "shading": "shade",
     "bg": "background",
@@ -127,7 +135,7 @@ class Scene(NamedTuple):
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
         """The cheapest way to render the scene within a tolerance, for each camera."""
         if self.others:
-            raise ValueError("others: several volumes are not planned for; give a step.")
+            raise ValueError("others: several volumes are not planned for; render them by a step.")
         what: Any = self.volume if self.source is None else self.source
         how: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
         how |= {"compositing": self.compositing, "lighting": self.lighting}
@@ -201,8 +209,12 @@ def look_of(options: Namespace) -> tuple[Volume, Transfer]:
     """The volume, which may be another one where labels are shown, and its transfer function."""
     volume, automatic = volume_of(options), is_automatic(options)
     transfer = None if automatic else transfer_of(options, volume)
-    if automatic or options.labels is not None:
-        volume, transfer = labels_if_any(volume, transfer) or (volume, transfer)
+    if volume.labels is not None and not np.any(volume.labels):
+        warnings.warn("labels: all voxels have the label 0, which stands for what is around", stacklevel=4)
+    if options.labels is not None:
+        return labels_shown(volume, transfer)
+    if automatic:
+        volume, transfer = labels_if_any(volume) or (volume, transfer)
     return volume, automatic_transfer(volume) if transfer is None else transfer
 
 
@@ -228,8 +240,13 @@ def _camera(
         transfer = TransferFunction(step, np.ones((2, 3)), [0.0, 1e6 / unit_of(volume)])
     given["parallel"] = options.parallel
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
+    direction, up = upright(volume, transfer, options.direction, options.view_up)
+    if options.clip_box is not None and not options.clip_inside_out:
+        with suppress(ValueError):  # of a box that holds nothing
+            others = [(each.crop(options.clip_box), its) for each, its in others]
+            volume = volume.crop(options.clip_box)
     what = with_others(volume, transfer, others)
-    camera = automatic_camera(*what, options.direction, options.view_up, **given)
+    camera = automatic_camera(*what, direction, up, **given)
     if orbit is None:
         return camera
     points = [visible_points(*pair, least) for pair in ((volume, transfer), *others)]
@@ -279,13 +296,14 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
 
 
 def volume_of(options: Namespace) -> Volume:
-    header = header_of(options) | {"labels": options.labels}
+    header, labels = header_of(options), options.labels
+    if not isinstance(labels, str | Path | None):
+        raise ValueError(f"labels must be a file; got {described(labels)}. Or jv.Volume(data, labels=...).")
     if not isinstance(options.file, Volume):
-        return load(options.file, **header)
+        return load(options.file, **header, labels=labels)
     if told := [name for name, value in header.items() if value is not None]:
-        hint = " Give it labels: jv.Volume(data, labels=...)." if told[0] == "labels" else ""
-        raise ValueError(f"{told[0]} is of files; volume is a Volume.{hint}")
-    return options.file
+        raise ValueError(f"{told[0]} is of files; volume is a Volume.")
+    return options.file if labels is None else labelled(options.file, labels)
 
 
 def header_of(options: Namespace) -> dict[str, Any]:
@@ -302,7 +320,8 @@ def is_automatic(options: Namespace) -> bool:
 def background_of(options: Namespace) -> tuple[float, float, float]:
     """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
     if options.background is None:
-        level = 0.0 if options.compositing in MODES.keys() - {"over"} else 1.0
+        is_dark = getattr(options, "preset", None) is not None and preset_name(options.preset).endswith("MIP")
+        level = 0.0 if is_dark or options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
     red, green, blue = np.asarray(linear_color("background", options.background), np.float64).tolist()
     if not all(0 <= each <= 1 for each in (red, green, blue)):
@@ -336,8 +355,11 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
     if clim is None:
         data, over = np.asarray(volume.data), options.compositing == "over"
         # what is around the object would be fog
-        clim = range_of_object(volume) if over else (float(data.min()), float(data.max()))
+        low, high = float(data.min()), float(data.max())
+        clim = range_of_object(volume) if over else (low, high if high > low else low + 1)
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
+    if options.compositing == "average" and options.clim is options.window is None:
+        clim = clim[0], brightest_mean(volume, clim[0])
     if options.compositing == "integral" and unit is None:
         return xray_transfer(volume, cmap, clim)
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)

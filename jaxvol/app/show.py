@@ -96,14 +96,18 @@ def show(
 
 
 def why_empty(scene: Scene, rendering: Rendering) -> str | None:
-    """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`."""
+    """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`, and the
+    values differ."""
     volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
+    data = np.asarray(scene.volume.data)
+    if scene.volume.labels is None and not scene.others and data.min() == data.max():
+        return f"all voxels have the value {float(data.flat[0]):g}: there is nothing to see in the volume"
     if np.isnan(opacity):
         return None
     if opacity > FAINT:
         differs = float(np.abs(np.asarray(rendering.image(scene.background)) - scene.background).max())
         low = f"hardly anything is visible: no pixel differs from the background by more than {differs:.2g}"
-        return None if differs > FAINT / 2 else f"{low}. Use another clim, background or mode."
+        return None if differs > FAINT / 2 else f"{low}. Use another clim, background or compositing."
     if opacity > 0:
         size = f"voxels have the size {voxel_size(volume):.3g}"
         change = f"a shorter unit_distance ({size}) or another clim"

@@ -98,7 +98,12 @@ class Plan(NamedTuple):
 
         Returns:
             As `render`.
+
+        Raises:
+            ValueError: as `render` does, and for other options.
         """
+        if unknown := sorted(options.keys() - {"outputs", "devices"}):
+            raise ValueError(f"options must be outputs and devices; got {', '.join(unknown)}.")
         how = {"compositing": self.compositing, "lighting": self.lighting, **options}
         if self.bricks is not None:
             return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
@@ -185,8 +190,9 @@ def plan(
         seed: of the choice of patches. With it, the plan depends on nothing but the scene.
 
     Returns:
-        A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, or nothing is seen
-        although blocks may show something, `Plan.within` is False and `Plan.parts` says so.
+        A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
+        False. If nothing is seen although blocks may show something, `Plan.parts` says so, and the predicted
+        error is what may have been missed.
 
     Raises:
         ValueError: for arguments of another kind, a tolerance out of range, arrays that are traced (plan

@@ -188,13 +188,14 @@ def fitted_range(
 ) -> tuple[tuple[float, float] | None, str | None]:
     """To what a preset is stretched for these values of a volume if nothing is said, None for its own range;
     and a word where that does not fit. Values of MR have no unit, those of CT are Hounsfield units."""
-    name, low, high = preset_name(name), float(values.min()), float(np.percentile(values, 99.9))
+    name, low, most = preset_name(name), float(values.min()), float(values.max())
+    high = most if name.endswith("MIP") else float(np.percentile(values, 99.9))
     first, last = PRESETS[name][1]
     if name.upper().startswith("MR") and high > 0 and not last / 2 <= high <= 2 * last:
         told = f"{name} is for values from {first:g} to {last:g}; it was stretched to 0 to {high:g}"
         return (0.0, high), f"{told}. Another clim stretches it otherwise."
     if name.upper().startswith("CT") and (low >= 0 or high < 200):
-        told = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to {high:g}"
+        told = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to {most:g}"
         return None, f"{told}. Of those stored + 1024, clim is ({first + 1024:g}, {last + 1024:g})."
     return None, None
 

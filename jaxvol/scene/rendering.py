@@ -1,5 +1,6 @@
 """What does a render return?"""
 
+import os
 import sys
 import warnings
 from functools import partial
@@ -155,6 +156,10 @@ class Rendering(eqx.Module):
 def open_window(rendering: Rendering) -> None:
     """Shows an image over its background in a window of matplotlib, until that is closed."""
     import matplotlib.pyplot as plt
+
+    if plt.get_backend().lower() == "agg" and "MPLBACKEND" not in os.environ:  # which was not asked for
+        told = "there is no display for a window; jaxvol.save_png(path, rendering.image()) writes the image"
+        warnings.warn(told, stacklevel=4)
 
     pixels = displayed(np.asarray(rendering.image(), np.float32))
     figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)

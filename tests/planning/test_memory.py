@@ -86,6 +86,8 @@ def test_a_plan_without_parts_is_printed_and_rendered():
     np.testing.assert_array_equal(found.render(*given).rgba, image.rgba)
     with pytest.raises(ValueError, match=r"transfer must be .* That is the camera"):
         found.render(*given[::-1])
+    with pytest.raises(ValueError, match="options must be outputs and devices; got output"):
+        found.render(*given, output="rgba")
 
 
 BAD: list[tuple[Any, Any, str]] = [

@@ -32,8 +32,8 @@ def _animate(options: argparse.Namespace) -> None:
     if kind not in (".gif", ".mp4"):
         raise ValueError(f"--output: must end in .gif or .mp4; got {path}.")
     fastest = 50 if kind == ".gif" else 240  # browsers show GIF frames of less than 2/100 s for 10/100 s
-    if not 0 < options.fps <= fastest:
-        raise ValueError(f"--fps of a {kind} must be above 0, and {fastest} at most; got {options.fps:g}.")
+    if not 0.01 <= options.fps <= fastest:
+        raise ValueError(f"--fps of a {kind} must be from 0.01 to {fastest}; got {options.fps:g}.")
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise ImportError('--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]".')
 

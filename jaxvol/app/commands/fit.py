@@ -17,6 +17,8 @@ def _fit(options: argparse.Namespace) -> None:
     output_file("--output", options.output)
     # these are checked before the volume is read
     views = read_views(options.images, options.cameras)
+    if options.labels is not None:
+        raise ValueError("--labels: fit finds one transfer function of the values, not one for each label.")
     background = background_of(options)
     volume = volume_of(options)
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...io import datasets
-from ...io.formats import read
+from ...io.formats import labelled, read
 from ...scene.volume import Volume
 from ..picture import header_of, is_automatic, look_of, other_of, volume_of
 from ..viewer import serve
@@ -45,6 +45,8 @@ def _info(options: argparse.Namespace) -> None:
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)
+    if options.labels is not None:
+        volume = labelled(volume, options.labels)
     data = np.asarray(volume.data)
     assumed = "spacing" not in arguments
     # of every k-th voxel of a large volume: sorting all takes seconds and memory
@@ -89,7 +91,9 @@ def add_info(commands: Any) -> None:
 def _view(options: argparse.Namespace) -> None:
     how = {name: getattr(options, name) for name in ("port", "host", "token")}
     others = tuple(map(other_of, options.others or ()))
-    file = None if options.labels or others else options.file  # a picture names no other file
+    told = any(value is not None for value in header_of(options).values())
+    # a picture names no other file, and does not hold what is said of its own
+    file = None if options.labels or others or told else options.file
     look = (volume_of(options),) if is_automatic(options) else look_of(options)
     page = serve(*look, lit=options.shade, title=options.file.name, file=file, others=others, **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)

@@ -69,7 +69,7 @@ def view(
             "over" or "integral". The controls are those of `volume`.
 
     Returns:
-        A widget `v`. `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting,
+        A widget `v`. Without `others`, `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting,
         compositing=v.compositing)` renders what it shows.
 
     Raises:

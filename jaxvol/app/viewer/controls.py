@@ -45,7 +45,11 @@ def _view_controls(model: Model) -> list[Control]:
     )
     low, high = float(data.min()), float(data.max())
     span = high - low or max(abs(low), 1.0)
-    isovalue = lambda: rounded(model.state.isovalue, span), lambda to: model.change(isovalue=to)
+
+    def get_isovalue() -> float:
+        return min(max(rounded(model.state.isovalue, span), low), rounded(low + span, span))
+
+    isovalue = get_isovalue, lambda to: model.change(isovalue=to)
     unit = rounded(span / 1000, span / 1000)
 
     def look(side: str) -> None:
@@ -96,11 +100,14 @@ def _clip_controls(model: Model) -> list[Control]:
         cut = {"clip": True, "normal": tuple((-toward).tolist()), "offset": 0.0}
         model.change(**{"offset": -1.0} if name == "none" else cut)
 
+    def set_depth(offset: float) -> None:
+        model.change(clip=True, offset=offset)
+
     return [
         _bound(model, "checkbox", "clip", "clip"),
         *map(range_of, range(3)),
         Control("dropdown", "cut from", lambda: chosen, choose, choices=("none", "view", *SIDES)),
-        _bound(model, "slider", "depth", "offset", limits=(-1.0, 1.0, 0.01)),
+        Control("slider", "depth", lambda: model.state.offset, set_depth, limits=(-1.0, 1.0, 0.01)),
     ]
 
 

@@ -77,6 +77,7 @@ class Model:
         self._shown: tuple[State, Pixels, Stage] | None = None
         self._level = 2
         self._compiled: set[Any] = set()
+        self._failed: set[Any] = set()
         self._changed = threading.Condition()
         self._next: State | None = None
         self._idle, self._closed, self._marked = True, False, False
@@ -236,8 +237,7 @@ class Model:
         done = self._told("compiled", renderer.overview)
         with self._changed:
             self._compiling = ""
-            if done:
-                self._compiled.add(renderer.program_key)
+            (self._compiled if done else self._failed).add(renderer.program_key)
             if done or self.state is not request:
                 self._next, self._idle = self.state, False
             self._changed.notify_all()
@@ -245,7 +245,7 @@ class Model:
     def _stand_in(self, request: State, last: State) -> State | None:
         """What is drawn until the program of a request is compiled, by that of the last one; None if that
         would be the image that is there. Has the program compiled, unless another is being compiled."""
-        if not self._compiling:
+        if not self._compiling and TileRenderer(self.scene, request).program_key not in self._failed:
             names = [told for name, told in PROGRAM.items() if getattr(request, name) != getattr(last, name)]
             names = [*sorted(request.enabled ^ last.enabled), *filter(None, names)]
             self._compiling = ", ".join(names) or "points"

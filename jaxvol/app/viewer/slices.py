@@ -48,7 +48,7 @@ def slice_controls(model: Model) -> list[Control]:
         rgb = np.clip((data - low) / ((high - low) or 1.0), 0, 1)[..., None].repeat(3, axis=2)
         if palette is not None:
             kinds = labels.take(round(at[axis]), axis)
-            rgb = np.where((kinds > 0)[..., None], rgb * palette[kinds], rgb)
+            rgb = np.where((kinds > 0)[..., None], rgb * palette[np.minimum(kinds, len(palette) - 1)], rgb)
         rgb = rgb[:: -1 if down[a] else 1, :: 1 if down[b] else -1].swapaxes(0, 1)
         picture = Image.fromarray((255 * rgb).astype(np.uint8)).resize((pixels[a], pixels[b]))
         x, y = (1 - at[a] / last[a] if down[a] else at[a] / last[a]), at[b] / last[b]

@@ -38,7 +38,7 @@ from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, labels_if_any
-from ..framing import FAINT, VISIBLE, automatic_camera, warn_of_distance
+from ..framing import FAINT, VISIBLE, automatic_camera, is_placed, warn_of_distance
 
 
 MIN_STEP, MAX_STEP = 1 / 16, 16.0  # voxels
@@ -78,7 +78,7 @@ class Orbit:
 
     @classmethod
     def of(cls, camera: Camera) -> "Orbit":
-        """That of a camera; of an orthographic one, from as far as shows the same height."""
+        """That of a camera, without its window; of an orthographic one, from where the same height shows."""
         place = camera.position, camera.focal_point, camera.view_up
         orbit = cls.at(*place, float(camera.view_angle))
         if camera.parallel_scale is None:
@@ -222,6 +222,8 @@ class Scene:
 
     def seen_from(self, state: State, toward: Vector) -> Orbit:
         """An orbit in this direction, as near as what is visible allows."""
+        if is_placed(self.volume):  # a patient's front, at -y, is up from above, too
+            toward = toward + np.array([0, 1e-6 * max(float(toward[2]), 0), 0])
         orbit = replace(state.orbit, toward=toward).turned(0, 0)  # not straight from above
         what = with_others(self.volume, state.transfer, self.others)
         how: Any = {"parallel": state.parallel, "size": state.size, "least": FAINT, "centered": True}

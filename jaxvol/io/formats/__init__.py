@@ -121,7 +121,7 @@ def load(
     arguments |= {name: value for name, value in given.items() if value is not None}
     try:
         volume = Volume(**arguments)
-        return volume if labels is None else _labelled(volume, labels)
+        return volume if labels is None else labelled(volume, labels)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from fault
 
@@ -205,9 +205,12 @@ def _one(path: Path, arguments: dict[str, Any], given: dict[str, int | None]) ->
     return arguments | {"data": data}
 
 
-def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
+def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
-    found = read(path)
+    try:
+        found = read(path)
+    except ValueError as fault:
+        raise ValueError(f"labels: {str(fault).removeprefix('path: ')}") from fault
     if (values := found["data"]).dtype.kind == "f":
         if not np.array_equal(values, np.rint(values)):
             raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
@@ -219,7 +222,7 @@ def _labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
         raise ValueError(
             f"labels: {path} must lie where the volume does, with corners {here.tolist()}; it has "
-            f"{there.tolist()}."
+            f"{there.tolist()}. SimpleITK's Resample, with sitkNearestNeighbor, puts it there."
         )
     place = volume.spacing, volume.origin
     numbers = np.asarray(labels.data)  # float32 of more than 65536 kinds

@@ -43,10 +43,13 @@ def raw_header(
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
     given = {"shape": shape, "dtype": dtype}
     fields |= _json_fields(path) | {name: value for name, value in given.items() if value is not None}
-    if not {"shape", "dtype"} <= fields.keys():
+    ways = {"shape": "shape=(nx, ny, nz)", "dtype": 'dtype="uint8"'}
+    if missing := ways.keys() - fields.keys():
+        told = " and ".join(sorted(missing, reverse=True))
         raise ValueError(
-            f"path: the shape and dtype of {path} are not both known. Give shape=(nx, ny, nz) "
-            'and dtype="uint8", or name it name_XxYxZ_dtype.raw, or put '
+            f"path: the {told} of {path} {'are' if len(missing) > 1 else 'is'} not known. "
+            f"Give {' and '.join(ways[name] for name in ways if name in missing)}, "
+            "or name it name_XxYxZ_dtype.raw, or put "
             f'{path.name}.json in its folder with {{"size": [nx, ny, nz], "type": "uint8"}}.'
         )
     shape, dtype = fields.pop("shape"), fields.pop("dtype")

@@ -10,7 +10,7 @@ import pytest
 from skimage.io import imread
 
 import jaxvol as jv
-from jaxvol.app.automatic import range_of_object, xray_transfer
+from jaxvol.app.automatic import brightest_mean, range_of_object, xray_transfer
 from jaxvol.app.cli import main
 from jaxvol.app.picture import Scene
 from jaxvol.app.show import why_empty
@@ -94,7 +94,7 @@ SCENES = {
     "a colormap": (["--cmap", "hot"], of_voxel("hot", OBJECT), "over", None, 1),
     "of all values": (
         ["--compositing", "average"],
-        of_voxel("gray"),
+        of_voxel("gray", (float(ENGINE.min()), brightest_mean(jv.Volume(ENGINE), 0.0))),
         "average",
         None,
         0,
@@ -149,9 +149,17 @@ def test_x_rays_are_as_bright_as_white_where_most_is_passed(volume_file):
     volume = jv.load(volume_file)
     found = xray_transfer(volume, "gray", RANGE)
     along = [
-        np.interp(np.asarray(volume.data), found.values, found.extinction).sum(axis) for axis in range(3)
+        np.interp(np.asarray(volume.data), found.values, found.extinction * found.colors[:, 0]).sum(axis)
+        for axis in range(3)
     ]
     assert max(np.percentile(each, 99.9) for each in along) == pytest.approx(1, rel=1e-4)
+
+
+def test_averages_are_as_bright_as_white_where_they_are_greatest(volume_file):
+    volume = jv.load(volume_file)
+    along = [np.percentile(np.asarray(volume.data).mean(axis), 99.9) for axis in range(3)]
+    assert brightest_mean(volume, 0.0) == pytest.approx(max(along))
+    assert brightest_mean(jv.Volume(np.full((3, 3, 3), 5.0)), 5.0) == 6
 
 
 def test_opacities_of_a_colormap_are_those_of_a_voxel_whatever_its_unit(volume_file, tmp_path, drawn):
@@ -386,7 +394,7 @@ BAD = {
     "level": (["FILE", "--window", "3"], "window and level go together; one is missing"),
     "window": (["FILE", "--window", "3", "--clim", "0", "1"], "clim and window exclude each other"),
     "preset": (["FILE", "--preset", "CT-Bnes"], "got 'CT-Bnes'. Did you mean CT-Bones"),
-    "raw": (["DIR/headless.raw"], "not both known. Give --shape nx ny nz and --dtype uint8, or name it"),
+    "raw": (["DIR/headless.raw"], "are not known. Give --shape nx ny nz and --dtype uint8, or name it"),
     "with": (["FILE", "--with", "FILE", "hot", "1"], "others are FILE, FILE CMAP or FILE CMAP LOW HIGH"),
     "labels and memory": (["FILE", "--with", "FILE", "--memory", "1M"], "memory reads one volume, without"),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),

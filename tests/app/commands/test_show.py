@@ -10,6 +10,7 @@ from skimage.io import imread
 import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
+from jaxvol.app.framing import upright
 from jaxvol.app.picture import DEFAULTS
 
 from .test_render import render, same
@@ -102,7 +103,7 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
         (volume, {"memory": "512M"}, "memory is of files; volume is a Volume"),
         (volume, {"compositing": jv.lighting.Phong()}, "compositing must be a name; got a Phong"),
         (volume, {"opacity": 0.3}, "show has no option 'opacity'. Did you mean transfer"),
-        (volume, {"labels": [1]}, r"labels is of files; .* jv.Volume\(data, labels="),
+        (volume, {"labels": [1]}, r"labels must be a file; got .* jv.Volume\(data, labels="),
         (volume, {"others": [volume], "shade": True}, "shade: several volumes are shown without light"),
         (volume, {"others": [volume], "tolerance": 0.1, "step": None}, "tolerance is for one volume"),
         (volume, {"window": -3, "level": 2}, "window must be greater than 0; got -3"),
@@ -114,6 +115,19 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
     assert same(drawn.scenes[-1][2], camera)
     jv.show(volume, compositing=jv.Isosurface(30.0), step=0.4)
     assert same(drawn.how[-1]["compositing"], jv.Isosurface(30.0))
+    box = (0, 9, 2, 20, 1, 20)
+    jv.show(volume, step=0.4, clip_box=box)
+    seen = volume.crop(box), jv.automatic_transfer(volume)
+    assert same(drawn.scenes[-1][2], jv.automatic_camera(*seen, *upright(volume, seen[1], None, None)))
+    for odd, message in (
+        (jv.Volume(np.full((4, 4, 4), 7.0)), "all voxels have the value 7"),
+        (
+            jv.Volume(volume.data, labels=np.zeros(volume.shape, np.uint8)),
+            "labels: all voxels have the label 0",
+        ),
+    ):
+        with pytest.warns(UserWarning, match=message):
+            jv.show(odd, step=0.4, size=8)
     drawn.level = 0.0
     with pytest.warns(UserWarning, match="nothing is visible: the volume's values run .* A clim from"):
         jv.show(volume, jv.preset("engine", (500, 900)), size=8, step=0.4)

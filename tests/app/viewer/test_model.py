@@ -407,6 +407,11 @@ def test_the_controls_change_march_and_light(controlled):
         assert model.state.step == expected
     controls["look from"].set("+z")
     np.testing.assert_allclose(model.state.orbit.toward, (0, 0, 1), atol=2e-3)
+    head = jv.Volume(BALL.data, BALL.spacing, origin=(0, 0, 1))  # of a patient, whose front, at -y, is up
+    for side, up in (("+z", -1), ("-z", -1)):
+        lying, its = controlled(head)
+        its["look from"].set(side)
+        assert lying.state.orbit.axes()[1][1] == pytest.approx(up, abs=1e-3)
     controls["background"].set("#ffffff")
     for mode, background, lit in (("maximum", (0, 0, 0), False), ("isosurface", (1, 1, 1), True)):
         controls["mode"].set(mode)
@@ -419,6 +424,8 @@ def test_the_controls_change_march_and_light(controlled):
 def test_a_box_and_a_plane_clip_what_is_shown(controlled):
     model, controls = controlled()
     assert not model.state.clip
+    controls["depth"].set(0.5)
+    assert model.state.clip
     controls["x"].set((3.0, 9.0))
     controls["cut from"].set("view")
     orbit = model.state.orbit
@@ -485,6 +492,8 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
     data = np.asarray(LABELS.data)
     unseen = jv.LabelTransferFunction({1: jv.TransferFunction([0, 1], np.ones((2, 3)), [0, 0])})
     assert "label" not in controlled(LABELS_OF_ONES, unseen)[1]
+    one = jv.LabelTransferFunction({1: jv.colormap("gray", (0, 255), unit_distance=1.0)})
+    assert "label" in controlled(jv.Volume(data, labels=data), one)[1]["slices"].get()  # of 2 there is none
     _, controls = controlled(jv.Volume(np.where(data == 2, np.uint8(9), data)), None)
     assert controls["label"].choices == ["1", "9"]  # as in the file
 

@@ -69,6 +69,9 @@ def test_another_machine_needs_the_token():
             jv.serve(VOLUME, GRAY, host="nohost.invalid")
     finally:
         served.close()
+    served = jv.serve(VOLUME, GRAY, port=18070, host="127.0.0.2")  # a random one
+    served.close()
+    assert len(served.url.rpartition("/")[2]) > 20
 
 
 def handled(page, origin: str) -> int:
