@@ -65,25 +65,18 @@ DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (51
 DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
 """Options of a picture, as they are where nothing is given."""
 
-ELSEWHERE = {
-    "mode": "compositing",
-    "blending": "compositing",
-    "colormap": "cmap",
-    "lut": "cmap",
-    "color": "cmap",
+CALLED = {
+    "background": "bg",
+    "camera": "camera_position cpos",
+    "cmap": "color colormap lut",
+    "compositing": "blending mode",
+    "isovalue": "isosurface",
+    "parallel": "parallel_projection",
+    "shade": "lighting shading",
+    "size": "resolution window_size",
+    "transfer": "opacity",
 }
-ELSEWHERE |= {
-    "camera_position": "camera",
-    "window_size": "size",
-    "resolution": "size",
-    "parallel_projection": "parallel",
-    "isosurface": "isovalue",
-    "lighting": "shade",
-    "shading": "shade",
-    "bg": "background",
-    "cpos": "camera",
-    "opacity": "transfer",
-}
+ELSEWHERE = {theirs: ours for ours, names in CALLED.items() for theirs in names.split()}
 """What other programs call options."""
 
 OVERRIDES = {

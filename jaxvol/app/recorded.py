@@ -80,7 +80,7 @@ def recorded_in(path: Path) -> dict[str, Any]:
         known = isinstance(content["options"], list) and isinstance(content["file"]["name"], str)
         known = known and all(isinstance(word, str) for word in content["options"])
         known = known and re.fullmatch("[0-9a-f]{64}", content["file"]["sha256"])
-        known = known and isinstance(content["file"].get("bytes", 0), int)
+        known = known and isinstance(content["file"]["bytes"], int)
     except (ValueError, RecursionError, KeyError, TypeError):
         known = False
     if not known:
@@ -90,13 +90,9 @@ def recorded_in(path: Path) -> dict[str, Any]:
     return content
 
 
-def volume_of_picture(picture: Path, name: str, size: int | None, sha256: str) -> Path:
+def volume_of_picture(picture: Path, name: str, size: int, sha256: str) -> Path:
     """The volume that a picture shows, unchanged: where it was, or in the picture's folder. Of what the
     picture names, only files of as many `size` bytes in all are read, and it is said which."""
-    if size is None:
-        raise ValueError(
-            f"{picture} is of an older jaxvol, and does not hold its volume's size. Name the volume."
-        )
     for path in (Path(name), picture.parent / Path(name).name):
         if path.exists():
             found = sum(file.stat().st_size for file in _files(path))

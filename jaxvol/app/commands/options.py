@@ -127,7 +127,7 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
         settings["recorded_transfer"] = found["transfer"]
     if not named:
         file = found["file"]
-        settings["file"] = volume_of_picture(path, file["name"], file.get("bytes"), file["sha256"])
+        settings["file"] = volume_of_picture(path, file["name"], file["bytes"], file["sha256"])
     return settings
 
 

@@ -83,8 +83,6 @@ BAD = {
     "frames": (["--frames", "0"], "--frames must be an integer from 1 to"),
     "fps": (["--fps", "0"], "--fps of a .gif must be from 0.01 to 50"),
     "fps of a gif": (["--fps", "60"], "--fps of a .gif must be from 0.01 to 50; got 60"),
-    "axis": (["--axis", "0", "0", "0"], "--axis must not be 0"),
-    "step and tolerance": (["--tolerance", "0.1"], "step and tolerance exclude"),
     "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }
 

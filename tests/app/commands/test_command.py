@@ -34,14 +34,6 @@ def test_version_and_help_are_told(capsys):
 
 BAD = [
     (["render", "x.raw", "--size", "many", "few"], "render: error: argument --size: invalid int value: 'm"),
-    (
-        ["render", "x.raw", "--memory", "lots"],
-        "render: error: argument --memory: must be a number of bytes, such as 256M or 2G; got 'lots'",
-    ),
-    (
-        ["render", "x.raw", "--memory", "0"],
-        "--memory: must be a number of bytes, such as 256M or 2G; got '0'",
-    ),
     (["fit", "x.raw", "--images", "a.png"], "fit: error: the following arguments are required: --cameras (j"),
     (
         ["render", "x.raw", "--sise", "9", "9"],

@@ -234,7 +234,7 @@ BAD = {
     "a value of another kind": (said("--step=much"), "argument --step: invalid float value: 'much'"),
     "a long value": (said("--step=" + "9a" * 5000), "argument --step: invalid float value"),
     "keys": (said(file={"name": "a", "bytes": 6, "sha256": "0" * 64, "path": "b"}), "which is not there"),
-    "no size": (said(file={"name": "a", "sha256": "0" * 64}), "is of an older jaxvol"),
+    "no size": (said(file={"name": "a", "sha256": "0" * 64}), "damaged"),
     "text for a size": (volume("a", "6"), "damaged"),
     "file": (said(file="/etc/passwd"), "damaged"),
     "no file": (said(), "which is not there"),
