@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
-from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_if_any, thresholds
+from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_if_any, preset_unit, thresholds
 from jaxvol.app.commands.animate import turned
 from jaxvol.app.framing import MARGIN, framed, visible_points
 from jaxvol.app.picture import _transfer_of_bricks, copy_of
@@ -272,6 +272,12 @@ def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows()
         np.testing.assert_array_equal(camera.view_up, (0, up, 0))
     with pytest.raises(ValueError, match=r"view_up must not point along direction, \(0\.0, 2\.0, 0\.0\)"):
         jv.automatic_camera(volume, transfer, (0, 2, 0), (0, -1, 0))
+
+
+def test_presets_count_millimetres_where_voxels_are_not_far_smaller():
+    data = np.zeros((2, 2, 2), np.uint8)
+    assert [preset_unit(jv.Volume(data, (s, s, s))) for s in (3.0, 0.5, 0.125)] == [1, 1, 1]
+    assert preset_unit(jv.Volume(data, (0.05, 0.05, 0.05))) == pytest.approx(0.05)
 
 
 def test_the_automatic_camera_shows_all_of_several_volumes():

@@ -47,7 +47,7 @@ class Parser(argparse.ArgumentParser):
     def given(self, words: Sequence[str]) -> dict[str, Any]:
         """The options that words give, without defaults."""
         names = self.defaults()
-        found = vars(self.parse_args(words, argparse.Namespace(**dict.fromkeys(names))))
+        found = vars(self.parse_args(in_full(words), argparse.Namespace(**dict.fromkeys(names))))
         return {name: found[name] for name in names if found[name] is not None}
 
 
@@ -76,6 +76,8 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
 def in_full(words: Sequence[str]) -> list[str]:
     """Words in which `--size 512` is that of a square, `--size 640x480` is two words, and
     `--background white` is in linear RGB."""
+    joined = "--size=", "--background="
+    words = [part for word in words for part in (word.split("=", 1) if word.startswith(joined) else [word])]
     found = [*words]
     for number, (name, value) in reversed([*enumerate(pairwise(words))]):
         if name == "--size" and (both := re.fullmatch(r"(\d+)x(\d+)", value)):

@@ -59,6 +59,8 @@ def test_every_kind_of_option_is_taken_from_a_file(config):
     assert str(found.pop("config")) == path
     assert expected.pop("config") is None
     assert found == expected
+    found = options("render", "--config", config('file = "a.raw"\nsize = 40\nbackground = "red"'))
+    assert (found.size, found.background) == ([40, 40], [1, 0, 0])
 
 
 def test_the_command_line_stands_above_the_file(config):

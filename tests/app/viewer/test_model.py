@@ -416,6 +416,10 @@ def test_the_controls_change_march_and_light(controlled):
     for mode, background, lit in (("maximum", (0, 0, 0), False), ("isosurface", (1, 1, 1), True)):
         controls["mode"].set(mode)
         assert (model.state.background, model.state.lit) == (background, lit)
+    assert model.scene.settings(model.state)["isovalue"] == model.state.isovalue != 0
+    controls["background"].set("#ff0000")
+    controls["mode"].set("maximum")  # keeps a colour that was chosen
+    assert model.state.background == (1, 0, 0)
     labels, controls = controlled(LABELS, None)
     controls["mode"].set("average")  # which labels cannot be shown by
     assert labels.state.mode == "over"
@@ -439,6 +443,9 @@ def test_a_box_and_a_plane_clip_what_is_shown(controlled):
         origin, normal = model.scene.plane(model.state)
         heights = (np.array(list(product(*np.asarray(BALL.bounds).reshape(3, 2)))) - origin) @ normal
         assert np.all(np.sign(heights) == -depth)
+    options = model.scene.settings(model.state)
+    assert options["clip_box"] == model.state.box
+    np.testing.assert_array_equal(options["clip_plane"], [[*origin, *normal]])
 
 
 def test_slices_pass_through_the_point_and_move_it(controlled):
