@@ -99,8 +99,8 @@ def why_empty(scene: Scene, rendering: Rendering) -> str | None:
     """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`, and the
     values differ."""
     volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
-    data = np.asarray(scene.volume.data)
-    if scene.volume.labels is None and not scene.others and data.min() == data.max():
+    alone = scene.volume.field is None and scene.volume.labels is None and not scene.others
+    if alone and (data := np.asarray(scene.volume.data)).min() == data.max():
         return f"all voxels have the value {float(data.flat[0]):g}: there is nothing to see in the volume"
     if np.isnan(opacity):
         return None
