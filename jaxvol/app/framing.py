@@ -58,10 +58,10 @@ def automatic_camera(
         transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts. Of
             several volumes, a list of one for each.
         direction: from the volume to the camera; by default to the right, in front, and higher.
-        view_up: by default z (from straight above or below, in the world of patients, the front is up); of a
-            volume that does not say where it lies (its origin is 0, its axes are the
-            world's, as of raw files), away from the face that cuts through most of what `automatic_transfer`
-            shows, if the opposite one does not: the neck, or the pot of a plant, is below.
+        view_up: by default z, or -y from straight above or below, where a patient's front is; of a volume
+            that does not say where it lies (its origin is 0, its axes are the world's, as of raw files), away
+            from the face that cuts through most of what `automatic_transfer` shows, if the opposite one does
+            not: the neck, or the pot of a plant, is below.
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
@@ -97,12 +97,11 @@ def upright(
     front[axis] *= sign
     toward = np.asarray(finite_array("direction", front if direction is None else direction, (3,)))
     up = np.asarray(finite_array("view_up", sign * np.eye(3)[axis] if view_up is None else view_up, (3,)))
-    if np.linalg.norm(np.cross(toward, up)) <= 1e-3 * np.linalg.norm(toward) * np.linalg.norm(up):
-        if view_up is not None and np.any(up) and np.any(toward):
-            raise ValueError(f"view_up must not point along direction, {pasted(toward)}; got {pasted(up)}.")
-        up = (-1 if is_placed(volume) else 1) * np.eye(3)[1]  # a patient's front lies at -y
-        up = -np.eye(3)[2] if toward[1] else up
-    return toward, up
+    along = np.linalg.norm(np.cross(toward, up)) <= 1e-3 * np.linalg.norm(toward) * np.linalg.norm(up)
+    if along and view_up is not None and np.any(up) and np.any(toward):
+        raise ValueError(f"view_up must not point along direction, {pasted(toward)}; got {pasted(up)}.")
+    # a patient's front lies at -y; of others, `Camera.looking_at` knows
+    return toward, -np.eye(3)[1] if along and view_up is None and is_placed(volume) else up
 
 
 def is_placed(volume: Volume) -> bool:

@@ -44,7 +44,7 @@ from .automatic import (
     unit_of,
     xray_transfer,
 )
-from .framing import FAINT, VISIBLE, automatic_camera, framed, upright, visible_points, warn_of_distance
+from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
 from .padding import padded
 
 
@@ -233,17 +233,16 @@ def _camera(
         transfer = TransferFunction(step, np.ones((2, 3)), [0.0, 1e6 / unit_of(volume)])
     given["parallel"] = options.parallel
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
-    direction, up = upright(volume, transfer, options.direction, options.view_up)
-    if options.clip_box is not None and not options.clip_inside_out:
-        with suppress(ValueError):  # of a box that holds nothing
-            others = [(each.crop(options.clip_box), its) for each, its in others]
-            volume = volume.crop(options.clip_box)
     what = with_others(volume, transfer, others)
-    camera = automatic_camera(*what, direction, up, **given)
-    if orbit is None:
+    camera = automatic_camera(*what, options.direction, options.view_up, **given)
+    clipped = options.clip_box is not None and not options.clip_inside_out
+    if orbit is None and not clipped:
         return camera
-    points = [visible_points(*pair, least) for pair in ((volume, transfer), *others)]
-    return framed(camera, np.concatenate(points), orbit(camera))
+    points = []
+    for each, its in ((volume, transfer), *others):
+        with suppress(ValueError):  # of a box that holds nothing of it
+            points.append(visible_points(each.crop(options.clip_box) if clipped else each, its, least))
+    return framed(camera, np.concatenate(points), orbit(camera) if orbit else ()) if points else camera
 
 
 def other_of(each: Any) -> tuple[Volume, Transfer]:
@@ -313,7 +312,7 @@ def is_automatic(options: Namespace) -> bool:
 def background_of(options: Namespace) -> tuple[float, float, float]:
     """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
     if options.background is None:
-        is_dark = getattr(options, "preset", None) is not None and preset_name(options.preset).endswith("MIP")
+        is_dark = options.preset is not None and preset_name(options.preset).endswith("MIP")
         level = 0.0 if is_dark or options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
     red, green, blue = np.asarray(linear_color("background", options.background), np.float64).tolist()
@@ -351,7 +350,7 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
         low, high = float(data.min()), float(data.max())
         clim = range_of_object(volume) if over else (low, high if high > low else low + 1)
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
-    if options.compositing == "average" and options.clim is options.window is None:
+    if options.compositing == "average" and options.clim is None and options.window is None:
         clim = clim[0], brightest_mean(volume, clim[0])
     if options.compositing == "integral" and unit is None:
         return xray_transfer(volume, cmap, clim)

@@ -136,30 +136,31 @@ class Rendering(eqx.Module):
         if in_notebook():
             sys.modules["IPython"].display.display(self)
             return
-        self._warn_if_empty(stacklevel=3)
-        open_window(self)
+        _warn_if_empty(self)
+        open_window(self, stacklevel=4)
 
     def _repr_png_(self) -> bytes | None:
         """What notebooks show: the image as a PNG, if it is one."""
         if self.rgba.ndim != 3 or is_traced(self.rgba):
             return None
-        self._warn_if_empty(stacklevel=2)
+        _warn_if_empty(self)
         return png_of(displayed(np.asarray(self.image(), np.float32)))
 
-    def _warn_if_empty(self, stacklevel: int) -> None:
-        if not np.asarray(self.rgba)[..., 3].any():  # NaN is not nothing
-            what = "does the camera see the volume, and the transfer function show its values?"
-            told = f"nothing is visible, all pixels are transparent: {what} jaxvol.show says why."
-            warnings.warn(told, stacklevel=stacklevel)
+
+def _warn_if_empty(rendering: Rendering) -> None:
+    if not np.asarray(rendering.rgba)[..., 3].any():  # NaN is not nothing
+        what = "does the camera see the volume, and the transfer function show its values?"
+        told = f"nothing is visible, all pixels are transparent: {what} jaxvol.show says why."
+        warnings.warn(told, stacklevel=4)  # where a method was called, which equinox wraps
 
 
-def open_window(rendering: Rendering) -> None:
+def open_window(rendering: Rendering, stacklevel: int = 3) -> None:
     """Shows an image over its background in a window of matplotlib, until that is closed."""
     import matplotlib.pyplot as plt
 
-    if plt.get_backend().lower() == "agg" and "MPLBACKEND" not in os.environ:  # which was not asked for
-        told = "there is no display for a window; jaxvol.save_png(path, rendering.image()) writes the image"
-        warnings.warn(told, stacklevel=4)
+    if plt.get_backend().lower() == "agg" and "MPLBACKEND" not in os.environ:  # as without a display
+        told = "matplotlib opens no window (agg); jaxvol.save_png(path, rendering.image()) writes the image"
+        warnings.warn(told, stacklevel=stacklevel)
 
     pixels = displayed(np.asarray(rendering.image(), np.float32))
     figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)

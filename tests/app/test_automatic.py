@@ -266,9 +266,9 @@ def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows()
         away = np.asarray(camera.position - camera.focal_point)
         np.testing.assert_allclose(away / away[2], (2, 4, 1), rtol=1e-3)
     # from above and below, a patient's front is up, at -y; where it is not known, y
-    for origin, toward, up in (((0, 0, 1), 1, -1), ((0, 0, 1), -1, -1), (0, 1, 1)):
-        lying = jv.Volume(data, origin=origin or (0, 0, 0))
-        camera = jv.automatic_camera(lying, transfer, (0, 0, toward), size=(32, 32))
+    for origin, toward, up in ((1, 1, -1), (1, -1, -1), (0, 1, 1)):
+        lying = jv.Volume(data, origin=(0, 0, origin))
+        camera = jv.automatic_camera(lying, transfer, (0, 1e-5, toward), size=(32, 32))
         np.testing.assert_array_equal(camera.view_up, (0, up, 0))
     with pytest.raises(ValueError, match=r"view_up must not point along direction, \(0\.0, 2\.0, 0\.0\)"):
         jv.automatic_camera(volume, transfer, (0, 2, 0), (0, -1, 0))

@@ -66,8 +66,8 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
             settings = _over(settings, weaker)
     check_exclusive(settings)
     defaults = command.defaults()
-    # two that not every command has: as the viewer composites, and what a picture may hold
-    options = {"compositing": "over", "recorded_transfer": None} | defaults | settings
+    # that not every command has: as the viewer composites and fits begin, and what a picture may hold
+    options = {"compositing": "over", "preset": None, "recorded_transfer": None} | defaults | settings
     if options.get("file", "") is None:
         command.error("the following arguments are required: FILE")
     return argparse.Namespace(execute=found.execute, defaults=defaults, **options)

@@ -10,7 +10,8 @@ from skimage.io import imread
 import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
-from jaxvol.app.framing import upright
+from jaxvol.app.framing import framed, visible_points
+from jaxvol.app.padding import padded
 from jaxvol.app.picture import DEFAULTS
 
 from .test_render import render, same
@@ -88,7 +89,7 @@ def test_several_volumes_are_in_one_picture(volume_file, tmp_path, drawn):
     jv.show(turned, size=16, step=0.4, others=turned)
 
 
-def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
+def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn, monkeypatch):
     volume = jv.load(volume_file)
     camera = jv.Camera.looking_at(volume, size=8)
     for what, options, message in (
@@ -117,8 +118,13 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn):
     assert same(drawn.how[-1]["compositing"], jv.Isosurface(30.0))
     box = (0, 9, 2, 20, 1, 20)
     jv.show(volume, step=0.4, clip_box=box)
-    seen = volume.crop(box), jv.automatic_transfer(volume)
-    assert same(drawn.scenes[-1][2], jv.automatic_camera(*seen, *upright(volume, seen[1], None, None)))
+    whole, left = jv.automatic_camera(volume, seen := jv.automatic_transfer(volume)), volume.crop(box)
+    assert same(drawn.scenes[-1][2], framed(whole, visible_points(left, seen)))
+    jv.show(volume, step=0.4, clip_box=(90, 99, 90, 99, 90, 99))  # which holds nothing
+    assert same(drawn.scenes[-1][2], whole)
+    monkeypatch.setattr("jaxvol.app.picture.padded", padded)
+    jv.show(volume, step=0.4, preset="CT-AAA", clim=(0, 255))
+    assert drawn.scenes[-1][1].values.shape == (8,)  # of 6 points, in the program of others
     for odd, message in (
         (jv.Volume(np.full((4, 4, 4), 7.0)), "all voxels have the value 7"),
         (
