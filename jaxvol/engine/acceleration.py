@@ -24,7 +24,7 @@ from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.beams import EmptySpaceIndex, View
 from ..march.march import March, Transform
-from ..ray import Scene, end
+from ..ray import Scene, by_rules, end
 from ..scene.camera import GivenRays, without_ends
 from ..scene.occupancy import BLOCK, Blocks, Occupancy
 from ..scene.several import Several, SeveralBlocks
@@ -36,6 +36,7 @@ from ..xla.platform import is_traced
 from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
 from .tiling import Tiling
+from .shifts import begin_rays
 from .wavefront import Beams, march_rays
 
 
@@ -175,10 +176,11 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         own = GivenRays(jnp.stack(begins, axis=-1), jnp.stack(seen_by.direction, axis=-1))
         one_tile = tiling._replace(tile=columns.size, devices=None)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
-        seen = Scene(volume, transfer, own, plain, FirstVisible()).prepared()
+        seen = by_rules(Scene(volume, transfer, own, plain, FirstVisible()).prepared())
         rays = tiles.rays(own, space, only, no_fault)
-        at, _ = march_rays(seen, index, Beams.of(tiles, own, rays, only), tiling, "depth")
-        rendering = vmap_rays(partial(end, seen))(rays, at)
+        start = begin_rays(plain, seen, rays, tiling, "depth")
+        found = march_rays(seen, index, Beams.of(tiles, own, rays, only), tiling, start)
+        rendering = vmap_rays(partial(end, seen))(rays, found.at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)
 
     ray = partial(source.ray_from, space.anchor)

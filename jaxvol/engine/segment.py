@@ -8,18 +8,17 @@ opacities a third. (Measured on CPU.)
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool
 
 from .._util.vec3 import Scalar, Vec3
 from ..compositing.selection import Selection
-from ..march.march import Cell, March
+from ..march.march import Cell
 from ..ray import Progress, Scene, add, move, opacity, pieces, read, stop
 from ..scene.several import Together
 from ..scene.space import Ray
@@ -32,8 +31,8 @@ from .tiling import Tiling
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, of arrays (cells, rays).
-    Cells that a ray does not keep (`_kept`) are transparent, and placed at its exit. `light`: the terms of
-    shading that is `inline`."""
+    Cells that a ray does not take are transparent, and placed at its exit. `light`: the terms of shading that
+    is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
@@ -73,63 +72,39 @@ def vmap_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
 
 
-def regular_from_here(at: Progress) -> Bool[Array, "*rays"]:
-    """Which rays have no shift ahead of them, and advance by whole steps from here on."""
-    return jnp.ones(at.finished.shape, bool) if at.shift is None else at.shift == 0
-
-
 def march_segment(
-    scene: Scene,
-    tiling: Tiling,
-    ray: Ray,
-    at: Progress,
-    *,
-    regular: bool,
-    until: Int[Array, " rays"] | None = None,
+    scene: Scene, tiling: Tiling, ray: Ray, at: Progress, *, shifts: bool = False
 ) -> tuple[Progress, Samples]:
-    """Marches rays by a segment of cells; by fewer, where a ray is finished, where a shift puts its next
-    samples elsewhere than those that were fetched, or at `until`. `regular`: no ray has a shift, a limit of
-    samples or `until` ahead of it, which is then not tested."""
-    march, classification, number = scene.march, scene.classification, tiling.cells
-    every = samples = _sampled(scene, number, ray, at)
-    kept: Int[Array, " rays"] | None = None
-    shifts = None
-    if not regular:
-        fewer = in_memory(always(at), partial(_kept, march), at, every.opacity, until)
-        (kept, shifts), samples = fewer, _truncated(every, fewer[0], ray)
+    """Marches rays by a segment of cells; by fewer, where a ray has no more of them, and by none where it is
+    finished. `shifts`: a segment is one cell, behind which rays may shift."""
+    classification, number = scene.classification, tiling.cells
+    samples = _sampled(scene, number, ray, at)
     colors: list[Vec3] | list[None]
-    values = [read[:1] for read in every.measured]
+    values = [read[:1] for read in samples.measured]
     if isinstance(scene.compositing, Selection):
-        colors, values = [None] * len(every.cells), every.measured
+        colors, values = [None] * len(samples.cells), samples.measured
     elif classification.light is None:
-        colors = _colors(scene, at, every.measured)
+        colors = _colors(scene, at, samples.measured)
     elif (shader := inline_shader(scene)) is not None:
-        assert every.light is not None
-        parts = every.cells, _colors(scene, at, every.measured), every.light
+        assert samples.light is not None
+        parts = samples.cells, _colors(scene, at, samples.measured), samples.light
         colors = lit_colors(shader, scene, ray, *parts)
     else:
         colors = shaded_colors(scene, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity)
-    cells = tuple(zip(every.cells, values, colors, every.opacity, strict=True))
+    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
 
-    def composited(ray: Ray, at: Progress, keeps: Bool[Array, ""] | None, cell: Any) -> Progress:
-        finished = at.finished
-        if keeps is not None:  # cells that are not kept are composited as if the ray were finished
-            at = replace(at, finished=finished | ~keeps)
+    def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
-        return stop(scene, replace(at, finished=finished))
-
-    def next_(at: Progress, each: tuple[Int[Array, ""], Any]) -> tuple[Progress, None]:
-        index, cell = each
-        # not by the opacities of `samples`, whose arrays would have to be stored
-        keeps = None if kept is None else index < kept
-        return jax.vmap(composited)(ray, at, keeps, cell), None
+        return stop(scene, at)
 
     # unrolled, so that nothing between two cells is put in memory
-    order = jnp.arange(number, dtype=at.index.dtype)
-    after, _ = jax.lax.scan(next_, at, (order, cells), unroll=number)
-    steps = jnp.full_like(at.index, number) if kept is None else kept
-    return jax.vmap(partial(move, march))(ray, after, shifts, steps), samples
+    after, _ = jax.lax.scan(
+        lambda at, cell: (jax.vmap(composited)(ray, at, cell), None), at, cells, unroll=number
+    )
+    steps = jnp.where(at.finished, 0, jnp.clip(at.track.until - at.index, 0, number))
+    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
+    return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples
 
 
 def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
@@ -170,9 +145,7 @@ def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
 
 def always(at: Progress) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
-    # An index cannot overflow: in a pass there are at most some `most_samples` / cells segments, and it grows
-    # by at most cells, finished or not: with 2**24 samples it stays below 2**31. Whether any ray is alive
-    # would take 1 % of a frame to find out.
+    # whether any ray is alive would take 1 % of a frame to find out
     return at.index[0] >= 0
 
 
@@ -226,32 +199,3 @@ def _measured_over(
         backs = [*inner, jax.tree.map(lambda leaf: leaf[1:], joints)]
         fronts = [jax.tree.map(lambda leaf: leaf[:-1], joints), *inner]
     return [classification.spanned(*each) for each in zip(attributes, fronts, backs, strict=True)]
-
-
-def _kept(
-    march: March, at: Progress, opacity: list[Scalar], until: Int[Array, " rays"] | None
-) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
-    """How many of a segment's cells each ray keeps, and whether the last of them shifts it. A ray with a
-    shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
-    left = march.most_samples - at.index
-    if until is not None:
-        left = jnp.clip(until - at.index, 0, left)
-    cells = opacity[0].shape[0]
-    # cell by cell, back to front: a reduction over all of them would be a loop of its own
-    first = jnp.full_like(left, cells + 1)
-    for k in reversed(range(cells)):
-        transparent = jnp.all(jnp.stack([alpha[k] for alpha in opacity]) == 0, axis=0)
-        first = jnp.where(transparent, k + 1, first)
-    shifts = ~regular_from_here(at) & (first <= jnp.minimum(left, cells))
-    return jnp.minimum(jnp.where(shifts, first, cells), left), shifts
-
-
-def _truncated(samples: Samples, kept: Int[Array, " rays"], ray: Ray) -> Samples:
-    """The samples, with all cells but the first `kept` made transparent and put beyond the exit."""
-    keeps = jnp.arange(samples.number, dtype=kept.dtype)[:, None] < kept[None]
-    cells = [
-        eqx.tree_at(lambda cell: cell.front, cell, jnp.where(keeps, cell.front, ray.length[None]))
-        for cell in samples.cells
-    ]
-    opacity = [jnp.where(keeps, alpha, 0) for alpha in samples.opacity]
-    return samples._replace(cells=cells, opacity=opacity)

@@ -1,0 +1,111 @@
+"""Where do rays begin, and where do they shift? Both are known before they are marched.
+
+A shift (`Transform.shift`) moves all cells behind a ray's first transparent one. Most rays begin in such a
+cell. The cells of all others are looked at in order, some rays at a time, before any is composited.
+"""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from ..compositing.blending import Outputs, Over
+from ..march.march import March
+from ..ray import NEVER, Progress, Scene, begin, measure, opacity, pieces, track_of
+from ..scene.space import Ray
+from ..xla.compaction import Chosen
+from ..xla.memory import in_memory
+from ..xla.sharding import varying
+from .rays import vmap_rays
+from .tiling import Tiling
+from .wavefront import with_fields
+
+
+CELLS = 8
+"""Cells of a ray that are looked at before it is asked whether one of them is transparent."""
+
+
+def begin_rays(
+    march: March,
+    scene: Scene,
+    rays: Ray,
+    tiling: Tiling,
+    outputs: Outputs | None,
+    shifted: Int[Array, "groups rays"] | None = None,
+    *,
+    finds_shifts: bool = True,
+) -> Progress:
+    """Rays at their entries; those that miss the volume are finished.
+
+    Args:
+        march: as given.
+        scene: prepared, with the march's `rules`.
+        rays: of shape (groups, rays in a group).
+        outputs: without them, nothing but the opacity is computed.
+        shifted: where the rays shift, if that is known.
+        finds_shifts: whether to find it out, otherwise.
+    """
+    track = vmap_rays(partial(track_of, march))(rays)
+    at = vmap_rays(lambda ray, track: begin(scene, ray, track, outputs))(rays, track)
+    at = with_fields(at, finished=rays.length <= 0)
+    if track.shifted is None or not (finds_shifts or shifted is not None):
+        return at
+    shifted = _shifted(scene, rays, at, tiling) if shifted is None else shifted
+    return eqx.tree_at(lambda at: at.track.shifted, at, shifted)
+
+
+def _shifted(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Int[Array, "groups rays"]:
+    """For each ray, the cell behind its first transparent one; NEVER if it meets none before its end."""
+    clear = vmap_rays(lambda ray, at: _opacity(scene, ray, at, 0) == 0)(rays, at)
+    shape = clear.shape
+    found = jnp.where(clear, 1, NEVER)
+    chosen = Chosen.of([~clear & ~at.finished], tiling.chunk)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (rays, at))
+
+    def search(indices: Int[Array, " chunk"], found: Int[Array, " rays"]) -> Int[Array, " rays"]:
+        rays, at = jax.tree.map(lambda leaf: leaf.at[indices].get(mode="clip"), flat)
+        return found.at[indices].set(_search(scene, rays, at), mode="drop")
+
+    return chosen.fold(search, varying(found.reshape(-1), rays)).reshape(shape)
+
+
+def _search(scene: Scene, rays: Ray, at: Progress) -> Int[Array, " rays"]:
+    """As `_shifted`, of a few rays."""
+    rules: Any = scene.march
+    over = isinstance(scene.compositing, Over)
+
+    def look(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        index, found, left = state
+        each = jnp.arange(CELLS, dtype=index.dtype)
+
+        def opacities(index: Array) -> Array:
+            rays_of = jax.vmap(partial(_opacity, scene), in_axes=(0, 0, None))
+            return jax.vmap(rays_of, in_axes=(None, None, 0))(rays, with_fields(at, index=index), each)
+
+        alpha = in_memory(index[0] >= 0, opacities, index)
+        first = jnp.min(jnp.where(alpha == 0, each[:, None], CELLS), axis=0)
+        found = jnp.where((found == NEVER) & (first < CELLS), index + first + 1, found)
+        # what lies behind the end of an opaque ray does not show
+        left = left * jnp.prod(1 - alpha, axis=0) if over else left
+        return index + CELLS, found, left
+
+    def going(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        index, found, left = state
+        front = jax.vmap(lambda track, index: track.front(index, rules.step))(at.track, index)
+        opaque = jax.vmap(rules.stop)(left) | (left <= 0)
+        searched = (found == NEVER) & (front < rays.length) & (index < at.track.until)
+        return jnp.any(searched & ~(opaque if over else jnp.zeros_like(opaque)))
+
+    none = jnp.full_like(at.index, NEVER)
+    state = varying((at.index, none, jnp.ones_like(rays.length)), rays)
+    return jax.lax.while_loop(going, look, state)[1]
+
+
+def _opacity(scene: Scene, ray: Ray, at: Progress, number: Any) -> Array:
+    """The greatest opacity of a cell's pieces."""
+    cut = pieces(scene, ray, at, number)
+    alphas = [opacity(scene, ray, piece, measure(scene, ray, piece)) for piece in cut]
+    return jnp.max(jnp.stack(alphas), axis=0)
