@@ -35,9 +35,9 @@ from ..xla.memo import memoized, memoized_of
 from ..xla.platform import is_traced
 from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
-from .tiling import Tiling
 from .shifts import begin_rays
-from .wavefront import Beams, march_rays
+from .tiling import Tiling
+from .wavefront import blinded, march_rays
 
 
 LIMIT = 2**30
@@ -179,7 +179,8 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         seen = by_rules(Scene(volume, transfer, own, plain, FirstVisible()).prepared())
         rays = tiles.rays(own, space, only, no_fault)
         start = begin_rays(plain, seen, rays, tiling, "depth")
-        found = march_rays(seen, index, Beams.of(tiles, own, rays, only), tiling, start)
+        skips = tiles.skips(index, own, rays, only, march.step)
+        found = march_rays(seen, rays, blinded(skips, start), tiling, skips)
         rendering = vmap_rays(partial(end, seen))(rays, found.at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)
 

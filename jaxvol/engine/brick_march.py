@@ -24,10 +24,10 @@ from .devices import on_devices
 from .gradients import ImageVjp, Sums
 from .rays import RayTiles, vmap_rays
 from .replay import Cotangents
-from .shifts import begin_rays
 from .resolve import resolve_pixels
+from .shifts import begin_rays
 from .tiling import RenderOptions
-from .wavefront import Beams, CellRange, march_rays, with_fields
+from .wavefront import CellRange, blinded, into_range, march_rays, with_fields
 
 
 class RayStates(eqx.Module):
@@ -69,11 +69,12 @@ def march_brick(
     def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
         number, states, range_ = each
         rays, start = states.rays, states.at
-        beams = Beams.of(tiles, scene.source, rays, number, range_, shifts=shifts)
         if restart:
             over = opaque(prepared, start) | (range_.until <= range_.first)
             start = with_fields(start, index=range_.first, finished=over)
-        after = march_rays(prepared, index, beams, options.tiling, start).at
+        skips = tiles.skips(index, scene.source, rays, number, scene.march.step)
+        here = into_range(prepared, rays, start, range_, shifts=shifts)
+        after = march_rays(prepared, rays, blinded(skips, here), tiles.tiling, skips, shifts=shifts).at
         after = eqx.tree_at(lambda at: at.track.until, after, start.track.until)
         # where it was restarted, a ray may go back
         over = opaque(prepared, after) if restart else start.finished | ended(prepared, rays, after)

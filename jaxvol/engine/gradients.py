@@ -24,10 +24,10 @@ from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import on_devices
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
+from .shifts import begin_rays
 from .tiling import RenderOptions
 from .voxel_gradient import asked_of, cotangents_of
-from .shifts import begin_rays
-from .wavefront import Beams, CellRange, Marched, Recorded, march_rays
+from .wavefront import CellRange, Marched, Recorded, blinded, into_range, march_rays
 
 
 def render_vjp(
@@ -147,8 +147,12 @@ class ImageVjp(NamedTuple):
         shifts: bool = False,
     ) -> Marched:
         """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
-        beams = Beams.of(self.tiles, self.scene.source, rays, number, range_, shifts=shifts)
-        return march_rays(self.lit, self.empty_space, beams, self.tiles.tiling, start, replay)
+        tiles, step = self.tiles, self.scene.march.step
+        skips = tiles.skips(self.empty_space, self.scene.source, rays, number, step)
+        start = blinded(skips, start)
+        if range_ is not None:
+            start = into_range(self.prepared, rays, start, range_, shifts=shifts)
+        return march_rays(self.lit, rays, start, tiles.tiling, skips, replay, shifts=shifts)
 
     def begin(self, rays: Ray, shifted: Int[Array, "groups rays"] | None) -> Progress:
         """Rays at their entries, of which nothing but the opacity is computed. `shifted`: where they shift;

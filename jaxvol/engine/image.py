@@ -29,9 +29,9 @@ from .devices import check_not_sharded, mesh_of, on_all, on_devices
 from .gradients import render_vjp
 from .rays import RayTiles, vmap_rays
 from .resolve import Found, resolve_image
-from .tiling import Adjoint, RenderOptions, Tiling
 from .shifts import begin_rays
-from .wavefront import Beams, Recorded, march_rays
+from .tiling import Adjoint, RenderOptions, Tiling
+from .wavefront import Recorded, blinded, march_rays
 
 
 RenderOutputs: TypeAlias = Literal["all", "rgba"]
@@ -131,9 +131,10 @@ def march_image(
     prepared = by_rules(acceleration.prepared(scene))
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, Recorded]:
-        beams, record_ = Beams.of(tiles, scene.source, rays, tile), record and index is not None
         start = begin_rays(scene.march, prepared, rays, tiling, options.outputs)
-        found = march_rays(prepared, index, beams, tiling, start, record=record_)
+        skips = tiles.skips(index, scene.source, rays, tile, scene.march.step)
+        known = record and skips is not None
+        found = march_rays(prepared, rays, blinded(skips, start), tiling, skips, record=known)
         recorded = Recorded(found.range, start.track.shifted if record else None)
         return vmap_rays(partial(end, prepared))(rays, found.at), recorded
 

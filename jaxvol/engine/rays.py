@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.checks import all_finite
-from ..march.beams import Box
+from .._util.vec3 import Scalar
+from ..march.beams import Box, EmptySpaceIndex, Skips
 from ..scene.camera import Camera, Ending, GivenRays, without_ends
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
@@ -120,6 +121,14 @@ class RayTiles(eqx.Module):
     @abstractmethod
     def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         """A function from an occupancy grid to the boxes around the beams of a tile."""
+
+    def skips(
+        self, index: EmptySpaceIndex | None, source: Any, rays: Ray, tile: Int[Array, ""], step: Scalar
+    ) -> Skips | None:
+        """Where the rays of a tile see nothing, if that is known."""
+        if index is None:
+            return None
+        return index.skips(self.box(source, rays, tile), self.tiling.cells * step)
 
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:

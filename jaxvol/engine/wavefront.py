@@ -21,18 +21,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..march.beams import Box, EmptySpaceIndex
+from ..march.beams import Skips
 from ..march.march import CellRules
 from ..ray import NEVER, Progress, Scene, Track, front, move
-from ..scene.occupancy import Occupancy
 from ..scene.space import Ray
 from ..xla.compaction import in_front
 from ..xla.packing import Layout
 from ..xla.sharding import varying
 from ..xla.trees import PyTree
-from .rays import RayTiles, vmap_rays
+from .rays import vmap_rays
 from .segment import Samples, SampleVisitor, march_segment
-from .tiling import Tiling
+from .tiling import GROUPS_OF_BEAM, Tiling
 
 
 Visited: TypeAlias = tuple[PyTree, PyTree, PyTree]
@@ -67,42 +66,6 @@ class Recorded(NamedTuple):
     shifted: Int[Array, "*rays"] | None
 
 
-class Beams(eqx.Module):
-    """Rays that are marched together, in groups, of which equally many in a row make up a beam.
-
-    Attributes:
-        rays: of shape (groups, rays in a group).
-        count: number of beams.
-        box: the boxes around the beams.
-        range: where known, the cells outside of which a ray sees nothing, and is not marched.
-        shifts: whether rays find on their way where they shift.
-    """
-
-    rays: Ray
-    count: int = eqx.field(static=True)
-    box: Callable[[Occupancy], Box] = eqx.field(static=True)
-    range: CellRange | None = None
-    shifts: bool = eqx.field(static=True, default=False)
-
-    @classmethod
-    def of(
-        cls,
-        tiles: RayTiles,
-        source: Any,
-        rays: Ray,
-        tile: Int[Array, ""],
-        range: CellRange | None = None,
-        *,
-        shifts: bool = False,
-    ) -> "Beams":
-        """The rays of a tile."""
-        return cls(rays, tiles.beam_count, tiles.box(source, rays, tile), range, shifts)
-
-    @property
-    def groups(self) -> int:
-        return self.rays.length.shape[0]
-
-
 class Marched(NamedTuple):
     """What marching a tile's rays found: where they end, of shape (groups, rays in a group); the range of
     each ray's visible cells, if it was asked for; and what the visitor did."""
@@ -131,8 +94,7 @@ class Job(NamedTuple):
     Attributes:
         layout: of the constants of rays: `Ray`, `Track`, the visitor's `given`.
         rays: these constants, packed.
-        skip_to: of the `EmptySpaceIndex`, asked about these beams; None where no empty space is known.
-        shifts: as in `Beams`.
+        skips, shifts: as for `march_rays`.
     """
 
     scene: Scene
@@ -140,9 +102,8 @@ class Job(NamedTuple):
     layout: Layout
     rays: dict[str, Array]
     groups: int
-    groups_of_beam: int
     visitor: SampleVisitor | None
-    skip_to: Callable[..., Array] | None
+    skips: Skips | None
     shifts: bool
 
     @property
@@ -159,48 +120,43 @@ def alive(at: Progress) -> Bool[Array, "*rays"]:
 
 def march_rays(
     scene: Scene,
-    index: EmptySpaceIndex | None,
-    beams: Beams,
-    tiling: Tiling,
+    rays: Ray,
     start: Progress,
+    tiling: Tiling,
+    skips: Skips | None = None,
     visitor: SampleVisitor | None = None,
     *,
     record: bool = False,
+    shifts: bool = False,
 ) -> Marched:
-    """Marches all rays to their ends.
+    """Marches rays to their ends.
 
     Args:
         scene: prepared, with the `rules` of its march in the march's place.
-        start: where the rays are.
+        rays: of shape (groups, rays in a group); equally many groups in a row make up a beam.
+        start: where they are.
+        skips: where their beams see nothing, if that is known.
         record: whether to record the range of each ray's visible cells.
+        shifts: whether rays find on their way where they shift.
     """
-    skip_to = None
-    if index is not None:
-        prepared = index.prepare(beams.box, tiling.cells * scene.march.step)
-        seen = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
-        blind = ~jnp.repeat(seen, beams.groups // beams.count)[:, None]
-        start = with_fields(start, finished=start.finished | blind)
-        skip_to = partial(index.skip_to, prepared)
-    if beams.range is not None:
-        start = _into_range(scene, beams.rays, start, beams.range, beams.shifts)
-    if beams.shifts:  # a cell at a time, since those behind a transparent one lie elsewhere
+    if shifts:  # a cell at a time, since those behind a transparent one lie elsewhere
         tiling = tiling._replace(cells=1)
     given, carry, sums, total = None, None, None, None
     if visitor is not None:
         given, carry, sums, total = visitor.given, visitor.carry, visitor.sums, visitor.total
     track, shifted = start.track, None
-    if beams.shifts:
+    if shifts:
         track, shifted = with_fields(track, shifted=None), track.shifted
     range_ = CellRange.none(start.index.shape) if record else None
-    fixed = beams.rays, track, given
+    fixed = rays, track, given
     lanes = Lanes(start.index, start.composite, start.stats, start.finished, shifted, range_, carry, sums)
-    lanes, total = varying((lanes, total), beams.rays)
+    lanes, total = varying((lanes, total), rays)
     layout = Layout.of(fixed)
-    parts = layout, layout.pack(fixed), beams.groups, beams.groups // beams.count
-    job = Job(scene, tiling, *parts, visitor, skip_to, beams.shifts)
+    groups = rays.length.shape[0]
+    job = Job(scene, tiling, layout, layout.pack(fixed), groups, visitor, skips, shifts)
     going = jnp.any(alive(start), axis=-1)
     lanes, total = _march_all(job, lanes, total, going)
-    if beams.shifts:
+    if shifts:
         track = with_fields(track, shifted=lanes.shifted)
     return Marched(vmap_rays(_progress)(lanes, track), lanes.range, (lanes.carry, lanes.sums, total))
 
@@ -243,7 +199,7 @@ def _march_batch(
     alive, and tells which still are. A row past the last one stands for no group."""
     tiling, group = job.tiling, job.tiling.group
     known = jnp.minimum(rows, job.groups - 1)
-    beam = jnp.repeat(known // job.groups_of_beam, group)
+    beam = jnp.repeat(known // GROUPS_OF_BEAM, group)
     taken, lanes = job.layout.take(job.rays, known), layout.lanes(layout.take(packed, known))
     none = jnp.repeat(rows >= job.groups, group)
     lanes = lanes._replace(finished=lanes.finished | none)
@@ -289,7 +245,18 @@ def with_fields(tree: Any, **changes: PyTree) -> Any:
     )
 
 
-def _into_range(scene: Scene, rays: Ray, at: Progress, range_: CellRange, shifts: bool) -> Progress:
+def blinded(skips: Skips | None, at: Progress) -> Progress:
+    """Finishes the rays of beams along which nothing is visible."""
+    if skips is None:
+        return at
+    groups = at.finished.shape[0]
+    seen = jnp.broadcast_to(skips.any_visible(), (groups // GROUPS_OF_BEAM,))
+    return with_fields(at, finished=at.finished | ~jnp.repeat(seen, GROUPS_OF_BEAM)[:, None])
+
+
+def into_range(
+    scene: Scene, rays: Ray, at: Progress, range_: CellRange, *, shifts: bool = False
+) -> Progress:
     """Moves rays to the first cell of their range, in front of which all cells are transparent. They take no
     cell behind its last one."""
     first, until = range_
@@ -307,9 +274,9 @@ def _moved(march: Any, ray: Ray, at: Progress, steps: Int[Array, ""], *, transpa
 
 def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
     """Moves rays to their next cell that is not proven empty."""
-    if job.skip_to is None:
+    if job.skips is None:
         return at
-    steps = _leap(job.rules, partial(job.skip_to, beam), rays, at)
+    steps = _leap(job.rules, partial(job.skips.skip_to, beam), rays, at)
     return jax.vmap(partial(_moved, job.rules, transparent=job.shifts or None))(rays, at, steps)
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import Index, Occupancy, Sums
 from ..scene.space import Ray
+from ..xla.memory import gather
 from ..xla.platform import on_gpu
 from ..xla.sharding import varying
 
@@ -26,20 +27,24 @@ STRETCHES = 128
 ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
 
 
+class Skips(eqx.Module):
+    """Where nothing is visible along the rays of some beams."""
+
+    @abstractmethod
+    def any_visible(self) -> Bool[Array, "*beams"]:
+        """Whether anything may be visible along each beam."""
+
+    @abstractmethod
+    def skip_to(self, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
+        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+
+
 class EmptySpaceIndex(eqx.Module):
     """Where nothing is visible, for beams of rays."""
 
     @abstractmethod
-    def prepare(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Any:
-        """What the other methods need, from the boxes around beams. `stretch`: the shortest useful leap."""
-
-    @abstractmethod
-    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
-        """Whether anything may be visible along each beam."""
-
-    @abstractmethod
-    def skip_to(self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
-        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+    def skips(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Skips:
+        """That along beams, from the boxes around them. `stretch`: the shortest useful leap."""
 
     def within_ranges(self) -> "EmptySpaceIndex":
         """What is of use where each ray's first and last visible cell are known."""
@@ -136,13 +141,25 @@ class Box(eqx.Module):
         return low, high
 
 
-class Stretches(eqx.Module):
+class Stretches(Skips):
     """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on."""
 
     near: Float[Array, " beams"]
     length: Scalar
     following: Int[Array, "stretches beams"]
     """For each stretch, the first one from there on that is not empty, or their number."""
+
+    def any_visible(self) -> Bool[Array, " beams"]:
+        return self.following[0] < self.following.shape[0]
+
+    def skip_to(self, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
+        count, beams = self.following.shape
+        near = gather(self.near, beam)
+        position = (rays.t_in + depth - near) / self.length
+        stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
+        following = gather(self.following.reshape(-1), stretch * beams + beam)
+        begin = near + following.astype(depth.dtype) * self.length - rays.t_in
+        return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
 
 def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
