@@ -287,9 +287,9 @@ def track_of(march: March, ray: Ray) -> Track:
     return Track(march.start(ray), march.shift(ray), jnp.full_like(count, NEVER), count)
 
 
-def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
+def pieces(scene: Scene, ray: Ray, at: Any, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
     """The pieces of the ray's next cell, or of the `number`-th one after it. Cells that are not taken lie
-    past the exit."""
+    past the exit. `at`: a `Progress`, of which `index` and `track` are read."""
     march, cell = scene.march, at.index + number
     begin = jnp.where(cell < at.track.until, at.track.front(cell, march.step), ray.length)
     return march.cut(Cell(begin, march.step, jnp.zeros(begin.shape, bool)), ray, scene.volume)

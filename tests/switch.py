@@ -161,7 +161,7 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "ends_at_exit", "tested_every", "valid", "block_side"
+STATIC = "joins", "ends_at_exit", "tested_every", "valid", "block_side", "rules", "reads_labels"
 
 
 @cache

@@ -80,6 +80,11 @@ class VolumeAcceleration(eqx.Module):
             seen,
         )
 
+    @property
+    def of_space(self) -> "VolumeAcceleration":
+        """What tells where space is empty."""
+        return VolumeAcceleration([], [], self.blocks, self.occupancy)
+
     def packed(self, scene: Scene) -> Scene:
         """The scene, with voxels fetched from their packed copy."""
         return scene._replace(volume=with_words(scene.volume, self.words, self.slopes))

@@ -18,7 +18,7 @@ from ..march.march import March
 from ..ray import Progress, Scene, by_rules, end, front, stopped
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, with_fields
 from .acceleration import NO_ACCELERATION, VolumeAcceleration, empty_space_of
 from .devices import on_devices
 from .gradients import ImageVjp, Sums
@@ -27,7 +27,7 @@ from .replay import Cotangents
 from .resolve import resolve_pixels
 from .shifts import begin_rays
 from .tiling import RenderOptions
-from .wavefront import CellRange, blinded, into_range, march_rays, with_fields
+from .wavefront import CellRange, blinded, into_range, march_rays
 
 
 class RayStates(eqx.Module):

@@ -18,7 +18,7 @@ from ..ray import Scene, by_rules, check_channels, end
 from ..reference import step, steps_across
 from ..scene.rendering import Rendering
 from ..scene.space import Ray, Space
-from ..xla.compiling import compiled
+from ..xla.compiling import compiled, in_program
 from ..xla.differentiation import forward_only, nan_derivatives, transformations
 from ..xla.linear import differentiable, moving_leaves, recomputed
 from ..xla.platform import is_traced
@@ -30,6 +30,7 @@ from .gradients import render_vjp
 from .rays import RayTiles, vmap_rays
 from .resolve import Found, resolve_image
 from .shifts import begin_rays
+from .stages import is_staged, staged_image
 from .tiling import Adjoint, RenderOptions, Tiling
 from .wavefront import Recorded, blinded, march_rays
 
@@ -178,7 +179,7 @@ def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcc
 
 
 _forward_image = compiled(_marched_image, has_jvp=True)
-_plain_image = compiled(_marched_image)
+_whole_image = compiled(_marched_image)
 _recorded_image = compiled(partial(march_image, record=True), by_jvp=True)
 _image_vjp = compiled(render_vjp, by_jvp=True)
 _direct_image = compiled(scan_image, has_jvp=True)
@@ -186,11 +187,19 @@ _pixels_kept = compiled(resolve_image, has_jvp=True)
 _pixels_recomputed = recomputed(resolve_image, WRONG_MODE["replay"])
 
 
+def _plain_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    if in_program(scene, acceleration) or not is_staged(scene, options):
+        return _whole_image(scene, options, acceleration)
+    return staged_image(scene, options, acceleration)[0]
+
+
 def _recorded(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
 ) -> tuple[Rendering, tuple[Rendering, Recorded]]:
-    rendering, ranges = _recorded_image(scene, options, acceleration)
-    return rendering, (rendering, ranges)
+    staged = not in_program(scene, acceleration) and is_staged(scene, options)
+    image = partial(staged_image, record=True) if staged else _recorded_image
+    rendering, recorded = image(scene, options, acceleration)
+    return rendering, (rendering, recorded)
 
 
 def _push(tangents: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Any:

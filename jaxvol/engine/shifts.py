@@ -12,16 +12,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..compositing.blending import Outputs, Over
+from ..compositing.blending import Outputs, Over, Weighting
 from ..march.march import March
-from ..ray import NEVER, Progress, Scene, begin, measure, opacity, pieces, track_of
+from ..ray import NEVER, Progress, Scene, begin, is_sample, measure, move, opacity, pieces, track_of
 from ..scene.space import Ray
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
 from ..xla.sharding import varying
+from ..xla.trees import with_fields
 from .rays import vmap_rays
 from .tiling import Tiling
-from .wavefront import with_fields
 
 
 CELLS = 8
@@ -53,15 +53,43 @@ def begin_rays(
     at = with_fields(at, finished=rays.length <= 0)
     if track.shifted is None or not (finds_shifts or shifted is not None):
         return at
-    shifted = _shifted(scene, rays, at, tiling) if shifted is None else shifted
-    return eqx.tree_at(lambda at: at.track.shifted, at, shifted)
+    if shifted is None:
+        at = find_shifts(scene, rays, at, tiling)
+    else:
+        at = eqx.tree_at(lambda at: at.track.shifted, at, shifted)
+    return behind_first_cells(scene, rays, at)
+
+
+def find_shifts(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Progress:
+    """Rays at their entries, of which is then known where they shift."""
+    return eqx.tree_at(lambda at: at.track.shifted, at, _shifted(scene, rays, at, tiling))
+
+
+def behind_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
+    """Rays, behind their first cells where they shift there, if that saves a segment."""
+    if scene.march.integrates and isinstance(scene.compositing, Weighting):
+        return vmap_rays(partial(_behind_first_cell, scene))(rays, at)
+    return at
+
+
+def _behind_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
+    """A ray, behind its first cell if it shifts there: a segment of cells that are integrated would end there
+    (`segment`). Not for a `Selection`, to which transparent cells may matter."""
+    moves = (at.track.shifted == 1) & ~at.finished
+    moved = move(scene.march, ray, at, None, 1)
+    if moved.stats is not None:
+        cut = pieces(scene, ray, at)
+        count = [is_sample(scene.march, ray, piece, divided=len(cut) > 1) for piece in cut]
+        samples = moved.stats.samples + jnp.sum(jnp.stack(count)).astype(jnp.int32)
+        moved = eqx.tree_at(lambda moved: moved.stats.samples, moved, samples)
+    return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
 
 
 def _shifted(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Int[Array, "groups rays"]:
     """For each ray, the cell behind its first transparent one; NEVER if it meets none before its end."""
     clear = vmap_rays(lambda ray, at: _opacity(scene, ray, at, 0) == 0)(rays, at)
     shape = clear.shape
-    found = jnp.where(clear, 1, NEVER)
+    found = jnp.where(clear, jnp.int32(1), jnp.int32(NEVER))
     chosen = Chosen.of([~clear & ~at.finished], tiling.chunk)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (rays, at))
 
@@ -86,7 +114,7 @@ def _search(scene: Scene, rays: Ray, at: Progress) -> Int[Array, " rays"]:
             return jax.vmap(rays_of, in_axes=(None, None, 0))(rays, with_fields(at, index=index), each)
 
         alpha = in_memory(index[0] >= 0, opacities, index)
-        first = jnp.min(jnp.where(alpha == 0, each[:, None], CELLS), axis=0)
+        first = jnp.min(jnp.where(alpha == 0, each[:, None], jnp.int32(CELLS)), axis=0)
         found = jnp.where((found == NEVER) & (first < CELLS), index + first + 1, found)
         # what lies behind the end of an opaque ray does not show
         left = left * jnp.prod(1 - alpha, axis=0) if over else left

@@ -26,9 +26,9 @@ from ..march.march import CellRules
 from ..ray import NEVER, Progress, Scene, Track, front, move
 from ..scene.space import Ray
 from ..xla.compaction import in_front
-from ..xla.packing import Layout
+from ..xla.packing import Layout, Packed
 from ..xla.sharding import varying
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, with_fields
 from .rays import vmap_rays
 from .segment import Samples, SampleVisitor, march_segment
 from .tiling import GROUPS_OF_BEAM, Tiling
@@ -67,12 +67,28 @@ class Recorded(NamedTuple):
 
 
 class Marched(NamedTuple):
-    """What marching a tile's rays found: where they end, of shape (groups, rays in a group); the range of
-    each ray's visible cells, if it was asked for; and what the visitor did."""
+    """What marching a tile's rays found, of shape (groups, rays in a group)."""
 
-    at: Progress
-    range: CellRange | None
-    visited: Visited
+    lanes: Packed
+    track: Track
+    total: PyTree
+    """Of the visitor."""
+
+    @property
+    def at(self) -> Progress:
+        """Where the rays end."""
+        return vmap_rays(_progress)(self.lanes.tree, self.track)
+
+    @property
+    def range(self) -> CellRange | None:
+        """The range of each ray's visible cells, if it was asked for."""
+        return self.lanes.tree.range
+
+    @property
+    def visited(self) -> Visited:
+        """What the visitor did."""
+        lanes = self.lanes.tree
+        return lanes.carry, lanes.sums, self.total
 
 
 class Lanes(NamedTuple):
@@ -92,15 +108,14 @@ class Job(NamedTuple):
     """What does not change while the rays of a tile are marched.
 
     Attributes:
-        layout: of the constants of rays: `Ray`, `Track`, the visitor's `given`.
-        rays: these constants, packed.
+        rays: the constants of rays: `Ray`, `Track`, and the visitor's `given`.
+        groups: how many there are.
         skips, shifts: as for `march_rays`.
     """
 
     scene: Scene
     tiling: Tiling
-    layout: Layout
-    rays: dict[str, Array]
+    rays: Packed
     groups: int
     visitor: SampleVisitor | None
     skips: Skips | None
@@ -151,14 +166,10 @@ def march_rays(
     fixed = rays, track, given
     lanes = Lanes(start.index, start.composite, start.stats, start.finished, shifted, range_, carry, sums)
     lanes, total = varying((lanes, total), rays)
-    layout = Layout.of(fixed)
-    groups = rays.length.shape[0]
-    job = Job(scene, tiling, layout, layout.pack(fixed), groups, visitor, skips, shifts)
+    job = Job(scene, tiling, Layout.of(fixed).pack(fixed), rays.length.shape[0], visitor, skips, shifts)
     going = jnp.any(alive(start), axis=-1)
-    lanes, total = _march_all(job, lanes, total, going)
-    if shifts:
-        track = with_fields(track, shifted=lanes.shifted)
-    return Marched(vmap_rays(_progress)(lanes, track), lanes.range, (lanes.carry, lanes.sums, total))
+    packed, total = _march_all(job, Layout.of(lanes).pack(lanes), total, going)
+    return Marched(packed, track, total)
 
 
 def _progress(lanes: Lanes, track: Track) -> Progress:
@@ -168,13 +179,14 @@ def _progress(lanes: Lanes, track: Track) -> Progress:
     return Progress(lanes.index, lanes.composite, lanes.stats, lanes.finished, track)
 
 
-def _march_all(job: Job, lanes: Lanes, total: PyTree, going: Bool[Array, " groups"]) -> tuple[Lanes, PyTree]:
+def _march_all(job: Job, lanes: Packed, total: PyTree, going: Bool[Array, " groups"]) -> tuple[Packed, PyTree]:
     """Marches groups for as long as any of their rays is alive, in rounds of batches."""
-    size, layout = job.tiling.batch_of(job.groups), Layout.of(lanes)
+    size = job.tiling.batch_of(job.groups)
     enough = int(job.tiling.min_alive * size)
 
     def round_(state: Any) -> Any:
-        rows, count = in_front(state[2]), jnp.sum(state[2], dtype=jnp.int32)
+        # of floats, which XLA adds with SIMD
+        rows, count = in_front(state[2]), jnp.sum(state[2].astype(jnp.float32)).astype(jnp.int32)
         # only full batches, as long as there are any: what remains joins those of the next round
         batches = 1 if job.tiling.turns else jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, enough, 0)
@@ -182,39 +194,39 @@ def _march_all(job: Job, lanes: Lanes, total: PyTree, going: Bool[Array, " group
         def one(i: Int[Array, ""], state: Any) -> Any:
             packed, total, going = state
             some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
-            packed, total, living = _march_batch(job, layout, some, packed, total, keep)
+            packed, total, living = _march_batch(job, some, packed, total, keep)
             return packed, total, going.at[some].set(living, mode="drop", unique_indices=True)
 
         return jax.lax.fori_loop(0, batches, one, state)
 
-    start = layout.pack(lanes), total, going
+    start = lanes, total, going
     packed, total, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), round_, start)
-    return layout.unpack(packed), total
+    return packed, total
 
 
 def _march_batch(
-    job: Job, layout: Layout, rows: Int[Array, " batch"], packed: Any, total: PyTree, keep: Int[Array, ""]
-) -> tuple[Any, PyTree, Bool[Array, " batch"]]:
+    job: Job, rows: Int[Array, " batch"], packed: Packed, total: PyTree, keep: Int[Array, ""]
+) -> tuple[Packed, PyTree, Bool[Array, " batch"]]:
     """Marches the groups in these rows by `Tiling.turns` segments, or else while more than `keep` of them are
     alive, and tells which still are. A row past the last one stands for no group."""
     tiling, group = job.tiling, job.tiling.group
     known = jnp.minimum(rows, job.groups - 1)
     beam = jnp.repeat(known // GROUPS_OF_BEAM, group)
-    taken, lanes = job.layout.take(job.rays, known), layout.lanes(layout.take(packed, known))
+    taken, lanes = job.rays.take(known), packed.take(known).tree
     none = jnp.repeat(rows >= job.groups, group)
     lanes = lanes._replace(finished=lanes.finished | none)
 
     def living(lanes: Lanes) -> Bool[Array, " batch"]:
-        _, track, _ = job.layout.lanes(taken)
+        _, track, _ = taken.tree
         rays = ~lanes.finished & (lanes.index < track.until)
         # XLA finds the maximum of floats with SIMD, but looks at one truth value after the other
         return jnp.max(rays.astype(jnp.float32).reshape(-1, group), axis=-1) > 0
 
     def advance(state: tuple[Lanes, PyTree]) -> tuple[Lanes, PyTree]:
         lanes, total = state
-        rays, track, given = job.layout.lanes(taken)
+        rays, track, given = taken.tree
         here = _to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
-        after, samples = march_segment(job.scene, tiling, rays, here, shifts=job.shifts)
+        after, samples = march_segment(job.scene, tiling, taken, here, shifts=job.shifts)
         carry, sums = lanes.carry, lanes.sums
         if job.visitor is not None:
             carry, found, total = job.visitor.visit(rays, here, samples, given, carry, total)
@@ -228,21 +240,12 @@ def _march_batch(
     if tiling.turns:
         state = jax.lax.fori_loop(0, tiling.turns, lambda _, state: advance(state), state)
     else:
-        state = jax.lax.while_loop(lambda state: jnp.sum(living(state[0])) > keep, advance, state)
+        def going(state: tuple[Lanes, PyTree]) -> Bool[Array, ""]:
+            return jnp.sum(living(state[0]).astype(jnp.float32)) > keep.astype(jnp.float32)
+
+        state = jax.lax.while_loop(going, advance, state)
     lanes, total = state
-    return layout.put(packed, rows, lanes), total, living(lanes)
-
-
-def with_fields(tree: Any, **changes: PyTree) -> Any:
-    """A module with other values for these fields, of many rays (`dataclasses.replace` would check the shapes
-    of one)."""
-    names = list(changes)
-    return eqx.tree_at(
-        lambda tree: [getattr(tree, name) for name in names],
-        tree,
-        [changes[name] for name in names],
-        is_leaf=lambda leaf: leaf is None,
-    )
+    return packed.put(rows, lanes), total, living(lanes)
 
 
 def blinded(skips: Skips | None, at: Progress) -> Progress:
@@ -263,11 +266,16 @@ def into_range(
     at = eqx.tree_at(lambda at: at.track.until, at, jnp.minimum(until, at.track.until))
     # of rays that see nothing, `first` is no index
     steps = jnp.where(first < until, jnp.maximum(first - at.index, 0), 0)
-    return vmap_rays(partial(_moved, scene.march, transparent=shifts or None))(rays, at, steps)
+    return vmap_rays(partial(_moved, scene.march, transparent=_clear(shifts)))(rays, at, steps)
+
+
+def _clear(shifts: bool) -> Bool[Array, ""] | None:
+    """What `move` is told of transparent cells."""
+    return jnp.ones((), bool) if shifts else None
 
 
 def _moved(march: Any, ray: Ray, at: Progress, steps: Int[Array, ""], *, transparent: Any) -> Progress:
-    """Moves a ray on by so many steps, whose cells are all transparent; True, if it may shift there."""
+    """Moves a ray on by so many steps, whose cells are all transparent. `transparent`: as for `move`."""
     moved = move(march, ray, at, transparent, steps)
     return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
@@ -277,7 +285,7 @@ def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) 
     if job.skips is None:
         return at
     steps = _leap(job.rules, partial(job.skips.skip_to, beam), rays, at)
-    return jax.vmap(partial(_moved, job.rules, transparent=job.shifts or None))(rays, at, steps)
+    return jax.vmap(partial(_moved, job.rules, transparent=_clear(job.shifts)))(rays, at, steps)
 
 
 def _leap(march: CellRules, skip_to: Callable[..., Array], rays: Ray, at: Progress) -> Int[Array, " rays"]:

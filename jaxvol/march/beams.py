@@ -46,6 +46,11 @@ class EmptySpaceIndex(eqx.Module):
     def skips(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Skips:
         """That along beams, from the boxes around them. `stretch`: the shortest useful leap."""
 
+    @property
+    def unshaped(self) -> "EmptySpaceIndex":
+        """The same index, so that its kernel knows no numbers of cells, if that is possible."""
+        return self
+
     def within_ranges(self) -> "EmptySpaceIndex":
         """What is of use where each ray's first and last visible cell are known."""
         return self
@@ -93,8 +98,8 @@ class Box(eqx.Module):
         """The box of all camera rays between a beam's corner rays, by beam and corner; origins count from the
         anchor."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
-        frame, shape = occupancy.frame, occupancy.occupied.shape
-        x, y, z = (size * n for size, n in zip(occupancy.size, shape, strict=True))
+        frame, shape = occupancy.frame, occupancy.shape
+        x, y, z = (size * jnp.asarray(n, size.dtype) for size, n in zip(occupancy.size, shape, strict=True))
         spans = x, y, z
         x, y, z = (low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True))
         center = frame.vector((x, y, z))
@@ -149,6 +154,12 @@ class Stretches(Skips):
     following: Int[Array, "stretches beams"]
     """For each stretch, the first one from there on that is not empty, or their number."""
 
+    @classmethod
+    def nowhere(cls, beams: int, like: Array) -> "Stretches":
+        """Those of beams in which nothing is known to be empty. `like`: an array of the type of depths."""
+        none = jnp.zeros((STRETCHES, beams), jnp.int32)
+        return cls(jnp.zeros(beams, like.dtype), jnp.full((), jnp.inf, like.dtype), none)
+
     def any_visible(self) -> Bool[Array, " beams"]:
         return self.following[0] < self.following.shape[0]
 
@@ -173,7 +184,8 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
     def occupied(at: Int[Array, ""]) -> Bool[Array, " beams"]:
         first = at.astype(length.dtype) * length
         low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
-        shape, inside = occupancy.occupied.shape, first < across
+        shape = [jnp.asarray(n, first.dtype) for n in occupancy.shape]
+        inside = first < across
         for a, b, n in zip(low, high, shape, strict=True):
             inside &= (b >= 0) & (a <= n)
 

@@ -124,11 +124,11 @@ class CellRules(eqx.Module):
     """
 
     step: Float[Array, ""]
-    place: Float[Array, ""]
-    entry: Float[Array, ""]
-    at_exit: Bool[Array, ""]
-    opacity_left: Float[Array, ""]
-    most_samples: Int[Array, ""]
+    place: Float[Array, ""] | np.ndarray
+    entry: Float[Array, ""] | np.ndarray
+    at_exit: Bool[Array, ""] | np.ndarray
+    opacity_left: Float[Array, ""] | np.ndarray
+    most_samples: Int[Array, ""] | np.ndarray
     integrates: bool = eqx.field(static=True)
     divide: Callable[[Cell, Ray, Volume], tuple[Cell, ...]] | None = eqx.field(static=True, default=None)
     custom: tuple[Transform, ...] = ()
@@ -313,10 +313,11 @@ class March(eqx.Module):
     def rules(self) -> CellRules:
         """How the kernel cuts and ends rays."""
         dtype = self.step.dtype
-        place, entry, left = (np.asarray(x, dtype) for x in (self.quadrature != "left", -np.inf, -1))
+        middle = 0.0 if self.quadrature == "left" else 0.5
+        place, entry, left = (np.asarray(number, dtype) for number in (middle, -np.inf, -1))
         most = np.asarray(self.most_samples, np.int32)
         plain = found = CellRules(
-            self.step, place / 2, entry, np.asarray(False), left, most, self.integrates
+            self.step, place, entry, np.asarray(False), left, most, self.integrates
         )
         for transform in self.transforms:
             answer = transform.rules(found)

@@ -28,6 +28,7 @@ from .._util.checks import (
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import is_traced
+from ..xla.trees import unchecked
 from .space import Line
 from .volume import Volume, corners_of
 
@@ -284,9 +285,9 @@ class Camera(eqx.Module):
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         return self.ray_from(None, column, row)
 
-    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any) -> tuple[Vec3, Vec3]:
+    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any, size: Any = None) -> tuple[Vec3, Vec3]:
         """As `ray`, with an origin that counts from `anchor`."""
-        beside, direction = self.beside(column, row)
+        beside, direction = self.beside(column, row, size)
         place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
         return place if beside is None else plus(place, beside), direction
 
@@ -352,7 +353,7 @@ class Camera(eqx.Module):
     @property
     def unsized(self) -> "Camera":
         """The camera without its size, so that all sizes have one structure."""
-        return with_static(self, size=(0, 0))
+        return unchecked(self, size=(0, 0))
 
 
 class GivenRays(eqx.Module):

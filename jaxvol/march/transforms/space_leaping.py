@@ -127,6 +127,10 @@ class _Beams(EmptySpaceIndex):
     occupancy: Occupancy
     sums: Sums
 
+    @property
+    def unshaped(self) -> "_Beams":
+        return _Beams(self.occupancy.unshaped, self.sums)
+
     def skips(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
         return stretches(self.occupancy, self.sums, box(self.occupancy), stretch)
 
@@ -169,7 +173,7 @@ class _Distances(EmptySpaceIndex, Skips):
         return depth
 
     def _leap(self, start: Vec3, rate: Any, length: Scalar, depth: Scalar) -> Scalar:
-        _, ny, nz = shape = self.occupancy.occupied.shape
+        _, ny, nz = shape = self.occupancy.shape
         point = [s + depth * r for s, r in zip(start, rate, strict=True)]
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
         i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))
