@@ -288,10 +288,10 @@ def track_of(march: March, ray: Ray) -> Track:
 
 
 def pieces(scene: Scene, ray: Ray, at: Any, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
-    """The pieces of the ray's next cell, or of the `number`-th one after it. Cells that are not taken lie
-    past the exit. `at`: a `Progress`, of which `index` and `track` are read."""
-    march, cell = scene.march, at.index + number
-    begin = jnp.where(cell < at.track.until, at.track.front(cell, march.step), ray.length)
+    """The pieces of the ray's next cell, or of the `number`-th one after it. `at`: a `Progress`, of which
+    `index` and `track` are read."""
+    march = scene.march
+    begin = at.track.front(at.index + number, march.step)
     return march.cut(Cell(begin, march.step, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
@@ -345,7 +345,7 @@ def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
 def is_sample(march: Any, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
     """Whether a piece counts as a sample. `divided`: transforms divide cells, so that pieces may have
     width 0."""
-    before_exit = march.sample(piece) < ray.length
+    before_exit = march.sample(piece) < ray.end
     # only where cells are divided: elsewhere the second test would take 15 % of a frame
     return before_exit & (piece.width > 0) if divided else before_exit
 

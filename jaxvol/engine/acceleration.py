@@ -184,7 +184,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         seen = by_rules(Scene(volume, transfer, own, plain, FirstVisible()).prepared())
         rays = tiles.rays(own, space, only, no_fault)
         start = begin_rays(plain, seen, rays, tiling, "depth")
-        skips = tiles.skips(index, own, rays, only, march.step)
+        skips = tiles.skips(index, rays, march.step)
         found = march_rays(seen, rays, blinded(skips, start), tiling, skips)
         rendering = vmap_rays(partial(end, seen))(rays, found.at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)

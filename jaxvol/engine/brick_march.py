@@ -72,7 +72,7 @@ def march_brick(
         if restart:
             over = opaque(prepared, start) | (range_.until <= range_.first)
             start = with_fields(start, index=range_.first, finished=over)
-        skips = tiles.skips(index, scene.source, rays, number, scene.march.step)
+        skips = tiles.skips(index, rays, scene.march.step)
         here = into_range(prepared, rays, start, range_, shifts=shifts)
         after = march_rays(prepared, rays, blinded(skips, here), tiles.tiling, skips, shifts=shifts).at
         after = eqx.tree_at(lambda at: at.track.until, after, start.track.until)

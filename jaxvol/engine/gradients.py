@@ -148,7 +148,7 @@ class ImageVjp(NamedTuple):
     ) -> Marched:
         """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
         tiles, step = self.tiles, self.scene.march.step
-        skips = tiles.skips(self.empty_space, self.scene.source, rays, number, step)
+        skips = tiles.skips(self.empty_space, rays, step)
         start = blinded(skips, start)
         if range_ is not None:
             start = into_range(self.prepared, rays, start, range_, shifts=shifts)

@@ -133,7 +133,7 @@ def march_image(
 
     def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, Recorded]:
         start = begin_rays(scene.march, prepared, rays, tiling, options.outputs)
-        skips = tiles.skips(index, scene.source, rays, tile, scene.march.step)
+        skips = tiles.skips(index, rays, scene.march.step)
         known = record and skips is not None
         found = march_rays(prepared, rays, blinded(skips, start), tiling, skips, record=known)
         recorded = Recorded(found.range, start.track.shifted if record else None)

@@ -18,13 +18,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Scalar
 from ..march.beams import Box, EmptySpaceIndex, Skips
 from ..scene.camera import Camera, Ending, GivenRays, without_ends
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
 from ..xla.memory import in_memory
-from ..xla.trees import PyTree, added
+from ..xla.trees import PyTree, added, unchecked
 from . import devices
 from .tiling import GROUPS_OF_BEAM, Tiling
 
@@ -158,16 +158,12 @@ class RayTiles(eqx.Module):
         """The rays of a tile, and which of them are of the image."""
 
     @abstractmethod
-    def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, rays: Ray) -> Callable[[Occupancy], Box]:
         """A function from an occupancy grid to the boxes around the beams of a tile."""
 
-    def skips(
-        self, index: EmptySpaceIndex | None, source: Any, rays: Ray, tile: Int[Array, ""], step: Scalar
-    ) -> Skips | None:
+    def skips(self, index: EmptySpaceIndex | None, rays: Ray, step: Scalar) -> Skips | None:
         """Where the rays of a tile see nothing, if that is known."""
-        if index is None:
-            return None
-        return index.skips(self.box(source, rays, tile), self.tiling.cells * step)
+        return None if index is None else index.skips(self.box(rays), self.tiling.cells * step)
 
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:
@@ -204,19 +200,16 @@ class _PixelTiles(RayTiles):
         width, height = self.size
         return lines(source, column, row, fault, self._traced_size), (column < width) & (row < height)
 
-    def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
-        source = without_ends(source)
-        y, x = jnp.divmod(jnp.arange(4), 2)
-        last = self.tiling.beam - 1
-        column, row = self._pixels(tile, y * last, x * last)
-        size = self._traced_size
+    def box(self, rays: Ray) -> Callable[[Occupancy], Box]:
+        side, last = self.tiling.side, self.tiling.group - 1
+        lanes = 0, side - 1, last - side + 1, last  # in the groups of a beam, its corners
 
-        def ray(anchor: Vec3 | None, column: Array, row: Array) -> tuple[Vec3, Vec3]:
-            return source.ray_from(anchor, column, row, size)
+        def corners(leaf: Array) -> Array:
+            groups = leaf.reshape(-1, GROUPS_OF_BEAM, leaf.shape[1])
+            return jnp.stack([groups[:, group, lane] for group, lane in enumerate(lanes)], axis=-1)
 
-        return lambda occupancy: Box.within(
-            occupancy, *vmap_rays(partial(ray, occupancy.anchor))(column, row)
-        )
+        chosen = unchecked(rays, path=None, pixel=None, gaps=(), spans=())
+        return lambda occupancy: Box.within(occupancy, jax.tree.map(corners, chosen))
 
     @property
     def _traced_size(self) -> tuple[Scalar, Scalar] | None:
@@ -271,7 +264,7 @@ class _GivenRayTiles(RayTiles):
         own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
         return own, number < count
 
-    def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
+    def box(self, rays: Ray) -> Callable[[Occupancy], Box]:
         by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
         return lambda occupancy: Box.around(occupancy, by_beam)
 
@@ -300,14 +293,14 @@ def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
 
 def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""], size: Any = None) -> Line:
     """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN. `size`:
-    of the image, where it is traced; then nothing is differentiated."""
+    of the image, where it is traced; then nothing is differentiated, and the camera is known to be valid."""
     left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
     # on a GPU, `in_memory` computes rays also of a fault
     camera = eqx.tree_at(lambda c: c.position, camera, jnp.where(fault, jnp.nan, camera.position))
     if size is None:
         beside, direction = _rounded(camera, columns, rows)
     else:
-        beside, direction = in_memory(all_finite(camera), partial(_through, camera, size=size), columns, rows)
+        beside, direction = in_memory(size[0] > 0, partial(_through, camera, size=size), columns, rows)
     # the position need not be stored for each ray
     x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
     return Line((x, y, z), direction, (columns + left, rows + top), beside=beside)

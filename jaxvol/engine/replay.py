@@ -36,7 +36,7 @@ from ..scene.space import Ray
 from ..scene.transfer import classification_of
 from ..scene.volume import fetches_of, voxels_of, with_fetches, with_voxels, without_voxels
 from ..scene.voxel_fetch import Fetched
-from ..xla.trees import PyTree, added, floats, zeros_of
+from ..xla.trees import PyTree, added, floats, with_fields, zeros_of
 from .segment import Samples, SampleVisitor, vmap_cells
 from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
@@ -142,6 +142,7 @@ class Replay(SampleVisitor):
         self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, carry: Scalar, total: Total
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
+        whole = with_fields(ray, reach=None)
         red, green, blue = each.color
         classify = vmap_cells(self.prepared.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
@@ -197,7 +198,7 @@ class Replay(SampleVisitor):
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_place = [None] * len(depths) if shaded is None else [part.of_place for part in shaded]
         (of_rules, of_march, of_volume, of_rays, of_transfer), fetched, of_fetched = self._geometric_vjp(
-            ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
+            whole, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         )
         total = total._replace(rules=added(total.rules, of_rules), volume=added(total.volume, of_volume))
         if of_march is not None:

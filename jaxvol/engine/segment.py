@@ -14,32 +14,34 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from ..compositing.blending import Weighting
+from ..compositing.blending import Composite, Over
 from ..compositing.selection import Selection
 from ..march.march import Cell
-from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, stop, stopped
+from ..ray import Progress, Scene, Track, add, is_sample, move, opacity, pieces, read, stop, stopped
 from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
 from ..xla.packing import Packed
-from ..xla.trees import PyTree, with_fields
+from ..xla.trees import PyTree, unchecked, with_fields
 from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
 
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, of arrays (cells, rays).
-    Cells that a ray does not take are transparent, and placed at its exit. `light`: the terms of shading that
-    is `inline`."""
+    Cells that a ray does not take are transparent, and lie past its `Ray.end`. `light`: the terms of shading
+    that is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
     opacity: list[Scalar]
     light: list[PyTree] | None = None
+    ray: Any = None
+    """The rays, which end where they take no other cell."""
 
     @property
     def number(self) -> int:
@@ -75,30 +77,43 @@ def vmap_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
 
 
 class Ahead(eqx.Module):
-    """The cells ahead of many rays.
+    """The cells ahead of many rays, up to the one behind which they shift.
 
     Attributes:
         taken: their `Ray`, `Track` and what a visitor is given, which branches take apart themselves, since
             XLA would store each array that a branch is given.
         index: of the next cell.
-        finished: whether rays take no other cell.
-        whole: whether all cells of a segment are to lie end to end. Then none lies ahead in which a ray
-            shifts, since that does not begin where the one in front of it ends.
+        offset: of these cells, as in `Track`.
+        reach: `Ray.reach`, the end of the last cell that is taken.
+        until: the first cell that is not.
     """
 
     taken: Packed
     index: Int[Array, " rays"]
-    finished: Bool[Array, " rays"]
-    whole: bool = eqx.field(static=True)
+    offset: Float[Array, " rays"]
+    reach: Float[Array, " rays"]
+    until: Int[Array, " rays"]
+
+    @classmethod
+    def of(cls, taken: Packed, at: Progress, step: Scalar) -> "Ahead":
+        """The cells ahead of rays that are `at` these places."""
+        (ray, _, _), track = taken.tree, at.track
+        offset, until = track.offset, track.until
+        if track.shift is not None and track.shifted is not None:
+            before = at.index < track.shifted
+            offset = offset + jnp.where(before, 0, track.shift)
+            until = jnp.where(before, jnp.minimum(until, track.shifted), until)
+        back = (offset + until.astype(offset.dtype)) * step
+        reach = jnp.where(at.finished, 0, jnp.minimum(back, ray.length))
+        return cls(taken, at.index, offset, reach, until)
 
     @property
     def place(self) -> "tuple[Ray, Place]":
-        """The rays, and where their next cell lies."""
-        ray, track, _ = self.taken.tree
-        until = jnp.where(self.finished, self.index, track.until)
-        if self.whole and track.shifted is not None:
-            until = jnp.where(self.index < track.shifted, jnp.minimum(until, track.shifted), until)
-        return ray, Place(self.index, eqx.tree_at(lambda track: track.until, track, until))
+        """The rays, which end where they take no other cell, and where their next cell lies."""
+        ray, _, _ = self.taken.tree
+        return with_fields(ray, reach=self.reach), Place(
+            self.index, unchecked(Track, offset=self.offset, shift=None, shifted=None, until=self.until)
+        )
 
 
 class Place(NamedTuple):
@@ -114,9 +129,9 @@ def march_segment(
     """Marches rays by a segment of cells; by fewer, where a ray has no more of them, and by none where it is
     finished. `shifts`: a segment is one cell, behind which rays may shift."""
     classification, number = scene.classification, tiling.cells
-    ahead = Ahead(taken, at.index, at.finished, scene.march.integrates and not shifts)
+    ahead = Ahead.of(taken, at, scene.march.step)
     samples = _sampled(scene, number, ahead)
-    ray, place = ahead.place
+    ray, _ = ahead.place
     colors: list[Vec3] | list[None]
     values = [read[:1] for read in samples.measured]
     if isinstance(scene.compositing, Selection):
@@ -129,27 +144,73 @@ def march_segment(
         colors = lit_colors(shader, scene, ray, *parts)
     else:
         colors = shaded_colors(scene, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity)
-    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
+    import os
+    if os.environ.get("ATONCE") and isinstance(scene.compositing, Over) and len(samples.cells) == 1 and not scene.march.custom:
+        after = _at_once(scene, ray, at, samples, colors[0])
+    else:
+        cells = zip(samples.cells, values, colors, samples.opacity, strict=True)
+        after = _one_by_one(scene, ray, at, tuple(cells), number)
+    steps = jnp.where(at.finished, 0, jnp.clip(ahead.until - at.index, 0, number))
+    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
+    return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples._replace(ray=ray)
 
-    # Whether a ray is stopped follows from what it has passed, but of transforms of one's own. So it is not
-    # carried from cell to cell, which XLA would then compute one after the other.
-    follows = isinstance(scene.compositing, Weighting) and not scene.march.custom
+
+def _one_by_one(scene: Scene, ray: Ray, at: Progress, cells: Any, number: int) -> Progress:
+    """Rays with a segment of cells composited."""
 
     def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
-        if follows:
-            at = with_fields(at, finished=stopped(scene, at.composite))
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
-        return at if follows else stop(scene, at)
+        return stop(scene, at)
 
     # unrolled, so that nothing between two cells is put in memory
     after, _ = jax.lax.scan(
         lambda at, cell: (jax.vmap(composited)(ray, at, cell), None), at, cells, unroll=number
     )
-    after = jax.vmap(partial(stop, scene))(with_fields(after, finished=at.finished) if follows else after)
-    steps = jnp.where(at.finished, 0, jnp.clip(place.track.until - at.index, 0, number))
-    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
-    return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples
+    return after
+
+
+def _at_once(scene: Scene, ray: Ray, at: Progress, samples: Samples, color: Vec3 | None) -> Progress:
+    """Rays with a segment of undivided cells composited by the operator "over", and ended by the library's
+    transforms: whether a ray is stopped in front of a cell follows from the opacity there, so that no cell
+    need wait for the one before it."""
+    mode, composite = scene.compositing, at.composite
+    assert isinstance(mode, Over)
+    (cell,), (alpha,) = samples.cells, samples.opacity
+    depth, number = scene.march.sample(cell), samples.number
+
+    def weights(before: Scalar, alpha: Scalar) -> Scalar:
+        front = mode.in_front(alpha, before)
+        stops = vmap_cells(lambda opacity: stopped(scene, Composite(opacity)))(front)
+        return jnp.where(stops, 0, mode.weight(alpha, front))
+
+    weight = in_memory(always(at), weights, composite.opacity, alpha)
+
+    def summed(start: Scalar, values: Scalar | None) -> Scalar:
+        for k in range(number):  # a reduction would be a loop of its own
+            start = start + (weight[k] if values is None else weight[k] * values[k])
+        return start
+
+    sums = moment = None
+    if composite.color is not None and color is not None:
+        r, g, b = map(summed, composite.color, color)
+        sums = r, g, b
+    if composite.moment is not None:
+        moment = summed(composite.moment, depth)
+    stats = at.stats
+    if stats is not None:
+        # a cell in front of which a ray is stopped is no sample: of those, too, whose weight is 0
+        front = mode.in_front(alpha, composite.opacity)
+        stops = vmap_cells(lambda opacity: stopped(scene, Composite(opacity)))(front)
+        counted = ~stops & vmap_cells(partial(is_sample, scene.march, divided=False), (False, True))(ray, cell)
+        samples_ = stats.samples
+        aligned = stats.aligned
+        for k in range(number):
+            samples_ = samples_ + counted[k].astype(samples_.dtype)
+            aligned = aligned | (cell.cut[k] & (weight[k] > 0))
+        stats = with_fields(stats, samples=samples_, aligned=aligned)
+    after = with_fields(at, composite=Composite(summed(composite.opacity, None), sums, moment), stats=stats)
+    return jax.vmap(partial(stop, scene))(after)
 
 
 def _sampled(scene: Scene, number: int, ahead: Ahead) -> Samples:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.blending import Outputs, Over, Weighting
 from ..march.march import March
-from ..ray import NEVER, Progress, Scene, begin, is_sample, measure, move, opacity, pieces, track_of
+from ..ray import NEVER, Progress, Scene, begin, is_sample, measure, opacity, pieces, track_of
 from ..scene.space import Ray
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
@@ -66,23 +66,22 @@ def find_shifts(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Progre
 
 
 def behind_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
-    """Rays, behind their first cells where they shift there, if that saves a segment."""
-    if scene.march.integrates and isinstance(scene.compositing, Weighting):
-        return vmap_rays(partial(_behind_first_cell, scene))(rays, at)
-    return at
+    """Rays, behind their first cells where they shift there: a segment of cells would end there (`segment`).
+    Not for a `Selection`, to which transparent cells may matter."""
+    if not isinstance(scene.compositing, Weighting):
+        return at
 
-
-def _behind_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
-    """A ray, behind its first cell if it shifts there: a segment of cells that are integrated would end there
-    (`segment`). Not for a `Selection`, to which transparent cells may matter."""
-    moves = (at.track.shifted == 1) & ~at.finished
-    moved = move(scene.march, ray, at, None, 1)
-    if moved.stats is not None:
+    def behind(ray: Ray, at: Progress) -> Progress:
         cut = pieces(scene, ray, at)
-        count = [is_sample(scene.march, ray, piece, divided=len(cut) > 1) for piece in cut]
-        samples = moved.stats.samples + jnp.sum(jnp.stack(count)).astype(jnp.int32)
-        moved = eqx.tree_at(lambda moved: moved.stats.samples, moved, samples)
-    return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
+        if len(cut) > 1:  # some of which may be no samples
+            return at
+        moves = (at.track.shifted == 1) & ~at.finished & is_sample(scene.march, ray, *cut, divided=False)
+        stats = at.stats
+        if stats is not None:
+            stats = with_fields(stats, samples=stats.samples + moves.astype(stats.samples.dtype))
+        return with_fields(at, index=jnp.where(moves, 1, at.index), stats=stats)
+
+    return vmap_rays(behind)(rays, at)
 
 
 def _shifted(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Int[Array, "groups rays"]:

@@ -9,7 +9,7 @@ Larger images are several tiles of rays. Inside of a larger program, `image.marc
 same functions, as a part of that.
 """
 
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -35,8 +35,8 @@ from ..xla.memo import memoized_of
 from ..xla.trees import unchecked, with_fields
 from .acceleration import VolumeAcceleration, empty_space_of
 from .rays import RayTiles, vmap_rays
-from .shifts import find_shifts
-from .tiling import RenderOptions, Tiling
+from .shifts import behind_first_cells, find_shifts
+from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
 from .wavefront import Marched, Recorded, blinded, march_rays
 
 
@@ -44,11 +44,11 @@ program: Any = partial(eqx.filter_jit, compiler_options=OPTIONS)
 
 
 class Started(NamedTuple):
-    """The rays of a tile before they are marched."""
+    """The rays of a tile before they are marched. None: what a scene has nothing of."""
 
     rays: Ray
     track: Track
-    skips: Skips
+    skips: Skips | None
     space: Space
 
 
@@ -112,11 +112,16 @@ def staged_image(
     passed = []
     for tile, until in enumerate(ends):
         number_ = np.asarray(tile, np.int32)
-        started = _start(given, pixels, seams, place, index, fault, most, number_, until, tiling, size)
-        track = started.track
+        started = _start(given, pixels, seams, place, index, fault, number_, until, tiling, size)
+        none, zero, never, nowhere = _nothing(*started.rays.length.shape, started.rays.length.dtype)
+        offset, shift = started.track.offset, started.track.shift
+        track = Track(none if offset is None else offset, none if shift is None else shift, never, most)
+        first = zero
         if scene.march.may_shift:
-            track = _shift(kernel, started.rays, track, tiling)
-        found = _march(*_told(kernel, started), track, started.skips, options.outputs, tiling, record)
+            track, first = _shift(kernel, started.rays, track, most, tiling)
+        skips = nowhere if started.skips is None else started.skips
+        told = _told(kernel, started._replace(skips=skips))
+        found = _march(*told, track, first, skips, options.outputs, tiling, record)
         passed.append(Passed(started.rays.t_in, started.rays.length, found, track.shifted))
     return _finish(passed, scene.compositing, source, tiling, size, record)
 
@@ -160,7 +165,6 @@ def _start(
     place: Volume,
     index: EmptySpaceIndex | None,
     fault: Bool[Array, ""],
-    most: Int[Array, ""],
     tile: Int[Array, ""],
     until: Array | None,
     tiling: Tiling,
@@ -170,11 +174,19 @@ def _start(
     tiles, space = RayTiles.of(source, tiling, tiles=(1, size), pixels=pixels), seams.locate(place)
     rays = tiles.rays(source, space, tile, fault, until)
     track = vmap_rays(partial(track_of, seams))(rays)
-    shift = jnp.zeros_like(track.offset) if track.shift is None else track.shift
-    shape = rays.length.shape
-    track = Track(track.offset, shift, jnp.full(shape, NEVER, jnp.int32), jnp.broadcast_to(most, shape))
-    skips = tiles.skips(index, source, rays, tile, seams.step)
-    return Started(rays, track, Stretches.nowhere(size, rays.length) if skips is None else skips, space)
+    offset = track.offset if seams.overriding("start") else None
+    skips = tiles.skips(index, rays, seams.step)
+    return Started(rays, Track(offset, track.shift, None, None), skips, space)
+
+
+@cache
+def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, Stretches]:
+    """What is told of rays that neither begin nor shift anywhere in particular: no steps, the first cell, no
+    cell; and where they see nothing, as far as is known."""
+    none, beams = np.zeros((groups, group), dtype), groups // GROUPS_OF_BEAM
+    stretches = Stretches.nowhere(beams, none.dtype)
+    zero, never = (np.full(none.shape, number, np.int32) for number in (0, NEVER))
+    return jax.device_put((none, zero, never, stretches))
 
 
 def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex | None:
@@ -221,21 +233,38 @@ def _told(kernel: Kernel, started: Started) -> tuple[Kernel, Ray]:
 
 
 @program
-def _shift(kernel: Kernel, rays: Ray, track: Track, tiling: Tiling) -> Track:
-    """Where the rays of a tile shift."""
-    scene = kernel.scene
+def _shift(
+    kernel: Kernel, rays: Ray, track: Track, most: Int[Array, ""], tiling: Tiling
+) -> tuple[Track, Int[Array, "groups rays"]]:
+    """Where the rays of a tile shift, and the first cell that is to be marched."""
+    scene, track = kernel.scene, _for_each(track, rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, None))(rays, track)
-    return find_shifts(scene, rays, with_fields(at, finished=rays.length <= 0), tiling).track
+    at = find_shifts(scene, rays, with_fields(at, finished=rays.length <= 0), tiling)
+    return with_fields(at.track, until=most), behind_first_cells(scene, rays, at).index
+
+
+def _for_each(track: Track, rays: Ray) -> Track:
+    """The track of each ray: the number of samples is one for all."""
+    return with_fields(track, until=jnp.broadcast_to(track.until, rays.length.shape))
 
 
 @program
 def _march(
-    kernel: Kernel, rays: Ray, track: Track, skips: Skips, outputs: Outputs, tiling: Tiling, record: bool
+    kernel: Kernel,
+    rays: Ray,
+    track: Track,
+    first: Int[Array, "groups rays"],
+    skips: Skips,
+    outputs: Outputs,
+    tiling: Tiling,
+    record: bool,
 ) -> Marched:
     """Marches the rays of a tile to their ends."""
-    scene = kernel.scene
+    scene, track = kernel.scene, _for_each(track, rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, outputs))(rays, track)
-    at = blinded(skips, with_fields(at, finished=rays.length <= 0))
+    at = blinded(skips, with_fields(at, index=first, finished=rays.length <= 0))
+    if at.stats is not None:  # transparent cells, which are samples
+        at = eqx.tree_at(lambda at: at.stats.samples, at, first)
     return march_rays(scene, rays, at, tiling, skips, record=record)
 
 

@@ -229,7 +229,7 @@ def _march_batch(
         after, samples = march_segment(job.scene, tiling, taken, here, shifts=job.shifts)
         carry, sums = lanes.carry, lanes.sums
         if job.visitor is not None:
-            carry, found, total = job.visitor.visit(rays, here, samples, given, carry, total)
+            carry, found, total = job.visitor.visit(samples.ray, here, samples, given, carry, total)
             sums = jax.tree.map(jnp.add, sums, found)
         range_ = None if lanes.range is None else lanes.range.widened(here, samples)
         shifted = after.track.shifted if job.shifts else None

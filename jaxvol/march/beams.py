@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3, along
@@ -19,6 +20,7 @@ from ..scene.space import Ray
 from ..xla.memory import gather
 from ..xla.platform import on_gpu
 from ..xla.sharding import varying
+from ..xla.trees import unchecked
 
 
 STRETCHES = 128
@@ -94,15 +96,16 @@ class Box(eqx.Module):
         return cls._of(occupancy, start, direction, near, far, hit, jnp.zeros_like(near))
 
     @classmethod
-    def within(cls, occupancy: Occupancy, origin: Vec3, direction: Vec3) -> "Box":
-        """The box of all camera rays between a beam's corner rays, by beam and corner; origins count from the
-        anchor."""
-        origin, direction = jax.lax.stop_gradient((origin, direction))
+    def within(cls, occupancy: Occupancy, rays: Ray) -> "Box":
+        """The box of all camera rays between a beam's corner rays, `rays` by beam and corner, whether these
+        meet the volume or not."""
+        entry, direction, t_in = jax.lax.stop_gradient((rays.entry, rays.direction, rays.t_in))
         frame, shape = occupancy.frame, occupancy.shape
         x, y, z = (size * jnp.asarray(n, size.dtype) for size, n in zip(occupancy.size, shape, strict=True))
         spans = x, y, z
         x, y, z = (low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True))
         center = frame.vector((x, y, z))
+        x, y, z = origin = along(entry, direction, -t_in)
         x, y, z = (c - o for o, c in zip(origin, center, strict=True))
         middle = jnp.sqrt(x * x + y * y + z * z)
         radius = frame.diagonal(spans) / 2
@@ -115,7 +118,8 @@ class Box(eqx.Module):
         nearest, farthest = jnp.min(middle, axis=-1), jnp.max(middle, axis=-1)
         spread = farthest - nearest + sum(jnp.max(o, axis=-1) - jnp.min(o, axis=-1) for o in origin)
         near, far = jnp.maximum(nearest - radius - spread, 0), farthest + radius + spread
-        start = frame.components(along(origin, direction, near[..., None]))
+        # from the entries, which float32 resolves where the origins are far away
+        start = frame.components(along(entry, direction, near[..., None] - t_in))
         direction, counts = frame.components(direction), jnp.ones(start[0].shape, bool)
         return cls._of(occupancy, start, direction, near, far, counts, bulge * frame.stretch)
 
@@ -155,10 +159,10 @@ class Stretches(Skips):
     """For each stretch, the first one from there on that is not empty, or their number."""
 
     @classmethod
-    def nowhere(cls, beams: int, like: Array) -> "Stretches":
-        """Those of beams in which nothing is known to be empty. `like`: an array of the type of depths."""
-        none = jnp.zeros((STRETCHES, beams), jnp.int32)
-        return cls(jnp.zeros(beams, like.dtype), jnp.full((), jnp.inf, like.dtype), none)
+    def nowhere(cls, beams: int, dtype: Any) -> Any:
+        """Those of beams in which nothing is known to be empty, as NumPy arrays. `dtype`: that of depths."""
+        near, length = np.zeros(beams, dtype), np.full((), np.inf, dtype)
+        return unchecked(cls, near=near, length=length, following=np.zeros((STRETCHES, beams), np.int32))
 
     def any_visible(self) -> Bool[Array, " beams"]:
         return self.following[0] < self.following.shape[0]

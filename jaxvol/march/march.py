@@ -114,7 +114,7 @@ class CellRules(eqx.Module):
     Attributes:
         step: distance between samples, world length.
         place: where in its cell a sample lies, from 0, its front, to 1.
-        entry: depth before which cells are cut; minus infinity if they are not.
+        at_entry: whether cells are cut at the entry.
         at_exit: whether cells are cut at the exit.
         opacity_left: transmittance at or below which rays end; negative: never.
         most_samples: of a ray.
@@ -125,11 +125,11 @@ class CellRules(eqx.Module):
 
     step: Float[Array, ""]
     place: Float[Array, ""] | np.ndarray
-    entry: Float[Array, ""] | np.ndarray
     at_exit: Bool[Array, ""] | np.ndarray
     opacity_left: Float[Array, ""] | np.ndarray
     most_samples: Int[Array, ""] | np.ndarray
     integrates: bool = eqx.field(static=True)
+    at_entry: bool = eqx.field(static=True, default=False)
     divide: Callable[[Cell, Ray, Volume], tuple[Cell, ...]] | None = eqx.field(static=True, default=None)
     custom: tuple[Transform, ...] = ()
 
@@ -142,7 +142,7 @@ class CellRules(eqx.Module):
         """The pieces of a cell."""
         if self.custom:
             return cut_by(self.custom, cell, ray, volume)
-        cell = cut_at_exit(cut_at_entry(cell, self.entry), ray, self.at_exit)
+        cell = cut_at_exit(cut_at_entry(cell) if self.at_entry else cell, ray, self.at_exit)
         return (cell,) if self.divide is None else self.divide(cell, ray, volume)
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
@@ -314,10 +314,10 @@ class March(eqx.Module):
         """How the kernel cuts and ends rays."""
         dtype = self.step.dtype
         middle = 0.0 if self.quadrature == "left" else 0.5
-        place, entry, left = (np.asarray(number, dtype) for number in (middle, -np.inf, -1))
+        place, left = np.asarray(middle, dtype), np.asarray(-1, dtype)
         most = np.asarray(self.most_samples, np.int32)
         plain = found = CellRules(
-            self.step, place, entry, np.asarray(False), left, most, self.integrates
+            self.step, place, np.asarray(False), left, most, self.integrates
         )
         for transform in self.transforms:
             answer = transform.rules(found)
@@ -378,22 +378,21 @@ def stop_by(transforms: tuple[Transform, ...], transmittance: Scalar) -> Bool[Ar
     return stopped
 
 
-def cut_at_entry(cell: Cell, entry: Any = 0) -> Cell:
-    """The cell without what lies before this depth; a cell may end there, and has width 0 then."""
+def cut_at_entry(cell: Cell) -> Cell:
+    """The cell without what lies before the entry; a cell may end there, and has width 0 then."""
     # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
-    front = jnp.where(cell.front > entry, cell.front, entry)
+    front = jnp.where(cell.front > 0, cell.front, 0)
     left = cell.width - (front - cell.front)
     return Cell(front, jnp.where(left > 0, left, 0), cell.cut)
 
 
 def cut_at_exit(cell: Cell, ray: Ray, cuts: Any = True) -> Cell:
     """The cell without what lies past the ray's exit, if it `cuts`."""
-    back = cell.front + cell.width
-    # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
-    left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
-    # also if it ends exactly at the exit: its width, and the gradient of that, then depend on the exit
-    width = jnp.where(cuts & (back >= ray.length), left, cell.width)
-    return Cell(cell.front, width, cell.cut | (cuts & (back > ray.length)))
+    left = jnp.where(cuts, ray.length, jnp.inf) - cell.front
+    # Not by jnp.minimum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10). A cell that ends just at
+    # the exit counts as cut there: its width, and the gradient of that, then depend on the exit.
+    width = jnp.where(left <= cell.width, left, cell.width)
+    return Cell(cell.front, jnp.where(width > 0, width, 0), cell.cut | (left < cell.width))
 
 
 def within(ray: Ray, depth: Scalar) -> Scalar:

@@ -285,9 +285,9 @@ class Camera(eqx.Module):
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         return self.ray_from(None, column, row)
 
-    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any, size: Any = None) -> tuple[Vec3, Vec3]:
+    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any) -> tuple[Vec3, Vec3]:
         """As `ray`, with an origin that counts from `anchor`."""
-        beside, direction = self.beside(column, row, size)
+        beside, direction = self.beside(column, row)
         place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
         return place if beside is None else plus(place, beside), direction
 
@@ -295,18 +295,18 @@ class Camera(eqx.Module):
         self, column: Num[Array, ""] | float, row: Num[Array, ""] | float, size: Any = None
     ) -> tuple[Vec3 | None, Vec3]:
         """How far beside the position a pixel's ray begins, if not there, and its unit direction. `size`: of
-        the image, in place of the camera's, where it is traced."""
+        the image, in place of the camera's, where it is traced, and the camera known to be `valid`."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
         x, y = self._column(column + 0.5, size), self._row(row + 0.5, size)
         right, up, forward = (apart(axis) for axis in axes_of(self))
-        scale = self.parallel_scale
+        scale, valid = self.parallel_scale, self.valid if size is None else True
         if scale is not None:
-            scale = jnp.where(self.valid, scale, jnp.nan)
+            scale = jnp.where(valid, scale, jnp.nan)
             x, y = scale * x, scale * y
             a, b, c = (x * r + y * u for r, u in zip(right, up, strict=True))
             return (a, b, c), forward
-        scale = jnp.where(self.valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
+        scale = jnp.where(valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
         dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return None, (dx / norm, dy / norm, dz / norm)

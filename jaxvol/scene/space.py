@@ -148,10 +148,17 @@ class Ray(eqx.Module):
     """Depths between entry and exit where the ray is outside the volume."""
     spans: tuple[Gap, ...] = ()
     """Of several volumes, the depths between which the ray is in each."""
+    reach: Scalar | None = None
+    """Depth from which on nothing is sampled; None: the exit."""
+
+    @property
+    def end(self) -> Scalar:
+        """Depth from which on nothing is sampled."""
+        return self.length if self.reach is None else self.reach
 
     def contains(self, depth: Scalar) -> Bool[Array, "..."]:
-        """Whether this depth is inside the volume: neither past the exit nor in a gap."""
-        return (depth < self.length) & ~self.in_gap(depth)
+        """Whether this depth is sampled inside the volume: neither past the end nor in a gap."""
+        return (depth < self.end) & ~self.in_gap(depth)
 
     def in_gap(self, depth: Scalar) -> Bool[Array, "..."]:
         within = jnp.zeros(jnp.shape(depth), bool)

@@ -12,9 +12,11 @@ PyTree: TypeAlias = Any
 
 
 def unchecked(module: Any, **changes: Any) -> Any:
-    """The module with other values for these fields, static ones too, without its constructor's checks."""
-    copy = object.__new__(type(module))
-    for name, value in {**vars(module), **changes}.items():
+    """The module with other values for these fields, static ones too, without its constructor's checks; or
+    one of a class, from all of its fields."""
+    new = isinstance(module, type)
+    copy = object.__new__(module if new else type(module))
+    for name, value in {**({} if new else vars(module)), **changes}.items():
         object.__setattr__(copy, name, value)
     return copy
 

@@ -9,7 +9,6 @@ from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from ..._util.checks import flag
@@ -90,7 +89,7 @@ class Jitter(Transform):
         return (cut_at_entry(cell) if self.front_residual else cell,)
 
     def rules(self, rules: CellRules) -> CellRules:
-        return replace(rules, entry=np.zeros_like(rules.entry)) if self.front_residual else rules
+        return replace(rules, at_entry=True) if self.front_residual else rules
 
 
 class EmptySpaceJitter(Transform):

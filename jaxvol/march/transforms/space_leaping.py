@@ -112,9 +112,10 @@ class SpaceLeaping(Transform):
         column = jnp.stack([column, column + last, column, column + last], axis=-1)
         row = jnp.stack([row, row, row + last, row + last], axis=-1)
         cast = jnp.vectorize(lambda x, y: tuple(part for end in view.ray(x, y) for part in end))
-        x, y, z, *direction = cast(column, row)
-        box = Box.within(occupancy, (x, y, z), tuple(direction))
-        box = jax.tree.map(jnp.ravel, box)
+        x, y, z, dx, dy, dz = (part.reshape(-1, 4) for part in cast(column, row))
+        none: Any = None
+        rays = Ray((x, y, z), (dx, dy, dz), jnp.zeros_like(x), none, none, none)
+        box = Box.within(occupancy, rays)
         beams = stretches(occupancy, Sums.of(occupancy.occupied), box, jnp.min(jnp.stack(occupancy.size)))
         first = beams.following[0].astype(beams.near.dtype)
         start = jnp.where(first < beams.following.shape[0], beams.near + first * beams.length, jnp.inf)
