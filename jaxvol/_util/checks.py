@@ -87,8 +87,12 @@ def finite(values: Any) -> Any:
 
 
 def all_finite(tree: Any) -> Array:
-    """Whether all floats in a tree's arrays are finite; evaluated when the program runs."""
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+    """Whether all floats in a tree's arrays are finite; evaluated when the program runs, or at once, if all
+    are NumPy arrays."""
+    arrays = (leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray))
+    leaves = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    if all(isinstance(leaf, np.ndarray) for leaf in leaves):
+        return np.asarray(all(np.isfinite(leaf).all() for leaf in leaves))
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves])) if leaves else jnp.array(True)
 
 

@@ -8,6 +8,7 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..xla.memory import gather
@@ -72,12 +73,18 @@ def points_below(
 def points_around(
     values: Float[Array, " n"], low: Float[Array, "*blocks"], high: Float[Array, "*blocks"]
 ) -> Range:
-    """The control points from `low` to `high`, and the next ones around."""
+    """The control points from `low` to `high`, and the next ones around; in NumPy, of NumPy arrays."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
-    first = jnp.maximum(points_below(values, low) - 1, 0)
+    xp, below = (np, _points_below) if isinstance(values, np.ndarray) else (jnp, points_below)
+    first = xp.maximum(below(values, low) - 1, 0)
     # the first point at or above `high`; the second of two points at `high`
-    last = jnp.maximum(points_below(values, high, strictly=True), points_below(values, high) - 1)
-    return first, jnp.minimum(last, values.shape[0] - 1)
+    last = xp.maximum(below(values, high, strictly=True), below(values, high) - 1)
+    return first, xp.minimum(last, values.shape[0] - 1)
+
+
+def _points_below(values: np.ndarray, value: np.ndarray, *, strictly: bool = False) -> np.ndarray:
+    """As `points_below`, in NumPy."""
+    return np.searchsorted(values, value, side="left" if strictly else "right")
 
 
 def table_row(rows: Float[Array, "points columns"], point: Int[Array, "..."]) -> Row:
@@ -99,18 +106,19 @@ def positive_between(
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
 ) -> Bool[Array, "*blocks"]:
-    """Whether the piecewise linear extinction is positive anywhere from `low` to `high`."""
+    """Whether the piecewise linear extinction is positive anywhere from `low` to `high`; in NumPy, of NumPy
+    arrays."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
-    positive, n = extinction > 0, values.shape[0]
+    positive, n, xp = extinction > 0, values.shape[0], np if isinstance(values, np.ndarray) else jnp
     if n > FEW:  # counting by look-up costs less than comparing with each point
-        before = jnp.concatenate([jnp.zeros(1, jnp.int32), jnp.cumsum(positive, dtype=jnp.int32)])
+        before = xp.concatenate([xp.zeros(1, np.int32), xp.cumsum(positive, dtype=np.int32)])
         # between two points the extinction is positive wherever it is at one of the two
         first, last = points_around(values, low, high)
         return before[last + 1] > before[first]
-    seen = jnp.zeros(low.shape, bool)
+    seen = xp.zeros(low.shape, bool)
     for point in range(n):
         # a point's extinction reaches from the point before it to the one behind it
-        reached = jnp.full(low.shape, positive[point])
+        reached = xp.full(low.shape, positive[point])
         if point > 0:
             reached &= (high > values[point - 1]) | (high >= values[point])
         if point < n - 1:

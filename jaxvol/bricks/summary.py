@@ -97,5 +97,5 @@ def _over_blocks(
 
 @eqx.filter_jit
 def _holding(holds: Callable[[Blocks], Any], low: Array | np.ndarray, high: Array | np.ndarray) -> Array:
-    least, most = widened(jnp.asarray(low), jnp.asarray(high))
+    least, most = map(jnp.asarray, widened(low, high))
     return holds(Blocks(least, most, None))

@@ -219,14 +219,6 @@ class Over(Weighting):
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
 
-    def in_front(self, alphas: Float[Array, "cells rays"], before: Float[Array, " rays"]) -> Array:
-        """The opacity in front of each of some cells, behind an opacity `before`: all at once, where adding
-        up one cell after the other would make as many kernels, to 1e-6."""
-        cell, left = jnp.arange(alphas.shape[0])[:, None], (1 - before)[None]
-        for k in range(alphas.shape[0] - 1):
-            left = left * jnp.where(cell > k, 1 - alphas[k][None], 1)
-        return 1 - left
-
 
 class OpticalDepths(Weighting):
     """A mode whose weights are the cells' optical depths: what is in front hides nothing. A subclass scales

@@ -32,13 +32,16 @@ from ..scene.transfer import Transfer
 from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
 from ..xla.memo import memoized, memoized_of
-from ..xla.platform import is_traced
+from ..xla.platform import is_traced, platform
 from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
 from .shifts import begin_rays
 from .tiling import Tiling
 from .wavefront import blinded, march_rays
 
+
+LARGE = 2**24
+"""Voxels from which on packed copies are not padded to a power of two."""
 
 LIMIT = 2**30
 """Bytes that a copy of the voxels may take at most, and one of their slopes."""
@@ -229,18 +232,41 @@ def with_words(
     return read_as(volume, *(None if word is None else Packed(word, slope) for word, slope in both))
 
 
-@jax.jit
-def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
+def shared_length(voxels: int) -> int:
+    """The length of packed copies of so many voxels: one of a few, so that kernels need not know the volume.
+    Large ones are at most a quarter longer than they need be."""
+    length = 1 << max(voxels - 1, 1).bit_length()
+    return length if length <= LARGE else -(-voxels // (length // 8)) * (length // 8)
+
+
+def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " words"]:
+    """In NumPy on a CPU, which compiles nothing."""
+    padding = shared_length(data.size) - data.size
+    if is_traced(data) or platform() != "cpu":
+        return _packed_by_jax(data, padding)
+    bits, voxels = 8 * data.dtype.itemsize, np.asarray(data)
+    words = np.zeros(data.size + padding, np.uint32)
+    planes = words[: data.size].reshape(data.shape)
+    for plane, of in zip(planes, voxels.view(f"uint{bits}"), strict=True):
+        plane[:] = of
+        # the neighbour of the last voxel is never used
+        plane[:, :-1] |= plane[:, 1:] << bits
+        if bits == 8:
+            plane[:-1] |= plane[1:] << 16
+    return jax.device_put(words)
+
+
+@partial(jax.jit, static_argnums=1)
+def _packed_by_jax(data: Shaped[Array, "nx ny nz"], padding: int) -> UInt32[Array, " words"]:
     bits = 8 * data.dtype.itemsize
 
     def plane(voxels: Shaped[Array, "ny nz"]) -> UInt32[Array, "ny nz"]:
         unsigned = voxels.view(f"uint{bits}").astype(jnp.uint32)
-        # the neighbour of the last voxel is never used
         words = unsigned | jnp.roll(unsigned, -1, 1) << bits
         return words | jnp.roll(words, -1, 0) << 16 if bits == 8 else words
 
     # plane by plane: the neighbours of all voxels would take several times the memory of the words
-    return jax.lax.map(plane, data).reshape(-1)
+    return jnp.pad(jax.lax.map(plane, data).reshape(-1), (0, padding))
 
 
 @jax.jit
@@ -265,4 +291,5 @@ def _packed_slopes(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
         return x << (32 - SLOPE_BITS) | y << 12 | z
 
     # plane by plane, as `_packed`
-    return jax.lax.map(plane, jnp.arange(last + 1)).reshape(-1)
+    found = jax.lax.map(plane, jnp.arange(last + 1)).reshape(-1)
+    return jnp.pad(found, (0, shared_length(data.size) - data.size))

@@ -67,7 +67,7 @@ def march_brick(
     prepared, shifts = by_rules(acceleration.prepared(scene)), scene.march.may_shift
 
     def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
-        number, states, range_ = each
+        _, states, range_ = each
         rays, start = states.rays, states.at
         if restart:
             over = opaque(prepared, start) | (range_.until <= range_.first)

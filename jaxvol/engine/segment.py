@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3
-from ..compositing.blending import Composite, Over
+from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
 from ..march.march import Cell
-from ..ray import Progress, Scene, Track, add, is_sample, move, opacity, pieces, read, stop, stopped
+from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, stop, stopped
 from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
@@ -144,73 +144,26 @@ def march_segment(
         colors = lit_colors(shader, scene, ray, *parts)
     else:
         colors = shaded_colors(scene, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity)
-    import os
-    if os.environ.get("ATONCE") and isinstance(scene.compositing, Over) and len(samples.cells) == 1 and not scene.march.custom:
-        after = _at_once(scene, ray, at, samples, colors[0])
-    else:
-        cells = zip(samples.cells, values, colors, samples.opacity, strict=True)
-        after = _one_by_one(scene, ray, at, tuple(cells), number)
-    steps = jnp.where(at.finished, 0, jnp.clip(ahead.until - at.index, 0, number))
-    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
-    return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples._replace(ray=ray)
-
-
-def _one_by_one(scene: Scene, ray: Ray, at: Progress, cells: Any, number: int) -> Progress:
-    """Rays with a segment of cells composited."""
+    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
+    # Whether a ray is stopped follows from what it has passed, but of transforms of one's own. So it is not
+    # carried from cell to cell, which XLA would then compute one after the other.
+    follows = isinstance(scene.compositing, Weighting) and not scene.march.custom
 
     def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
+        if follows:
+            at = with_fields(at, finished=stopped(scene, at.composite))
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
-        return stop(scene, at)
+        return at if follows else stop(scene, at)
 
     # unrolled, so that nothing between two cells is put in memory
     after, _ = jax.lax.scan(
         lambda at, cell: (jax.vmap(composited)(ray, at, cell), None), at, cells, unroll=number
     )
-    return after
-
-
-def _at_once(scene: Scene, ray: Ray, at: Progress, samples: Samples, color: Vec3 | None) -> Progress:
-    """Rays with a segment of undivided cells composited by the operator "over", and ended by the library's
-    transforms: whether a ray is stopped in front of a cell follows from the opacity there, so that no cell
-    need wait for the one before it."""
-    mode, composite = scene.compositing, at.composite
-    assert isinstance(mode, Over)
-    (cell,), (alpha,) = samples.cells, samples.opacity
-    depth, number = scene.march.sample(cell), samples.number
-
-    def weights(before: Scalar, alpha: Scalar) -> Scalar:
-        front = mode.in_front(alpha, before)
-        stops = vmap_cells(lambda opacity: stopped(scene, Composite(opacity)))(front)
-        return jnp.where(stops, 0, mode.weight(alpha, front))
-
-    weight = in_memory(always(at), weights, composite.opacity, alpha)
-
-    def summed(start: Scalar, values: Scalar | None) -> Scalar:
-        for k in range(number):  # a reduction would be a loop of its own
-            start = start + (weight[k] if values is None else weight[k] * values[k])
-        return start
-
-    sums = moment = None
-    if composite.color is not None and color is not None:
-        r, g, b = map(summed, composite.color, color)
-        sums = r, g, b
-    if composite.moment is not None:
-        moment = summed(composite.moment, depth)
-    stats = at.stats
-    if stats is not None:
-        # a cell in front of which a ray is stopped is no sample: of those, too, whose weight is 0
-        front = mode.in_front(alpha, composite.opacity)
-        stops = vmap_cells(lambda opacity: stopped(scene, Composite(opacity)))(front)
-        counted = ~stops & vmap_cells(partial(is_sample, scene.march, divided=False), (False, True))(ray, cell)
-        samples_ = stats.samples
-        aligned = stats.aligned
-        for k in range(number):
-            samples_ = samples_ + counted[k].astype(samples_.dtype)
-            aligned = aligned | (cell.cut[k] & (weight[k] > 0))
-        stats = with_fields(stats, samples=samples_, aligned=aligned)
-    after = with_fields(at, composite=Composite(summed(composite.opacity, None), sums, moment), stats=stats)
-    return jax.vmap(partial(stop, scene))(after)
+    after = jax.vmap(partial(stop, scene))(with_fields(after, finished=at.finished) if follows else after)
+    steps = jnp.where(at.finished, 0, jnp.clip(ahead.until - at.index, 0, number))
+    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
+    return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples._replace(ray=ray)
 
 
 def _sampled(scene: Scene, number: int, ahead: Ahead) -> Samples:

@@ -18,20 +18,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from .._util.piecewise_linear import positive_between
 from ..compositing.blending import Compositing, Outputs
 from ..lighting.shading import Lighting, lit_classification
 from ..march.beams import EmptySpaceIndex, Skips, Stretches
-from ..march.march import CellRules, March
+from ..march.march import CellRules, March, Transform
 from ..march.transforms.space_leaping import SpaceLeaping
 from ..ray import NEVER, Progress, Scene, Track, begin, end, track_of
 from ..scene.camera import Camera, Ending, GivenRays, without_ends
+from ..scene.occupancy import Blocks, Occupancy, Sums
 from ..scene.rendering import Rendering
 from ..scene.space import Ray, Space
-from ..scene.transfer import Transfer, with_shared_points
+from ..scene.transfer import Transfer, TransferFunction, with_shared_points
 from ..scene.volume import Volume, grids, with_fetches, without_voxels
 from ..scene.voxel_fetch import Extent, Nodes, Packed
 from ..xla.compiling import OPTIONS
 from ..xla.memo import memoized_of
+from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
 from .acceleration import VolumeAcceleration, empty_space_of
 from .rays import RayTiles, vmap_rays
@@ -133,8 +136,21 @@ def _only(march: March, *seams: str) -> March:
     return unchecked(march, transforms=kept, quadrature="left", max_samples=None)
 
 
+def _has_fault(scene: Scene) -> Bool[Array, ""] | np.ndarray:
+    """`Scene.has_fault`; on a CPU in NumPy, which compiles nothing, of the kinds that know how."""
+    kinds = (*map(type, scene.march.transforms), type(scene.transfer))
+    others = [kind for kind in kinds if getattr(kind, "valid", None) not in (Transform.valid, Transfer.valid)]
+    if platform() != "cpu" or any(kind is not TransferFunction for kind in others):
+        return _has_fault_by_jax(scene)
+    return np.asarray(jax.tree.map(_known, scene).has_fault)
+
+
+def _known(leaf: Any) -> Any:
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
+
+
 @program
-def _has_fault(scene: Scene) -> Bool[Array, ""]:
+def _has_fault_by_jax(scene: Scene) -> Bool[Array, ""]:
     return scene.has_fault
 
 
@@ -195,14 +211,32 @@ def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex
         return None
     march = unchecked(_only(scene.march, "empty_space", "locate", "clip"), step=None)
     given = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
-    leaves = jax.tree.leaves(given)
-    if all(isinstance(leaf, jax.Array) for leaf in leaves):
+    if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(given)):
         return memoized_of(given, _index)
     return _index(given)
 
 
-@program
 def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
+    scene, acceleration = given
+    (leap, *seams), blocks, transfer = scene.march.transforms, acceleration.blocks, scene.transfer
+    usual = type(scene.compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
+    whole = isinstance(blocks, Blocks) and scene.volume.field is None and scene.volume.first is None
+    if platform() != "cpu" or seams or not usual or not whole or leap.method != "hierarchy":
+        return _index_by_jax(given)
+    # in NumPy, which compiles nothing
+    low, high = np.asarray(blocks.low), np.asarray(blocks.high)
+    values, extinction = np.asarray(transfer.values), np.asarray(transfer.extinction)
+    visible = positive_between(values, extinction, low, high) | ~(low <= high)
+    grid = jax.tree.map(np.asarray, _without_voxels(scene.volume, scene.march))
+    size = tuple(blocks.side * step for step in grid.spacing)
+    zero = np.zeros_like(size[0])
+    occupancy = Occupancy(None, (zero, zero, zero), size, grid.frame, tuple(grid.origin))
+    sizes = np.asarray(visible.shape, np.int32)
+    return leap.index_of(unchecked(occupancy, sizes=sizes), Sums.of(visible))
+
+
+@program
+def _index_by_jax(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     scene, acceleration = given
     nowhere = GivenRays(jnp.zeros((0, 3)), jnp.zeros((0, 3)))
     index = empty_space_of(scene._replace(source=nowhere), acceleration, Tiling())

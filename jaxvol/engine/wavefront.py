@@ -179,7 +179,9 @@ def _progress(lanes: Lanes, track: Track) -> Progress:
     return Progress(lanes.index, lanes.composite, lanes.stats, lanes.finished, track)
 
 
-def _march_all(job: Job, lanes: Packed, total: PyTree, going: Bool[Array, " groups"]) -> tuple[Packed, PyTree]:
+def _march_all(
+    job: Job, lanes: Packed, total: PyTree, going: Bool[Array, " groups"]
+) -> tuple[Packed, PyTree]:
     """Marches groups for as long as any of their rays is alive, in rounds of batches."""
     size = job.tiling.batch_of(job.groups)
     enough = int(job.tiling.min_alive * size)
@@ -240,6 +242,7 @@ def _march_batch(
     if tiling.turns:
         state = jax.lax.fori_loop(0, tiling.turns, lambda _, state: advance(state), state)
     else:
+
         def going(state: tuple[Lanes, PyTree]) -> Bool[Array, ""]:
             return jnp.sum(living(state[0]).astype(jnp.float32)) > keep.astype(jnp.float32)
 
@@ -257,9 +260,7 @@ def blinded(skips: Skips | None, at: Progress) -> Progress:
     return with_fields(at, finished=at.finished | ~jnp.repeat(seen, GROUPS_OF_BEAM)[:, None])
 
 
-def into_range(
-    scene: Scene, rays: Ray, at: Progress, range_: CellRange, *, shifts: bool = False
-) -> Progress:
+def into_range(scene: Scene, rays: Ray, at: Progress, range_: CellRange, *, shifts: bool = False) -> Progress:
     """Moves rays to the first cell of their range, in front of which all cells are transparent. They take no
     cell behind its last one."""
     first, until = range_

@@ -316,9 +316,7 @@ class March(eqx.Module):
         middle = 0.0 if self.quadrature == "left" else 0.5
         place, left = np.asarray(middle, dtype), np.asarray(-1, dtype)
         most = np.asarray(self.most_samples, np.int32)
-        plain = found = CellRules(
-            self.step, place, np.asarray(False), left, most, self.integrates
-        )
+        plain = found = CellRules(self.step, place, np.asarray(False), left, most, self.integrates)
         for transform in self.transforms:
             answer = transform.rules(found)
             if answer is None:
@@ -389,8 +387,8 @@ def cut_at_entry(cell: Cell) -> Cell:
 def cut_at_exit(cell: Cell, ray: Ray, cuts: Any = True) -> Cell:
     """The cell without what lies past the ray's exit, if it `cuts`."""
     left = jnp.where(cuts, ray.length, jnp.inf) - cell.front
-    # Not by jnp.minimum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10). A cell that ends just at
-    # the exit counts as cut there: its width, and the gradient of that, then depend on the exit.
+    # Not by jnp.minimum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10). A cell that ends just
+    # at the exit counts as cut there: its width, and the gradient of that, then depend on the exit.
     width = jnp.where(left <= cell.width, left, cell.width)
     return Cell(cell.front, jnp.where(width > 0, width, 0), cell.cut | (left < cell.width))
 

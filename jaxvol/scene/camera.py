@@ -467,10 +467,9 @@ def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
 
 
-@partial(jax.jit, static_argnums=1)
 def _is_valid(height: Scalar, is_angle: bool, up: Array, forward: Array) -> Bool[Array, ""]:
     # a margin, since the constructor may round another way
-    beside = _sine(up, forward / jnp.max(jnp.abs(forward))) > 0.5e-6
+    beside = _sine(up, forward / abs(forward).max()) > 0.5e-6
     return (height > 0) & ((height < 180) | (not is_angle)) & beside
 
 

@@ -20,7 +20,7 @@ from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
 from ..xla.memory import gather
-from ..xla.platform import on_gpu
+from ..xla.platform import is_traced, on_gpu, platform
 from ..xla.sharding import varying
 from ..xla.trees import unchecked
 from .volume import Volume
@@ -101,7 +101,15 @@ class Sums(eqx.Module):
     """Number of cells along x, y, z."""
 
     @classmethod
-    def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
+    def of(cls, occupied: Bool[Array, "cx cy cz"] | np.ndarray) -> "Sums":
+        sizes = np.asarray(occupied.shape, np.int32)
+        if isinstance(occupied, np.ndarray):
+            table = np.pad(occupied.astype(np.int32), ((1, 0),) * 3)
+            for axis in range(3):
+                np.cumsum(table, axis=axis, out=table)
+            # of one of a few lengths, so that few programs read it
+            table = np.pad(table.reshape(-1), (0, (1 << (table.size - 1).bit_length()) - table.size))
+            return cls(jax.device_put(table), sizes)
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
         for axis in range(3):
             if on_gpu():  # a loop launches a kernel for each layer
@@ -111,7 +119,7 @@ class Sums(eqx.Module):
             start = varying(jnp.zeros_like(table[0]), table)
             _, sums = jax.lax.scan(lambda total, layer: (total + layer,) * 2, start, table)
             table = jnp.moveaxis(sums, 0, 2)
-        return cls(table.reshape(-1), np.asarray(occupied.shape, np.int32))
+        return cls(table.reshape(-1), sizes)
 
     def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:
         """Whether any cell from `first` to `last` is occupied, both inclusive and inside the grid."""
@@ -194,17 +202,33 @@ def _with_both_sides(plane: Array, axis: int) -> Array:
 @cache
 def _for(side: int, compute: Callable[..., Any]) -> Callable[..., Any]:
     """A function of an array for blocks of this side: the same one each time, as `memoized` needs it."""
-    return jax.jit(partial(compute, side=side))
+    if compute is not _ranges:
+        return jax.jit(partial(compute, side=side))
+    jitted = jax.jit(partial(compute, side=side))
+
+    def ranges(data: Array) -> tuple[Array, Array]:
+        """In NumPy on a CPU, which compiles nothing."""
+        if is_traced(data) or platform() != "cpu" or data.dtype.kind not in "uif":
+            return jitted(data)
+        return jax.device_put(_ranges(np.asarray(data), side))
+
+    return ranges
 
 
-def _ranges(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
+def _ranges(data: Any, side: int) -> tuple[Any, Any]:
     low, high = widened(*extremes(data, side))
-    return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
+    return (low, high) if data.ndim == 3 else tuple(np.moveaxis(end, -1, 0) for end in (low, high))
+
+
+def extremes(data: Any, side: int = BLOCK) -> tuple[Any, Any]:
+    """Least and greatest node of each block; NaN where a node is."""
+    if isinstance(data, np.ndarray):
+        return over_blocks(data, np.minimum, side=side), over_blocks(data, np.maximum, side=side)
+    return _extremes(data, side)
 
 
 @partial(jax.jit, static_argnums=1)
-def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Array, Array]:
-    """Least and greatest node of each block; NaN where a node is."""
+def _extremes(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
 
     def of(nodes: Array) -> tuple[Array, Array]:
         return over_blocks(nodes, jnp.minimum, side=side), over_blocks(nodes, jnp.maximum, side=side)
@@ -223,11 +247,11 @@ def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Arr
     return low, high
 
 
-@jax.jit
-def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"]) -> tuple[Array, Array]:
+def widened(low: Any, high: Any) -> tuple[Any, Any]:
     """Ranges of the values interpolated between nodes, from those of the nodes."""
-    low, high = low.astype(jnp.float32), high.astype(jnp.float32)
-    slack = ROUNDING * jnp.maximum(abs(low), abs(high))
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    xp = np if isinstance(low, np.ndarray) else jnp
+    slack = np.float32(ROUNDING) * xp.maximum(abs(low), abs(high))
     return low - slack, high + slack
 
 
@@ -292,11 +316,14 @@ def _label_bits(labels: Integer[Array, "nx ny nz"], side: int) -> UInt32[Array, 
     return over_blocks(bits, jnp.bitwise_or, side=side)
 
 
-def over_blocks(values: Array, combine: Callable[[Array, Array], Array], *, side: int) -> Array:
+def over_blocks(values: Any, combine: Callable[[Any, Any], Any], *, side: int) -> Any:
     """Combines all nodes of each block, axis by axis."""
     for axis in range(min(values.ndim, 3)):  # channels stay
-        cells = values.shape[axis] - 1
-        along = partial(jax.lax.slice_in_dim, values, axis=axis)
+        cells, xp = values.shape[axis] - 1, np if isinstance(values, np.ndarray) else jnp
+
+        def along(first: int, end: int, step: int = 1, axis: int = axis, values: Any = values) -> Any:
+            return values[(slice(None),) * axis + (slice(first, end, step),)]
+
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, side)
         found = []
@@ -305,5 +332,5 @@ def over_blocks(values: Array, combine: Callable[[Array, Array], Array], *, side
             found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
         if rest:
             found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))
-        values = jnp.concatenate(found, axis)
+        values = xp.concatenate(found, axis)
     return values

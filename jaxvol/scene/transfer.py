@@ -256,7 +256,7 @@ class TransferFunction(Transfer):
 
     @property
     def valid(self) -> Bool[Array, ""]:
-        return jnp.all(self.values[..., 1:] >= self.values[..., :-1])
+        return (self.values[..., 1:] >= self.values[..., :-1]).all()
 
     @property
     def _seen(self) -> Float[Array, " n"]:

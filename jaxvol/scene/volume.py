@@ -193,10 +193,10 @@ class Volume(eqx.Module):
     @property
     def valid(self) -> Bool[Array, ""]:
         """Whether spacing and direction, which may be traced, place the voxels in space, not in a plane."""
-        placed = jnp.all(self.spacing > 0)
+        placed = (self.spacing > 0).all()
         if self.direction is None:
             return placed
-        return placed & (jnp.abs(_determinant(self.direction)) > FLAT / 2)
+        return placed & (abs(_determinant(self.direction)) > FLAT / 2)
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -90,7 +90,7 @@ class SpaceLeaping(Transform):
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
         occupancy = jax.lax.stop_gradient(occupancy)
         if self.method == "hierarchy":
-            return _Beams(occupancy, Sums.of(occupancy.occupied))
+            return self.index_of(occupancy, Sums.of(occupancy.occupied))
         distances = _Distances(occupancy, occupancy.distance(), None, None, self.cell)
         if self.method == "distance":
             return distances
@@ -105,6 +105,10 @@ class SpaceLeaping(Transform):
             across = jnp.minimum(hits[:, 1:], hits[:, :-1])
             starts = jnp.minimum(across[1:], across[:-1])
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
+
+    def index_of(self, occupancy: Occupancy, sums: Sums) -> EmptySpaceIndex:
+        """That of `"hierarchy"`, from sums of occupied cells."""
+        return _Beams(occupancy, sums)
 
     def _beam_starts(self, occupancy: Occupancy, view: View, column: Array, row: Array) -> Array:
         """For each square of pixels, from its first one, up to where its rays meet nothing visible."""
