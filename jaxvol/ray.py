@@ -65,7 +65,7 @@ class Scene(NamedTuple):
         return self._replace(space=space, classification=lit)
 
     @property
-    def has_fault(self) -> Bool[Array, ""]:
+    def has_fault(self) -> Any:
         """Whether a number on which all pixels depend is NaN, infinite, or out of its range: a step that is
         not positive; a volume, a transfer function, a transform or a camera that is not `valid`.
 

@@ -86,7 +86,7 @@ def finite(values: Any) -> Any:
     return abs(values) < np.inf
 
 
-def all_finite(tree: Any) -> Array:
+def all_finite(tree: Any) -> Any:
     """Whether all floats in a tree's arrays are finite; evaluated when the program runs, or at once, if all
     are NumPy arrays."""
     arrays = (leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray))

@@ -4,12 +4,12 @@ Transfer functions are such functions of a volume's value. A table has one row f
 all that values from this point up to the next one need: see `TransferFunction.rows`.
 """
 
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..xla.memory import gather
 from ..xla.platform import on_gpu
@@ -25,8 +25,8 @@ ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
 Row: TypeAlias = tuple[Scalar, ...]
 """One row of a table."""
 
-Range: TypeAlias = tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]
-"""The first and the last of some control points, inclusive."""
+Range: TypeAlias = tuple[Any, Any]
+"""Indices (blocks) of the first and the last of some control points, inclusive."""
 
 
 def clip_below(value: Scalar, least: Scalar) -> Scalar:
@@ -70,9 +70,7 @@ def points_below(
     return jax.lax.cond(even, counted, searched, value)
 
 
-def points_around(
-    values: Float[Array, " n"], low: Float[Array, "*blocks"], high: Float[Array, "*blocks"]
-) -> Range:
+def points_around(values: Any, low: Any, high: Any) -> Range:
     """The control points from `low` to `high`, and the next ones around; in NumPy, of NumPy arrays."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     xp, below = (np, _points_below) if isinstance(values, np.ndarray) else (jnp, points_below)
@@ -100,12 +98,7 @@ def interpolate_row(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:
     return (r, g, b), jnp.where(extinction < 0, 0, extinction)
 
 
-def positive_between(
-    values: Float[Array, " n"],
-    extinction: Float[Array, " n"],
-    low: Float[Array, "*blocks"],
-    high: Float[Array, "*blocks"],
-) -> Bool[Array, "*blocks"]:
+def positive_between(values: Any, extinction: Any, low: Any, high: Any) -> Any:
     """Whether the piecewise linear extinction is positive anywhere from `low` to `high`; in NumPy, of NumPy
     arrays."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)

@@ -27,6 +27,7 @@ from ..scene.rendering import BrickReport
 from ..scene.space import Ray
 from ..scene.volume import Volume, part_of, with_voxels
 from ..xla.compiling import compiled
+from ..xla.trees import with_fields
 from .cells import BrickCells, CurvedRays, Visit, curved_cells, padded, straight_cells
 from .grid import BrickGrid, Margin, Node, divided, split, stored_shape
 from .sources import READERS, VoxelSource

@@ -124,7 +124,7 @@ def _pixels(scene: Scene, options: RenderOptions, acceleration: VolumeAccelerati
 def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, Recorded]:
-    """The image, by the fast engine; and, if `record` asks for it, what the second march needs of the first."""
+    """The image; and, if `record` asks for it, what the second march needs of the first."""
     tiles, tiling = RayTiles.of(scene.source, options.tiling), options.tiling
     index = empty_space_of(acceleration.packed(scene), acceleration, tiling)
     # voxels are fetched from their packed copy from here on

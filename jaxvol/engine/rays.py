@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.checks import all_finite
 from .._util.vec3 import Scalar
@@ -57,14 +57,12 @@ class RayTiles(eqx.Module):
         *,
         direct: bool = False,
         tiles: tuple[int, int] | None = None,
-        pixels: Int[Array, "2"] | None = None,
     ) -> "RayTiles":
         """The tiles of a camera's pixels, or of given rays.
 
         Args:
             direct: small ones, for `"direct"`.
             tiles: number of tiles, and of beams in each, in place of those that follow from the tiling.
-            pixels: width and height of the camera's image, where they are traced.
         """
         source, shares = without_ends(source), devices.number_of(tiling.devices)
         most = tiling.direct_tile if direct else tiling.tile
@@ -76,11 +74,12 @@ class RayTiles(eqx.Module):
             return -(-beams // (count * shares)), count
 
         if isinstance(source, Camera):
-            width, height = source.size if pixels is None else (pixels[0], pixels[1])
+            width, height = source.size
             across, down = -(-width // tiling.beam), -(-height // tiling.beam)
             # if the columns were a multiple of the devices, each device would always get the same ones
-            across += shares > 1 and across % shares == 0
-            return _PixelTiles(*divided(across * down), tiling, (width, height), across, down)
+            if shares > 1 and across % shares == 0:
+                across += 1
+            return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
         shape = source.origins.shape[:-1]
         return _GivenRayTiles(*divided(_beams_of(source, tiling)), tiling, shape)
 
@@ -134,22 +133,19 @@ class RayTiles(eqx.Module):
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
-    def rays(
-        self,
-        source: Source,
-        space: Space,
-        tile: Int[Array, ""],
-        fault: Bool[Array, ""],
-        until: Float[Array, "groups rays"] | None = None,
-    ) -> Ray:
+    def rays(self, source: Source, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         """The rays of a tile, cut to the volume. Those that only fill up groups miss it. If there is a
-        `fault` in the scene, all of them are NaN, and so invalid. `until`: where they end, if the source does
-        not know it."""
+        `fault` in the scene, all of them are NaN, and so invalid."""
+        return entering(space, *self.ending_lines(source, tile, fault), self.tiling.searched)
+
+    def ending_lines(
+        self, source: Source, tile: Int[Array, ""], fault: Bool[Array, ""]
+    ) -> tuple[Line, Bool[Array, "groups rays"]]:
+        """The rays of a tile, up to where they end, and which of them are of the image."""
         found, wanted = self.lines_of(without_ends(source), tile, fault)
         if isinstance(source, Ending):
-            until = self.disassemble(source.until)[tile]
-        found = found._replace(until=until)
-        return entering(space, found, wanted, self.tiling.searched)
+            found = found._replace(until=self.disassemble(source.until)[tile])
+        return found, wanted
 
     @abstractmethod
     def lines_of(
@@ -158,12 +154,14 @@ class RayTiles(eqx.Module):
         """The rays of a tile, and which of them are of the image."""
 
     @abstractmethod
-    def box(self, rays: Ray) -> Callable[[Occupancy], Box]:
-        """A function from an occupancy grid to the boxes around the beams of a tile."""
+    def box(self, occupancy: Occupancy, rays: Ray) -> Box:
+        """The boxes around the beams of a tile."""
 
     def skips(self, index: EmptySpaceIndex | None, rays: Ray, step: Scalar) -> Skips | None:
         """Where the rays of a tile see nothing, if that is known."""
-        return None if index is None else index.skips(self.box(rays), self.tiling.cells * step)
+        if index is None:
+            return None
+        return index.skips(partial(self.box, rays=rays), self.tiling.cells * step)
 
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:
@@ -185,9 +183,9 @@ def _beams_of(source: Camera | GivenRays, tiling: Tiling) -> int:
 class _PixelTiles(RayTiles):
     """A camera's pixels: beams row by row, and each beam group by group."""
 
-    size: tuple[Any, Any]
-    across: Any
-    down: Any
+    size: tuple[int, int] = eqx.field(static=True)
+    across: int = eqx.field(static=True)
+    down: int = eqx.field(static=True)
 
     def lines_of(
         self, source: Camera, tile: Int[Array, ""], fault: Bool[Array, ""]
@@ -198,27 +196,10 @@ class _PixelTiles(RayTiles):
         column, row = self._pixels(tile, group_y * side + y, group_x * side + x)
         column, row = column.reshape(-1, group), row.reshape(-1, group)
         width, height = self.size
-        return lines(source, column, row, fault, self._traced_size), (column < width) & (row < height)
+        return lines(source, column, row, fault), (column < width) & (row < height)
 
-    def box(self, rays: Ray) -> Callable[[Occupancy], Box]:
-        side, last = self.tiling.side, self.tiling.group - 1
-        lanes = 0, side - 1, last - side + 1, last  # in the groups of a beam, its corners
-
-        def corners(leaf: Array) -> Array:
-            groups = leaf.reshape(-1, GROUPS_OF_BEAM, leaf.shape[1])
-            return jnp.stack([groups[:, group, lane] for group, lane in enumerate(lanes)], axis=-1)
-
-        chosen = unchecked(rays, path=None, pixel=None, gaps=(), spans=())
-        return lambda occupancy: Box.within(occupancy, jax.tree.map(corners, chosen))
-
-    @property
-    def _traced_size(self) -> tuple[Scalar, Scalar] | None:
-        """Width and height of the image, if they are traced."""
-        width, height = self.size
-        if isinstance(width, int):
-            return None
-        dtype = jnp.result_type(float)
-        return width.astype(dtype), height.astype(dtype)
+    def box(self, occupancy: Occupancy, rays: Ray) -> Box:
+        return box_of_corners(self.tiling, rays, occupancy)
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of the pixels (x, y) of each of a tile's beams."""
@@ -264,9 +245,8 @@ class _GivenRayTiles(RayTiles):
         own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
         return own, number < count
 
-    def box(self, rays: Ray) -> Callable[[Occupancy], Box]:
-        by_beam = jax.tree.map(lambda leaf: leaf.reshape(self.beam_count, -1), rays)
-        return lambda occupancy: Box.around(occupancy, by_beam)
+    def box(self, occupancy: Occupancy, rays: Ray) -> Box:
+        return box_of_rays(self.tiling, rays, occupancy)
 
     def assemble(self, leaf: Array) -> Array:
         rest, size = leaf.shape[3:], self.tiling.rays_per_beam
@@ -291,24 +271,20 @@ def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
     return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None], fault))
 
 
-def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""], size: Any = None) -> Line:
-    """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN. `size`:
-    of the image, where it is traced; then nothing is differentiated, and the camera is known to be valid."""
+def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Line:
+    """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN."""
     left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
     # on a GPU, `in_memory` computes rays also of a fault
     camera = eqx.tree_at(lambda c: c.position, camera, jnp.where(fault, jnp.nan, camera.position))
-    if size is None:
-        beside, direction = _rounded(camera, columns, rows)
-    else:
-        beside, direction = in_memory(size[0] > 0, partial(_through, camera, size=size), columns, rows)
+    beside, direction = _rounded(camera, columns, rows)
     # the position need not be stored for each ray
     x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
     return Line((x, y, z), direction, (columns + left, rows + top), beside=beside)
 
 
-def _through(camera: Camera, columns: Lanes, rows: Lanes, size: Any = None) -> Any:
+def _through(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
     """What is computed of the rays of pixels: directions, and where they begin in parallel projection."""
-    return vmap_rays(partial(camera.beside, size=size))(columns, rows)
+    return vmap_rays(camera.beside)(columns, rows)
 
 
 @jax.custom_jvp
@@ -326,6 +302,24 @@ def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -
     camera, columns, rows = primals
     _, change = jax.jvp(lambda camera: _through(camera, columns, rows), (camera,), tangents[:1])
     return _rounded(*primals), change
+
+
+def box_of_corners(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
+    """The boxes around beams of pixels."""
+    side, last = tiling.side, tiling.group - 1
+    lanes = 0, side - 1, last - side + 1, last  # in the groups of a beam, its corners
+
+    def corners(leaf: Array) -> Array:
+        groups = leaf.reshape(-1, GROUPS_OF_BEAM, leaf.shape[1])
+        return jnp.stack([groups[:, group, lane] for group, lane in enumerate(lanes)], axis=-1)
+
+    chosen = unchecked(rays, path=None, pixel=None, gaps=(), spans=())
+    return Box.within(occupancy, jax.tree.map(corners, chosen))
+
+
+def box_of_rays(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
+    """The boxes around beams of any rays."""
+    return Box.around(occupancy, jax.tree.map(lambda leaf: leaf.reshape(-1, tiling.rays_per_beam), rays))
 
 
 def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._util.piecewise_linear import positive_between
 from ..compositing.blending import Compositing, Outputs
@@ -25,11 +25,11 @@ from ..march.beams import EmptySpaceIndex, Skips, Stretches
 from ..march.march import CellRules, March, Transform
 from ..march.transforms.space_leaping import SpaceLeaping
 from ..ray import NEVER, Progress, Scene, Track, begin, end, track_of
-from ..scene.camera import Camera, Ending, GivenRays, without_ends
+from ..scene.camera import Camera, GivenRays, without_ends
 from ..scene.occupancy import Blocks, Occupancy, Sums
 from ..scene.rendering import Rendering
-from ..scene.space import Ray, Space
-from ..scene.transfer import Transfer, TransferFunction, with_shared_points
+from ..scene.space import Line, Ray, Space
+from ..scene.transfer import Transfer, TransferFunction, classification_of, with_shared_points
 from ..scene.volume import Volume, grids, with_fetches, without_voxels
 from ..scene.voxel_fetch import Extent, Nodes, Packed
 from ..xla.compiling import OPTIONS
@@ -37,7 +37,7 @@ from ..xla.memo import memoized_of
 from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
 from .acceleration import VolumeAcceleration, empty_space_of
-from .rays import RayTiles, vmap_rays
+from .rays import RayTiles, box_of_corners, box_of_rays, entering, vmap_rays
 from .shifts import behind_first_cells, find_shifts
 from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
 from .wavefront import Marched, Recorded, blinded, march_rays
@@ -71,8 +71,11 @@ class Kernel(NamedTuple):
         volume, transfer, rules, *rest = self
         march: Any = rules
         _, lighting, space = rest
-        light: Any = (volume, transfer, space, lighting)
-        classification = lit_classification(*light, integrated=rules.integrates)
+        if lighting is None or space is None:
+            classification = classification_of(transfer, volume, integrated=rules.integrates)
+        else:
+            given = volume, transfer, space, lighting
+            classification = lit_classification(*given, integrated=rules.integrates)
         return Scene(*self[:2], None, march, *rest, classification)
 
 
@@ -106,19 +109,15 @@ def staged_image(
     place = _without_voxels(scene.volume, seams)
     size, number = RayTiles.shared(source, tiling)
     most = np.asarray(scene.march.most_samples, np.int32)
-    ends = [None] * number
-    if isinstance(scene.source, Ending):
-        ends = _ends(scene.source, tiling, size, number)
-    given, pixels = source, None
-    if isinstance(source, Camera):
-        given, pixels = source.unsized, np.asarray(source.size, np.int32)
+    position = source.position if isinstance(source, Camera) else None
     passed = []
-    for tile, until in enumerate(ends):
-        number_ = np.asarray(tile, np.int32)
-        started = _start(given, pixels, seams, place, index, fault, number_, until, tiling, size)
+    for tile in range(number):
+        lines = _lines(scene.source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
+        started = _start(*lines, position, seams, place, index, fault, tiling)
         none, zero, never, nowhere = _nothing(*started.rays.length.shape, started.rays.length.dtype)
         offset, shift = started.track.offset, started.track.shift
-        track = Track(none if offset is None else offset, none if shift is None else shift, never, most)
+        offset, shift = (none if part is None else part for part in (offset, shift))
+        track = unchecked(Track, offset=offset, shift=shift, shifted=never, until=most)
         first = zero
         if scene.march.may_shift:
             track, first = _shift(kernel, started.rays, track, most, tiling)
@@ -158,41 +157,55 @@ def _has_fault_by_jax(scene: Scene) -> Bool[Array, ""]:
 
 
 def _without_voxels(volume: Volume, seams: March) -> Volume:
-    """The place of the voxels. Of a single grid in the world's own space, their number is an array."""
+    """The place of the voxels. Of a single grid in the world's own space, their number is an array; a
+    transform with a space of its own is told the whole volume."""
+    if seams.overriding("locate"):
+        return volume
     own = grids(volume)
-    extents = [Extent(grid.shape) for grid in own]
-    if len(own) == 1 and not seams.overriding("locate"):
+    extents: list[Any] = [Extent(grid.shape) for grid in own]
+    if len(own) == 1:
         extents = [Nodes(np.asarray(volume.shape, np.int32))]
     place = with_fetches(without_voxels(volume), extents)
     return unchecked(place, labels=None, label_ids=None)
 
 
 @program
-def _ends(source: Ending, tiling: Tiling, size: int, number: int) -> list[Array]:
-    """Where the rays of each tile end."""
-    return list(RayTiles.of(source, tiling, tiles=(number, size)).disassemble(source.until))
+def _lines(
+    source: Any, tiling: Tiling, number: int, size: int, tile: Int[Array, ""]
+) -> tuple[Line, Bool[Array, "groups rays"]]:
+    """The rays of a tile before they meet the volume, and which of them are of the image."""
+    tiles = RayTiles.of(source, tiling, tiles=(number, size))
+    line, wanted = tiles.ending_lines(source, tile, jnp.zeros((), bool))
+    # the rays of a camera begin at one point
+    camera = isinstance(without_ends(source), Camera)
+    return line._replace(origin=None) if camera else line, wanted
 
 
 @program
 def _start(
-    source: Any,
-    pixels: Int[Array, "2"] | None,
+    line: Line,
+    wanted: Bool[Array, "groups rays"],
+    position: Float[Array, "3"] | None,
     seams: March,
     place: Volume,
     index: EmptySpaceIndex | None,
     fault: Bool[Array, ""],
-    tile: Int[Array, ""],
-    until: Array | None,
     tiling: Tiling,
-    size: int,
 ) -> Started:
-    """Makes the rays of a tile. `pixels`: width and height of a camera's image. `until`: where rays end."""
-    tiles, space = RayTiles.of(source, tiling, tiles=(1, size), pixels=pixels), seams.locate(place)
-    rays = tiles.rays(source, space, tile, fault, until)
+    """Cuts the rays of a tile to the volume. `position`: of the camera."""
+    if position is not None:
+        x, y, z = (jnp.broadcast_to(part, wanted.shape) for part in position)
+        line = line._replace(origin=(x, y, z))
+    x, y, z = line.origin
+    line = line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z))
+    rays = entering(seams.locate(place), line, wanted, tiling.searched)
     track = vmap_rays(partial(track_of, seams))(rays)
     offset = track.offset if seams.overriding("start") else None
-    skips = tiles.skips(index, rays, seams.step)
-    return Started(rays, Track(offset, track.shift, None, None), skips, space)
+    # of rays of one's own, neighbours need not be near each other
+    box = box_of_corners if position is not None else box_of_rays
+    skips = None if index is None else index.skips(partial(box, tiling, rays), tiling.cells * seams.step)
+    track = unchecked(track, offset=offset, shifted=None, until=None)
+    return Started(rays, track, skips, seams.locate(place))
 
 
 @cache
@@ -230,9 +243,10 @@ def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     grid = jax.tree.map(np.asarray, _without_voxels(scene.volume, scene.march))
     size = tuple(blocks.side * step for step in grid.spacing)
     zero = np.zeros_like(size[0])
-    occupancy = Occupancy(None, (zero, zero, zero), size, grid.frame, tuple(grid.origin))
+    place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(grid.origin)}
     sizes = np.asarray(visible.shape, np.int32)
-    return leap.index_of(unchecked(occupancy, sizes=sizes), Sums.of(visible))
+    occupancy = unchecked(Occupancy, occupied=None, **place, frame=grid.frame, known=None, sizes=sizes)
+    return leap.index_of(occupancy, Sums.of(visible))
 
 
 @program
@@ -320,7 +334,7 @@ def _finish(
     scene = Scene(none, none, source, none, compositing)
 
     def finish(t_in: Array, length: Array, at: Progress) -> Rendering:
-        return end(scene, Ray(none, none, t_in, length, none, none), at)
+        return end(scene, unchecked(Ray, t_in=t_in, length=length), at)
 
     each = [vmap_rays(finish)(tile.t_in, tile.length, tile.marched.at) for tile in passed]
     rendering = jax.tree.map(lambda *leaves: tiles.assemble(jnp.stack(leaves)), *each)

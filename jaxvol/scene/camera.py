@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Num
+from jaxtyping import Array, Float, Int, Num
 
 from .._util.checks import (
     Arrayable,
@@ -28,7 +28,6 @@ from .._util.checks import (
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import is_traced
-from ..xla.trees import unchecked
 from .space import Line
 from .volume import Volume, corners_of
 
@@ -275,7 +274,7 @@ class Camera(eqx.Module):
         return replace(self, window=window, corner=None)
 
     @property
-    def valid(self) -> Bool[Array, ""]:
+    def valid(self) -> Any:
         """Whether angle, scale and `view_up`, which may be traced, are such as the constructor accepts; else
         all rays are NaN."""
         height = self.view_angle if self.parallel_scale is None else self.parallel_scale
@@ -291,22 +290,19 @@ class Camera(eqx.Module):
         place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
         return place if beside is None else plus(place, beside), direction
 
-    def beside(
-        self, column: Num[Array, ""] | float, row: Num[Array, ""] | float, size: Any = None
-    ) -> tuple[Vec3 | None, Vec3]:
-        """How far beside the position a pixel's ray begins, if not there, and its unit direction. `size`: of
-        the image, in place of the camera's, where it is traced, and the camera known to be `valid`."""
+    def beside(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3 | None, Vec3]:
+        """How far beside the position a pixel's ray begins, if not there, and its unit direction."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
-        x, y = self._column(column + 0.5, size), self._row(row + 0.5, size)
+        x, y = self._column(column + 0.5), self._row(row + 0.5)
         right, up, forward = (apart(axis) for axis in axes_of(self))
-        scale, valid = self.parallel_scale, self.valid if size is None else True
+        scale = self.parallel_scale
         if scale is not None:
-            scale = jnp.where(valid, scale, jnp.nan)
+            scale = jnp.where(self.valid, scale, jnp.nan)
             x, y = scale * x, scale * y
             a, b, c = (x * r + y * u for r, u in zip(right, up, strict=True))
             return (a, b, c), forward
-        scale = jnp.where(valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
+        scale = jnp.where(self.valid, jnp.tan(jnp.deg2rad(self.view_angle) / 2), jnp.nan)
         dx, dy, dz = along(along(forward, right, scale * x), up, scale * y)
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return None, (dx / norm, dy / norm, dz / norm)
@@ -339,21 +335,14 @@ class Camera(eqx.Module):
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
-    def _column(self, column: Any, size: Any = None) -> Scalar:
+    def _column(self, column: Any) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
         left, right, _, _ = self.window
-        width, _ = self.size if size is None else size
-        return left + (right - left) * (column / width)
+        return left + (right - left) * (column / self.size[0])
 
-    def _row(self, row: Any, size: Any = None) -> Scalar:
+    def _row(self, row: Any) -> Scalar:
         _, _, bottom, top = self.window
-        _, height = self.size if size is None else size
-        return top - (top - bottom) * (row / height)
-
-    @property
-    def unsized(self) -> "Camera":
-        """The camera without its size, so that all sizes have one structure."""
-        return unchecked(self, size=(0, 0))
+        return top - (top - bottom) * (row / self.size[1])
 
 
 class GivenRays(eqx.Module):
@@ -467,7 +456,7 @@ def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
     return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
 
 
-def _is_valid(height: Scalar, is_angle: bool, up: Array, forward: Array) -> Bool[Array, ""]:
+def _is_valid(height: Any, is_angle: bool, up: Any, forward: Any) -> Any:
     # a margin, since the constructor may round another way
     beside = _sine(up, forward / abs(forward).max()) > 0.5e-6
     return (height > 0) & ((height < 180) | (not is_angle)) & beside

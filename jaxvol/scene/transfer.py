@@ -92,7 +92,7 @@ class Transfer(eqx.Module):
         return ()
 
     @property
-    def valid(self) -> Bool[Array, ""] | bool:
+    def valid(self) -> Any:
         """Whether its parameters, which may be traced, are such as its constructor accepts; else the image is
         NaN. (Whether they are finite is checked of all.)"""
         return True
@@ -255,7 +255,7 @@ class TransferFunction(Transfer):
         return 1
 
     @property
-    def valid(self) -> Bool[Array, ""]:
+    def valid(self) -> Any:
         return (self.values[..., 1:] >= self.values[..., :-1]).all()
 
     @property

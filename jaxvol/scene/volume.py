@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Integer, Shaped
+from jaxtyping import Array, Float, Int, Integer, Shaped
 
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
@@ -191,7 +191,7 @@ class Volume(eqx.Module):
         return self[tuple(map(slice, low.tolist(), high.tolist()))]
 
     @property
-    def valid(self) -> Bool[Array, ""]:
+    def valid(self) -> Any:
         """Whether spacing and direction, which may be traced, place the voxels in space, not in a plane."""
         placed = (self.spacing > 0).all()
         if self.direction is None:
@@ -199,8 +199,8 @@ class Volume(eqx.Module):
         return placed & (abs(_determinant(self.direction)) > FLAT / 2)
 
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Number of nodes along x, y, z."""
+    def shape(self) -> Any:
+        """Number of nodes along x, y, z: three integers, which are traced in some kernels."""
         return self.fetch.shape(self.data)
 
     @property

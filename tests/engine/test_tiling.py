@@ -141,19 +141,6 @@ def test_memory_beside_the_image_does_not_grow_with_it():
     assert large - small <= 1.1 * bytes_per_pixel * pixels
 
 
-def test_a_transform_that_is_not_asked_for_leaves_no_trace():
-    """A plain march's program has fewer operations than that of any other."""
-    volume = anisotropic_noise()
-
-    def operations(*transforms):
-        arguments = volume, soft_transfer(), around(volume, (8, 8)), jv.March(0.07, transforms)
-        return cast(Any, eqx.filter_jit(jv.render)).lower(*arguments).lowered.cost_analysis()["flops"]
-
-    plain = operations()
-    assert 0 < plain < operations(jv.AlphaCorrection())
-    assert plain < operations(jv.EarlyTermination(0.1))
-
-
 def test_unknown_outputs_are_named():
     volume = anisotropic_noise()
     with pytest.raises(ValueError, match="outputs must be one of all, rgba; got 'depth'"):

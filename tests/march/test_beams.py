@@ -13,7 +13,9 @@ import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.march.beams import STRETCHES, Box, stretches
 from jaxvol.scene.occupancy import Occupancy, Sums
+from jaxvol.scene.space import Ray
 from jaxvol.xla import platform
+from jaxvol.xla.trees import unchecked
 
 from ..round_trips import counted
 
@@ -57,8 +59,12 @@ def occupancy(occupied):
 @jax.jit
 def box_of(origins, directions):
     """The box of a beam, and its two corners at each of many distances."""
-    corners = tuple(origins.T), tuple(directions.T)
-    box = Box.within(occupancy(jnp.zeros(BLOCKS, bool)), *corners)
+    # as rays that miss the volume, and begin somewhere on their way
+    t_in = jnp.asarray([0.0, 0.3, 0.1, 0.2], jnp.float32)
+    entries = origins + t_in[:, None] * directions
+    places = {"entry": tuple(entries.T), "direction": tuple(directions.T), "t_in": t_in}
+    others = {"length": jnp.zeros(4), "path": None, "pixel": None, "gaps": (), "spans": (), "reach": None}
+    box = Box.within(occupancy(jnp.zeros(BLOCKS, bool)), unchecked(Ray, **places, **others))
     at = jnp.linspace(0, 1, 9) * (box.far - box.near)
     return box, at, jax.vmap(lambda u: tuple(jnp.stack(corner) for corner in box.between(u, u)))(at)
 
@@ -90,7 +96,7 @@ def test_stretches_called_empty_contain_nothing_along_any_ray():
     for seed, (rays, corners) in enumerate(beams(False)):
         occupied = np.random.default_rng(seed).random(BLOCKS) < 0.01
         box, *_ = box_of(*corners)
-        found = known(occupied, jax.tree.map(lambda leaf: np.asarray(leaf)[None], box))
+        found = known(occupied, jax.tree.map(lambda leaf: np.asarray(leaf)[..., None], box))
         following, near, length = (
             np.asarray(x) for x in (found.following[:, 0], found.near[0], found.length)
         )
@@ -107,7 +113,7 @@ def test_stretches_called_empty_contain_nothing_along_any_ray():
 def test_stretches_are_the_same_all_at_once(monkeypatch):
     seen = occupancy(np.random.default_rng(0).random(BLOCKS) < 0.005)
     boxes = [box_of(*corners)[0] for _, corners in beams(False)[-3:]]
-    box = jax.tree.map(lambda *leaves: np.stack(leaves), *boxes)
+    box = jax.tree.map(lambda *leaves: np.stack(leaves, axis=-1), *boxes)
     arguments = seen, eqx.filter_jit(Sums.of)(seen.occupied), box, jnp.float32(0.05)
     in_turn, (looks, _) = counted(stretches, *arguments)
     monkeypatch.setattr(platform, "platform", lambda: "gpu")

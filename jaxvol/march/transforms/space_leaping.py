@@ -14,6 +14,7 @@ from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import BLOCK, FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
 from ...xla.memory import gather
+from ...xla.trees import unchecked
 from ..beams import Box, EmptySpaceIndex, Skips, Stretches, View, stretches
 from ..march import Transform
 
@@ -117,9 +118,9 @@ class SpaceLeaping(Transform):
         row = jnp.stack([row, row, row + last, row + last], axis=-1)
         cast = jnp.vectorize(lambda x, y: tuple(part for end in view.ray(x, y) for part in end))
         x, y, z, dx, dy, dz = (part.reshape(-1, 4) for part in cast(column, row))
-        none: Any = None
-        rays = Ray((x, y, z), (dx, dy, dz), jnp.zeros_like(x), none, none, none)
-        box = Box.within(occupancy, rays)
+        rays = {"entry": (x, y, z), "direction": (dx, dy, dz), "t_in": jnp.zeros_like(x)}
+        none = {"length": None, "path": None, "pixel": None, "gaps": (), "spans": (), "reach": None}
+        box = Box.within(occupancy, unchecked(Ray, **rays, **none))
         beams = stretches(occupancy, Sums.of(occupancy.occupied), box, jnp.min(jnp.stack(occupancy.size)))
         first = beams.following[0].astype(beams.near.dtype)
         start = jnp.where(first < beams.following.shape[0], beams.near + first * beams.length, jnp.inf)
