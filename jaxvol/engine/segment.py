@@ -162,7 +162,9 @@ def march_segment(
     )
     after = jax.vmap(partial(stop, scene))(with_fields(after, finished=at.finished) if follows else after)
     steps = jnp.where(at.finished, 0, jnp.clip(ahead.until - at.index, 0, number))
-    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
+    # of rays that move: others take no cell here
+    clear = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) & (steps > 0)
+    transparent = clear if shifts else None
     return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples._replace(ray=ray)
 
 

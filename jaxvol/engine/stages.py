@@ -123,7 +123,8 @@ def staged_image(
             track, first = _shift(kernel, started.rays, track, most, tiling)
         skips = nowhere if started.skips is None else started.skips
         told = _told(kernel, started._replace(skips=skips))
-        found = _march(*told, track, first, skips, options.outputs, tiling, record)
+        # where rays do not leap, what has no extinction has a gradient, too
+        found = _march(*told, track, first, skips, options.outputs, tiling, record and scene.march.leaps)
         passed.append(Passed(started.rays.t_in, started.rays.length, found, track.shifted))
     return _finish(passed, scene.compositing, source, tiling, size, record)
 
