@@ -21,7 +21,10 @@ def import_with_types_checked():
     """Imports the library so that shapes and types are checked at every call, which takes seven seconds."""
     typechecker.leave_inner_functions()
     with install_import_hook("jaxvol", "tests.typechecker.check"):
-        import jaxvol  # noqa: F401
+        import jaxvol
+
+        for name in dir(jaxvol):  # each is imported when it is first used
+            getattr(jaxvol, name)
 
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
