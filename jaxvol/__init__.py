@@ -5,10 +5,13 @@ it. A volume gives values, a transfer function maps them to colour and extinctio
 composited front to back into a `Rendering`.
 """
 
-import lazy_loader
-
 # before what takes long to load
 from ._util import interruption as _interruption  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
+
+# isort: split
+import lazy_loader
+
 from ._util.version import __version__ as __version__
 
 

@@ -46,6 +46,7 @@ from .automatic import (
 )
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
 from .padding import padded
+from .settings import OF_COLORS, header_of
 
 
 def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
@@ -56,43 +57,6 @@ def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
 
 POINTS = 8, 16
 """Those that the transfer functions of pictures are padded to: most presets have up to 8."""
-
-OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
-OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
-OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
-DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))
-DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "others": []}
-DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
-"""Options of a picture, as they are where nothing is given."""
-
-CALLED = {
-    "background": "bg",
-    "camera": "camera_position cpos",
-    "cmap": "color colormap lut",
-    "compositing": "blending mode",
-    "isovalue": "isosurface",
-    "parallel": "parallel_projection",
-    "shade": "lighting shading",
-    "size": "resolution window_size",
-    "transfer": "opacity",
-}
-ELSEWHERE = {theirs: ours for ours, names in CALLED.items() for theirs in names.split()}
-"""What other programs call options."""
-
-OVERRIDES = {
-    "preset": {"cmap", "transfer", "recorded_transfer"},
-    "cmap": {"preset", "transfer", "recorded_transfer"},
-    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "window", "level", "unit_distance"},
-    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"},
-    "camera": {"direction"},
-    "direction": {"camera"},
-    "clim": {"window", "level"},
-    "window": {"clim"},
-    "level": {"clim"},
-    "step": {"tolerance"},
-    "tolerance": {"step"},
-}
-"""Options that exclude this one, which is an error, and that it overrides in a picture."""
 
 
 class Scene(NamedTuple):
@@ -137,15 +101,6 @@ class Scene(NamedTuple):
         tolerance = PLANNED if tolerance is None else tolerance
         transfer = padded(self.transfer, *POINTS)
         return [plan(what, transfer, camera, tolerance, **how) for camera in cameras]
-
-
-def check_exclusive(settings: dict[str, Any]) -> None:
-    """Refuse options that exclude each other."""
-    on = {name for name, value in settings.items() if value is not None and value is not False}
-    for name in sorted(on):
-        for other in sorted(on & OVERRIDES.get(name, set())):
-            both = f"{name} and {other}".replace("recorded_transfer", "the transfer function in the picture")
-            raise ValueError(f"{both} exclude each other; leave one out.")
 
 
 def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
@@ -296,11 +251,6 @@ def volume_of(options: Namespace) -> Volume:
     if told := [name for name, value in header.items() if value is not None]:
         raise ValueError(f"{told[0]} is of files; volume is a Volume.")
     return options.file if labels is None else labelled(options.file, labels)
-
-
-def header_of(options: Namespace) -> dict[str, Any]:
-    """What the options say of the file."""
-    return {name: getattr(options, name) for name in OF_FILES}
 
 
 def is_automatic(options: Namespace) -> bool:

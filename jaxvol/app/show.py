@@ -23,7 +23,8 @@ from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
 from .automatic import check_known
-from .picture import DEFAULTS, ELSEWHERE, Scene, check_exclusive, scene_of, with_march
+from .picture import Scene, scene_of, with_march
+from .settings import DEFAULTS, ELSEWHERE, check_exclusive
 
 
 OF_CAMERAS = {"direction", "view_up", "view_angle", "parallel", "size"}

@@ -1,6 +1,7 @@
 """Where are compiled programs kept, so that the next process need not compile them again?"""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import jax
@@ -47,9 +48,10 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
 
 
 def keep_programs_by_default() -> None:
-    """`keep_programs()`, unless JAX keeps them somewhere already."""
+    """`keep_programs()`, unless JAX keeps them somewhere already, or the folder cannot be made."""
     if not _folder():
-        keep_programs()
+        with suppress(OSError):
+            keep_programs()
 
 
 def _folder() -> str | None:

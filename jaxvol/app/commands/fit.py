@@ -8,8 +8,9 @@ from typing import Any
 
 from ..._util.checks import output_file
 from ...fitting import ImageResidual, fit, flat_grey, read_views, write_transfer
+from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import background_of, quick_march, volume_of
-from .options import add_clim, add_command, add_output, add_sampling, add_volume, refuse_to_replace
+from .options import Parser, add_clim, add_output, add_sampling, add_volume, refuse_to_replace
 
 
 def _fit(options: argparse.Namespace) -> None:
@@ -19,6 +20,7 @@ def _fit(options: argparse.Namespace) -> None:
     views = read_views(options.images, options.cameras)
     if options.labels is not None:
         raise ValueError("--labels: fit finds one transfer function of the values, not one for each label.")
+    keep_programs_by_default()
     background = background_of(options)
     volume = volume_of(options)
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
@@ -43,8 +45,8 @@ def _show_step(step: int, parameters: Any, loss: float) -> None:
     print(f"\rstep {step}, loss {loss:.4g}", end="", file=sys.stderr, flush=True)
 
 
-def add_fit(commands: Any) -> None:
-    parser = add_command(commands, "fit", "fit a transfer function to images of a volume", _fit)
+def add_fit(parser: Parser) -> None:
+    parser.set_defaults(execute=_fit)
     add_volume(parser)
     add_sampling(parser)
     text = "sRGB, as PNG"

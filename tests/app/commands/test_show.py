@@ -12,7 +12,7 @@ from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
 from jaxvol.app.framing import framed, visible_points
 from jaxvol.app.padding import padded
-from jaxvol.app.picture import DEFAULTS
+from jaxvol.app.settings import DEFAULTS
 
 from .test_render import render, same
 
