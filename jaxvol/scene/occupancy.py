@@ -6,6 +6,7 @@ gradients.
 """
 
 import itertools
+import operator
 from collections.abc import Callable
 from functools import cache, partial, reduce
 from typing import Any
@@ -13,7 +14,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8, UInt32
 
 from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
@@ -54,8 +56,12 @@ class Blocks(eqx.Module):
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False, side: int = BLOCK) -> "Blocks":
         """The blocks of a volume, computed once for each array; ranges of `slopes` only where asked for."""
-        labels = None if volume.labels is None else memoized(volume.labels, _for(side, _label_bits))
-        low, high = map(volume.in_grid_order, memoized(volume.data, _for(side, _ranges)))
+        bits, ends = _for(side, _label_bits), _for(side, _ranges)
+        labels = (
+            None if volume.labels is None else memoized(volume.labels, bits, partial(_label_bits, side=side))
+        )
+        low, high = memoized(volume.data, ends, partial(_ranges_in_numpy, side=side))
+        low, high = map(volume.in_grid_order, (low, high))
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
@@ -182,6 +188,12 @@ def _ranges(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array
     return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
 
 
+def _ranges_in_numpy(data: Shaped[np.ndarray, "nx ny nz *c"], side: int) -> tuple[np.ndarray, np.ndarray]:
+    low, high = (over_blocks(data, combine, side=side) for combine in (np.minimum, np.maximum))
+    low, high = _widened(low, high, np)
+    return (low, high) if data.ndim == 3 else (np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0))
+
+
 @partial(jax.jit, static_argnums=1)
 def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Array, Array]:
     """Least and greatest node of each block; NaN where a node is."""
@@ -206,8 +218,12 @@ def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Arr
 @jax.jit
 def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"]) -> tuple[Array, Array]:
     """Ranges of the values interpolated between nodes, from those of the nodes."""
-    low, high = low.astype(jnp.float32), high.astype(jnp.float32)
-    slack = ROUNDING * jnp.maximum(abs(low), abs(high))
+    return _widened(low, high, jnp)
+
+
+def _widened(low: Any, high: Any, xp: Any) -> tuple[Any, Any]:
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    slack = ROUNDING * xp.maximum(abs(low), abs(high))
     return low - slack, high + slack
 
 
@@ -267,16 +283,18 @@ def _lengths(
     return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
 
 
-def _label_bits(labels: Integer[Array, "nx ny nz"], side: int) -> UInt32[Array, "bx by bz"]:
-    bits = jnp.uint32(1) << (labels.astype(jnp.int32) % 32).astype(jnp.uint32)
-    return over_blocks(bits, jnp.bitwise_or, side=side)
+def _label_bits(labels: Any, side: int) -> Any:
+    bits = np.uint32(1) << (labels.astype(np.int32) % 32).astype(np.uint32)
+    return over_blocks(bits, operator.or_, side=side)
 
 
-def over_blocks(values: Array, combine: Callable[[Array, Array], Array], *, side: int) -> Array:
-    """Combines all nodes of each block, axis by axis."""
+def over_blocks(values: Any, combine: Callable[[Any, Any], Any], *, side: int) -> Any:
+    """Combines all nodes of each block, axis by axis, in the library of the array."""
+    known = isinstance(values, np.ndarray)
+    join, part = (np.concatenate, _part) if known else (jnp.concatenate, jax.lax.slice_in_dim)
     for axis in range(min(values.ndim, 3)):  # channels stay
         cells = values.shape[axis] - 1
-        along = partial(jax.lax.slice_in_dim, values, axis=axis)
+        along = partial(part, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, side)
         found = []
@@ -285,5 +303,9 @@ def over_blocks(values: Array, combine: Callable[[Array, Array], Array], *, side
             found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
         if rest:
             found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))
-        values = jnp.concatenate(found, axis)
+        values = join(found, axis)
     return values
+
+
+def _part(values: np.ndarray, start: int, end: int, step: int = 1, *, axis: int) -> np.ndarray:
+    return values[(slice(None),) * axis + (slice(start, end, step),)]

@@ -53,7 +53,7 @@ def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> 
         bricks = rendering.bricks
         counts = " x ".join(map(str, bricks.counts))
         print(f"{path}: {bricks.loads} of {counts} bricks read, {bricks.bytes_read} bytes")
-    if np.any(rendering.exhausted):
+    if np.asarray(rendering.exhausted).any():
         print(f"{path}: incomplete: rays used up their {scene.march.most_samples} samples; use a longer step")
 
 
