@@ -46,6 +46,7 @@ from .automatic import (
 )
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
 from .padding import padded
+from .progress import progress
 from .settings import OF_COLORS, header_of
 
 
@@ -89,6 +90,11 @@ class Scene(NamedTuple):
             found = render_bricks(self.source, transfer, camera, self.march, **how)
         return jax.block_until_ready(found)
 
+    def picture(self, quiet: bool) -> Rendering:
+        """The image of `camera`, shown as it is made."""
+        with progress(f"drawing {self.camera.size[0]} x {self.camera.size[1]} pixels", quiet=quiet):
+            return self.render(self.camera)
+
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
         """The cheapest way to render the scene within a tolerance, for each camera."""
         if self.others:
@@ -128,7 +134,9 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     several = options.others if isinstance(options.others, list | tuple) else [options.others]
     source, others = None, tuple(map(other_of, several))
     if options.memory is None:
-        volume, transfer = look_of(options)
+        name = "volume" if isinstance(options.file, Volume) else options.file
+        with progress(f"reading {name}", quiet=options.quiet):
+            volume, transfer = look_of(options)
     else:
         if options.labels is not None or others:
             raise ValueError("memory reads one volume, without labels and others.")
@@ -228,7 +236,8 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
         step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
     if step is not None:
         return scene._replace(march=quick_march(step, scene.transforms))
-    plans = scene.plans(cameras, options.tolerance)
+    with progress("planning", quiet=options.quiet):
+        plans = scene.plans(cameras, options.tolerance)
     found = min(plans, key=lambda plan: float(plan.march.step))
     # a view in which cells must be integrated needs that at any step
     integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)

@@ -10,6 +10,7 @@ OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue
 DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))
 DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "others": []}
 DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
+DEFAULTS |= {"quiet": False}
 """Options of a picture, as they are where nothing is given."""
 
 CALLED = {

@@ -18,6 +18,7 @@ from ..._util.whole_files import whole_file
 from ...scene.camera import Camera
 from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import scene_of, with_march
+from ..progress import progress
 from ..show import why_empty
 from .options import Parser, add_output, add_scene, add_vector
 
@@ -53,10 +54,10 @@ def _animate(options: argparse.Namespace) -> None:
         empty.append(why_empty(scene, rendering))
         return displayed(np.asarray(rendering.image(scene.background), np.float32))
 
-    images = map(image_of, views(scene.camera, count))
-    with whole_file(path) as part:
+    with progress("drawing", count, quiet=options.quiet) as drawn, whole_file(path) as part:
         write = _write_gif if kind == ".gif" else _write_mp4
-        write(part, images, options.fps)
+        images = map(image_of, views(scene.camera, count))
+        write(part, (image for image in images if drawn() or True), options.fps)
     took = time.perf_counter() - begun
     print(f"{path}: {count} frames of {' x '.join(map(str, options.size))} pixels in {took:.1f} s")
     if all(empty):

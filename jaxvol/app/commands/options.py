@@ -172,6 +172,11 @@ def add_output(parser: Parser, default: str, help: str) -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path(default), help=text)
 
 
+def add_quiet(parser: Parser) -> None:
+    text = "do not show what is being done, on stderr, as where that is no terminal"
+    parser.add_argument("-q", "--quiet", action="store_true", default=False, help=text)
+
+
 def add_vector(group: Any, flag: str, names: str, help: str, **more: Any) -> None:
     """Add an option of several numbers, as many as there are names."""
     metavar = tuple(names.split())
@@ -298,4 +303,5 @@ def add_scene(parser: Parser) -> None:
     add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append")
     text = "cut away what is inside the box and on that side of all planes, and show the rest"
     group.add_argument("--clip-inside-out", action=SWITCH, help=text)
+    add_quiet(parser)
     parser.set_defaults(**DEFAULTS)

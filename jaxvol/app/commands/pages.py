@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from .options import SWITCH, Parser, add_output, add_size
+from .options import SWITCH, Parser, add_output, add_quiet, add_size
 
 
 def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
@@ -78,6 +78,7 @@ PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit
 def _demo(options: argparse.Namespace) -> None:
     from ..._util.checks import output_file
     from ...xla.persistent_cache import keep_programs_by_default
+    from ..progress import progress
 
     keep_programs_by_default()
     page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'
@@ -86,7 +87,8 @@ def _demo(options: argparse.Namespace) -> None:
         folder = Path(made)
         for section, pictures in PICTURES.items():
             print(f"{options.output}: {', '.join(pictures)}", flush=True)
-            section(folder, tuple(options.size), options.resolution)
+            with progress(f"drawing {', '.join(pictures)}", quiet=options.quiet):
+                section(folder, tuple(options.size), options.resolution)
             images = "".join(f'<img src="{name}.png" alt="{name}" width="32%"> ' for name in pictures)
             page += f"{images}<pre>{html.escape(inspect.getsource(section))}</pre>\n"
         (folder / "index.html").write_text(page, encoding="utf-8")
@@ -99,6 +101,7 @@ def _demo(options: argparse.Namespace) -> None:
 def add_demo(parser: Parser) -> None:
     parser.set_defaults(execute=_demo)
     add_output(parser, "jaxvol-demo", "folder to write")
+    add_quiet(parser)
     add_size(parser)
     parser.add_argument("--resolution", type=int, default=320, metavar="N", help="voxels along the head")
 

@@ -11,6 +11,7 @@ from ...io.display import image_file, save_image
 from ...scene.rendering import Rendering
 from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import Scene, scene_of, with_march
+from ..progress import progress
 from ..recorded import text_of_options
 from ..show import why_empty
 from .options import SWITCH, Parser, add_output, add_scene, refuse_to_replace
@@ -26,7 +27,7 @@ def _render(options: argparse.Namespace) -> None:
     scene = scene_of(options)
     scene = with_march(scene, options, [scene.camera])
     ready = time.perf_counter()
-    rendering = scene.render(scene.camera)
+    rendering = scene.picture(options.quiet)
     ended = time.perf_counter()
     before = "reading and planning" if options.step is None else "reading"
     steps = f"{before} {ready - begun:.2f} s, compiling and rendering {ended - ready:.2f} s"
@@ -76,7 +77,9 @@ def _plan(options: argparse.Namespace) -> None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
     keep_programs_by_default()
     scene = scene_of(options)
-    print(*scene.plans([scene.camera], options.tolerance))
+    with progress("planning", quiet=options.quiet):
+        plans = scene.plans([scene.camera], options.tolerance)
+    print(*plans)
 
 
 def add_plan(parser: Parser) -> None:
