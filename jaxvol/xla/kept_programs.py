@@ -7,7 +7,9 @@ JAX's cache, the folder is trusted: who may write to it may run code.
 """
 
 import hashlib
+import os
 import re
+import tempfile
 from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import version
@@ -21,7 +23,6 @@ import numpy as np
 from jax import export
 from jax.core import ShapedArray
 
-from .._util.whole_files import whole_file
 from .compiling import OPTIONS
 from .persistent_cache import kept_folder
 from .platform import is_traced
@@ -129,8 +130,9 @@ def _read(file: Path) -> export.Exported | None:
 
 def _write(file: Path, program: bytes) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(file) as part:
-        part.write_bytes(MAGIC + hashlib.sha256(program).digest() + program)
+    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
+        part.write(MAGIC + hashlib.sha256(program).digest() + program)
+    os.replace(part.name, file)  # appears whole, also for processes that write it at the same time
 
 
 def _name(parts: Any) -> str:
