@@ -10,6 +10,8 @@ from ._util import interruption as _interruption  # noqa: F401  # pyright: ignor
 
 
 # isort: split
+import sys
+
 import lazy_loader
 
 from ._util.version import __version__ as __version__
@@ -17,3 +19,8 @@ from ._util.version import __version__ as __version__
 
 # names are those of `__init__.pyi`; a module is imported when the first of its names is used
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+if "ipykernel" in sys.modules:  # a notebook keeps its programs, as `show` and the command do
+    from .xla.persistent_cache import keep_programs_by_default as _keep_programs_by_default
+
+    _keep_programs_by_default()

@@ -23,10 +23,10 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     """Keeps compiled programs in a folder, so that the first image of the next process takes less time.
 
     XLA compiles a program for each kind of scene (sizes, transforms, light), which takes some 4 s. Call this
-    before the first image, in a script or a notebook: it turns on JAX's persistent compilation cache for this
-    process. The command `jaxvol` does so by itself, and so do `view` and the page of `jaxvol view`, unless
-    JAX has a folder already. The programs are those of this machine, this version of jaxvol and of JAX;
-    others are added. To be rid of them, delete the folder.
+    before the first image of a script: it turns on JAX's persistent compilation cache for this
+    process. The command `jaxvol` does so by itself, and so do notebooks, `show`, `view` and the page of
+    `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. The programs are those
+    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the folder.
 
     Args:
         folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
