@@ -26,7 +26,8 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     before the first image of a script: it turns on JAX's persistent compilation cache for this
     process. The command `jaxvol` does so by itself, and so do notebooks, `show`, `view` and the page of
     `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. The programs are those
-    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the folder.
+    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the
+    folder.
 
     Args:
         folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
