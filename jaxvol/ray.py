@@ -98,6 +98,12 @@ class Scene(NamedTuple):
         return self._replace(transfer=transfer, march=march, lighting=None)
 
 
+def by_rules(scene: Scene) -> Scene:
+    """The prepared scene for the kernel of its march, with the march's `rules` in its place."""
+    rules: Any = scene.march.rules
+    return scene._replace(march=rules)
+
+
 EXPECTED: dict[str, tuple[type, str, str]] = {
     "volume": (
         Volume,
@@ -215,22 +221,41 @@ def _check_near(volume: Volume, lighting: Lighting) -> None:
         )
 
 
-class Progress(eqx.Module):
-    """How far a ray has come.
+NEVER = int(jnp.iinfo(jnp.int32).max)
+"""A cell that no ray has."""
 
-    The front of the next cell lies at `(offset + index) d`. Counting steps rather than summing them keeps the
-    ten-thousandth sample as exact as the first; `offset` holds what transforms add, in steps. `composite` is
-    the compositing mode's state after all cells so far. `shift`, in steps, is added to `offset` after the
-    first transparent cell, and is 0 from then on. Two are None where they are not needed: `stats` unless
-    all outputs are asked for, `shift` unless a transform shifts.
+
+class Track(eqx.Module):
+    """Where the cells of a ray lie.
+
+    Cell k begins at the depth `(offset + k) d`, and from the cell `shifted` on, at `(offset + shift + k) d`:
+    behind the first transparent cell, NEVER as long as that is not known. Counting steps rather than summing
+    them keeps the ten-thousandth sample as exact as the first. `until`: the first cell that is not taken.
+    `shift` and `shifted` are None where no transform shifts.
     """
 
-    index: Int[Array, ""]
     offset: Scalar
+    shift: Scalar | None
+    shifted: Int[Array, ""] | None
+    until: Int[Array, ""]
+
+    def front(self, number: Int[Array, "..."], step: Scalar) -> Scalar:
+        """Depth at which a cell begins."""
+        offset = self.offset
+        if self.shift is not None and self.shifted is not None:
+            offset = offset + jnp.where(number >= self.shifted, self.shift, 0)
+        return (offset + number.astype(offset.dtype)) * step
+
+
+class Progress(eqx.Module):
+    """How far a ray has come along its `track`: to the cell `index`, which is the next one. `composite` is
+    the compositing mode's state after all cells so far; `stats` is None unless all outputs are asked for."""
+
+    index: Int[Array, ""]
     composite: PyTree
     stats: "SampleStats | None"
     finished: Bool[Array, ""]
-    shift: Scalar | None
+    track: Track
 
 
 class SampleStats(eqx.Module):
@@ -240,24 +265,33 @@ class SampleStats(eqx.Module):
     aligned: Bool[Array, ""]
 
 
-def begin(scene: Scene, ray: Ray, outputs: Outputs | None = "all") -> Progress:
+def begin(scene: Scene, ray: Ray, track: Track, outputs: Outputs | None = "all") -> Progress:
     """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
-    march, compositing = scene.march, scene.compositing
+    compositing = scene.compositing
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
     return Progress(
         index=count,
-        offset=march.start(ray),
         composite=compositing.begin(zero, outputs),
         stats=SampleStats(count, no) if outputs == "all" else None,
         finished=no,
-        shift=march.shift(ray) if march.may_shift else None,
+        track=track,
     )
 
 
-def pieces(scene: Scene, ray: Ray, at: Progress, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
-    """The pieces of the ray's next cell, or of the `number`-th one after it."""
-    march, begin = scene.march, front(scene.march, at, number)
+def track_of(march: March, ray: Ray) -> Track:
+    """The cells of a ray at its entry, of which none is known to be transparent."""
+    count = jnp.full(ray.length.shape, march.most_samples, jnp.int32)
+    if not march.may_shift:
+        return Track(march.start(ray), None, None, count)
+    return Track(march.start(ray), march.shift(ray), jnp.full_like(count, NEVER), count)
+
+
+def pieces(scene: Scene, ray: Ray, at: Any, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
+    """The pieces of the ray's next cell, or of the `number`-th one after it. Cells that are not taken lie
+    past the exit. `at`: a `Progress`, of which `index` and `track` are read."""
+    march, cell = scene.march, at.index + number
+    begin = jnp.where(cell < at.track.until, at.track.front(cell, march.step), ray.length)
     return march.cut(Cell(begin, march.step, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
@@ -308,7 +342,7 @@ def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     return 2 * t / (1 + t)
 
 
-def is_sample(march: March, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
+def is_sample(march: Any, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
     """Whether a piece counts as a sample. `divided`: transforms divide cells, so that pieces may have
     width 0."""
     before_exit = march.sample(piece) < ray.length
@@ -356,20 +390,21 @@ def stopped(scene: Scene, composite: Any) -> Bool[Array, ""]:
     return stops | finished
 
 
-def move(march: March, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
+def move(march: Any, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
     """Moves on by this many steps. `transparent`: whether the cell just composited, or all cells leapt over,
-    are transparent, so that a shift ahead is added now; None where none is ahead. The ray is finished if the
-    next cell begins past the exit."""
+    are transparent, so that the ray shifts here if it has not yet; None where that is known before. The ray
+    is finished if the next cell begins past the exit."""
     at = replace(at, index=at.index + steps)
-    if at.shift is not None and transparent is not None:
-        shift = jnp.where(transparent, at.shift, 0)
-        at = replace(at, offset=at.offset + shift, shift=jnp.where(transparent, 0, at.shift))
+    track = at.track
+    if track.shifted is not None and transparent is not None:
+        shifted = jnp.where(transparent, jnp.minimum(track.shifted, at.index), track.shifted)
+        at = replace(at, track=replace(track, shifted=shifted))
     return replace(at, finished=at.finished | (front(march, at) >= ray.length))
 
 
-def front(march: March, at: Progress, ahead: Any = 0) -> Scalar:
+def front(march: Any, at: Progress, ahead: Any = 0) -> Scalar:
     """Depth at which the next cell begins, or the one so many steps ahead of it."""
-    return (at.offset + (at.index + ahead).astype(at.offset.dtype)) * march.step
+    return at.track.front(at.index + ahead, march.step)
 
 
 def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:

@@ -30,6 +30,7 @@ from .ray import (
     pieces,
     resolve,
     stop,
+    track_of,
 )
 from .scene.rendering import Rendering
 from .scene.several import together
@@ -93,7 +94,8 @@ def render_ray_reference(
     def one(at: Progress, _: None) -> tuple[Progress, None]:
         return step(marched, ray, at), None
 
-    at, _ = jax.lax.scan(one, varying(begin(marched, ray), ray), None, length=length)
+    start = begin(marched, ray, track_of(marched.march, ray))
+    at, _ = jax.lax.scan(one, varying(start, ray), None, length=length)
     rendering = end(marched, ray, at)
     return resolved(shown, line, rendering) if scene.resolves else rendering
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from jaxtyping import Array, Bool
 
 import jaxvol as jv
-from jaxvol.march.march import EmptySpaceIndex
+from jaxvol.march.beams import EmptySpaceIndex, Skips
 from jaxvol.scene.occupancy import BLOCK
 from jaxvol.scene.space import Space
 
@@ -49,17 +49,22 @@ class _Index(EmptySpaceIndex):
     inner: EmptySpaceIndex
     on: Bool[Array, ""]
 
-    def prepare(self, box, stretch):
-        return self.inner.prepare(box, stretch)
-
-    def any_visible(self, prepared):
-        return self.inner.any_visible(prepared) | ~self.on
-
-    def skip_to(self, prepared, beam, rays, depth):
-        return jnp.where(self.on, self.inner.skip_to(prepared, beam, rays, depth), depth)
+    def skips(self, box, stretch):
+        return _Skips(self.inner.skips(box, stretch), self.on)
 
     def within_ranges(self):
         return _Index(self.inner.within_ranges(), self.on)
+
+
+class _Skips(Skips):
+    inner: Skips
+    on: Bool[Array, ""]
+
+    def any_visible(self):
+        return self.inner.any_visible() | ~self.on
+
+    def skip_to(self, beam, rays, depth):
+        return jnp.where(self.on, self.inner.skip_to(beam, rays, depth), depth)
 
 
 class _Space(Space):
@@ -156,7 +161,7 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "ends_at_exit", "tested_every", "valid", "block_side"
+STATIC = "joins", "ends_at_exit", "tested_every", "valid", "block_side", "rules", "reads_labels"
 
 
 @cache

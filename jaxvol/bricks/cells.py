@@ -98,7 +98,8 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
     brick, passable, empty = visit
     # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
     # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
-    fronts = [at.offset] if at.shift is None else [at.offset, at.offset + at.shift]
+    track = at.track
+    fronts = [track.offset] if track.shift is None else [track.offset, track.offset + track.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
     # A ray may come back into the volume and leave it before the next of these points: this counts, too.
     returns = [(back, _located(rays, back)) for _, back in rays.gaps]

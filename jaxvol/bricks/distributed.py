@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Int, Shaped
 from .._util.axes import permuted
 from ..compositing.blending import Over
 from ..engine.acceleration import VolumeAcceleration
-from ..engine.brick_march import RayStates, begin_rays, finish_image, join_segments, march_brick
+from ..engine.brick_march import RayStates, begin_image, finish_image, join_segments, march_brick
 from ..engine.devices import AXIS, REPLICATED, SHARDED
 from ..engine.tiling import RenderOptions
 from ..engine.wavefront import CellRange
@@ -147,7 +147,7 @@ def _on_each(mesh: Mesh, one: Callable[..., Any], replicated: bool, given: Any, 
 
 def _begin(scene: Scene, options: RenderOptions, _: Array) -> Share:
     """All rays at their entries, and all of their cells."""
-    underway = begin_rays(scene, options)
+    underway = begin_image(scene, options)
     none = jnp.zeros(underway.rays.length.shape, jnp.int32)
     return Share(underway, CellRange(none, jnp.full_like(none, jnp.iinfo(jnp.int32).max)))
 
@@ -184,7 +184,7 @@ def _march(
     part = part_of(with_voxels(scene.volume, [voxels]), first, grid.shape)
     acceleration = VolumeAcceleration.of(part, scene.transfer, scene.march, scene.lighting)
     cells, here = share.of_brick(grid, scene, brick), scene._replace(volume=part)
-    return Share(march_brick(here, options, acceleration, share.underway, cells, exact=True), share.own)
+    return Share(march_brick(here, options, acceleration, share.underway, cells), share.own)
 
 
 def _join(scene: Scene, options: RenderOptions, share: Share) -> Rendering:

@@ -201,7 +201,7 @@ def scene_of(
     )
 
 
-_begin_rays, _march_brick = compiled(brick_march.begin_rays), compiled(brick_march.march_brick)
+_begin_image, _march_brick = compiled(brick_march.begin_image), compiled(brick_march.march_brick)
 _finish_image, _resolve_image = compiled(brick_march.finish_image), compiled(resolve_image)
 _resolve_brick, _begin_vjp = compiled(brick_march.resolve_brick), compiled(brick_march.begin_vjp)
 _vjp_of_brick, _finish_vjp = compiled(brick_march.vjp_of_brick), compiled(brick_march.finish_vjp)
@@ -214,7 +214,7 @@ def _image(scene: Scene, request: Request) -> Rendering:
     if request.deals_bricks:
         assert request.mesh is not None
         return render_distributed(traversal, request.mesh)
-    underway, pixels = _begin_rays(marched, options), None
+    underway, pixels = _begin_image(marched, options), None
     for brick, cells in traversal.bricks(underway.rays, underway.at):
         before, restart = underway.at, callable(request.method)
         underway = _march_brick(*_on(brick, marched, options), underway, cells, restart)

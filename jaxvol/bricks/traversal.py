@@ -18,7 +18,7 @@ from .._util.files import MOST_VOXELS
 from .._util.memory import give_back
 from ..engine import devices
 from ..engine.tiling import RenderOptions, Tiling
-from ..engine.wavefront import CellRange, with_fields
+from ..engine.wavefront import CellRange
 from ..march.march import March
 from ..ray import Progress, Scene
 from ..scene.camera import Camera

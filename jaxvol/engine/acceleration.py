@@ -24,7 +24,7 @@ from ..compositing.selection import FirstVisible
 from ..lighting.shading import Lighting
 from ..march.beams import EmptySpaceIndex, View
 from ..march.march import March, Transform
-from ..ray import Scene, end
+from ..ray import Scene, by_rules, end
 from ..scene.camera import GivenRays, without_ends
 from ..scene.occupancy import BLOCK, Blocks, Occupancy
 from ..scene.several import Several, SeveralBlocks
@@ -35,8 +35,9 @@ from ..xla.memo import memoized, memoized_of
 from ..xla.platform import is_traced
 from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
+from .shifts import begin_rays
 from .tiling import Tiling
-from .wavefront import Beams, march_rays
+from .wavefront import blinded, march_rays
 
 
 LIMIT = 2**30
@@ -78,6 +79,11 @@ class VolumeAcceleration(eqx.Module):
             _blocks_of(volume, transfer, march) if march.leaps and seen is None else None,
             seen,
         )
+
+    @property
+    def of_space(self) -> "VolumeAcceleration":
+        """What tells where space is empty."""
+        return VolumeAcceleration([], [], self.blocks, self.occupancy)
 
     def packed(self, scene: Scene) -> Scene:
         """The scene, with voxels fetched from their packed copy."""
@@ -175,10 +181,12 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         own = GivenRays(jnp.stack(begins, axis=-1), jnp.stack(seen_by.direction, axis=-1))
         one_tile = tiling._replace(tile=columns.size, devices=None)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
-        seen = Scene(volume, transfer, own, plain, FirstVisible()).prepared()
+        seen = by_rules(Scene(volume, transfer, own, plain, FirstVisible()).prepared())
         rays = tiles.rays(own, space, only, no_fault)
-        at, _ = march_rays(seen, index, Beams.of(tiles, own, rays, only), tiling, "depth")
-        rendering = vmap_rays(partial(end, seen))(rays, at)
+        start = begin_rays(plain, seen, rays, tiling, "depth")
+        skips = tiles.skips(index, own, rays, only, march.step)
+        found = march_rays(seen, rays, blinded(skips, start), tiling, skips)
+        rendering = vmap_rays(partial(end, seen))(rays, found.at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)
 
     ray = partial(source.ray_from, space.anchor)

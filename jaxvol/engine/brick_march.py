@@ -15,18 +15,19 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.blending import joined
 from ..march.march import March
-from ..ray import Progress, Scene, begin, end, front, stopped
+from ..ray import Progress, Scene, by_rules, end, front, stopped
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, with_fields
 from .acceleration import NO_ACCELERATION, VolumeAcceleration, empty_space_of
 from .devices import on_devices
 from .gradients import ImageVjp, Sums
 from .rays import RayTiles, vmap_rays
 from .replay import Cotangents
 from .resolve import resolve_pixels
+from .shifts import begin_rays
 from .tiling import RenderOptions
-from .wavefront import Beams, CellRange, march_rays, with_fields
+from .wavefront import CellRange, blinded, into_range, march_rays
 
 
 class RayStates(eqx.Module):
@@ -37,15 +38,15 @@ class RayStates(eqx.Module):
 
 
 @on_devices("sharded")
-def begin_rays(scene: Scene, options: RenderOptions) -> RayStates:
+def begin_image(scene: Scene, options: RenderOptions) -> RayStates:
     """All rays at their entries. Of the volume, no voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), scene.has_fault
-    prepared = scene._replace(lighting=None).prepared()
+    prepared, tiling = scene._replace(lighting=None).prepared(), options.tiling
 
     def one(each: tuple[Int[Array, ""]]) -> RayStates:
         rays = tiles.rays(scene.source, prepared.space, each[0], fault)
-        at = vmap_rays(lambda ray: begin(prepared, ray, options.outputs))(rays)
-        return RayStates(rays, with_fields(at, finished=rays.length <= 0))
+        at = begin_rays(scene.march, prepared, rays, tiling, options.outputs, finds_shifts=False)
+        return RayStates(rays, at)
 
     return tiles.map(one)
 
@@ -58,25 +59,23 @@ def march_brick(
     states: RayStates,
     ranges: CellRange,
     restart: bool = False,
-    exact: bool = False,
 ) -> RayStates:
     """Marches each ray through `ranges`. `scene`: with a brick of the volume, which holds what rays meet
-    there, and in a segment more. `restart`: from where their ranges begin, unless they are opaque. `exact`:
-    rays take no cell behind their range."""
+    there. `restart`: from where their ranges begin, unless they are opaque."""
     tiles = RayTiles.of(scene.source, options.tiling)
     index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
-    prepared = acceleration.prepared(scene)
+    prepared, shifts = by_rules(acceleration.prepared(scene)), scene.march.may_shift
 
     def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
         number, states, range_ = each
         rays, start = states.rays, states.at
-        beams = Beams.of(tiles, scene.source, rays, number, range_)
         if restart:
             over = opaque(prepared, start) | (range_.until <= range_.first)
             start = with_fields(start, index=range_.first, finished=over)
-        after, _ = march_rays(
-            prepared, index, beams, options.tiling, options.outputs, resumed=start, exact=restart or exact
-        )
+        skips = tiles.skips(index, scene.source, rays, number, scene.march.step)
+        here = into_range(prepared, rays, start, range_, shifts=shifts)
+        after = march_rays(prepared, rays, blinded(skips, here), tiles.tiling, skips, shifts=shifts).at
+        after = eqx.tree_at(lambda at: at.track.until, after, start.track.until)
         # where it was restarted, a ray may go back
         over = opaque(prepared, after) if restart else start.finished | ended(prepared, rays, after)
         return RayStates(rays, with_fields(after, finished=over))
@@ -185,10 +184,9 @@ def begin_vjp(
     def one(each: tuple[Int[Array, ""], Rendering, Rendering]) -> ReplayState:
         number, rendering, cotangent = each
         rays, _ = image.rays(number)
-        at = vmap_rays(lambda ray: begin(image.prepared, ray, None))(rays)
         given = Cotangents.of(rays, rendering, cotangent)
         replay = image.replay(rays, given, sums.total)
-        states = RayStates(rays, with_fields(at, finished=rays.length <= 0))
+        states = RayStates(rays, image.begin(rays, None))
         return ReplayState(states, given, replay.carry, replay.sums)
 
     return sums, image.tiles.map(one, *jax.tree.map(image.tiles.disassemble, (rendering, cotangent)))
@@ -205,14 +203,16 @@ def vjp_of_brick(
     ranges: CellRange,
 ) -> tuple[Sums, ReplayState]:
     """The second march through `ranges`, as `march_brick`."""
-    image = ImageVjp.of(scene, perturbed, options, acceleration)
+    image, shifts = ImageVjp.of(scene, perturbed, options, acceleration), scene.march.may_shift
 
     def one(sums: Sums, each: tuple[Int[Array, ""], ReplayState, CellRange]) -> tuple[Sums, ReplayState]:
         number, state, range_ = each
         rays, at = state.states.rays, state.states.at
         replay = image.replay(rays, state.given, sums.total)
         replay.carry, replay.sums = state.carry, state.of_rays
-        after, (carry, of_rays, total) = image.march(rays, number, range_, replay, resumed=at)
+        found = image.march(rays, number, range_, replay, at, shifts=shifts)
+        after, (carry, of_rays, total) = found.at, found.visited
+        after = eqx.tree_at(lambda at: at.track.until, after, at.track.until)
         over = at.finished | ended(image.prepared, rays, after)
         states = RayStates(rays, with_fields(after, finished=over))
         return sums._replace(total=total), ReplayState(states, state.given, carry, of_rays)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..lighting.shading import Shader, Surroundings
 from ..march.beams import EmptySpaceIndex
-from ..ray import Progress, Scene
+from ..ray import Progress, Scene, by_rules
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..scene.volume import Volume, voxels_of, with_voxels, without_voxels
@@ -24,9 +24,10 @@ from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import on_devices
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
+from .shifts import begin_rays
 from .tiling import RenderOptions
 from .voxel_gradient import asked_of, cotangents_of
-from .wavefront import Beams, CellRange, State, march_rays
+from .wavefront import CellRange, Marched, Recorded, blinded, into_range, march_rays
 
 
 def render_vjp(
@@ -34,16 +35,16 @@ def render_vjp(
     perturbed: Any,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
-    residuals: tuple[Rendering, CellRange | None],
+    residuals: tuple[Rendering, Recorded],
     cotangent: Any,
 ) -> Any:
     """Vector–Jacobian product of `render`: a cotangent for each perturbed leaf of the scene.
 
-    `residuals`: the image, and the visible cells of its rays where they were recorded. `cotangent`: of the
-    image, None for what the loss does not use. A loss that uses a pixel that is NaN has the gradient NaN."""
-    rendering, ranges = residuals
+    `residuals`: the image, and what was recorded of its rays. `cotangent`: of the image, None for what the
+    loss does not use. A loss that uses a pixel that is NaN has the gradient NaN."""
+    rendering, recorded = residuals
     whole = of_all_outputs(rendering, cotangent)
-    found = _vjp_by_tiles(scene, perturbed, options, acceleration, rendering, ranges, whole)
+    found = _vjp_by_tiles(scene, perturbed, options, acceleration, rendering, recorded, whole)
     return of_perturbed(found, perturbed, rendering, whole)
 
 
@@ -99,7 +100,7 @@ class ImageVjp(NamedTuple):
     ) -> "ImageVjp":
         """The pull-back of a scene's image."""
         index = empty_space_of(scene, acceleration, options.tiling)
-        lit = prepared = acceleration.prepared(scene._replace(lighting=None))
+        lit = prepared = by_rules(acceleration.prepared(scene._replace(lighting=None)))
         shader, pull_shader = None, None
         if scene.lighting is not None:
             shader, pull_shader = _shader_of(
@@ -139,13 +140,25 @@ class ImageVjp(NamedTuple):
         self,
         rays: Ray,
         number: Int[Array, ""],
-        ranges: CellRange | None,
+        range_: CellRange | None,
         replay: Replay,
-        resumed: Progress | None = None,
-    ) -> State:
+        start: Progress,
+        *,
+        shifts: bool = False,
+    ) -> Marched:
         """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
-        beams = Beams.of(self.tiles, self.scene.source, rays, number, ranges)
-        return march_rays(self.lit, self.empty_space, beams, self.tiles.tiling, None, replay, resumed)
+        tiles, step = self.tiles, self.scene.march.step
+        skips = tiles.skips(self.empty_space, self.scene.source, rays, number, step)
+        start = blinded(skips, start)
+        if range_ is not None:
+            start = into_range(self.prepared, rays, start, range_, shifts=shifts)
+        return march_rays(self.lit, rays, start, tiles.tiling, skips, replay, shifts=shifts)
+
+    def begin(self, rays: Ray, shifted: Int[Array, "groups rays"] | None) -> Progress:
+        """Rays at their entries, of which nothing but the opacity is computed. `shifted`: where they shift;
+        None: that is found on the way."""
+        march, tiling = self.scene.march, self.tiles.tiling
+        return begin_rays(march, self.prepared, rays, tiling, None, shifted, finds_shifts=False)
 
     def replay(self, rays: Ray, given: Cotangents, total: Total) -> Replay:
         """What pulls the samples of rays back."""
@@ -171,6 +184,11 @@ class ImageVjp(NamedTuple):
         total = total._replace(volume=added(total.volume, of_volume), march=added(total.march, of_march))
         return Sums(total, added(sums.source, of_source))
 
+    def pull_rules(self, of_rules: PyTree) -> PyTree:
+        """The cotangents of the march, from those of its rules."""
+        moving, fixed = eqx.partition(self.scene.march, eqx.is_inexact_array)
+        return jax.vjp(lambda moving: eqx.combine(moving, fixed).rules.moving, moving)[1](of_rules)[0]
+
     def cotangents(self, sums: Sums) -> Scene:
         """Those of the scene's parts; 0 for those that are not asked for."""
         total, volume = sums.total, self.scene.volume
@@ -179,6 +197,8 @@ class ImageVjp(NamedTuple):
         of_volume, of_transfer, of_source, of_march = (
             zeros_of(part) if found is None else found for part, found in zip(parts, of_parts, strict=True)
         )
+        if total.rules is not None:
+            of_march = added(of_march, self.pull_rules(total.rules))
         of_volume = with_voxels(of_volume, cotangents_of(volume, total.voxels))
         of_lighting = None
         if self.pull_shader is not None:
@@ -191,30 +211,31 @@ class ImageVjp(NamedTuple):
         )
 
 
-@on_devices("replicated", sharded=("ranges",))
+@on_devices("replicated", sharded=("recorded",))
 def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
     rendering: Rendering,
-    ranges: CellRange | None,
+    recorded: Recorded,
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
     image = ImageVjp.of(scene, perturbed, options, acceleration)
-    if image.empty_space is not None and ranges is not None:
+    if image.empty_space is not None and recorded.range is not None:
         image = image._replace(empty_space=image.empty_space.within_ranges())
 
     def tile(sums: Sums, each: Any) -> tuple[Sums, None]:
-        number, range_, rendering, cotangent = each
+        number, recorded, rendering, cotangent = each
         rays, pull = image.rays(number)
         replay = image.replay(rays, Cotangents.of(rays, rendering, cotangent), sums.total)
-        _, (_, of_rays, total) = image.march(rays, number, range_, replay)
+        start = image.begin(rays, recorded.shifted)
+        _, of_rays, total = image.march(rays, number, recorded.range, replay, start).visited
         return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), ranges, *parts)
+    sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), recorded, *parts)
     return image.cotangents(sums)
 
 

@@ -14,11 +14,11 @@ from jaxtyping import Array, Int
 
 from ..compositing.selection import Selection
 from ..lighting.template_lighting import with_baked_light
-from ..ray import Scene, begin, check_channels, end
+from ..ray import Scene, by_rules, check_channels, end
 from ..reference import step, steps_across
 from ..scene.rendering import Rendering
-from ..scene.space import Ray
-from ..xla.compiling import compiled
+from ..scene.space import Ray, Space
+from ..xla.compiling import compiled, in_program
 from ..xla.differentiation import forward_only, nan_derivatives, transformations
 from ..xla.linear import differentiable, moving_leaves, recomputed
 from ..xla.platform import is_traced
@@ -29,8 +29,10 @@ from .devices import check_not_sharded, mesh_of, on_all, on_devices
 from .gradients import render_vjp
 from .rays import RayTiles, vmap_rays
 from .resolve import Found, resolve_image
+from .shifts import begin_rays
+from .stages import is_staged, staged_image
 from .tiling import Adjoint, RenderOptions, Tiling
-from .wavefront import Beams, CellRange, VisibleRangeRecorder, march_rays
+from .wavefront import Recorded, blinded, march_rays
 
 
 RenderOutputs: TypeAlias = Literal["all", "rgba"]
@@ -121,20 +123,23 @@ def _pixels(scene: Scene, options: RenderOptions, acceleration: VolumeAccelerati
 @on_devices("both")
 def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
-) -> tuple[Rendering, CellRange | None]:
-    """The image, by the fast engine; and the range of each ray's visible cells, where rays leap and `record`
-    asks for it."""
-    tiles = RayTiles.of(scene.source, options.tiling)
-    index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
-    prepared = acceleration.prepared(scene)  # voxels are fetched from their packed copy from here on
+) -> tuple[Rendering, Recorded]:
+    """The image, by the fast engine; and, if `record` asks for it, what the second march needs of the first.
+    """
+    tiles, tiling = RayTiles.of(scene.source, options.tiling), options.tiling
+    index = empty_space_of(acceleration.packed(scene), acceleration, tiling)
+    # voxels are fetched from their packed copy from here on
+    prepared = by_rules(acceleration.prepared(scene))
 
-    def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, CellRange | None]:
-        beams = Beams.of(tiles, scene.source, rays, tile)
-        recorder = VisibleRangeRecorder(rays.length.shape) if record and index is not None else None
-        at, (ranges, *_) = march_rays(prepared, index, beams, options.tiling, options.outputs, recorder)
-        return vmap_rays(partial(end, prepared))(rays, at), ranges
+    def marched(tile: Int[Array, ""], rays: Ray) -> tuple[Rendering, Recorded]:
+        start = begin_rays(scene.march, prepared, rays, tiling, options.outputs)
+        skips = tiles.skips(index, scene.source, rays, tile, scene.march.step)
+        known = record and skips is not None
+        found = march_rays(prepared, rays, blinded(skips, start), tiling, skips, record=known)
+        recorded = Recorded(found.range, start.track.shifted if record else None)
+        return vmap_rays(partial(end, prepared))(rays, found.at), recorded
 
-    return _over_tiles(prepared, tiles, marched)
+    return _over_tiles(scene, prepared.space, tiles, marched)
 
 
 @on_devices("replicated")
@@ -147,22 +152,23 @@ def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceler
 
     def scanned(_: Int[Array, ""], rays: Ray) -> tuple[Rendering, None]:
         one = vmap_rays(partial(step, prepared))
-        start = varying(vmap_rays(lambda ray: begin(prepared, ray, options.outputs))(rays), rays)
+        start = begin_rays(scene.march, prepared, rays, options.tiling, options.outputs, finds_shifts=False)
+        start = varying(start, rays)
         at, _ = jax.lax.scan(lambda at, none: (one(rays, at), none), start, None, length=options.steps)
         return vmap_rays(partial(end, prepared))(rays, at), None
 
-    return _over_tiles(prepared, tiles, scanned)[0]
+    return _over_tiles(scene, prepared.space, tiles, scanned)[0]
 
 
 def _over_tiles(
-    scene: Scene, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
+    scene: Scene, space: Space, tiles: RayTiles, one: Callable[[Int[Array, ""], Ray], tuple[Rendering, Any]]
 ) -> tuple[Rendering, Any]:
     """Calls `one(tile, rays)` for each tile in turn. Returns the renderings, assembled to an image, and what
     else it returned, stacked."""
     fault = scene.has_fault
 
     def tile(each: tuple[Int[Array, ""]]) -> tuple[Rendering, Any]:
-        return one(each[0], tiles.rays(scene.source, scene.space, each[0], fault))
+        return one(each[0], tiles.rays(scene.source, space, each[0], fault))
 
     renderings, more = tiles.map(tile)
     return nan_derivatives(jax.tree.map(tiles.assemble, renderings), fault), more
@@ -173,7 +179,7 @@ def _marched_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcc
 
 
 _forward_image = compiled(_marched_image, has_jvp=True)
-_plain_image = compiled(_marched_image)
+_whole_image = compiled(_marched_image)
 _recorded_image = compiled(partial(march_image, record=True), by_jvp=True)
 _image_vjp = compiled(render_vjp, by_jvp=True)
 _direct_image = compiled(scan_image, has_jvp=True)
@@ -181,11 +187,19 @@ _pixels_kept = compiled(resolve_image, has_jvp=True)
 _pixels_recomputed = recomputed(resolve_image, WRONG_MODE["replay"])
 
 
+def _plain_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
+    if in_program(scene, acceleration) or not is_staged(scene, options):
+        return _whole_image(scene, options, acceleration)
+    return staged_image(scene, options, acceleration)[0]
+
+
 def _recorded(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration
-) -> tuple[Rendering, tuple[Rendering, CellRange | None]]:
-    rendering, ranges = _recorded_image(scene, options, acceleration)
-    return rendering, (rendering, ranges)
+) -> tuple[Rendering, tuple[Rendering, Recorded]]:
+    staged = not in_program(scene, acceleration) and is_staged(scene, options)
+    image = partial(staged_image, record=True) if staged else _recorded_image
+    rendering, recorded = image(scene, options, acceleration)
+    return rendering, (rendering, recorded)
 
 
 def _push(tangents: Any, scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Any:

@@ -15,17 +15,18 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import all_finite
-from ..march.beams import Box
+from .._util.vec3 import Scalar, Vec3
+from ..march.beams import Box, EmptySpaceIndex, Skips
 from ..scene.camera import Camera, Ending, GivenRays, without_ends
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree, added
 from . import devices
-from .tiling import Tiling
+from .tiling import GROUPS_OF_BEAM, Tiling
 
 
 Lanes = Int[Array, "groups rays"]
@@ -49,24 +50,54 @@ class RayTiles(eqx.Module):
     tiling: Tiling = eqx.field(static=True)
 
     @classmethod
-    def of(cls, source: Source, tiling: Tiling, *, direct: bool = False) -> "RayTiles":
-        """The tiles of a camera's pixels, or of given rays; small ones for `"direct"`."""
-        source = without_ends(source)
-        side, most = tiling.beam, tiling.direct_tile if direct else tiling.tile
-        shares = devices.number_of(tiling.devices)
+    def of(
+        cls,
+        source: Source,
+        tiling: Tiling,
+        *,
+        direct: bool = False,
+        tiles: tuple[int, int] | None = None,
+        pixels: Int[Array, "2"] | None = None,
+    ) -> "RayTiles":
+        """The tiles of a camera's pixels, or of given rays.
 
-        def divided(beams: int) -> tuple[int, int]:
+        Args:
+            direct: small ones, for `"direct"`.
+            tiles: number of tiles, and of beams in each, in place of those that follow from the tiling.
+            pixels: width and height of the camera's image, where they are traced.
+        """
+        source, shares = without_ends(source), devices.number_of(tiling.devices)
+        most = tiling.direct_tile if direct else tiling.tile
+
+        def divided(beams: Any) -> tuple[int, int]:
+            if tiles is not None:
+                return tiles
             count = max(min(most, -(-beams // shares)), 1)
             return -(-beams // (count * shares)), count
 
         if isinstance(source, Camera):
-            width, height = source.size
-            across, down = -(-width // side), -(-height // side)
+            width, height = source.size if pixels is None else (pixels[0], pixels[1])
+            across, down = -(-width // tiling.beam), -(-height // tiling.beam)
             # if the columns were a multiple of the devices, each device would always get the same ones
             across += shares > 1 and across % shares == 0
-            return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
+            return _PixelTiles(*divided(across * down), tiling, (width, height), across, down)
         shape = source.origins.shape[:-1]
-        return _GivenRayTiles(*divided(-(-math.prod(shape) // tiling.rays_per_beam)), tiling, shape)
+        return _GivenRayTiles(*divided(_beams_of(source, tiling)), tiling, shape)
+
+    @staticmethod
+    def shared(source: Camera | GivenRays, tiling: Tiling) -> tuple[int, int]:
+        """Beams of a tile, one of three numbers, so that most images share programs; and how many tiles hold
+        all rays."""
+        beams = _beams_of(source, tiling)
+        for size in (tiling.tile // 16, tiling.tile // 4):
+            if beams <= 2 * size:
+                return size, max(-(-beams // size), 1)
+        return tiling.tile, -(-beams // tiling.tile)
+
+    @property
+    def groups(self) -> int:
+        """Number of groups in each tile."""
+        return self.beam_count * GROUPS_OF_BEAM
 
     def scan(
         self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
@@ -103,12 +134,21 @@ class RayTiles(eqx.Module):
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
-    def rays(self, source: Source, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
+    def rays(
+        self,
+        source: Source,
+        space: Space,
+        tile: Int[Array, ""],
+        fault: Bool[Array, ""],
+        until: Float[Array, "groups rays"] | None = None,
+    ) -> Ray:
         """The rays of a tile, cut to the volume. Those that only fill up groups miss it. If there is a
-        `fault` in the scene, all of them are NaN, and so invalid."""
+        `fault` in the scene, all of them are NaN, and so invalid. `until`: where they end, if the source does
+        not know it."""
         found, wanted = self.lines_of(without_ends(source), tile, fault)
         if isinstance(source, Ending):
-            found = found._replace(until=self.disassemble(source.until)[tile])
+            until = self.disassemble(source.until)[tile]
+        found = found._replace(until=until)
         return entering(space, found, wanted, self.tiling.searched)
 
     @abstractmethod
@@ -121,6 +161,14 @@ class RayTiles(eqx.Module):
     def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         """A function from an occupancy grid to the boxes around the beams of a tile."""
 
+    def skips(
+        self, index: EmptySpaceIndex | None, source: Any, rays: Ray, tile: Int[Array, ""], step: Scalar
+    ) -> Skips | None:
+        """Where the rays of a tile see nothing, if that is known."""
+        if index is None:
+            return None
+        return index.skips(self.box(source, rays, tile), self.tiling.cells * step)
+
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:
         """From (tiles, groups, rays in a group, *rest) to the image's shape."""
@@ -130,12 +178,20 @@ class RayTiles(eqx.Module):
         """The inverse of `assemble`; 0 for rays that only fill up groups."""
 
 
+def _beams_of(source: Camera | GivenRays, tiling: Tiling) -> int:
+    """Number of beams that hold all rays."""
+    if isinstance(source, Camera):
+        width, height = source.size
+        return -(-width // tiling.beam) * -(-height // tiling.beam)
+    return -(-math.prod(source.origins.shape[:-1]) // tiling.rays_per_beam)
+
+
 class _PixelTiles(RayTiles):
     """A camera's pixels: beams row by row, and each beam group by group."""
 
-    size: tuple[int, int] = eqx.field(static=True)
-    across: int = eqx.field(static=True)
-    down: int = eqx.field(static=True)
+    size: tuple[Any, Any]
+    across: Any
+    down: Any
 
     def lines_of(
         self, source: Camera, tile: Int[Array, ""], fault: Bool[Array, ""]
@@ -146,16 +202,30 @@ class _PixelTiles(RayTiles):
         column, row = self._pixels(tile, group_y * side + y, group_x * side + x)
         column, row = column.reshape(-1, group), row.reshape(-1, group)
         width, height = self.size
-        return lines(source, column, row, fault), (column < width) & (row < height)
+        return lines(source, column, row, fault, self._traced_size), (column < width) & (row < height)
 
     def box(self, source: Any, rays: Ray, tile: Int[Array, ""]) -> Callable[[Occupancy], Box]:
         source = without_ends(source)
         y, x = jnp.divmod(jnp.arange(4), 2)
         last = self.tiling.beam - 1
         column, row = self._pixels(tile, y * last, x * last)
+        size = self._traced_size
+
+        def ray(anchor: Vec3 | None, column: Array, row: Array) -> tuple[Vec3, Vec3]:
+            return source.ray_from(anchor, column, row, size)
+
         return lambda occupancy: Box.within(
-            occupancy, *vmap_rays(partial(source.ray_from, occupancy.anchor))(column, row)
+            occupancy, *vmap_rays(partial(ray, occupancy.anchor))(column, row)
         )
+
+    @property
+    def _traced_size(self) -> tuple[Scalar, Scalar] | None:
+        """Width and height of the image, if they are traced."""
+        width, height = self.size
+        if isinstance(width, int):
+            return None
+        dtype = jnp.result_type(float)
+        return width.astype(dtype), height.astype(dtype)
 
     def _pixels(self, tile: Int[Array, ""], y: Array, x: Array) -> tuple[Lanes, Lanes]:
         """Columns and rows of the pixels (x, y) of each of a tile's beams."""
@@ -228,20 +298,24 @@ def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
     return jax.tree.map(lambda leaf: leaf[0], lines(source, columns[None], rows[None], fault))
 
 
-def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Line:
-    """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN."""
+def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""], size: Any = None) -> Line:
+    """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN. `size`:
+    of the image, where it is traced; then nothing is differentiated."""
     left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
     # on a GPU, `in_memory` computes rays also of a fault
     camera = eqx.tree_at(lambda c: c.position, camera, jnp.where(fault, jnp.nan, camera.position))
-    beside, direction = _rounded(camera, columns, rows)
+    if size is None:
+        beside, direction = _rounded(camera, columns, rows)
+    else:
+        beside, direction = in_memory(all_finite(camera), partial(_through, camera, size=size), columns, rows)
     # the position need not be stored for each ray
     x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
     return Line((x, y, z), direction, (columns + left, rows + top), beside=beside)
 
 
-def _through(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
+def _through(camera: Camera, columns: Lanes, rows: Lanes, size: Any = None) -> Any:
     """What is computed of the rays of pixels: directions, and where they begin in parallel projection."""
-    return vmap_rays(camera.beside)(columns, rows)
+    return vmap_rays(partial(camera.beside, size=size))(columns, rows)
 
 
 @jax.custom_jvp

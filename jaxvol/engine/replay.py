@@ -70,7 +70,10 @@ class Total(NamedTuple):
     """Gradients summed over all rays; None for what is not asked for."""
 
     transfer: PyTree
+    rules: PyTree
+    """Of `CellRules.moving`."""
     march: PyTree
+    """Of the march, but for what its rules take from it."""
     volume: PyTree
     """Of everything in it but the voxels."""
     voxels: Sums
@@ -95,6 +98,7 @@ class Total(NamedTuple):
         volume = scene.volume
         return cls(
             zeros_of(scene.transfer) if transfer else None,
+            jax.tree.map(jnp.zeros_like, scene.march.rules.moving) if geometric else None,
             zeros_of(scene.march) if geometric else None,
             zeros_of(without_voxels(volume)) if geometric else None,
             zero_sums(volume, voxels),
@@ -192,10 +196,12 @@ class Replay(SampleVisitor):
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
         of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
         of_place = [None] * len(depths) if shaded is None else [part.of_place for part in shaded]
-        (of_march, of_volume, of_rays, of_transfer), fetched, of_fetched = self._geometric_vjp(
+        (of_rules, of_march, of_volume, of_rays, of_transfer), fetched, of_fetched = self._geometric_vjp(
             ray, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         )
-        total = total._replace(march=added(total.march, of_march), volume=added(total.volume, of_volume))
+        total = total._replace(rules=added(total.rules, of_rules), volume=added(total.volume, of_volume))
+        if of_march is not None:
+            total = total._replace(march=added(total.march, of_march))
         if self.reads_transfer:
             total = total._replace(transfer=added(total.transfer, of_transfer))
         if total.of_voxels:
@@ -216,22 +222,27 @@ class Replay(SampleVisitor):
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
-    ) -> tuple[tuple[PyTree, PyTree, PyTree, PyTree], list[list[Fetched]], list[Any]]:
+    ) -> tuple[tuple[PyTree, ...], list[list[Fetched]], list[Any]]:
         """From the cotangents of each piece's measured values and width, of its depth where the loss depends
-        on that, and of its point where it is shaded: those of march, volume, rays, and of the transfer
-        function where samples are measured by it; what was fetched of each array of voxels; and the
-        cotangents of that. The number of samples counts as constant."""
-        parts = self.prepared.march, without_voxels(self.scene.volume), ray, self.scene.transfer
+        on that, and of its point where it is shaded: those of the march's rules, of the march where samples
+        are shaded, of volume, rays, and of the transfer function where samples are measured by it; what was
+        fetched of each array of voxels; and the cotangents of that. The number of samples counts as constant.
+        """
+        rules: Any = self.prepared.march
         geometric, voxels = self.total.geometric, self.total.of_voxels
-        asked = geometric, geometric, geometric, self.reads_transfer
+        parts = self.scene.march, without_voxels(self.scene.volume), ray, self.scene.transfer
+        asked = geometric and self.shader is not None, geometric, geometric, self.reads_transfer
         moving = tuple(floats(part) if a else None for part, a in zip(parts, asked, strict=True))
         fixed = tuple(
             eqx.filter(part, eqx.is_inexact_array, inverse=True) if a else part
             for part, a in zip(parts, asked, strict=True)
         )
+        moving = (rules.moving if geometric else None, *moving)
+        fixed = (rules.constant if geometric else rules, *fixed)
         *shared, ray_fixed, transfer_fixed = fixed
 
         def one(
+            rules: PyTree,
             march: PyTree,
             volume: PyTree,
             ray: PyTree,
@@ -241,31 +252,31 @@ class Replay(SampleVisitor):
             at: Progress,
             number: Int[Array, ""],
         ) -> tuple[list[Any], list[list[Fetched]]]:
-            march, volume, ray, transfer = eqx.combine(
-                (march, volume, ray, transfer), (*shared, ray_fixed, transfer_fixed)
+            rules, march, volume, ray, transfer = eqx.combine(
+                (rules, march, volume, ray, transfer), (*shared, ray_fixed, transfer_fixed)
             )
             whole, fetched = with_voxels(volume, voxels_of(self.scene.volume)), []
             if voxels:
                 here, fetched = recorded(whole, perturbations)
             else:
                 here = with_fetches(whole, fetches_of(self.prepared.volume))
-            classification = classification_of(transfer, here, integrated=march.integrates)
+            classification = classification_of(transfer, here, integrated=rules.integrates)
             classification = classification._replace(search=None)  # what it finds has no gradient
-            scene = self.prepared._replace(march=march, volume=here, classification=classification)
-            space = march.locate(here)
+            scene = self.prepared._replace(march=rules, volume=here, classification=classification)
+            space = None if self.shader is None else march.locate(here)
             found = []
             for piece in pieces(scene, ray, at, number):
-                depth, measured = march.sample(piece), measure(scene, ray, piece, recorded=True)
+                depth, measured = rules.sample(piece), measure(scene, ray, piece, recorded=True)
                 place = along(ray.entry, ray.direction, depth)
-                lit = None if self.shader is None else (space.world(place), place, ray.direction)
+                lit = None if space is None else (space.world(place), place, ray.direction)
                 at_depth = depth if self.given.depth is not None else None
                 found.append((floats(measured), piece.width, at_depth, lit))
             return found, fetched
 
-        rays = jax.vmap(one, in_axes=(None, None, 0, None, 0, 0, 0, None))
-        cells = jax.vmap(rays, in_axes=(None, None, None, None, 0, None, None, 0))
+        rays = jax.vmap(one, in_axes=(None, None, None, 0, None, 0, 0, 0, None))
+        cells = jax.vmap(rays, in_axes=(None, None, None, None, None, 0, None, None, 0))
 
-        def all_(moving: tuple[PyTree, PyTree, PyTree, PyTree], perturbations: list[Any]) -> PyTree:
+        def all_(moving: tuple[PyTree, ...], perturbations: list[Any]) -> PyTree:
             each = jnp.arange(number, dtype=at.index.dtype)
             return cells(*moving, perturbations, ray_fixed, at, each)
 

@@ -8,7 +8,6 @@ opacities a third. (Measured on CPU.)
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,22 +17,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Scalar, Vec3
+from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
-from ..march.march import Cell, March
-from ..ray import Progress, Scene, add, move, opacity, pieces, read, stop
+from ..march.march import Cell
+from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, stop, stopped
 from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
-from ..xla.trees import PyTree
+from ..xla.packing import Packed
+from ..xla.trees import PyTree, with_fields
 from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
 
 
 class Samples(NamedTuple):
     """The next cells of many rays: lists with one entry for each piece of a cell, of arrays (cells, rays).
-    Cells that a ray does not keep (`_kept`) are transparent, and placed at its exit. `light`: the terms of
-    shading that is `inline`."""
+    Cells that a ray does not take are transparent, and placed at its exit. `light`: the terms of shading that
+    is `inline`."""
 
     cells: list[Cell]
     measured: list[Measured]
@@ -73,106 +74,125 @@ def vmap_cells(f: Any, of_cells: tuple[bool, ...] = (True,)) -> Any:
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if each else None for each in of_cells))
 
 
-def regular_from_here(at: Progress) -> Bool[Array, "*rays"]:
-    """Which rays have no shift ahead of them, and advance by whole steps from here on."""
-    return jnp.ones(at.finished.shape, bool) if at.shift is None else at.shift == 0
+class Ahead(eqx.Module):
+    """The cells ahead of many rays.
+
+    Attributes:
+        taken: their `Ray`, `Track` and what a visitor is given, which branches take apart themselves, since
+            XLA would store each array that a branch is given.
+        index: of the next cell.
+        finished: whether rays take no other cell.
+        whole: whether all cells of a segment are to lie end to end. Then none lies ahead in which a ray
+            shifts, since that does not begin where the one in front of it ends.
+    """
+
+    taken: Packed
+    index: Int[Array, " rays"]
+    finished: Bool[Array, " rays"]
+    whole: bool = eqx.field(static=True)
+
+    @property
+    def place(self) -> "tuple[Ray, Place]":
+        """The rays, and where their next cell lies."""
+        ray, track, _ = self.taken.tree
+        until = jnp.where(self.finished, self.index, track.until)
+        if self.whole and track.shifted is not None:
+            until = jnp.where(self.index < track.shifted, jnp.minimum(until, track.shifted), until)
+        return ray, Place(self.index, eqx.tree_at(lambda track: track.until, track, until))
+
+
+class Place(NamedTuple):
+    """Where the next cells of rays lie: what `pieces` reads of a `Progress`."""
+
+    index: Int[Array, "*rays"]
+    track: Track
 
 
 def march_segment(
-    scene: Scene,
-    tiling: Tiling,
-    ray: Ray,
-    at: Progress,
-    *,
-    regular: bool,
-    until: Int[Array, " rays"] | None = None,
+    scene: Scene, tiling: Tiling, taken: Packed, at: Progress, *, shifts: bool = False
 ) -> tuple[Progress, Samples]:
-    """Marches rays by a segment of cells; by fewer, where a ray is finished, where a shift puts its next
-    samples elsewhere than those that were fetched, or at `until`. `regular`: no ray has a shift, a limit of
-    samples or `until` ahead of it, which is then not tested."""
-    march, classification, number = scene.march, scene.classification, tiling.cells
-    every = samples = _sampled(scene, number, ray, at)
-    kept: Int[Array, " rays"] | None = None
-    shifts = None
-    if not regular:
-        fewer = in_memory(always(at), partial(_kept, march), at, every.opacity, until)
-        (kept, shifts), samples = fewer, _truncated(every, fewer[0], ray)
+    """Marches rays by a segment of cells; by fewer, where a ray has no more of them, and by none where it is
+    finished. `shifts`: a segment is one cell, behind which rays may shift."""
+    classification, number = scene.classification, tiling.cells
+    ahead = Ahead(taken, at.index, at.finished, scene.march.integrates and not shifts)
+    samples = _sampled(scene, number, ahead)
+    ray, place = ahead.place
     colors: list[Vec3] | list[None]
-    values = [read[:1] for read in every.measured]
+    values = [read[:1] for read in samples.measured]
     if isinstance(scene.compositing, Selection):
-        colors, values = [None] * len(every.cells), every.measured
+        colors, values = [None] * len(samples.cells), samples.measured
     elif classification.light is None:
-        colors = _colors(scene, at, every.measured)
+        colors = _colors(scene, at, samples.measured)
     elif (shader := inline_shader(scene)) is not None:
-        assert every.light is not None
-        parts = every.cells, _colors(scene, at, every.measured), every.light
+        assert samples.light is not None
+        parts = samples.cells, _colors(scene, at, samples.measured), samples.light
         colors = lit_colors(shader, scene, ray, *parts)
     else:
         colors = shaded_colors(scene, tiling.chunk, ray, at, samples.cells, samples.measured, samples.opacity)
-    cells = tuple(zip(every.cells, values, colors, every.opacity, strict=True))
+    cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
 
-    def composited(ray: Ray, at: Progress, keeps: Bool[Array, ""] | None, cell: Any) -> Progress:
-        finished = at.finished
-        if keeps is not None:  # cells that are not kept are composited as if the ray were finished
-            at = replace(at, finished=finished | ~keeps)
+    # Whether a ray is stopped follows from what it has passed, but of transforms of one's own. So it is not
+    # carried from cell to cell, which XLA would then compute one after the other.
+    follows = isinstance(scene.compositing, Weighting) and not scene.march.custom
+
+    def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
+        if follows:
+            at = with_fields(at, finished=stopped(scene, at.composite))
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
-        return stop(scene, replace(at, finished=finished))
-
-    def next_(at: Progress, each: tuple[Int[Array, ""], Any]) -> tuple[Progress, None]:
-        index, cell = each
-        # not by the opacities of `samples`, whose arrays would have to be stored
-        keeps = None if kept is None else index < kept
-        return jax.vmap(composited)(ray, at, keeps, cell), None
+        return at if follows else stop(scene, at)
 
     # unrolled, so that nothing between two cells is put in memory
-    order = jnp.arange(number, dtype=at.index.dtype)
-    after, _ = jax.lax.scan(next_, at, (order, cells), unroll=number)
-    steps = jnp.full_like(at.index, number) if kept is None else kept
-    return jax.vmap(partial(move, march))(ray, after, shifts, steps), samples
+    after, _ = jax.lax.scan(
+        lambda at, cell: (jax.vmap(composited)(ray, at, cell), None), at, cells, unroll=number
+    )
+    after = jax.vmap(partial(stop, scene))(with_fields(after, finished=at.finished) if follows else after)
+    steps = jnp.where(at.finished, 0, jnp.clip(place.track.until - at.index, 0, number))
+    transparent = jnp.all(jnp.stack(samples.opacity) == 0, axis=(0, 1)) if shifts else None
+    return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples
 
 
-def _sampled(scene: Scene, number: int, ray: Ray, at: Progress) -> Samples:
+def _sampled(scene: Scene, number: int, ahead: Ahead) -> Samples:
     """The samples of so many cells ahead of each ray."""
     march, classification = scene.march, scene.classification
 
-    def pieces_of(at: Progress) -> tuple[Cell, ...]:
+    def pieces_of(ahead: Ahead) -> tuple[Cell, ...]:
         rays = jax.vmap(partial(pieces, scene), in_axes=(0, 0, None))
-        return jax.vmap(rays, in_axes=(None, None, 0))(ray, at, jnp.arange(number, dtype=at.index.dtype))
+        each = jnp.arange(number, dtype=ahead.index.dtype)
+        return jax.vmap(rays, in_axes=(None, None, 0))(*ahead.place, each)
 
-    cut = pieces_of(at)
+    cut = pieces_of(ahead)
     divided = len(cut) > 1
     # Dividing a cell is expensive, so that its pieces are stored. An undivided cell costs less to recompute
     # than to load.
     given = cut if divided else None
 
-    def cells(at: Progress, given: Any) -> tuple[Cell, ...]:
-        return given if divided else pieces_of(at)
+    def cells(ahead: Ahead, given: Any) -> tuple[Cell, ...]:
+        return given if divided else pieces_of(ahead)
 
-    def measured(at: Progress, given: Any) -> list[Measured]:
-        each = vmap_cells(partial(read, scene), (False, True))
-        return [each(ray, piece) for piece in cells(at, given)]
+    def measured(ahead: Ahead, given: Any) -> list[Measured]:
+        each, (ray, _) = vmap_cells(partial(read, scene), (False, True)), ahead.place
+        return [each(ray, piece) for piece in cells(ahead, given)]
 
-    def opacities(at: Progress, given: Any, values: list[Measured]) -> list[Scalar]:
-        each = vmap_cells(partial(opacity, scene), (False, True, True))
-        return [each(ray, piece, read) for piece, read in zip(cells(at, given), values, strict=True)]
+    def opacities(ahead: Ahead, given: Any, values: list[Measured]) -> list[Scalar]:
+        each, (ray, _) = vmap_cells(partial(opacity, scene), (False, True, True)), ahead.place
+        return [each(ray, piece, read) for piece, read in zip(cells(ahead, given), values, strict=True)]
 
-    live = always(at)
+    live = always(ahead)
     if march.integrates:
-        values = _measured_over(scene, ray, live, partial(cells, at, given))
+        values = _measured_over(scene, ahead, live, cells, given)
     else:
-        values = _searched(classification, live, in_memory(live, measured, at, given))
-    alphas = in_memory(live, opacities, at, given, values)
+        values = _searched(classification, live, in_memory(live, measured, ahead, given))
+    alphas = in_memory(live, opacities, ahead, given, values)
     shader = inline_shader(scene)
-    light = None if shader is None else light_terms(shader, scene, live, ray, partial(cells, at, given))
-    return Samples(list(cells(at, given)), values, alphas, light)
+    ray, _ = ahead.place
+    light = None if shader is None else light_terms(shader, scene, live, ray, partial(cells, ahead, given))
+    return Samples(list(cells(ahead, given)), values, alphas, light)
 
 
-def always(at: Progress) -> Bool[Array, ""]:
+def always(at: Any) -> Bool[Array, ""]:
     """Always true, but opaque to XLA, so that branches survive."""
-    # An index cannot overflow: in a pass there are at most some `most_samples` / cells segments, and it grows
-    # by at most cells, finished or not: with 2**24 samples it stays below 2**31. Whether any ray is alive
-    # would take 1 % of a frame to find out.
+    # whether any ray is alive would take 1 % of a frame to find out
     return at.index[0] >= 0
 
 
@@ -198,7 +218,7 @@ def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
 
 
 def _measured_over(
-    scene: Scene, ray: Ray, live: Bool[Array, ""], cells: Callable[[], tuple[Cell, ...]]
+    scene: Scene, ahead: Ahead, live: Bool[Array, ""], cells: Callable[..., tuple[Cell, ...]], given: Any
 ) -> list[Measured]:
     """What is measured over the pieces of cells, each end once where they are joined."""
     march, classification = scene.march, scene.classification
@@ -208,17 +228,21 @@ def _measured_over(
     )
     ends_of = vmap_cells(lambda ray, piece: march.ends(piece, ray), (False, True))
 
-    def measured(_: Any) -> list[Measured]:
+    def measured(ahead: Ahead, given: Any) -> list[Measured]:
         """At the ends of all pieces; where they are joined, at the first front and at all backs."""
-        ends = [ends_of(ray, piece) for piece in cells()]
+        ray, _ = ahead.place
+        ends = [ends_of(ray, piece) for piece in cells(ahead, given)]
         if not march.joins:
             return [at(ray, depth) for pair in ends for depth in pair]
         # where a cell begins, the last piece of the one in front of it ends
         first = jnp.concatenate([ends[0][0][:1], ends[-1][1]])
         return [at(ray, first), *(at(ray, back) for _, back in ends[:-1])]
 
-    attributes = in_memory(live, lambda _: [between(ray, piece) for piece in cells()], live)
-    read = _searched(classification, live, in_memory(live, measured, live))
+    def attributes_of(ahead: Ahead, given: Any) -> list[Measured]:
+        return [between(ahead.place[0], piece) for piece in cells(ahead, given)]
+
+    attributes = in_memory(live, attributes_of, ahead, given)
+    read = _searched(classification, live, in_memory(live, measured, ahead, given))
     if not march.joins:
         fronts, backs = read[::2], read[1::2]
     else:
@@ -226,32 +250,3 @@ def _measured_over(
         backs = [*inner, jax.tree.map(lambda leaf: leaf[1:], joints)]
         fronts = [jax.tree.map(lambda leaf: leaf[:-1], joints), *inner]
     return [classification.spanned(*each) for each in zip(attributes, fronts, backs, strict=True)]
-
-
-def _kept(
-    march: March, at: Progress, opacity: list[Scalar], until: Int[Array, " rays"] | None
-) -> tuple[Int[Array, " rays"], Bool[Array, " rays"]]:
-    """How many of a segment's cells each ray keeps, and whether the last of them shifts it. A ray with a
-    shift ahead goes no farther than its next transparent cell, after which its samples lie elsewhere."""
-    left = march.most_samples - at.index
-    if until is not None:
-        left = jnp.clip(until - at.index, 0, left)
-    cells = opacity[0].shape[0]
-    # cell by cell, back to front: a reduction over all of them would be a loop of its own
-    first = jnp.full_like(left, cells + 1)
-    for k in reversed(range(cells)):
-        transparent = jnp.all(jnp.stack([alpha[k] for alpha in opacity]) == 0, axis=0)
-        first = jnp.where(transparent, k + 1, first)
-    shifts = ~regular_from_here(at) & (first <= jnp.minimum(left, cells))
-    return jnp.minimum(jnp.where(shifts, first, cells), left), shifts
-
-
-def _truncated(samples: Samples, kept: Int[Array, " rays"], ray: Ray) -> Samples:
-    """The samples, with all cells but the first `kept` made transparent and put beyond the exit."""
-    keeps = jnp.arange(samples.number, dtype=kept.dtype)[:, None] < kept[None]
-    cells = [
-        eqx.tree_at(lambda cell: cell.front, cell, jnp.where(keeps, cell.front, ray.length[None]))
-        for cell in samples.cells
-    ]
-    opacity = [jnp.where(keeps, alpha, 0) for alpha in samples.opacity]
-    return samples._replace(cells=cells, opacity=opacity)

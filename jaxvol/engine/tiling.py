@@ -14,6 +14,9 @@ from ..xla.platform import on_gpu
 Adjoint: TypeAlias = Literal["replay", "forward", "direct"]
 
 
+GROUPS_OF_BEAM = 4
+"""Groups of a beam, 2 x 2 of a camera's pixels."""
+
 LEAST_BATCH = 72
 """Groups that are marched at a time in a small image: 1152 rays, whose kernels still take longer than their
 launch. (Two CPU cores, the engine: images of 64², 128² and 256² pixels take 0.67, 0.68 and 0.89 of the time

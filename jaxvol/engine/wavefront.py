@@ -5,8 +5,8 @@
   refilled from the groups that are left. Idle lanes cost as much as working ones.
 - On a GPU, to find out how many are left costs more than some idle lanes: a batch, of as many rays as keep it
   busy, is marched by a known number of segments (`Tiling.turns`), and refilled after each.
-- The segment of a ray that may still shift (`Transform.shift`) ends at its next transparent cell. As soon as
-  a batch has no such rays left, it takes whole segments without that test.
+- Where a ray shifts (`Transform.shift`) is found before it is marched (`shifts`), so that all of its cells
+  are known. Through bricks, whose voxels are not there before, it is found on the way, cell by cell.
 - Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments.
 
 None of it shows in an image: cells, transforms and compositing are those of `ray`. (Measured on CPU.)
@@ -21,23 +21,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..compositing.blending import Outputs, Weighting
-from ..march.beams import Box, EmptySpaceIndex
-from ..march.march import March
-from ..ray import Progress, Scene, begin, front, is_sample, measure, move, opacity, pieces
-from ..scene.occupancy import Occupancy
+from ..march.beams import Skips
+from ..march.march import CellRules
+from ..ray import NEVER, Progress, Scene, Track, front, move
 from ..scene.space import Ray
 from ..xla.compaction import in_front
-from ..xla.memory import gather
+from ..xla.packing import Layout, Packed
 from ..xla.sharding import varying
-from ..xla.trees import PyTree
-from .rays import RayTiles, vmap_rays
-from .segment import Samples, SampleVisitor, march_segment, regular_from_here
-from .tiling import Tiling
+from ..xla.trees import PyTree, with_fields
+from .rays import vmap_rays
+from .segment import Samples, SampleVisitor, march_segment
+from .tiling import GROUPS_OF_BEAM, Tiling
 
 
-State: TypeAlias = tuple[Progress, tuple[PyTree, PyTree, PyTree]]
-"""Where all rays are, and a visitor's `carry`, `sums` and `total`."""
+Visited: TypeAlias = tuple[PyTree, PyTree, PyTree]
+"""A visitor's `carry`, `sums` and `total`."""
 
 
 class CellRange(NamedTuple):
@@ -46,283 +44,256 @@ class CellRange(NamedTuple):
     first: Int[Array, "*rays"]
     until: Int[Array, "*rays"]
 
-
-class VisibleRangeRecorder(SampleVisitor):
-    """Records each ray's first and last visible cell, over rays of this shape. A ray without any has
-    `until` = 0, and a `first` that is not one of its cells."""
-
-    given = sums = total = None
-    carry: CellRange
-
-    def __init__(self, shape: tuple[int, ...]):
-        self.carry = CellRange(
-            jnp.full(shape, jnp.iinfo(jnp.int32).max, jnp.int32), jnp.zeros(shape, jnp.int32)
-        )
-
-    def visit(
-        self, ray: Ray, at: Progress, samples: Samples, given: None, carry: CellRange, total: None
-    ) -> tuple[CellRange, None, None]:
-        begin = at.index[None] + jnp.arange(samples.number, dtype=at.index.dtype)[:, None]
-        visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
-        first = jnp.min(jnp.where(visible, begin, carry.first[None]), axis=0)
-        until = jnp.max(jnp.where(visible, begin + 1, carry.until[None]), axis=0)
-        return CellRange(jnp.minimum(carry.first, first), until), None, None
-
-
-class Beams(eqx.Module):
-    """Rays that are marched together, in groups, of which equally many in a row make up a beam.
-
-    Attributes:
-        rays: of shape (groups, rays in a group).
-        count: number of beams.
-        box: the boxes around the beams.
-        range: where known, the cells outside of which a ray sees nothing, and is not marched.
-    """
-
-    rays: Ray
-    count: int = eqx.field(static=True)
-    box: Callable[[Occupancy], Box] = eqx.field(static=True)
-    range: CellRange | None = None
-
     @classmethod
-    def of(
-        cls, tiles: RayTiles, source: Any, rays: Ray, tile: Int[Array, ""], range: CellRange | None = None
-    ) -> "Beams":
-        """The rays of a tile."""
-        return cls(rays, tiles.beam_count, tiles.box(source, rays, tile), range)
+    def none(cls, shape: tuple[int, ...]) -> "CellRange":
+        """Those of rays without any visible cell."""
+        return cls(jnp.full(shape, NEVER, jnp.int32), jnp.zeros(shape, jnp.int32))
+
+    def widened(self, at: Progress, samples: Samples) -> "CellRange":
+        """The range with those cells of a segment that are visible."""
+        number = at.index[None] + jnp.arange(samples.number, dtype=at.index.dtype)[:, None]
+        visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
+        first = jnp.min(jnp.where(visible, number, NEVER), axis=0)
+        until = jnp.max(jnp.where(visible, number + 1, 0), axis=0)
+        return CellRange(jnp.minimum(self.first, first), jnp.maximum(self.until, until))
+
+
+class Recorded(NamedTuple):
+    """What the first march of rays leaves for the second: the range of their visible cells, where rays leap;
+    and where they shift, where they do."""
+
+    range: CellRange | None
+    shifted: Int[Array, "*rays"] | None
+
+
+class Marched(NamedTuple):
+    """What marching a tile's rays found, of shape (groups, rays in a group)."""
+
+    lanes: Packed
+    track: Track
+    total: PyTree
+    """Of the visitor."""
 
     @property
-    def groups(self) -> int:
-        return self.rays.length.shape[0]
+    def at(self) -> Progress:
+        """Where the rays end."""
+        return vmap_rays(_progress)(self.lanes.tree, self.track)
+
+    @property
+    def range(self) -> CellRange | None:
+        """The range of each ray's visible cells, if it was asked for."""
+        return self.lanes.tree.range
+
+    @property
+    def visited(self) -> Visited:
+        """What the visitor did."""
+        lanes = self.lanes.tree
+        return lanes.carry, lanes.sums, self.total
+
+
+class Lanes(NamedTuple):
+    """What of rays changes while they are marched."""
+
+    index: Int[Array, "*rays"]
+    composite: PyTree
+    stats: Any
+    finished: Bool[Array, "*rays"]
+    shifted: Int[Array, "*rays"] | None
+    range: CellRange | None
+    carry: PyTree
+    sums: PyTree
 
 
 class Job(NamedTuple):
     """What does not change while the rays of a tile are marched.
 
     Attributes:
-        skip_to: of the `EmptySpaceIndex`, asked about these beams; None where no empty space is known.
-        resumable: whether rays that are finished stay where they are, so that they can go on from there; and
-            `exact`: whether they take no cell behind the last one of their range.
+        rays: the constants of rays: `Ray`, `Track`, and the visitor's `given`.
+        groups: how many there are.
+        skips, shifts: as for `march_rays`.
     """
 
     scene: Scene
-    beams: Beams
     tiling: Tiling
+    rays: Packed
+    groups: int
     visitor: SampleVisitor | None
-    skip_to: Callable[..., Array] | None
-    resumable: bool = False
-    exact: bool = False
+    skips: Skips | None
+    shifts: bool
 
-    def alive(self, at: Progress) -> Bool[Array, "*rays"]:
-        """Rays that are not finished, and may take more samples."""
-        return ~at.finished & (at.index < self.scene.march.most_samples)
+    @property
+    def rules(self) -> CellRules:
+        """Those of the march."""
+        rules: Any = self.scene.march
+        return rules
 
-    def shifts(self, at: Progress) -> Bool[Array, "*rays"]:
-        """Rays that are alive and still have a shift ahead."""
-        return self.alive(at) & ~regular_from_here(at)
+
+def alive(at: Progress) -> Bool[Array, "*rays"]:
+    """Rays that are not finished, and may take more samples."""
+    return ~at.finished & (at.index < at.track.until)
 
 
 def march_rays(
     scene: Scene,
-    index: EmptySpaceIndex | None,
-    beams: Beams,
+    rays: Ray,
+    start: Progress,
     tiling: Tiling,
-    outputs: Outputs | None = "all",
+    skips: Skips | None = None,
     visitor: SampleVisitor | None = None,
-    resumed: Progress | None = None,
-    exact: bool = False,
-) -> State:
-    """Marches all rays to their ends. Returns where they end, of shape (groups, rays in a group), with these
-    outputs or nothing but opacity; and the visitor's `carry`, `sums` and `total`.
+    *,
+    record: bool = False,
+    shifts: bool = False,
+) -> Marched:
+    """Marches rays to their ends.
 
-    `resumed`: where rays have come to, if not at their entries. Then `beams.range` says which of their cells
-    are marched, and `index` is asked about these alone; a ray ends where they do, or up to a segment behind,
-    and is `finished` there; or, if `exact`, just where they do."""
-    march, rays = scene.march, beams.rays
-    visible, skip_to = rays.length > 0, None
-    if index is not None:
-        prepared = index.prepare(beams.box, tiling.cells * march.step)
-        seen = jnp.broadcast_to(index.any_visible(prepared), (beams.count,))
-        visible &= jnp.repeat(seen, beams.groups // beams.count)[:, None]
-        skip_to = partial(index.skip_to, prepared)
-    if resumed is None:
-        at = vmap_rays(lambda ray: begin(scene, ray, outputs))(rays)
-        at = with_fields(at, finished=~visible)
-    else:
-        at = resumed
-    # A shortcut: a ray with a shift ahead is put behind its first cell if that is transparent. Not for a
-    # `Selection`, to which such cells may matter; not where rays leap, since a leap shifts them, too; not for
-    # a visitor, which must see every sample.
-    weighs = isinstance(scene.compositing, Weighting)
-    if march.may_shift and weighs and index is None and visitor is None and resumed is None:
-        at = vmap_rays(partial(_past_first_cell, scene))(rays, at)
-    if beams.range is not None:
-        first, until = beams.range
-        if resumed is not None:
-            first = jnp.where(visible, first, until)
-        # `first` is not a valid index for rays that see nothing: these are finished before, and so not moved.
-        at = finished_after(beams.range, at)
-        at = vmap_rays(partial(_moved, march))(rays, at, jnp.maximum(first - at.index, 0))
-        at = finished_after(beams.range, at)
-    visited = (None, None, None) if visitor is None else (visitor.carry, visitor.sums, visitor.total)
-    state: State = varying((at, visited), rays)
-    return _march_all(Job(scene, beams, tiling, visitor, skip_to, resumed is not None, exact), state)
+    Args:
+        scene: prepared, with the `rules` of its march in the march's place.
+        rays: of shape (groups, rays in a group); equally many groups in a row make up a beam.
+        start: where they are.
+        skips: where their beams see nothing, if that is known.
+        record: whether to record the range of each ray's visible cells.
+        shifts: whether rays find on their way where they shift.
+    """
+    if shifts:  # a cell at a time, since those behind a transparent one lie elsewhere
+        tiling = tiling._replace(cells=1)
+    given, carry, sums, total = None, None, None, None
+    if visitor is not None:
+        given, carry, sums, total = visitor.given, visitor.carry, visitor.sums, visitor.total
+    track, shifted = start.track, None
+    if shifts:
+        track, shifted = with_fields(track, shifted=None), track.shifted
+    range_ = CellRange.none(start.index.shape) if record else None
+    fixed = rays, track, given
+    lanes = Lanes(start.index, start.composite, start.stats, start.finished, shifted, range_, carry, sums)
+    lanes, total = varying((lanes, total), rays)
+    job = Job(scene, tiling, Layout.of(fixed).pack(fixed), rays.length.shape[0], visitor, skips, shifts)
+    going = jnp.any(alive(start), axis=-1)
+    packed, total = _march_all(job, Layout.of(lanes).pack(lanes), total, going)
+    return Marched(packed, track, total)
 
 
-def _march_all(job: Job, state: State) -> State:
+def _progress(lanes: Lanes, track: Track) -> Progress:
+    """Where one ray is."""
+    if lanes.shifted is not None:
+        track = with_fields(track, shifted=lanes.shifted)
+    return Progress(lanes.index, lanes.composite, lanes.stats, lanes.finished, track)
+
+
+def _march_all(job: Job, lanes: Packed, total: PyTree, going: Bool[Array, " groups"]) -> tuple[Packed, PyTree]:
     """Marches groups for as long as any of their rays is alive, in rounds of batches."""
-    size = job.tiling.batch_of(job.beams.groups)
+    size = job.tiling.batch_of(job.groups)
     enough = int(job.tiling.min_alive * size)
 
-    def round_(state: tuple[State, Bool[Array, " groups"]]) -> tuple[State, Bool[Array, " groups"]]:
-        rows, count = in_front(state[1]), jnp.sum(state[1], dtype=jnp.int32)
+    def round_(state: Any) -> Any:
+        # of floats, which XLA adds with SIMD
+        rows, count = in_front(state[2]), jnp.sum(state[2].astype(jnp.float32)).astype(jnp.int32)
         # only full batches, as long as there are any: what remains joins those of the next round
         batches = 1 if job.tiling.turns else jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, enough, 0)
 
-        def one(i: Int[Array, ""], state: tuple[State, Array]) -> tuple[State, Array]:
+        def one(i: Int[Array, ""], state: Any) -> Any:
+            packed, total, going = state
             some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
-            after, going = _march_batch(job, some, state[0], keep)
-            return after, state[1].at[some].set(going, mode="drop")
+            packed, total, living = _march_batch(job, some, packed, total, keep)
+            return packed, total, going.at[some].set(living, mode="drop", unique_indices=True)
 
         return jax.lax.fori_loop(0, batches, one, state)
 
-    going = jnp.any(job.alive(state[0]), axis=-1)
-    return jax.lax.while_loop(lambda state: jnp.any(state[1]), round_, (state, going))[0]
+    start = lanes, total, going
+    packed, total, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), round_, start)
+    return packed, total
 
 
 def _march_batch(
-    job: Job, rows: Int[Array, " batch"], state: State, keep: Int[Array, ""]
-) -> tuple[State, Bool[Array, " batch"]]:
+    job: Job, rows: Int[Array, " batch"], packed: Packed, total: PyTree, keep: Int[Array, ""]
+) -> tuple[Packed, PyTree, Bool[Array, " batch"]]:
     """Marches the groups in these rows by `Tiling.turns` segments, or else while more than `keep` of them are
     alive, and tells which still are. A row past the last one stands for no group."""
-    tiling, beams, visitor = job.tiling, job.beams, job.visitor
-    size, group = rows.size, tiling.group
-    known = jnp.minimum(rows, beams.groups - 1)
-    beam = jnp.repeat(known // (beams.groups // beams.count), group)
+    tiling, group = job.tiling, job.tiling.group
+    known = jnp.minimum(rows, job.groups - 1)
+    beam = jnp.repeat(known // GROUPS_OF_BEAM, group)
+    taken, lanes = job.rays.take(known), packed.take(known).tree
+    none = jnp.repeat(rows >= job.groups, group)
+    lanes = lanes._replace(finished=lanes.finished | none)
 
-    def take(leaf: Array) -> Array:
-        # flat, so that the loop changes it in place: a reshape in there would copy it
-        return gather(leaf, known).reshape(-1, *leaf.shape[2:])
-
-    def grouped(part: Array) -> Array:
-        return part.reshape(size, group, *part.shape[1:])
-
-    def scatter(leaf: Array, part: Array) -> Array:
-        return leaf.at[rows].set(grouped(part), mode="drop")
-
-    def scatter_add(leaf: Array, part: Array) -> Array:
-        return leaf.at[rows].add(grouped(part), mode="drop")
-
-    at, (carry, sums, total) = state
-    given = None if visitor is None else visitor.given
-    rays, here, range_, given, carried = jax.tree.map(take, (beams.rays, at, beams.range, given, carry))
-    here = with_fields(here, finished=here.finished | jnp.repeat(rows >= beams.groups, group))
-    added = jax.tree.map(lambda leaf: jnp.zeros((size * group, *leaf.shape[2:]), leaf.dtype), sums)
-    added = varying(added, rays)
-
-    def groups(rays: Bool[Array, " rays"]) -> Bool[Array, " batch"]:
+    def living(lanes: Lanes) -> Bool[Array, " batch"]:
+        _, track, _ = taken.tree
+        rays = ~lanes.finished & (lanes.index < track.until)
         # XLA finds the maximum of floats with SIMD, but looks at one truth value after the other
-        return jnp.max(grouped(rays.astype(jnp.float32)), axis=-1) > 0
+        return jnp.max(rays.astype(jnp.float32).reshape(-1, group), axis=-1) > 0
 
-    def enough(here: Progress) -> Bool[Array, ""]:
-        return jnp.sum(groups(job.alive(here))) > keep
+    def advance(state: tuple[Lanes, PyTree]) -> tuple[Lanes, PyTree]:
+        lanes, total = state
+        rays, track, given = taken.tree
+        here = _to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
+        after, samples = march_segment(job.scene, tiling, taken, here, shifts=job.shifts)
+        carry, sums = lanes.carry, lanes.sums
+        if job.visitor is not None:
+            carry, found, total = job.visitor.visit(rays, here, samples, given, carry, total)
+            sums = jax.tree.map(jnp.add, sums, found)
+        range_ = None if lanes.range is None else lanes.range.widened(here, samples)
+        shifted = after.track.shifted if job.shifts else None
+        moved = after.index, after.composite, after.stats, after.finished, shifted
+        return Lanes(*moved, range_, carry, sums), total
 
-    def advance(state: State, *, regular: bool) -> State:
-        here, (carried, added, total) = state
-        here = finished_after(range_, _to_next_cell(job, beam, rays, here, range_))
-        until = range_.until if job.exact and range_ is not None else None
-        after, samples = march_segment(job.scene, tiling, rays, here, regular=regular, until=until)
-        if job.resumable:
-            after = _staying(here, after)
-        if visitor is not None:
-            carried, found, total = visitor.visit(rays, here, samples, given, carried, total)
-            added = jax.tree.map(jnp.add, added, found)
-        return finished_after(range_, after), (carried, added, total)
-
-    def turn(_: Int[Array, ""], state: State) -> State:
-        here, visited = state
-        over = ~job.alive(here)  # those out of samples, too: they must not take more
-        after, visited = advance((with_fields(here, finished=over), visited), regular=not may_end)
-        return with_fields(after, finished=jnp.where(over, here.finished, after.finished)), visited
-
-    # segments in which a ray may shift, or run out of samples, cost a tenth more: so as few as possible
-    limited = job.scene.march.max_samples is not None or job.exact
-    may_end = limited or job.scene.march.may_shift
-    marched: State = here, (carried, added, total)
+    state = lanes, total
     if tiling.turns:
-        marched = jax.lax.fori_loop(0, tiling.turns, turn, marched)
+        state = jax.lax.fori_loop(0, tiling.turns, lambda _, state: advance(state), state)
     else:
-        if may_end:
-            marched = jax.lax.while_loop(
-                lambda state: enough(state[0]) & (limited | jnp.any(job.shifts(state[0]))),
-                partial(advance, regular=False),
-                marched,
-            )
-        if not limited:
-            marched = jax.lax.while_loop(
-                lambda state: enough(state[0]), partial(advance, regular=True), marched
-            )
-    here, (carried, added, total) = marched
-    visited = jax.tree.map(scatter, carry, carried), jax.tree.map(scatter_add, sums, added), total
-    return (jax.tree.map(scatter, at, here), visited), groups(job.alive(here))
+        def going(state: tuple[Lanes, PyTree]) -> Bool[Array, ""]:
+            return jnp.sum(living(state[0]).astype(jnp.float32)) > keep.astype(jnp.float32)
+
+        state = jax.lax.while_loop(going, advance, state)
+    lanes, total = state
+    return packed.put(rows, lanes), total, living(lanes)
 
 
-def with_fields(at: Progress, **changes: PyTree) -> Progress:
-    """`at` with other values for these fields, of many rays (`dataclasses.replace` would check the shapes of
-    one)."""
-    return eqx.tree_at(lambda at: [getattr(at, name) for name in changes], at, list(changes.values()))
+def blinded(skips: Skips | None, at: Progress) -> Progress:
+    """Finishes the rays of beams along which nothing is visible."""
+    if skips is None:
+        return at
+    groups = at.finished.shape[0]
+    seen = jnp.broadcast_to(skips.any_visible(), (groups // GROUPS_OF_BEAM,))
+    return with_fields(at, finished=at.finished | ~jnp.repeat(seen, GROUPS_OF_BEAM)[:, None])
 
 
-def finished_after(range_: CellRange | None, at: Progress) -> Progress:
-    """Finishes rays that have passed the end of their range."""
-    return at if range_ is None else with_fields(at, finished=at.finished | (at.index >= range_.until))
+def into_range(
+    scene: Scene, rays: Ray, at: Progress, range_: CellRange, *, shifts: bool = False
+) -> Progress:
+    """Moves rays to the first cell of their range, in front of which all cells are transparent. They take no
+    cell behind its last one."""
+    first, until = range_
+    at = eqx.tree_at(lambda at: at.track.until, at, jnp.minimum(until, at.track.until))
+    # of rays that see nothing, `first` is no index
+    steps = jnp.where(first < until, jnp.maximum(first - at.index, 0), 0)
+    return vmap_rays(partial(_moved, scene.march, transparent=_clear(shifts)))(rays, at, steps)
 
 
-def _staying(here: Progress, after: Progress) -> Progress:
-    """`after`, but rays that were finished before keep their position."""
-    names = "index", "offset", "shift"
-    there, moved = ({n: getattr(at, n) for n in names if getattr(at, n) is not None} for at in (here, after))
-    return with_fields(after, **jax.tree.map(partial(jnp.where, here.finished), there, moved))
+def _clear(shifts: bool) -> Bool[Array, ""] | None:
+    """What `move` is told of transparent cells."""
+    return jnp.ones((), bool) if shifts else None
 
 
-def _past_first_cell(scene: Scene, ray: Ray, at: Progress) -> Progress:
-    """Moves a ray past its first cell if that is transparent. Most rays begin in empty space and would shift
-    there, and so use one cell of their first segment only."""
-    march, cut = scene.march, pieces(scene, ray, at)
-    alphas = [opacity(scene, ray, piece, measure(scene, ray, piece)) for piece in cut]
-    moves = jnp.all(jnp.stack(alphas) == 0) & ~at.finished
-    moved = move(march, ray, at, jnp.ones((), bool), 1)
-    if moved.stats is not None:
-        count = jnp.sum(jnp.stack([is_sample(march, ray, piece, divided=len(cut) > 1) for piece in cut]))
-        samples = moved.stats.samples + count.astype(moved.stats.samples.dtype)
-        moved = eqx.tree_at(lambda moved: moved.stats.samples, moved, samples)
-    return jax.tree.map(lambda a, b: jnp.where(moves, a, b), moved, at)
-
-
-def _moved(march: March, ray: Ray, at: Progress, steps: Int[Array, ""]) -> Progress:
-    """Moves a ray on by so many steps, whose cells are all transparent."""
-    moved = move(march, ray, at, jnp.ones((), bool), steps)
+def _moved(march: Any, ray: Ray, at: Progress, steps: Int[Array, ""], *, transparent: Any) -> Progress:
+    """Moves a ray on by so many steps, whose cells are all transparent. `transparent`: as for `move`."""
+    moved = move(march, ray, at, transparent, steps)
     return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
 
-def _to_next_cell(
-    job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress, range_: CellRange | None
-) -> Progress:
+def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
     """Moves rays to their next cell that is not proven empty."""
-    if job.skip_to is None:
+    if job.skips is None:
         return at
-    steps = _leap(job.scene.march, partial(job.skip_to, beam), rays, at)
-    if range_ is not None:  # behind it, nothing is known
-        steps = jnp.minimum(steps, jnp.maximum(range_.until - at.index, 0))
-    return jax.vmap(partial(_moved, job.scene.march))(rays, at, steps)
+    steps = _leap(job.rules, partial(job.skips.skip_to, beam), rays, at)
+    return jax.vmap(partial(_moved, job.rules, transparent=_clear(job.shifts)))(rays, at, steps)
 
 
-def _leap(march: March, skip_to: Callable[..., Array], rays: Ray, at: Progress) -> Int[Array, " rays"]:
+def _leap(march: CellRules, skip_to: Callable[..., Array], rays: Ray, at: Progress) -> Int[Array, " rays"]:
     """Steps to the first cell that is not proven empty. Where there is none, they end past the exit."""
     here = front(march, at)
     there = skip_to(rays, here)
     whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
+    left = jnp.maximum(at.track.until - at.index, 0)
     # clipped before it becomes an integer, whose range it may exceed
-    steps = jnp.clip(whole, 0, march.most_samples).astype(at.index.dtype)
-    return jnp.minimum(steps, march.most_samples - at.index)
+    steps = jnp.clip(whole, 0, left.astype(whole.dtype)).astype(left.dtype)
+    return jnp.minimum(steps, left)

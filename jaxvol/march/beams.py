@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import Index, Occupancy, Sums
 from ..scene.space import Ray
+from ..xla.memory import gather
 from ..xla.platform import on_gpu
 from ..xla.sharding import varying
 
@@ -26,20 +27,29 @@ STRETCHES = 128
 ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
 
 
+class Skips(eqx.Module):
+    """Where nothing is visible along the rays of some beams."""
+
+    @abstractmethod
+    def any_visible(self) -> Bool[Array, "*beams"]:
+        """Whether anything may be visible along each beam."""
+
+    @abstractmethod
+    def skip_to(self, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
+        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+
+
 class EmptySpaceIndex(eqx.Module):
     """Where nothing is visible, for beams of rays."""
 
     @abstractmethod
-    def prepare(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Any:
-        """What the other methods need, from the boxes around beams. `stretch`: the shortest useful leap."""
+    def skips(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Skips:
+        """That along beams, from the boxes around them. `stretch`: the shortest useful leap."""
 
-    @abstractmethod
-    def any_visible(self, prepared: Any) -> Bool[Array, "*beams"]:
-        """Whether anything may be visible along each beam."""
-
-    @abstractmethod
-    def skip_to(self, prepared: Any, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
-        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+    @property
+    def unshaped(self) -> "EmptySpaceIndex":
+        """The same index, so that its kernel knows no numbers of cells, if that is possible."""
+        return self
 
     def within_ranges(self) -> "EmptySpaceIndex":
         """What is of use where each ray's first and last visible cell are known."""
@@ -88,8 +98,8 @@ class Box(eqx.Module):
         """The box of all camera rays between a beam's corner rays, by beam and corner; origins count from the
         anchor."""
         origin, direction = jax.lax.stop_gradient((origin, direction))
-        frame, shape = occupancy.frame, occupancy.occupied.shape
-        x, y, z = (size * n for size, n in zip(occupancy.size, shape, strict=True))
+        frame, shape = occupancy.frame, occupancy.shape
+        x, y, z = (size * jnp.asarray(n, size.dtype) for size, n in zip(occupancy.size, shape, strict=True))
         spans = x, y, z
         x, y, z = (low + span / 2 for low, span in zip(occupancy.origin, spans, strict=True))
         center = frame.vector((x, y, z))
@@ -136,13 +146,31 @@ class Box(eqx.Module):
         return low, high
 
 
-class Stretches(eqx.Module):
+class Stretches(Skips):
     """The stretches of beams, each of this `length`, from the distance `near` of the ray origins on."""
 
     near: Float[Array, " beams"]
     length: Scalar
     following: Int[Array, "stretches beams"]
     """For each stretch, the first one from there on that is not empty, or their number."""
+
+    @classmethod
+    def nowhere(cls, beams: int, like: Array) -> "Stretches":
+        """Those of beams in which nothing is known to be empty. `like`: an array of the type of depths."""
+        none = jnp.zeros((STRETCHES, beams), jnp.int32)
+        return cls(jnp.zeros(beams, like.dtype), jnp.full((), jnp.inf, like.dtype), none)
+
+    def any_visible(self) -> Bool[Array, " beams"]:
+        return self.following[0] < self.following.shape[0]
+
+    def skip_to(self, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
+        count, beams = self.following.shape
+        near = gather(self.near, beam)
+        position = (rays.t_in + depth - near) / self.length
+        stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
+        following = gather(self.following.reshape(-1), stretch * beams + beam)
+        begin = near + following.astype(depth.dtype) * self.length - rays.t_in
+        return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
 
 
 def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> Stretches:
@@ -156,7 +184,8 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
     def occupied(at: Int[Array, ""]) -> Bool[Array, " beams"]:
         first = at.astype(length.dtype) * length
         low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
-        shape, inside = occupancy.occupied.shape, first < across
+        shape = [jnp.asarray(n, first.dtype) for n in occupancy.shape]
+        inside = first < across
         for a, b, n in zip(low, high, shape, strict=True):
             inside &= (b >= 0) & (a <= n)
 

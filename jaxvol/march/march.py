@@ -6,11 +6,15 @@ the last may reach past the exit. A transform is one idea of one paper: it overr
 `Transform`, the seams. At each seam the answers of all transforms are combined, so that they compose.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar, Literal, TypeAlias, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import check_answer, described, integer, number
 from .._util.texts import pasted
@@ -85,10 +89,89 @@ class Transform(eqx.Module):
         """Whether the ray is finished, given the answer of the transforms before."""
         return stopped
 
+    def rules(self, rules: "CellRules") -> "CellRules | None":
+        """The rules with what `cut` and `stop` do as numbers, so that marches with and without this
+        transform share a program. None, the default where it overrides either: unknown."""
+        seams = "cut", "stop"
+        plain = all(getattr(type(self), seam) is getattr(Transform, seam) for seam in seams)
+        return rules if plain else None
+
+    @property
+    def reads_labels(self) -> bool:
+        """Whether `cut` reads the volume's labels."""
+        return False
+
     @property
     def tested_every(self) -> int | None:
         """After how many samples rays that are finished are looked for, and left out; None: any number."""
         return None
+
+
+class CellRules(eqx.Module):
+    """How the kernel of a march cuts rays into cells, and ends them. What the library's transforms do is
+    numbers here, so that all subsets of them, and both quadratures that sample, share a program.
+
+    Attributes:
+        step: distance between samples, world length.
+        place: where in its cell a sample lies, from 0, its front, to 1.
+        entry: depth before which cells are cut; minus infinity if they are not.
+        at_exit: whether cells are cut at the exit.
+        opacity_left: transmittance at or below which rays end; negative: never.
+        most_samples: of a ray.
+        divide: cuts a cell at what lies within; None if nothing does.
+        custom: transforms that cut or stop in ways of their own. If there are any, all are here, and only
+            `step`, `place` and `most_samples` count beside them.
+    """
+
+    step: Float[Array, ""]
+    place: Float[Array, ""] | np.ndarray
+    entry: Float[Array, ""] | np.ndarray
+    at_exit: Bool[Array, ""] | np.ndarray
+    opacity_left: Float[Array, ""] | np.ndarray
+    most_samples: Int[Array, ""] | np.ndarray
+    integrates: bool = eqx.field(static=True)
+    divide: Callable[[Cell, Ray, Volume], tuple[Cell, ...]] | None = eqx.field(static=True, default=None)
+    custom: tuple[Transform, ...] = ()
+
+    @property
+    def joins(self) -> bool:
+        """Whether pieces touch: see `Transform`."""
+        return all(transform.joins for transform in self.custom)
+
+    def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+        """The pieces of a cell."""
+        if self.custom:
+            return cut_by(self.custom, cell, ray, volume)
+        cell = cut_at_exit(cut_at_entry(cell, self.entry), ray, self.at_exit)
+        return (cell,) if self.divide is None else self.divide(cell, ray, volume)
+
+    def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
+        """Whether a ray with this much transmittance left ends before its exit."""
+        return stop_by(self.custom, transmittance) if self.custom else transmittance <= self.opacity_left
+
+    def sample(self, cell: Cell) -> Scalar:
+        """Depth at which a cell is sampled; of one that is integrated, its middle."""
+        return cell.front + cell.width * self.place
+
+    def ends(self, cell: Cell, ray: Ray) -> tuple[Scalar, Scalar]:
+        """Depths of a cell's front and back, neither before the entry nor past the exit."""
+        return within(ray, cell.front), within(ray, cell.front + cell.width)
+
+    @property
+    def moving(self) -> "CellRules":
+        """What has a gradient; None in place of all else."""
+        return eqx.filter(self, self._moves)
+
+    @property
+    def constant(self) -> "CellRules":
+        """What has none; None in place of all else."""
+        return eqx.filter(self, self._moves, inverse=True)
+
+    @property
+    def _moves(self) -> Any:
+        none = jax.tree.map(lambda _: False, self)
+        floats = jax.tree.map(eqx.is_inexact_array, self.custom)
+        return eqx.tree_at(lambda rules: (rules.step, rules.custom), none, (True, floats))
 
 
 class March(eqx.Module):
@@ -220,24 +303,35 @@ class March(eqx.Module):
         return jnp.clip(shift, -1, 0)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        pieces = (cell,)
-        for transform in self.transforms:
-            divided = [transform.cut(piece, ray, volume) for piece in pieces]
-            for cells in divided:
-                _check_kind(transform, "cut", cells, tuple)
-                if not cells:
-                    raise ValueError(f"{type(transform).__name__}.cut must return at least one Cell; got ().")
-                for each in cells:
-                    _check_kind(transform, "cut", each, Cell)
-            pieces = tuple(each for cells in divided for each in cells)
-        return pieces
+        return cut_by(self.transforms, cell, ray, volume)
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
         """Whether a ray with this much transmittance left ends before its exit."""
-        stopped = jnp.zeros(jnp.shape(transmittance), bool)
+        return stop_by(self.transforms, transmittance)
+
+    @property
+    def rules(self) -> CellRules:
+        """How the kernel cuts and ends rays."""
+        dtype = self.step.dtype
+        middle = 0.0 if self.quadrature == "left" else 0.5
+        place, entry, left = (np.asarray(number, dtype) for number in (middle, -np.inf, -1))
+        most = np.asarray(self.most_samples, np.int32)
+        plain = found = CellRules(
+            self.step, place, entry, np.asarray(False), left, most, self.integrates
+        )
         for transform in self.transforms:
-            stopped = _checked(transform, "stop", transform.stop(stopped, transmittance), stopped)
-        return stopped
+            answer = transform.rules(found)
+            if answer is None:
+                return replace(plain, custom=self.transforms)
+            found = answer
+        # rays have gaps only where a transform places or clips the volume
+        gaps = self.overriding("locate") or self.overriding("clip")
+        return found if gaps or self.reads_labels else replace(found, divide=None)
+
+    @property
+    def reads_labels(self) -> bool:
+        """Whether cells are cut at the faces of labels."""
+        return any(transform.reads_labels for transform in self.transforms)
 
     @property
     def integrates(self) -> bool:
@@ -259,6 +353,47 @@ class March(eqx.Module):
     def ends(self, cell: Cell, ray: Ray) -> tuple[Scalar, Scalar]:
         """Depths of a cell's front and back, neither before the entry nor past the exit."""
         return within(ray, cell.front), within(ray, cell.front + cell.width)
+
+
+def cut_by(transforms: tuple[Transform, ...], cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+    """The pieces into which transforms divide a cell, one after the other."""
+    pieces = (cell,)
+    for transform in transforms:
+        divided = [transform.cut(piece, ray, volume) for piece in pieces]
+        for cells in divided:
+            _check_kind(transform, "cut", cells, tuple)
+            if not cells:
+                raise ValueError(f"{type(transform).__name__}.cut must return at least one Cell; got ().")
+            for each in cells:
+                _check_kind(transform, "cut", each, Cell)
+        pieces = tuple(each for cells in divided for each in cells)
+    return pieces
+
+
+def stop_by(transforms: tuple[Transform, ...], transmittance: Scalar) -> Bool[Array, ""]:
+    """Whether transforms end a ray with this much transmittance left."""
+    stopped = jnp.zeros(jnp.shape(transmittance), bool)
+    for transform in transforms:
+        stopped = _checked(transform, "stop", transform.stop(stopped, transmittance), stopped)
+    return stopped
+
+
+def cut_at_entry(cell: Cell, entry: Any = 0) -> Cell:
+    """The cell without what lies before this depth; a cell may end there, and has width 0 then."""
+    # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
+    front = jnp.where(cell.front > entry, cell.front, entry)
+    left = cell.width - (front - cell.front)
+    return Cell(front, jnp.where(left > 0, left, 0), cell.cut)
+
+
+def cut_at_exit(cell: Cell, ray: Ray, cuts: Any = True) -> Cell:
+    """The cell without what lies past the ray's exit, if it `cuts`."""
+    back = cell.front + cell.width
+    # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
+    left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
+    # also if it ends exactly at the exit: its width, and the gradient of that, then depend on the exit
+    width = jnp.where(cuts & (back >= ray.length), left, cell.width)
+    return Cell(cell.front, width, cell.cut | (cuts & (back > ray.length)))
 
 
 def within(ray: Ray, depth: Scalar) -> Scalar:

@@ -28,6 +28,7 @@ from .._util.checks import (
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
 from ..xla.platform import in_numpy, is_traced
+from ..xla.trees import unchecked
 from .space import Line
 from .volume import Volume
 
@@ -287,17 +288,20 @@ class Camera(eqx.Module):
         """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
         return self.ray_from(None, column, row)
 
-    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any) -> tuple[Vec3, Vec3]:
+    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any, size: Any = None) -> tuple[Vec3, Vec3]:
         """As `ray`, with an origin that counts from `anchor`."""
-        beside, direction = self.beside(column, row)
+        beside, direction = self.beside(column, row, size)
         place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
         return place if beside is None else plus(place, beside), direction
 
-    def beside(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3 | None, Vec3]:
-        """How far beside the position a pixel's ray begins, if not there, and its unit direction."""
+    def beside(
+        self, column: Num[Array, ""] | float, row: Num[Array, ""] | float, size: Any = None
+    ) -> tuple[Vec3 | None, Vec3]:
+        """How far beside the position a pixel's ray begins, if not there, and its unit direction. `size`: of
+        the image, in place of the camera's, where it is traced."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
-        x, y = self._column(column + 0.5), self._row(row + 0.5)
+        x, y = self._column(column + 0.5, size), self._row(row + 0.5, size)
         right, up, forward = (apart(axis) for axis in axes_of(self))
         scale = self.parallel_scale
         if scale is not None:
@@ -338,14 +342,21 @@ class Camera(eqx.Module):
         left, top = jnp.round(self.corner).astype(jnp.int32)
         return left, top
 
-    def _column(self, column: Any) -> Scalar:
+    def _column(self, column: Any, size: Any = None) -> Scalar:
         """Image-plane x of a column; whole numbers are pixel edges."""
         left, right, _, _ = self.window
-        return left + (right - left) * (column / self.size[0])
+        width, _ = self.size if size is None else size
+        return left + (right - left) * (column / width)
 
-    def _row(self, row: Any) -> Scalar:
+    def _row(self, row: Any, size: Any = None) -> Scalar:
         _, _, bottom, top = self.window
-        return top - (top - bottom) * (row / self.size[1])
+        _, height = self.size if size is None else size
+        return top - (top - bottom) * (row / height)
+
+    @property
+    def unsized(self) -> "Camera":
+        """The camera without its size, so that all sizes have one structure."""
+        return unchecked(self, size=(0, 0))
 
 
 class GivenRays(eqx.Module):

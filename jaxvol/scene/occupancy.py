@@ -23,6 +23,7 @@ from ..xla.memo import memoized
 from ..xla.memory import gather
 from ..xla.platform import on_gpu
 from ..xla.sharding import varying
+from ..xla.trees import unchecked
 from .volume import Volume
 
 
@@ -100,7 +101,9 @@ class Sums(eqx.Module):
     """A summed-volume table: counts the occupied cells of a grid in any box, by eight look-ups."""
 
     table: Int[Array, " entries"]
-    shape: tuple[int, int, int] = eqx.field(static=True)
+    """Those of the grid with one more cell on each axis; then any."""
+    sizes: Int[Array, "3"] | np.ndarray
+    """Number of cells along x, y, z."""
 
     @classmethod
     def of(cls, occupied: Bool[Array, "cx cy cz"]) -> "Sums":
@@ -113,12 +116,11 @@ class Sums(eqx.Module):
             start = varying(jnp.zeros_like(table[0]), table)
             _, sums = jax.lax.scan(lambda total, layer: (total + layer,) * 2, start, table)
             table = jnp.moveaxis(sums, 0, 2)
-        nx, ny, nz = occupied.shape
-        return cls(table.reshape(-1), (nx, ny, nz))
+        return cls(table.reshape(-1), np.asarray(occupied.shape, np.int32))
 
     def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:
         """Whether any cell from `first` to `last` is occupied, both inclusive and inside the grid."""
-        _, ny, nz = (n + 1 for n in self.shape)
+        ny, nz = self.sizes[1] + 1, self.sizes[2] + 1
         x, y, z = (((low, -1), (high + 1, 1)) for low, high in zip(first, last, strict=True))
         count = jnp.zeros((), jnp.int32)
         for (i, sign_i), (j, sign_j), (k, sign_k) in itertools.product(x, y, z):
@@ -129,7 +131,8 @@ class Sums(eqx.Module):
 class Occupancy(eqx.Module):
     """A regular grid of cells. Everything visible lies in an occupied cell of it."""
 
-    occupied: Bool[Array, "cx cy cz"]
+    occupied: Bool[Array, "cx cy cz"] | None
+    """None of what is `unshaped`."""
     origin: Vec3
     """Corner of the grid, along the axes of `frame`, from `anchor` on."""
     size: Vec3
@@ -139,6 +142,22 @@ class Occupancy(eqx.Module):
     """That of the `Space`."""
     known: UInt8[Array, " cells"] | None = None
     """`distance`, where it has been computed before."""
+    sizes: Int[Array, "3"] | np.ndarray | None = None
+    """Number of cells along x, y, z, where it is traced."""
+
+    @property
+    def unshaped(self) -> "Occupancy":
+        """The place of its cells, of which their number is traced."""
+        return unchecked(self, occupied=None, sizes=np.asarray(self.shape, np.int32))
+
+    @property
+    def shape(self) -> tuple[Any, Any, Any]:
+        """Number of cells along x, y, z."""
+        if self.occupied is None:
+            assert self.sizes is not None
+            return self.sizes[0], self.sizes[1], self.sizes[2]
+        nx, ny, nz = self.occupied.shape
+        return nx, ny, nz
 
     def distance(self) -> UInt8[Array, " cells"]:
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""

@@ -245,7 +245,9 @@ class Affine(Space):
         field = volume.field
         self.inner = tuple(map(Affine, field.volumes)) if isinstance(field, Several) else ()
         self.first, self.spacing, self.frame = apart(volume.origin), apart(volume.spacing), volume.frame
-        x, y, z = (step * (n - 1) for step, n in zip(self.spacing, volume.shape, strict=True))
+        x, y, z = (
+            step * jnp.asarray(n - 1, step.dtype) for step, n in zip(self.spacing, volume.shape, strict=True)
+        )
         self.high = x, y, z
 
     @property

@@ -24,6 +24,7 @@ from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
 from ..xla.platform import is_traced
+from ..xla.trees import unchecked
 from .occupancy import Blocks
 from .volume import Volume
 
@@ -292,9 +293,10 @@ class TransferFunction(Transfer):
 
         def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
-            row = tuple(rows[0])
-            for start, following in zip(values[1:], rows[1:], strict=True):
-                row = tuple(jnp.where(value >= start, b, a) for a, b in zip(row, following, strict=True))
+            numbers = range(rows.shape[1])
+            row = tuple(rows[0, j] for j in numbers)
+            for k in range(1, values.shape[0]):  # numbers one by one, since XLA would store whole rows
+                row = tuple(jnp.where(value >= values[k], rows[k, j], row[j]) for j in numbers)
             return linear.interpolate_row(row, linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
 
         return chosen if values.shape[0] <= linear.FEW else looked_up
@@ -369,6 +371,34 @@ def _span_of(rows: Float[Array, "spans 26"], measured: Measured) -> tuple[linear
     return linear.table_row(rows, index), index
 
 
+SHARED_POINTS = 8, 16, 256
+"""Numbers of control points for which programs are compiled."""
+
+
+def with_shared_points(transfer: Any) -> Any:
+    """The same function by one of a few numbers of points: beyond the last one it is constant."""
+    if type(transfer) is not TransferFunction or transfer.values.shape[0] in SHARED_POINTS:
+        return transfer
+    given = transfer.values, transfer.colors, transfer.extinction
+    if not all(isinstance(leaf, jax.Array) and not is_traced(leaf) for leaf in given):
+        return transfer
+    values, colors, extinction = memoized_of(given, _padded)
+    return unchecked(transfer, values=values, colors=colors, extinction=extinction)
+
+
+def _padded(given: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    values, colors, extinction = map(np.asarray, given)
+    missing = min((n for n in SHARED_POINTS if n >= len(values)), default=0) - len(values)
+    if missing <= 0:
+        return given
+    # far enough apart to differ in the float type
+    step = max(float(values[-1] - values[0]) or 1.0, 1e-3 * abs(float(values[-1])))
+    beyond = (values[-1] + step * np.arange(1, missing + 1)).astype(values.dtype)
+    values, extinction = np.append(values, beyond), np.append(extinction, np.repeat(extinction[-1], missing))
+    colors = np.append(colors, np.repeat(colors[-1:], missing, axis=0), axis=0)
+    return jax.device_put((values, colors, extinction))
+
+
 def sized(transfer: Any, volume: Any) -> Any:
     """The transfer function for a volume: where its lengths are counted in voxels, in world length."""
     if type(transfer) is not TransferFunction or not transfer.per_voxel or not hasattr(volume, "spacing"):
@@ -376,10 +406,8 @@ def sized(transfer: Any, volume: Any) -> Any:
     given = transfer.extinction, volume.spacing
     kept = all(isinstance(each, jax.Array) and not is_traced(each) for each in given)
     extinction = memoized_of(given, _in_world_length) if kept else _in_world_length(given)
-    plain = TransferFunction.__new__(TransferFunction)  # unchecked: an optimiser may leave numbers negative
-    for name, value in {**vars(transfer), "extinction": extinction, "per_voxel": False}.items():
-        object.__setattr__(plain, name, value)
-    return plain
+    # an optimiser may leave numbers negative
+    return unchecked(transfer, extinction=extinction, per_voxel=False)
 
 
 @jax.jit

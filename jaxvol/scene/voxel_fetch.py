@@ -75,6 +75,10 @@ class Fetch(eqx.Module):
         """Trilinear interpolation at a grid coordinate."""
         return trilinear(*self.cube(data, coordinate))
 
+    def _stored(self, data: Any) -> tuple[Any, ...]:
+        """Numbers of voxels along the axes of the array."""
+        return data.shape
+
     def shape(self, data: Shaped[Array, "nx ny nz *c"]) -> tuple[int, int, int]:
         """Number of nodes of the grid."""
         if self.window is not None:
@@ -133,14 +137,14 @@ class Fetch(eqx.Module):
 
         def neighbours(offset: int) -> Cube:
             at = list(node)
-            at[axis] = jnp.clip(node[axis] + offset, 0, data.shape[axis] - 2)
+            at[axis] = jnp.clip(node[axis] + offset, 0, self._stored(data)[axis] - 2)
             return _with_first(axis, self.cube_at(data, (at[0], at[1], at[2]), dtype))
 
         def slope(whole: Bool[Array, ""], before: Scalar, after: Scalar) -> Scalar:
             return (after - before) * jnp.where(whole, 1, 0.5).astype(dtype)
 
         # A cube does not reach past the border. There it begins with the first node, or ends with the last.
-        first, last = node[axis] == 0, node[axis] == data.shape[axis] - 2
+        first, last = node[axis] == 0, node[axis] == self._stored(data)[axis] - 2
         (a, b), (c, d) = neighbours(-1), neighbours(1)
         b = jax.tree.map(partial(jnp.where, first), a, b)
         c = jax.tree.map(partial(jnp.where, last), d, c)
@@ -187,6 +191,18 @@ class Extent(Fetch):
         return self.nodes
 
 
+class Nodes(Fetch):
+    """No voxels, only how many nodes the grid has, which is traced."""
+
+    counts: Int[Array, "3"] | np.ndarray
+
+    def cube_at(self, data: Any, node: Node, dtype: Any) -> Cube:
+        raise ValueError("volume has no voxels here.")
+
+    def shape(self, data: Any) -> tuple[Any, Any, Any]:
+        return self.counts[0], self.counts[1], self.counts[2]
+
+
 class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
@@ -202,21 +218,43 @@ class Zeros(Fetch):
 
 
 class Packed(Fetch):
-    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches."""
+    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
 
-    words: UInt32[Array, " voxels"]
-    nodes: UInt32[Array, " voxels"] | None = None
+    It needs no other array than that, so that kernels need not know the shape of the volume: `unshaped`."""
+
+    words: UInt32[Array, " words"]
+    """At least as many as voxels."""
+    nodes: UInt32[Array, " words"] | None = None
     """Of 8-bit voxels, doubled slopes of each node in 10 bits each: x in the highest, y from bit 12 on."""
     begin: Int[Array, ""] | None = None
+    sizes: Int[Array, "3"] | np.ndarray | None = None
+    """Number of nodes along x, y, z; None: those of the voxels."""
+    kind: str | None = eqx.field(static=True, default=None)
+    """Type of the voxels; None: theirs."""
+
+    def unshaped(self, data: Shaped[Array, "nx ny nz"]) -> "Packed":
+        """The same fetch without the voxels."""
+        return replace(self, sizes=np.asarray(data.shape, np.int32), kind=str(data.dtype))
+
+    def shape(self, data: Shaped[Array, "nx ny nz *c"]) -> tuple[Any, Any, Any]:
+        if self.sizes is None:
+            return super().shape(data)
+        return self.sizes[0], self.sizes[1], self.sizes[2]
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
         return replace(self, begin=begin)
 
+    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+        return flat_index(self.split(data, coordinate)[0], self._stored(data))
+
+    def _stored(self, data: Any) -> tuple[Any, ...]:
+        return data.shape if self.sizes is None else self.shape(data)
+
     def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
-        _, ny, nz = data.shape
-        base = flat_index(node, data.shape)
-        bits = 8 * data.dtype.itemsize
-        signed = jnp.issubdtype(data.dtype, jnp.signedinteger)
+        _, ny, nz = self._stored(data)
+        base = flat_index(node, self._stored(data))
+        kind = np.dtype(data.dtype if self.kind is None else self.kind)
+        bits, signed = 8 * kind.itemsize, kind.kind == "i"
 
         def voxel(word: Int[Array, ""], number: int) -> Scalar:
             if signed:  # shifting down from the top bits extends the sign
@@ -237,19 +275,20 @@ class Packed(Fetch):
         if nodes is None:
             return super().slopes(data, coordinate)
         node, fraction = self.split(data, coordinate)
-        base = flat_index(node, data.shape) if self.begin is None else self.begin
+        base = flat_index(node, self._stored(data)) if self.begin is None else self.begin
         dtype = coordinate[0].dtype
-        _, ny, nz = data.shape
+        _, ny, nz = self._stored(data)
         shift = 32 - SLOPE_BITS
 
-        # slices, which are not stored, so that all eight fetches share one index
-        last = (ny + 1) * nz + 1
-        length = data.size - last
-
-        def word(offset: int) -> Int[Array, ""]:
+        def word(x: int, y: int, z: int) -> Int[Array, ""]:
+            offset = (x * ny + y) * nz + z
+            if self.sizes is not None:
+                return gather(nodes, base + offset).astype(jnp.int32)
+            # slices, which are not stored, so that all eight fetches share one index
+            length = nodes.size - ((ny + 1) * nz + 1)
             return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
 
-        words = cube_of(lambda x, y, z: word((x * ny + y) * nz + z))
+        words = cube_of(word)
 
         def slope(bits: int, word: Int[Array, ""]) -> Scalar:
             """The slope from so many bits below the highest one on, times a power of two."""
@@ -410,7 +449,7 @@ def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, "
 
 def split(coordinate: Vec3, shape: tuple[int, ...]) -> tuple[Node, Vec3]:
     """The node below a coordinate, and the fractions past it; the last node belongs to the cell below."""
-    x, y, z = (jnp.clip(c, 0, n - 1) for c, n in zip(coordinate, shape, strict=True))
+    x, y, z = (jnp.clip(c, 0, jnp.asarray(n - 1, c.dtype)) for c, n in zip(coordinate, shape, strict=True))
     # the second clip also keeps the index of a NaN inside the array
     i, j, k = (jnp.clip(c.astype(jnp.int32), 0, n - 2) for c, n in zip((x, y, z), shape, strict=True))
     return (i, j, k), (x - i.astype(x.dtype), y - j.astype(y.dtype), z - k.astype(z.dtype))

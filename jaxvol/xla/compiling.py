@@ -62,6 +62,11 @@ def _probe() -> Array:
     return jnp.zeros(())
 
 
+def in_program(*args: Any) -> bool:
+    """Whether arguments are traced, or a program is being traced around this call."""
+    return is_traced(args, _probe())
+
+
 def computed_now(function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)` of concrete arrays, computed at once also where a larger program is being traced."""
     if not is_traced(_probe()):

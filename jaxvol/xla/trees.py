@@ -11,6 +11,26 @@ PyTree: TypeAlias = Any
 """A tree of arrays. The type of this name in jaxtyping is one that type checkers cannot know, on purpose."""
 
 
+def unchecked(module: Any, **changes: Any) -> Any:
+    """The module with other values for these fields, static ones too, without its constructor's checks."""
+    copy = object.__new__(type(module))
+    for name, value in {**vars(module), **changes}.items():
+        object.__setattr__(copy, name, value)
+    return copy
+
+
+def with_fields(tree: Any, **changes: Any) -> Any:
+    """A module with other values for these fields, of many rays (`dataclasses.replace` would check the shapes
+    of one)."""
+    names = list(changes)
+    return eqx.tree_at(
+        lambda tree: [getattr(tree, name) for name in names],
+        tree,
+        [changes[name] for name in names],
+        is_leaf=lambda leaf: leaf is None,
+    )
+
+
 def floats(tree: PyTree) -> PyTree:
     """The leaves that can have a gradient; None in place of the others."""
     return eqx.filter(tree, eqx.is_inexact_array)

@@ -15,7 +15,7 @@ from jaxvol.bricks.grid import EDGE, Margin, nodes_within, split
 from jaxvol.bricks.render import scene_of
 from jaxvol.bricks.summary import Summary
 from jaxvol.bricks.traversal import _curved
-from jaxvol.engine.brick_march import begin_rays
+from jaxvol.engine.brick_march import begin_image
 from jaxvol.engine.tiling import RenderOptions, Tiling
 
 from ..scenes import in_float64, to_float64
@@ -186,7 +186,7 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
     scene = scene_of(source_of(fog()), SHEETS, FROM_THE_SIDE, CURVED, "over", None)
 
     def cells_of(scene):
-        underway = begin_rays(scene, RenderOptions("all", Tiling.of_backend(None)))
+        underway = begin_image(scene, RenderOptions("all", Tiling.of_backend(None)))
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
         visit = jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)

@@ -1,17 +1,20 @@
 """How wide is a cell that crosses a face? Sampling alignment, also called alpha correction (Kye 2013)."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ..._util.checks import flag
 from ..._util.vec3 import Scalar
 from ...scene.space import Ray
 from ...scene.volume import Volume
-from ..march import Cell, Transform
+from ..march import Cell, CellRules, Transform, cut_at_exit
 
 
 PROBES = 4
@@ -59,15 +62,26 @@ class AlphaCorrection(Transform):
         self.labels = flag("labels", labels)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        back = cell.front + cell.width
-        reaches_past = back > ray.length
-        # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
-        left = jnp.where(cell.front < ray.length, ray.length - cell.front, 0)
-        # also if it ends exactly at the exit: its width, and the gradient of that, then depend on the exit
-        cell = Cell(cell.front, jnp.where(back >= ray.length, left, cell.width), cell.cut | reaches_past)
-        if self.labels:
-            return _divided(cell, *_label_faces(cell, ray, volume))
-        return _divided(cell, *_gap_faces(cell, ray)) if ray.gaps else (cell,)
+        return self._divide(cut_at_exit(cell, ray), ray, volume)
+
+    def rules(self, rules: CellRules) -> CellRules:
+        return replace(rules, at_exit=np.asarray(True), divide=self._divide)
+
+    @property
+    def reads_labels(self) -> bool:
+        return self.labels
+
+    @property
+    def _divide(self) -> Callable[[Cell, Ray, Volume], tuple[Cell, ...]]:
+        return _divided_by_labels if self.labels else _divided_by_gaps
+
+
+def _divided_by_labels(cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+    return _divided(cell, *_label_faces(cell, ray, volume))
+
+
+def _divided_by_gaps(cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
+    return _divided(cell, *_gap_faces(cell, ray)) if ray.gaps else (cell,)
 
 
 def _divided(cell: Cell, first: Scalar, last: Scalar, changes: Bool[Array, ""]) -> tuple[Cell, Cell, Cell]:

@@ -1,5 +1,6 @@
 """When can a ray stop before its exit? Early ray termination (KISTI report 2005)."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -7,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import integer, number
 from ..._util.vec3 import Scalar
-from ..march import Transform
+from ..march import CellRules, Transform
 
 
 class EarlyTermination(Transform):
@@ -47,3 +48,6 @@ class EarlyTermination(Transform):
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
         return stopped | (transmittance <= self.opacity_left)
+
+    def rules(self, rules: CellRules) -> CellRules:
+        return replace(rules, opacity_left=self.opacity_left)

@@ -4,10 +4,12 @@ Samples at the same depths in all pixels show rings around surfaces: wood grain.
 samples of each pixel by a random fraction ξ of a step, which turns the rings into noise of the same energy.
 """
 
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from ..._util.checks import flag
@@ -15,7 +17,7 @@ from ..._util.noise import blue_tile, hashed_uniforms, seed_word
 from ..._util.vec3 import Scalar
 from ...scene.space import Ray
 from ...scene.volume import Volume
-from ..march import Cell, Transform
+from ..march import Cell, CellRules, Transform, cut_at_entry
 
 
 Pattern = Literal["white", "blue"]
@@ -85,12 +87,10 @@ class Jitter(Transform):
         return steps + offset
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-        if not self.front_residual:
-            return (cell,)
-        # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
-        front = jnp.where(cell.front > 0, cell.front, 0)
-        left = cell.width - (front - cell.front)
-        return (Cell(front, jnp.where(left > 0, left, 0), cell.cut),)  # a piece may end before the entry
+        return (cut_at_entry(cell) if self.front_residual else cell,)
+
+    def rules(self, rules: CellRules) -> CellRules:
+        return replace(rules, entry=np.zeros_like(rules.entry)) if self.front_residual else rules
 
 
 class EmptySpaceJitter(Transform):

@@ -14,7 +14,7 @@ from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import BLOCK, FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
 from ...xla.memory import gather
-from ..beams import Box, EmptySpaceIndex, Stretches, View, stretches
+from ..beams import Box, EmptySpaceIndex, Skips, Stretches, View, stretches
 from ..march import Transform
 
 
@@ -127,23 +127,15 @@ class _Beams(EmptySpaceIndex):
     occupancy: Occupancy
     sums: Sums
 
-    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
+    @property
+    def unshaped(self) -> "_Beams":
+        return _Beams(self.occupancy.unshaped, self.sums)
+
+    def skips(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
         return stretches(self.occupancy, self.sums, box(self.occupancy), stretch)
 
-    def any_visible(self, prepared: Stretches) -> Bool[Array, " beams"]:
-        return prepared.following[0] < prepared.following.shape[0]
 
-    def skip_to(self, prepared: Stretches, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
-        count, beams = prepared.following.shape
-        near = gather(prepared.near, beam)
-        position = (rays.t_in + depth - near) / prepared.length
-        stretch = jnp.clip(position.astype(jnp.int32), 0, count - 1)
-        following = gather(prepared.following.reshape(-1), stretch * beams + beam)
-        begin = near + following.astype(depth.dtype) * prepared.length - rays.t_in
-        return jnp.where(following > stretch, jnp.where(following >= count, jnp.inf, begin), depth)
-
-
-class _Distances(EmptySpaceIndex):
+class _Distances(EmptySpaceIndex, Skips):
     """Skips, ray by ray, as far as the nearest occupied cell allows."""
 
     occupancy: Occupancy
@@ -154,16 +146,16 @@ class _Distances(EmptySpaceIndex):
     """Pixel at the corner of the first cell."""
     cell: int = eqx.field(static=True)
 
-    def prepare(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> None:
-        return None
+    def skips(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Skips:
+        return self
 
-    def any_visible(self, prepared: None) -> Bool[Array, ""]:
+    def any_visible(self) -> Bool[Array, ""]:
         return jnp.ones((), bool)
 
     def within_ranges(self) -> EmptySpaceIndex:
         return replace(self, starts=None, corner=None)
 
-    def skip_to(self, prepared: None, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
+    def skip_to(self, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
         start = self.occupancy.cell(rays.entry)
         direction = self.occupancy.frame.components(rays.direction)
         rate = [r / size for r, size in zip(direction, self.occupancy.size, strict=True)]
@@ -181,7 +173,7 @@ class _Distances(EmptySpaceIndex):
         return depth
 
     def _leap(self, start: Vec3, rate: Any, length: Scalar, depth: Scalar) -> Scalar:
-        _, ny, nz = shape = self.occupancy.occupied.shape
+        _, ny, nz = shape = self.occupancy.shape
         point = [s + depth * r for s, r in zip(start, rate, strict=True)]
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
         i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))

@@ -1,0 +1,111 @@
+"""Holds the arrays of many rays as the rows of a few, so that each is gathered and scattered at once.
+
+XLA compiles a kernel for each array that is gathered: of a ray with twenty numbers, twenty.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+from .trees import PyTree
+
+
+class Row(NamedTuple):
+    """Where a leaf lies in a packed tree: rows from `first` on of the array of `kind`, a type. Integers of 32
+    bits, and truth values as such, lie there as floats with the same bits, so that one array holds them all.
+
+    Attributes:
+        dtype: of the leaf.
+        shape: of the leaf, for each ray.
+    """
+
+    kind: str
+    first: int
+    dtype: Any
+    shape: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return math.prod(self.shape)
+
+
+class Layout(NamedTuple):
+    """The places of a tree's leaves."""
+
+    structure: Any
+    rows: tuple[Row, ...]
+
+    @classmethod
+    def of(cls, tree: PyTree) -> "Layout":
+        """That of a tree of arrays (groups, rays in a group, ...)."""
+        leaves, structure = jax.tree.flatten(tree)
+        rows, used = [], dict[str, int]()
+        for leaf in leaves:
+            kind = "float32" if leaf.dtype in (bool, jnp.int32) else str(leaf.dtype)
+            row = Row(kind, used.get(kind, 0), leaf.dtype, leaf.shape[2:])
+            rows.append(row)
+            used[kind] = row.first + row.count
+        return cls(structure, tuple(rows))
+
+    def pack(self, tree: PyTree) -> "Packed":
+        """The rows (rows, groups, rays in a group) of a tree."""
+        rows = self._joined(tree, lambda leaf: leaf.reshape(*leaf.shape[:2], -1).transpose(2, 0, 1))
+        return Packed(rows, self)
+
+    def _joined(self, tree: PyTree, rows_of: Callable[[Array], Array]) -> dict[str, Array]:
+        parts = dict[str, list[Array]]()
+        for leaf, row in zip(jax.tree.leaves(tree), self.rows, strict=True):
+            leaf = leaf.astype(jnp.int32) if leaf.dtype == bool else leaf
+            leaf = jax.lax.bitcast_convert_type(leaf, row.kind) if leaf.dtype == jnp.int32 else leaf
+            parts.setdefault(row.kind, []).append(rows_of(leaf))
+        return {kind: jnp.concatenate(arrays) for kind, arrays in parts.items()}
+
+
+class Packed(eqx.Module):
+    """A tree of arrays as rows of a few arrays, by kind. Where a branch is given this rather than the tree,
+    XLA need not store each leaf for it."""
+
+    rows: dict[str, Array]
+    layout: Layout = eqx.field(static=True)
+
+    @property
+    def tree(self) -> PyTree:
+        """The tree, of arrays (groups, rays in a group, ...), or of what was taken, (lanes, ...)."""
+        leaves = []
+        for row in self.layout.rows:
+            array = self.rows[row.kind]
+            if row.shape:
+                part = jax.lax.slice_in_dim(array, row.first, row.first + row.count)
+                part = jnp.moveaxis(part, 0, -1)
+                part = part.reshape(*part.shape[:-1], *row.shape)
+            else:
+                part = array[row.first]
+            if row.kind != str(row.dtype):
+                part = jax.lax.bitcast_convert_type(part, jnp.int32).astype(row.dtype)
+            leaves.append(part)
+        return jax.tree.unflatten(self.layout.structure, leaves)
+
+    def take(self, groups: Int[Array, " batch"]) -> "Packed":
+        """The rays of these groups, one after the other: lanes."""
+
+        def taken(array: Array) -> Array:
+            part = array.at[:, groups].get(mode="promise_in_bounds", wrap_negative_indices=False)
+            return part.reshape(array.shape[0], -1)
+
+        return Packed({kind: taken(array) for kind, array in self.rows.items()}, self.layout)
+
+    def put(self, groups: Int[Array, " batch"], tree: PyTree) -> "Packed":
+        """The same with a tree of lanes in these groups; groups past the end are dropped."""
+        lanes = self.layout._joined(tree, lambda leaf: leaf.reshape(leaf.shape[0], -1).T)
+
+        def replaced(array: Array, rows: Array) -> Array:
+            part = rows.reshape(array.shape[0], groups.size, array.shape[2])
+            return array.at[:, groups].set(part, mode="drop", unique_indices=True)
+
+        return Packed({kind: replaced(array, lanes[kind]) for kind, array in self.rows.items()}, self.layout)
