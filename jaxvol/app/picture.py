@@ -45,7 +45,6 @@ from .automatic import (
     xray_transfer,
 )
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
-from .padding import padded
 from .progress import progress
 from .settings import OF_COLORS, header_of
 
@@ -54,10 +53,6 @@ def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
     """Of a step that is given."""
     fast = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
     return March(step, (*transforms, *fast), "midpoint")
-
-
-POINTS = 8, 16
-"""Those that the transfer functions of pictures are padded to: most presets have up to 8."""
 
 
 class Scene(NamedTuple):
@@ -81,13 +76,12 @@ class Scene(NamedTuple):
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
         how = {"compositing": self.compositing, "lighting": self.lighting}
-        transfer = padded(self.transfer, *POINTS)
         if self.source is None:
-            what = with_others(self.volume, transfer, self.others)
+            what = with_others(self.volume, self.transfer, self.others)
             found = render(*what, camera, self.march, **how)
         else:
             how["memory"] = self.memory
-            found = render_bricks(self.source, transfer, camera, self.march, **how)
+            found = render_bricks(self.source, self.transfer, camera, self.march, **how)
         return jax.block_until_ready(found)
 
     def picture(self, quiet: bool) -> Rendering:
@@ -105,8 +99,7 @@ class Scene(NamedTuple):
         if self.source is not None:
             how["memory"] = self.memory
         tolerance = PLANNED if tolerance is None else tolerance
-        transfer = padded(self.transfer, *POINTS)
-        return [plan(what, transfer, camera, tolerance, **how) for camera in cameras]
+        return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
 
 
 def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:

@@ -25,7 +25,7 @@ from ..scene.occupancy import Blocks
 from ..scene.rendering import BrickReport, Rendering
 from ..scene.several import Several
 from ..scene.space import median_node_distance
-from ..scene.transfer import Transfer, sized
+from ..scene.transfer import Transfer, sized, with_shared_points
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .memory import read_within, with_bricks
@@ -319,16 +319,16 @@ def chosen_transforms(
 
 
 def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:
-    """Which blocks may change a pixel; in one row, of lengths that many volumes share, for one program."""
+    """Which blocks may change a pixel; in one row, of a length that many volumes share: a power of 8."""
     count = math.prod(blocks.shape)
-    length = 2 ** max(12, (count - 1).bit_length())
+    length = 8 ** max(4, -(-(count - 1).bit_length() // 3))
 
     def in_a_row(leaf: Array) -> Array:
         row = np.asarray(leaf).reshape(*leaf.shape[:-3], count)
         row = np.append(row, row[..., -1:].repeat(length - count, axis=-1), axis=-1)
         return jnp.asarray(row[..., None, None], leaf.dtype)
 
-    found = _occupied_in_a_row(mode, transfer, jax.tree.map(in_a_row, blocks))
+    found = _occupied_in_a_row(mode, with_shared_points(transfer), jax.tree.map(in_a_row, blocks))
     return np.asarray(found).reshape(-1)[:count].reshape(blocks.shape)
 
 
