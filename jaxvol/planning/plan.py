@@ -312,16 +312,14 @@ def chosen_transforms(
     empty = float(np.mean(~visible))
     leaps = (SpaceLeaping(),) if empty >= EMPTY or copy else ()
     proof = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
-    return (*leaps, *(() if aligned else (AlphaCorrection(),))), [
-        alpha,
-        Part("SpaceLeaping", bool(leaps), proof),
-    ]
+    added = () if aligned else (AlphaCorrection(),)
+    return (*leaps, *added), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
 
 
 def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:
-    """Which blocks may change a pixel; in one row, of lengths that many volumes share, for one program."""
+    """Which blocks may change a pixel; in one row, of a length that many volumes share: a power of 8."""
     count = math.prod(blocks.shape)
-    length = 2 ** max(12, (count - 1).bit_length())
+    length = 8 ** max(4, -(-(count - 1).bit_length() // 3))
 
     def in_a_row(leaf: Array) -> Array:
         row = np.asarray(leaf).reshape(*leaf.shape[:-3], count)
