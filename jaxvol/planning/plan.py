@@ -312,10 +312,8 @@ def chosen_transforms(
     empty = float(np.mean(~visible))
     leaps = (SpaceLeaping(),) if empty >= EMPTY or copy else ()
     proof = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
-    return (*leaps, *(() if aligned else (AlphaCorrection(),))), [
-        alpha,
-        Part("SpaceLeaping", bool(leaps), proof),
-    ]
+    added = () if aligned else (AlphaCorrection(),)
+    return (*leaps, *added), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
 
 
 def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:

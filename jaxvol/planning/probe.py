@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ from .._util.vec3 import Scalar, along, apart
 from ..engine.image import render_scene
 from ..march.march import March
 from ..ray import Scene
-from ..scene.camera import Camera, GivenRays
+from ..scene.camera import Camera, GivenRays, axes_of
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
 from ..scene.space import Space
@@ -55,7 +54,6 @@ class Candidates(NamedTuple):
     """Patches of a camera's image, which of them meet the volume, and which are likely to show anything."""
 
     camera: Camera
-    space: Space
     hit: Bool[np.ndarray, " patches"]
     likely: Bool[np.ndarray, " patches"]
 
@@ -65,15 +63,19 @@ class Candidates(NamedTuple):
         from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
 
         (width, height), (across, down) = camera.size, _patches(camera)
-        row, column = np.divmod(np.arange(width * height), width)
-        met = [far > np.maximum(near, 0) for *_, near, far in _rays(camera, space, column, row)]
-        hit = np.concatenate(met).reshape(height, width)
+
+        def hits(pixels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+            enters, leaves = _intervals(space, *_rays(camera, pixels % width, pixels // width))
+            return leaves > np.maximum(enters, 0)
+
+        parts = np.split(np.arange(width * height), range(RAYS, width * height, RAYS))
+        hit = np.concatenate(list(map(hits, parts))).reshape(height, width)
         hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
         hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
         near = maximum_filter(visible, 2 * NEAR + 1, mode="constant")
         likely = hit & _passes(camera, space, near)
         hit[0] |= not hit.any()
-        return cls(camera, space, hit, likely)
+        return cls(camera, hit, likely)
 
     @property
     def wanted(self) -> int:
@@ -90,8 +92,7 @@ class Candidates(NamedTuple):
         """Those of pixels; past the edges of the image, of the last ones."""
         ends = zip((column, row), self.camera.size, strict=True)
         column, row = (np.minimum(each, n - 1).reshape(-1) for each, n in ends)
-        cast = list(_rays(self.camera, self.space, column, row))
-        origins, directions = (np.concatenate([part[k] for part in cast]) for k in (0, 1))
+        origins, directions = _rays(self.camera, column, row)
         pixels = np.stack([column, row], axis=-1) + np.round(np.asarray(self.camera.corner)).astype(int)
         arrays = origins, directions, pixels.astype(np.int32)
         return GivenRays(*(jnp.asarray(each, each.dtype) for each in arrays))
@@ -259,22 +260,33 @@ def _in_parts(program: Callable[..., Any], size: int, *arrays: np.ndarray) -> It
         yield jax.tree.map(lambda each, count=size - missing: np.asarray(each)[:count], found)
 
 
-def _rays(camera: Camera, space: Space, column: np.ndarray, row: np.ndarray) -> Iterator[Any]:
-    """Origins and directions of the rays of pixels, and depths at which they enter and leave the volume, as
-    from `slab_interval`."""
-    unit, dtype = replace(camera, size=(1, 1), corner=None), np.dtype(camera.position.dtype)
-    ends = zip((column, row), camera.size, strict=True)
-    places = (((each + 0.5) / n - 0.5).astype(dtype) for each, n in ends)
-    return _in_parts(partial(_cast, unit, space), RAYS, *places)
+def _rays(camera: Camera, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions of the rays of pixels, as of `Camera.ray`, in NumPy."""
+    known = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), camera)
+    (left, right, bottom, top), (width, height) = known.window, camera.size
+    x = left + (right - left) * (column + 0.5) / width
+    y = top - (top - bottom) * (row + 0.5) / height
+    across, up, forward = axes_of(known, np)
+    beside = x[:, None] * across + y[:, None] * up
+    if camera.parallel_scale is not None:
+        origins, directions = known.position + known.parallel_scale * beside, forward + 0 * beside
+    else:
+        directions = forward + np.tan(np.deg2rad(known.view_angle) / 2) * beside
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        origins = known.position + 0 * beside
+    dtype = np.dtype(camera.position.dtype)
+    return origins.astype(dtype), directions.astype(dtype)
 
 
 @jax.jit
-def _cast(unit: Camera, space: Space, columns: Array, rows: Array) -> tuple[Array, Array, Array, Array]:
-    def cast(column: Scalar, row: Scalar) -> Any:
-        origin, direction = unit.ray(column, row)
-        return jnp.stack(origin), jnp.stack(direction), *space.interval(origin, direction)
+def _interval(space: Space, origins: Array, directions: Array) -> tuple[Array, Array]:
+    return space.interval(*(tuple(each.T) for each in (origins, directions)))
 
-    return jax.vmap(cast)(columns, rows)
+
+def _intervals(space: Space, *rays: np.ndarray) -> list[np.ndarray]:
+    """Depths at which rays enter and leave the volume."""
+    parts = _in_parts(partial(_interval, space), RAYS, *rays)
+    return [np.concatenate(ends) for ends in zip(*parts, strict=True)]
 
 
 def _passes(
@@ -283,7 +295,8 @@ def _passes(
     """Whether the middle ray of each patch passes through one of the blocks."""
     across, down = _patches(camera)
     row, column = (SIDE * each + (SIDE - 1) / 2 for each in np.divmod(np.arange(across * down), across))
-    lines = map(np.concatenate, zip(*_rays(camera, space, column, row), strict=True))
+    rays = _rays(camera, column, row)
+    lines = *rays, *_intervals(space, *rays)
     last, found = np.array(blocks.shape) - 1, []
     for at, crosses in _in_parts(partial(_along, space), LINES, *lines):
         i, j, k = np.clip(np.floor(at / BLOCK).T, 0, last[:, None, None]).astype(int)
