@@ -23,7 +23,10 @@ def import_with_types_checked():
         return
     typechecker.leave_inner_functions()
     with install_import_hook("jaxvol", "tests.typechecker.check"):
-        import jaxvol  # noqa: F401
+        import jaxvol
+
+        for name in dir(jaxvol):  # each is imported when it is first used
+            getattr(jaxvol, name)
 
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -78,4 +78,4 @@ def check(name):
     if name == "README.md":
         assert names["found"].losses[-1] < 0.1 * names["found"].losses[0]
         assert_tells_something(names["found"].parameters)
-        assert isinstance(names["plan"], jv.planning.Plan)
+        assert isinstance(names["plan"], jv.Plan)

@@ -24,7 +24,7 @@ def seed_word(seed: int | Any) -> UInt32[Array, ""]:
     if is_traced(seed) and jnp.shape(seed) == () and jnp.issubdtype(jnp.result_type(seed), jnp.integer):
         return jnp.asarray(seed).astype(jnp.uint32)
     word = integer("seed", seed, 0, 2**32 - 1, otherwise=", or a key of jax.random")
-    return jnp.asarray(word, jnp.uint32)
+    return jnp.asarray(np.array(word, np.uint32), jnp.uint32)
 
 
 def is_key(seed: Any) -> bool:

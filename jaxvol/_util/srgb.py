@@ -2,7 +2,8 @@
 
 import io
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -29,7 +30,7 @@ def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    return _to_srgb(jnp.asarray(linear))
+    return _by_curve(_to_srgb, linear)
 
 
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
@@ -43,7 +44,7 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
 
     Source: IEC 61966-2-1.
     """
-    return _from_srgb(jnp.asarray(display))
+    return _by_curve(_from_srgb, display)
 
 
 def linear_color(name: str, color: Any, shape: Any = (3,)) -> Any:
@@ -76,7 +77,8 @@ def displayed(
     color, opacity = image[..., :3], image[..., 3:]
     # straight alpha: viewers multiply by the opacity
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
-    return np.asarray(_in_8_bits(color, opacity)).astype(np.uint8)
+    shown = [_to_srgb(color, np), np.clip(opacity, 0, 1)]
+    return np.round(np.concatenate(shown, axis=-1) * 255).astype(np.uint8)
 
 
 def png_of(pixels: UInt8[np.ndarray, "height width channels"], text: Mapping[str, str] = {}) -> bytes:
@@ -91,22 +93,24 @@ def png_of(pixels: UInt8[np.ndarray, "height width channels"], text: Mapping[str
     return file.getvalue()
 
 
-# Jitted: one program for each shape, rather than one for each operation.
+def _by_curve(curve: Callable[[Any, Any], Any], values: Any) -> Float[Array, "*image"]:
+    if isinstance(values, jax.Array) or is_traced(values):
+        return _on_device(curve, jnp.asarray(values))
+    found, dtype = curve(np.asarray(values), np), jnp.result_type(float)  # compiles nothing
+    return jnp.asarray(found.astype(dtype), dtype)
 
 
-@jax.jit
-def _to_srgb(linear: Array) -> Float[Array, "*image"]:
-    linear = jnp.clip(linear, 0, 1)
-    curved = 1.055 * jnp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
-    return jnp.where(linear <= 0.0031308, 12.92 * linear, curved)
+@partial(jax.jit, static_argnums=0)  # one program for each shape, rather than one for each operation
+def _on_device(curve: Callable[[Any, Any], Any], values: Array) -> Array:
+    return curve(values, jnp)
 
 
-@jax.jit
-def _from_srgb(display: Array) -> Float[Array, "*image"]:
-    display = jnp.clip(display, 0, 1)
-    return jnp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)
+def _to_srgb(linear: Any, xp: Any) -> Any:
+    linear = xp.clip(linear, 0, 1)
+    curved = 1.055 * xp.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055
+    return xp.where(linear <= 0.0031308, 12.92 * linear, curved)
 
 
-@jax.jit
-def _in_8_bits(color: Any, opacity: Any) -> Float[Array, "height width channels"]:
-    return jnp.round(jnp.concatenate([_to_srgb(color), jnp.clip(opacity, 0, 1)], axis=-1) * 255)
+def _from_srgb(display: Any, xp: Any) -> Any:
+    display = xp.clip(display, 0, 1)
+    return xp.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4)

@@ -3,7 +3,12 @@
 from importlib import metadata
 
 
-try:
-    __version__ = metadata.version("jaxvol")
-except metadata.PackageNotFoundError:  # run from a checkout
-    __version__ = "(not installed)"
+def version_of(package: str) -> str:
+    """The version of an installed package."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:  # run from a checkout
+        return "(not installed)"
+
+
+__version__ = version_of("jaxvol")

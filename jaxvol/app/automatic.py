@@ -62,8 +62,11 @@ def sampled(volume: Volume, data: Any = None) -> Shaped[np.ndarray, "nx ny nz *c
 def unit_of(volume: Volume) -> float:
     """The length to which opacities refer, so that they do not depend on the volume's units: a hundredth of
     its diagonal."""
-    low, high = (np.asarray(corner) for corner in volume.corners)
-    return float(np.linalg.norm(high - low)) / 100
+    across = (np.array(volume.shape) - 1) * np.asarray(volume.spacing)
+    return (
+        float(np.linalg.norm(across if volume.direction is None else np.asarray(volume.direction) @ across))
+        / 100
+    )
 
 
 def preset_unit(volume: Any) -> float:

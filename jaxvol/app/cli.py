@@ -8,23 +8,44 @@ import sys
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib import import_module
+from typing import Any
 
-import jax
-
-from .._util.checks import printable
 from .._util.interruption import end_at_once, raise_again
-from .._util.version import __version__
+from .._util.version import __version__, version_of
 from .._util.whole_files import remove_unfinished
-from ..xla.persistent_cache import SHORTEST, default_programs
-from .commands.animate import add_animate
-from .commands.fit import add_fit
 from .commands.options import Parser, parsed
-from .commands.pages import add_demo, add_figures
-from .commands.render import add_plan, add_render
-from .commands.volumes import add_datasets, add_info, add_view
 
 
-COMMANDS = add_demo, add_render, add_animate, add_plan, add_fit, add_figures, add_info, add_datasets, add_view
+COMMANDS = {
+    "demo": (
+        "pages",
+        "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them",
+    ),
+    "render": ("render", "render a volume file to an image"),
+    "animate": ("animate", "render a volume file from a camera that turns about it"),
+    "plan": ("render", "show the cheapest way to render a volume file within a tolerance, and why"),
+    "fit": ("fit", "fit a transfer function to images of a volume"),
+    "figures": (
+        "pages",
+        "make the figures and tables of the source papers, and a page of them, from recorded results",
+    ),
+    "warm": ("warm", "compile the programs of usual pictures, and keep them, so that these take less time"),
+    "info": (
+        "volumes",
+        "print shape, type, place in the world and values of a volume file, as jaxvol loads it",
+    ),
+    "datasets": (
+        "volumes",
+        "list the public Open SciVis volumes; or print the path of one, downloaded if need be",
+    ),
+    "view": (
+        "volumes",
+        "look at a volume file in the browser; without --host only on this machine; Ctrl-C ends it",
+    ),
+}
+"""By name, the module in `commands/` whose `add_NAME` adds a command's options, and what it does."""
 
 EXAMPLES = """\
 examples:
@@ -56,8 +77,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         raise_again()
         options = parsed(parser_of_all(), words or ["--help"])
-        jax.config.update("jax_compilation_cache_dir", str(default_programs()))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
@@ -71,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except (ValueError, OSError, ImportError, OverflowError) as fault:
         return _told(program, str(fault).removeprefix("path: "))  # the argument's name in Python
-    except (MemoryError, jax.errors.JaxRuntimeError) as fault:
+    except (MemoryError, RuntimeError) as fault:
         if not isinstance(fault, MemoryError) and "RESOURCE_EXHAUSTED" not in str(fault):
             raise
         return _told(program, f"there is not enough memory ({fault})")
@@ -93,6 +112,8 @@ ARGUMENT = re.compile(r'\b(shape|dtype|spacing|nan|time|channel)=(?:\(([\w, ]+)\
 
 def _told(program: str, fault: str) -> int:
     """Print a fault in one line, which may hold text of files. Returns the exit code."""
+    from .._util.checks import printable  # here: takes long to import
+
     fault = ARGUMENT.sub(lambda found: f"--{found[1]} {(found[2] or found[3]).replace(',', '')}", fault)
     print(f"{program}: error: {printable(' '.join(fault.split()))}", file=sys.stderr)
     return 2
@@ -106,10 +127,16 @@ def parser_of_all() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "--version", action="version", version=f"%(prog)s {__version__} (jax {jax.__version__})"
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add in COMMANDS:
-        add(commands)
+    told = f"%(prog)s {__version__} (jax {version_of('jax')})"
+    parser.add_argument("--version", action="version", version=told)
+    commands: Any = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, (module, text) in COMMANDS.items():
+        about = {"help": text, "description": f"{text[0].upper()}{text[1:]}."}
+        added = commands.add_parser(name, add_options=partial(_add_options, module, name), **about)
+        added.set_defaults(parser=added)
     return parser
+
+
+def _add_options(module: str, name: str, parser: Parser) -> None:
+    """Add the options of a command, and the function that executes it."""
+    getattr(import_module(f"{__package__}.commands.{module}"), f"add_{name}")(parser)

@@ -204,7 +204,7 @@ def framed(
     focal, distance = middle, 0.0
     free, front = NEAREST * float(np.linalg.norm(np.ptp(points, axis=0))), 0.0
     for view in views:
-        right, up, forward = (np.asarray(axis, np.float64) for axis in axes_of(view))
+        right, up, forward = (np.asarray(axis, np.float64) for axis in axes_of(view, np))
         axes = np.stack([right, up], axis=1)
         across, depth = (points - middle) @ axes / t, -(points - middle) @ forward
         nearer, front = depth * perspective, max(front, float(depth.max()))
@@ -215,7 +215,7 @@ def framed(
             away = distance - nearer if perspective else np.ones(len(points))
             shifts = [brentq(excess, x.min(), x.max(), (x, away)) for x in across.T]
             focal = middle + axes @ (t * np.array(shifts))
-    away = np.asarray(camera.position - camera.focal_point, np.float64)
+    away = np.asarray(camera.position) - np.asarray(camera.focal_point, np.float64)
     # an orthographic camera shows what is before it, too
     length = distance if perspective else max(float(np.linalg.norm(away)), front + free)
     return Camera(

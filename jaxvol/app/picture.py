@@ -45,54 +45,14 @@ from .automatic import (
     xray_transfer,
 )
 from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
-from .padding import padded
+from .progress import progress
+from .settings import OF_COLORS, header_of
 
 
 def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
     """Of a step that is given."""
     fast = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
     return March(step, (*transforms, *fast), "midpoint")
-
-
-POINTS = 8, 16
-"""Those that the transfer functions of pictures are padded to: most presets have up to 8."""
-
-OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
-OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
-OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
-DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))
-DEFAULTS |= {"step": None, "tolerance": None, "compositing": "over", "size": (512, 512), "others": []}
-DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}
-"""Options of a picture, as they are where nothing is given."""
-
-CALLED = {
-    "background": "bg",
-    "camera": "camera_position cpos",
-    "cmap": "color colormap lut",
-    "compositing": "blending mode",
-    "isovalue": "isosurface",
-    "parallel": "parallel_projection",
-    "shade": "lighting shading",
-    "size": "resolution window_size",
-    "transfer": "opacity",
-}
-ELSEWHERE = {theirs: ours for ours, names in CALLED.items() for theirs in names.split()}
-"""What other programs call options."""
-
-OVERRIDES = {
-    "preset": {"cmap", "transfer", "recorded_transfer"},
-    "cmap": {"preset", "transfer", "recorded_transfer"},
-    "transfer": {"preset", "cmap", "recorded_transfer", "clim", "window", "level", "unit_distance"},
-    "recorded_transfer": {"preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"},
-    "camera": {"direction"},
-    "direction": {"camera"},
-    "clim": {"window", "level"},
-    "window": {"clim"},
-    "level": {"clim"},
-    "step": {"tolerance"},
-    "tolerance": {"step"},
-}
-"""Options that exclude this one, which is an error, and that it overrides in a picture."""
 
 
 class Scene(NamedTuple):
@@ -116,14 +76,18 @@ class Scene(NamedTuple):
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
         how = {"compositing": self.compositing, "lighting": self.lighting}
-        transfer = padded(self.transfer, *POINTS)
         if self.source is None:
-            what = with_others(self.volume, transfer, self.others)
+            what = with_others(self.volume, self.transfer, self.others)
             found = render(*what, camera, self.march, **how)
         else:
             how["memory"] = self.memory
-            found = render_bricks(self.source, transfer, camera, self.march, **how)
+            found = render_bricks(self.source, self.transfer, camera, self.march, **how)
         return jax.block_until_ready(found)
+
+    def picture(self, quiet: bool) -> Rendering:
+        """The image of `camera`, shown as it is made."""
+        with progress(f"drawing {self.camera.size[0]} x {self.camera.size[1]} pixels", quiet=quiet):
+            return self.render(self.camera)
 
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
         """The cheapest way to render the scene within a tolerance, for each camera."""
@@ -135,17 +99,7 @@ class Scene(NamedTuple):
         if self.source is not None:
             how["memory"] = self.memory
         tolerance = PLANNED if tolerance is None else tolerance
-        transfer = padded(self.transfer, *POINTS)
-        return [plan(what, transfer, camera, tolerance, **how) for camera in cameras]
-
-
-def check_exclusive(settings: dict[str, Any]) -> None:
-    """Refuse options that exclude each other."""
-    on = {name for name, value in settings.items() if value is not None and value is not False}
-    for name in sorted(on):
-        for other in sorted(on & OVERRIDES.get(name, set())):
-            both = f"{name} and {other}".replace("recorded_transfer", "the transfer function in the picture")
-            raise ValueError(f"{both} exclude each other; leave one out.")
+        return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
 
 
 def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
@@ -173,7 +127,9 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     several = options.others if isinstance(options.others, list | tuple) else [options.others]
     source, others = None, tuple(map(other_of, several))
     if options.memory is None:
-        volume, transfer = look_of(options)
+        name = "volume" if isinstance(options.file, Volume) else options.file
+        with progress(f"reading {name}", quiet=options.quiet):
+            volume, transfer = look_of(options)
     else:
         if options.labels is not None or others:
             raise ValueError("memory reads one volume, without labels and others.")
@@ -273,7 +229,8 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
         step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
     if step is not None:
         return scene._replace(march=quick_march(step, scene.transforms))
-    plans = scene.plans(cameras, options.tolerance)
+    with progress("planning", quiet=options.quiet):
+        plans = scene.plans(cameras, options.tolerance)
     found = min(plans, key=lambda plan: float(plan.march.step))
     # a view in which cells must be integrated needs that at any step
     integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)
@@ -296,11 +253,6 @@ def volume_of(options: Namespace) -> Volume:
     if told := [name for name, value in header.items() if value is not None]:
         raise ValueError(f"{told[0]} is of files; volume is a Volume.")
     return options.file if labels is None else labelled(options.file, labels)
-
-
-def header_of(options: Namespace) -> dict[str, Any]:
-    """What the options say of the file."""
-    return {name: getattr(options, name) for name in OF_FILES}
 
 
 def is_automatic(options: Namespace) -> bool:

@@ -47,7 +47,7 @@ def text_of_options(options: argparse.Namespace, transfer: Transfer) -> dict[str
     held. None of a picture with volumes of other files, which it may not name."""
     if options.labels is not None or options.others:
         return {}
-    given = {name: getattr(options, name) for name in options.defaults}
+    given = {name: getattr(options, name) for name in options.defaults.keys() - {"quiet"}}
     changed = {name: value for name, value in given.items() if value != options.defaults[name]}
     settings = {name: value for name, value in changed.items() if not isinstance(value, Path)}
     from_file = options.transfer is not None or options.recorded_transfer is not None

@@ -23,7 +23,8 @@ from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
 from .automatic import check_known
-from .picture import DEFAULTS, ELSEWHERE, Scene, check_exclusive, scene_of, with_march
+from .picture import Scene, scene_of, with_march
+from .settings import DEFAULTS, ELSEWHERE, check_exclusive
 
 
 OF_CAMERAS = {"direction", "view_up", "view_angle", "parallel", "size"}
@@ -50,8 +51,8 @@ def show(
             its transfer function, or a colormap and maybe its range. Look: `compositing`, `isovalue`,
             `shade`, `background`. Camera: `camera`, a `Camera` or six numbers, `direction`, `view_up`,
             `view_angle`, `parallel`, `zoom`, `size`. What is cut away: `clip_box`, `clip_plane`,
-            `clip_inside_out`. How it is computed: `step` or `tolerance`, `memory`. Of a raw file: `shape`,
-            `dtype`, `spacing`, `nan`, `time`, `channel`.
+            `clip_inside_out`. How it is computed: `step` or `tolerance`, `memory`, `quiet`. Of a raw file:
+            `shape`, `dtype`, `spacing`, `nan`, `time`, `channel`.
             `jaxvol render --help` describes each.
 
     Returns:
@@ -87,7 +88,7 @@ def show(
     chosen = Namespace(**DEFAULTS | options, recorded_transfer=None, file=file)
     scene = scene_of(chosen)
     scene = with_march(scene, chosen, [scene.camera])
-    rendering = replace(scene.render(scene.camera), background=scene.background)
+    rendering = replace(scene.picture(chosen.quiet), background=scene.background)
     if why := why_empty(scene, rendering):
         warnings.warn(why, stacklevel=2)
     if not in_notebook():

@@ -269,7 +269,7 @@ def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:
     if camera.parallel_scale is not None:
         pixel *= float(camera.parallel_scale)
     else:
-        forward, position = (np.asarray(each, float) for each in (axes_of(camera)[2], camera.position))
+        forward, position = (np.asarray(each, float) for each in (axes_of(camera, np)[2], camera.position))
         size = np.array(finest.spacing) * (np.array(finest.shape) - 1)
         corners = np.array(finest.origin) + np.array(list(product((0, 1), repeat=3))) * size
         nearest = max(float(np.min((corners - position) @ forward)), 0.0)

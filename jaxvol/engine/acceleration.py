@@ -32,7 +32,7 @@ from ..scene.transfer import Transfer
 from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
 from ..xla.memo import memoized, memoized_of
-from ..xla.platform import is_traced, platform
+from ..xla.platform import is_traced
 from ..xla.trees import constant
 from .rays import RayTiles, lines, vmap_rays
 from .shifts import begin_rays
@@ -212,7 +212,7 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
         or 4 * data.size > LIMIT
     ):
         return None
-    return memoized(data, _packed)
+    return memoized(data, _packed, _packed_in_numpy)
 
 
 def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
@@ -239,34 +239,29 @@ def shared_length(voxels: int) -> int:
     return length if length <= LARGE else -(-voxels // (length // 8)) * (length // 8)
 
 
+@jax.jit
 def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " words"]:
-    """In NumPy on a CPU, which compiles nothing."""
-    padding = shared_length(data.size) - data.size
-    if is_traced(data) or platform() != "cpu":
-        return _packed_by_jax(data, padding)
-    bits, voxels = 8 * data.dtype.itemsize, np.asarray(data)
-    words = np.zeros(data.size + padding, np.uint32)
-    planes = words[: data.size].reshape(data.shape)
-    for plane, of in zip(planes, voxels.view(f"uint{bits}"), strict=True):
-        plane[:] = of
-        # the neighbour of the last voxel is never used
-        plane[:, :-1] |= plane[:, 1:] << bits
-        if bits == 8:
-            plane[:-1] |= plane[1:] << 16
-    return jax.device_put(words)
-
-
-@partial(jax.jit, static_argnums=1)
-def _packed_by_jax(data: Shaped[Array, "nx ny nz"], padding: int) -> UInt32[Array, " words"]:
     bits = 8 * data.dtype.itemsize
 
     def plane(voxels: Shaped[Array, "ny nz"]) -> UInt32[Array, "ny nz"]:
         unsigned = voxels.view(f"uint{bits}").astype(jnp.uint32)
+        # the neighbour of the last voxel is never used
         words = unsigned | jnp.roll(unsigned, -1, 1) << bits
         return words | jnp.roll(words, -1, 0) << 16 if bits == 8 else words
 
     # plane by plane: the neighbours of all voxels would take several times the memory of the words
-    return jnp.pad(jax.lax.map(plane, data).reshape(-1), (0, padding))
+    return jnp.pad(jax.lax.map(plane, data).reshape(-1), (0, shared_length(data.size) - data.size))
+
+
+def _packed_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> UInt32[np.ndarray, " words"]:
+    bits, words = 8 * data.dtype.itemsize, np.zeros(shared_length(data.size), np.uint32)
+    planes = words[: data.size].reshape(data.shape)
+    for plane, voxels in zip(planes, data.view(f"uint{bits}"), strict=True):
+        plane[:] = voxels
+        plane[:, :-1] |= plane[:, 1:] << bits
+        if bits == 8:
+            plane[:-1] |= plane[1:] << 16
+    return words
 
 
 @jax.jit

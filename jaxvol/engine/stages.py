@@ -235,7 +235,8 @@ def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     (leap, *seams), blocks, transfer = scene.march.transforms, acceleration.blocks, scene.transfer
     usual = type(scene.compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
     whole = isinstance(blocks, Blocks) and scene.volume.field is None and scene.volume.first is None
-    if platform() != "cpu" or seams or not usual or not whole or leap.method != "hierarchy":
+    known = whole and not blocks.low.committed and platform() == "cpu"
+    if seams or not usual or not known or leap.method != "hierarchy":
         return _index_by_jax(given)
     # in NumPy, which compiles nothing
     low, high = np.asarray(blocks.low), np.asarray(blocks.high)

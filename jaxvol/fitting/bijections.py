@@ -150,7 +150,9 @@ class Pose(Bijection):
                 f"{name} must be a camera that differs from the pose's start only in position and "
                 f"orientation, at the same distance from its focal point; got {value} for the start {start}."
             )
-        axes = [np.stack([np.asarray(axis, float) for axis in axes_of(c)], axis=1) for c in (start, value)]
+        axes = [
+            np.stack([np.asarray(axis, float) for axis in axes_of(c, np)], axis=1) for c in (start, value)
+        ]
         rotation = Rotation.from_matrix(axes[1] @ axes[0].T).as_rotvec()
         shift = (value.focal_point - start.focal_point) / _distance(start)
         return {"rotation": jnp.asarray(rotation, shift.dtype), "translation": shift}

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -23,8 +24,8 @@ from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.rendering import BrickReport, Rendering
 from ..scene.several import Several
-from ..scene.space import Space, median_node_distance
-from ..scene.transfer import Transfer, sized
+from ..scene.space import median_node_distance
+from ..scene.transfer import Transfer, sized, with_shared_points
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .memory import read_within, with_bricks
@@ -159,13 +160,12 @@ def plan(
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
       0 have no gradient from what is leapt over. `fastest_leaping` measures which of its methods is the
       fastest.
-    - **`AlphaCorrection`**: left out if it is proven that nothing is visible in the blocks at the volume's
-      faces, and where a `Clip` cuts.
+    - **`AlphaCorrection`**: always kept.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
     - **bricks**: for a volume that does not fit into `memory`, with what `render` makes of it, the march is
       planned on a copy of every n-th voxel along each axis, and its step divided by n, or by more until
-      bricks fit. The error is that of the copy; `AlphaCorrection` and `SpaceLeaping` are kept.
+      bricks fit. The error is that of the copy; `SpaceLeaping` is kept.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater: an estimate from
     some of the pixels, and from how images change with the last halvings of the step. The noise of a lighting
@@ -184,7 +184,7 @@ def plan(
         compositing: as for `render`.
         lighting: as for `render`.
         gradients: whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
-            (empty space, faces) is proven for this transfer function only.
+            (empty space) is proven for this transfer function only.
         once: whether the march is for a single image. `"preintegrated"`, whose program takes longer to
             compile than it saves, is then tried only where the midpoint rule is not within the tolerance.
         seed: of the choice of patches. With it, the plan depends on nothing but the scene.
@@ -219,7 +219,7 @@ def plan(
         shown, _ = mode.marched(transfer, March(1.0, given), volume)
     visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
     candidates, seed = Candidates.of(camera, space, visible), integer("seed", seed, 0)
-    proven, parts = proven_transforms(visible, space, given, copy=stride > 1)
+    proven, parts = chosen_transforms(visible, given, copy=stride > 1)
     voxel = float(median_node_distance(space, visible.shape))
 
     over = isinstance(scene.compositing, Over)
@@ -234,7 +234,7 @@ def plan(
     probe = Probe.of(candidates, seed)
     first = search(ends, tolerance, {})
     seen = first.render(COARSEST, "midpoint").image
-    shows = bool(np.asarray(visible).any())
+    shows = bool(visible.any())
     if shows and is_empty(seen):  # what is visible lies in other patches, or between samples
         quadrature = "preintegrated" if first.integrable else "midpoint"
         coarse = March(COARSEST * voxel, first.transforms, quadrature)
@@ -297,36 +297,42 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
     return float(tolerance), given
 
 
-def proven_transforms(
-    visible: Bool[Array, "bx by bz"], space: Space, given: tuple[Transform, ...], *, copy: bool = False
+def chosen_transforms(
+    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...], *, copy: bool = False
 ) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that proofs decide on, from the blocks that may hold anything visible. `copy`: these are of
-    a copy, which does not prove that there is nothing in between."""
-    faces = [bool(each) for each in _visible_at_faces(space, visible)]
+    """Transforms that do not depend on the step, from the blocks that may hold anything visible. `copy`:
+    these are of a copy, which does not prove that there is nothing in between."""
     aligned = any(isinstance(each, AlphaCorrection) for each in given)
-    added = () if aligned or not (any(faces) or copy) else (AlphaCorrection(),)
-    if aligned:
-        why = "part of the scene"
-    elif any(faces):
-        of_what = "faces" if len(faces) == 6 else "faces and cuts"
-        why = f"something may be visible at {sum(faces)} of the volume's {len(faces)} {of_what}"
-    else:
-        why = UNPROVEN if copy else "nothing is visible at the volume's faces: proven"
-    alpha = Part("AlphaCorrection", aligned or bool(added), why)
-    empty = float(np.mean(~np.asarray(visible)))
+    why = (
+        "part of the scene"
+        if aligned
+        else "the error at faces is left out; costs nothing where there is none"
+    )
+    alpha = Part("AlphaCorrection", True, why)
+    empty = float(np.mean(~visible))
     leaps = (SpaceLeaping(),) if empty >= EMPTY or copy else ()
     proof = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
-    return (*added, *leaps), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
+    added = () if aligned else (AlphaCorrection(),)
+    return (*leaps, *added), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
 
 
-@eqx.filter_jit  # operations by themselves take seconds to compile
-def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-    return mode.occupied(transfer, blocks)
+def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:
+    """Which blocks may change a pixel; in one row, of a length that many volumes share: a power of 8."""
+    count = math.prod(blocks.shape)
+    length = 8 ** max(4, -(-(count - 1).bit_length() // 3))
+
+    def in_a_row(leaf: Array) -> Array:
+        row = np.asarray(leaf).reshape(*leaf.shape[:-3], count)
+        row = np.append(row, row[..., -1:].repeat(length - count, axis=-1), axis=-1)
+        return jnp.asarray(row[..., None, None], leaf.dtype)
+
+    found = _occupied_in_a_row(mode, with_shared_points(transfer), jax.tree.map(in_a_row, blocks))
+    return np.asarray(found).reshape(-1)[:count].reshape(blocks.shape)
 
 
 @eqx.filter_jit
-def _visible_at_faces(space: Space, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
-    return space.visible_at_faces(visible)
+def _occupied_in_a_row(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[Array, "n 1 1"]:
+    return mode.occupied(transfer, blocks)
 
 
 def brightest_of(image: Rendering) -> float:

@@ -1,7 +1,8 @@
 """How far is an image from the converged one, and what does it cost? Found out from some of its pixels."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import along
+from .._util.vec3 import Scalar, along, apart
 from ..engine.image import render_scene
 from ..march.march import March
 from ..ray import Scene
-from ..scene.camera import Camera, GivenRays
+from ..scene.camera import Camera, GivenRays, axes_of
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
 from ..scene.space import Space
@@ -57,16 +58,22 @@ class Candidates(NamedTuple):
     likely: Bool[np.ndarray, " patches"]
 
     @classmethod
-    def of(cls, camera: Camera, space: Space, visible: Bool[Array, "bx by bz"]) -> "Candidates":
+    def of(cls, camera: Camera, space: Space, visible: Bool[np.ndarray, "bx by bz"]) -> "Candidates":
         """`visible`: blocks that may hold anything visible."""
         from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
 
         (width, height), (across, down) = camera.size, _patches(camera)
-        hit = np.asarray(_hits(camera, space))
+
+        def hits(pixels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+            enters, leaves = _intervals(space, *_rays(camera, pixels % width, pixels // width))
+            return leaves > np.maximum(enters, 0)
+
+        parts = np.split(np.arange(width * height), range(RAYS, width * height, RAYS))
+        hit = np.concatenate(list(map(hits, parts))).reshape(height, width)
         hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
         hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
-        near = jnp.asarray(maximum_filter(np.asarray(visible), 2 * NEAR + 1, mode="constant"))
-        likely = hit & np.asarray(_passes(camera, space, near)).reshape(-1)
+        near = maximum_filter(visible, 2 * NEAR + 1, mode="constant")
+        likely = hit & _passes(camera, space, near)
         hit[0] |= not hit.any()
         return cls(camera, hit, likely)
 
@@ -83,8 +90,12 @@ class Candidates(NamedTuple):
 
     def rays(self, column: Int[np.ndarray, "*n"], row: Int[np.ndarray, "*n"]) -> GivenRays:
         """Those of pixels; past the edges of the image, of the last ones."""
-        places = (np.minimum(each, n - 1) for each, n in zip((column, row), self.camera.size, strict=True))
-        return _rays(self.camera, *(jnp.asarray(each.reshape(-1), jnp.int32) for each in places))
+        ends = zip((column, row), self.camera.size, strict=True)
+        column, row = (np.minimum(each, n - 1).reshape(-1) for each, n in ends)
+        origins, directions = _rays(self.camera, column, row)
+        pixels = np.stack([column, row], axis=-1) + np.round(np.asarray(self.camera.corner)).astype(int)
+        arrays = origins, directions, pixels.astype(np.int32)
+        return GivenRays(*(jnp.asarray(each, each.dtype) for each in arrays))
 
     def narrowed(self, render: Callable[[GivenRays], Rendering]) -> "Candidates":
         """Likely are those that show anything in pixels which are spread evenly over the likely ones, or else
@@ -234,47 +245,75 @@ def _patches(camera: Camera) -> tuple[int, int]:
     return -(-width // SIDE), -(-height // SIDE)
 
 
+RAYS, LINES = 2**15, 2**10
+"""Rays, and lines of `POINTS`, that are computed at a time, by programs that images of all sizes share."""
+
+
+def _in_parts(program: Callable[..., Any], size: int, *arrays: np.ndarray) -> Iterator[Any]:
+    """Results, as NumPy arrays, of a program that takes as many elements of arrays at a time."""
+    for begin in range(0, len(arrays[0]), size):
+        given = [each[begin : begin + size] for each in arrays]
+        missing = size - len(given[0])
+        found = program(
+            *(np.pad(each, ((0, missing), *((0, 0),) * (each.ndim - 1)), "edge") for each in given)
+        )
+        yield jax.tree.map(lambda each, count=size - missing: np.asarray(each)[:count], found)
+
+
+def _rays(camera: Camera, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions of the rays of pixels, as of `Camera.ray`, in NumPy."""
+    known = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), camera)
+    (left, right, bottom, top), (width, height) = known.window, camera.size
+    x = left + (right - left) * (column + 0.5) / width
+    y = top - (top - bottom) * (row + 0.5) / height
+    across, up, forward = axes_of(known, np)
+    beside = x[:, None] * across + y[:, None] * up
+    if camera.parallel_scale is not None:
+        origins, directions = known.position + known.parallel_scale * beside, forward + 0 * beside
+    else:
+        directions = forward + np.tan(np.deg2rad(known.view_angle) / 2) * beside
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        origins = known.position + 0 * beside
+    dtype = np.dtype(camera.position.dtype)
+    return origins.astype(dtype), directions.astype(dtype)
+
+
 @jax.jit
-def _hits(camera: Camera, space: Space) -> Bool[Array, "height width"]:
-    """Which pixels' rays meet the volume."""
-
-    def hits(column: Int[Array, ""], row: Int[Array, ""]) -> Bool[Array, ""]:
-        near, far = space.interval(*camera.ray(column, row))
-        return far > jnp.maximum(near, 0)
-
-    width, height = camera.size
-    columns, rows = jnp.meshgrid(jnp.arange(width), jnp.arange(height))
-    return jax.vmap(jax.vmap(hits))(columns, rows)
+def _interval(space: Space, origins: Array, directions: Array) -> tuple[Array, Array]:
+    return space.interval(*(tuple(each.T) for each in (origins, directions)))
 
 
-@jax.jit
-def _passes(camera: Camera, space: Space, blocks: Bool[Array, "bx by bz"]) -> Bool[Array, "down across"]:
+def _intervals(space: Space, *rays: np.ndarray) -> list[np.ndarray]:
+    """Depths at which rays enter and leave the volume."""
+    parts = _in_parts(partial(_interval, space), RAYS, *rays)
+    return [np.concatenate(ends) for ends in zip(*parts, strict=True)]
+
+
+def _passes(
+    camera: Camera, space: Space, blocks: Bool[np.ndarray, "bx by bz"]
+) -> Bool[np.ndarray, " patches"]:
     """Whether the middle ray of each patch passes through one of the blocks."""
-
-    def passes(column: Int[Array, ""], row: Int[Array, ""]) -> Bool[Array, ""]:
-        middle = [SIDE * part.astype(camera.position.dtype) + (SIDE - 1) / 2 for part in (column, row)]
-        line = camera.ray(*middle)
-        entry, leave = space.interval(*line)
-        entry = jnp.maximum(entry, 0)
-        depths = entry + (leave - entry) * ((jnp.arange(POINTS, dtype=entry.dtype) + 0.5) / POINTS)
-
-        def at(depth: Float[Array, ""]) -> Bool[Array, ""]:
-            coordinate = space.coordinate(along(*line, depth))
-            i, j, k = (
-                jnp.clip(jnp.floor(c / BLOCK), 0, n - 1).astype(jnp.int32)
-                for c, n in zip(coordinate, blocks.shape, strict=True)
-            )
-            return blocks[i, j, k]
-
-        return (leave > entry) & jnp.any(jax.vmap(at)(depths))
-
-    columns, rows = jnp.meshgrid(*map(jnp.arange, _patches(camera)))
-    return jax.vmap(jax.vmap(passes))(columns, rows)
+    across, down = _patches(camera)
+    row, column = (SIDE * each + (SIDE - 1) / 2 for each in np.divmod(np.arange(across * down), across))
+    rays = _rays(camera, column, row)
+    lines = *rays, *_intervals(space, *rays)
+    last, found = np.array(blocks.shape) - 1, []
+    for at, crosses in _in_parts(partial(_along, space), LINES, *lines):
+        i, j, k = np.clip(np.floor(at / BLOCK).T, 0, last[:, None, None]).astype(int)
+        found.append(crosses & blocks[i, j, k].any(axis=0))
+    return np.concatenate(found)
 
 
 @jax.jit
-def _rays(camera: Camera, columns: Int[Array, " rays"], rows: Int[Array, " rays"]) -> GivenRays:
-    origins, directions = jax.vmap(camera.ray)(columns, rows)
-    left, top = camera.first_pixel
-    pixels = jnp.stack([columns + left, rows + top], axis=-1)
-    return GivenRays(jnp.stack(origins, axis=-1), jnp.stack(directions, axis=-1), pixels)
+def _along(space: Space, origins: Array, directions: Array, nears: Array, fars: Array) -> tuple[Array, Array]:
+    """Grid coordinates of `POINTS` points along each ray, and whether it meets the volume."""
+    parts = (jnp.arange(POINTS, dtype=nears.dtype) + 0.5) / POINTS
+
+    def at(origin: Array, direction: Array, entry: Scalar, leave: Scalar, part: Scalar) -> Array:
+        line = apart(origin), apart(direction)
+        return jnp.stack(space.coordinate(along(*line, entry + (leave - entry) * part)))
+
+    entries = jnp.maximum(nears, 0)
+    over_parts = jax.vmap(at, in_axes=(None, None, None, None, 0))
+    points = jax.vmap(over_parts, in_axes=(0, 0, 0, 0, None))(origins, directions, entries, fars, parts)
+    return points, fars > entries

@@ -27,9 +27,9 @@ from .._util.checks import (
 )
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3, along, apart, minus, plus
-from ..xla.platform import is_traced
+from ..xla.platform import in_numpy, is_traced
 from .space import Line
-from .volume import Volume, corners_of
+from .volume import Volume
 
 
 class Camera(eqx.Module):
@@ -145,9 +145,12 @@ class Camera(eqx.Module):
         )
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
         width, height = _image_size(size)
-        cells = np.array(volume.shape, np.int32) - 1  # an array, so that all shapes share one program
+        cells = np.array(volume.shape, volume.spacing.dtype) - 1
         place, aspect = (volume.origin, volume.spacing, volume.direction, cells), min(1.0, width / height)
-        position, center, up, scale = _fitted_view(place, direction, view_up, view_angle, aspect)
+        with np.errstate(over="ignore"):  # refused below
+            view = _fitted_view(*in_numpy(place, direction, view_up, view_angle, aspect))
+        position, center, up, scale = view
+        position = jnp.asarray(position.astype(direction.dtype), direction.dtype)
         position = _moderate("volume, as seen from the camera,", position)
         scale = scale if flag("parallel", parallel) else None
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
@@ -270,7 +273,7 @@ class Camera(eqx.Module):
             center: what becomes the image's center, in fractions of width and height from the top left.
         """
         factor = number("zoom factor", factor, above=0)
-        window = _zoomed(self.window, factor, finite_array("center", center, (2,)))
+        window = _zoomed(*in_numpy(self.window, factor, finite_array("center", center, (2,))))
         return replace(self, window=window, corner=None)
 
     @property
@@ -386,25 +389,29 @@ def finer(camera: Camera, n: int) -> Camera:
     return replace(camera, size=(n * width, n * height), corner=n * camera.corner)
 
 
-def axes_of(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
-    """Unit vectors to the right of the image, up in it, and forward."""
-    forward = camera.focal_point - camera.position
-    forward = forward / jnp.linalg.norm(forward)
-    right = jnp.cross(forward, camera.view_up)
-    right = right / jnp.linalg.norm(right)
-    return right, jnp.cross(right, forward), forward
+def axes_of(camera: Camera, xp: Any = jnp) -> tuple[Any, Any, Any]:
+    """Unit vectors to the right of the image, up in it, and forward: in `jax.numpy`, or in `numpy`."""
+    place = camera.focal_point, camera.position, camera.view_up
+    focal, position, up = place if xp is jnp else map(np.asarray, place)
+    forward = focal - position
+    forward = forward / xp.linalg.norm(forward)
+    right = xp.cross(forward, up)
+    right = right / xp.linalg.norm(right)
+    return right, xp.cross(right, forward), forward
 
 
-@jax.jit  # or the first image would wait for a program per operation
-def _fitted_view(place: Any, direction: Array, up: Array, angle: Array, aspect: Any) -> tuple[Array, ...]:
-    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere."""
-    low, high = corners_of(*place)
-    center, radius = (low + high) / 2, jnp.linalg.norm(high - low) / 2
-    half = jnp.arctan(jnp.tan(jnp.deg2rad(angle) / 2) * aspect)
-    position = center + direction / jnp.linalg.norm(direction) * radius / jnp.sin(half)
-    y, minus_z = jnp.asarray([0.0, 1.0, 0.0]), jnp.asarray([0.0, 0.0, -1.0])
-    other = jnp.where(_sine(y, direction) > 1e-3, y, minus_z)
-    up = jnp.where(_sine(up, direction) > 1e-3, up, other)
+def _fitted_view(xp: Any, of: Any) -> tuple[Any, ...]:
+    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere.
+    `of`: the place of the volume, direction, up direction, view angle and aspect."""
+    (origin, spacing, turn, cells), direction, up, angle, aspect = of
+    across = cells * spacing
+    across = across if turn is None else (turn * across[None, :]).sum(axis=1)
+    center, radius = origin + across / 2, xp.linalg.norm(across) / 2
+    half = xp.arctan(xp.tan(xp.deg2rad(angle) / 2) * aspect)
+    position = center + direction / xp.linalg.norm(direction) * radius / xp.sin(half)
+    y, minus_z = np.array([0, 1, 0], direction.dtype), np.array([0, 0, -1], direction.dtype)
+    other = xp.where(_sine(y, direction) > 1e-3, y, minus_z)
+    up = xp.where(_sine(up, direction) > 1e-3, up, other)
     return position, center, up, radius / aspect
 
 
@@ -447,13 +454,12 @@ def _facing(
     return [source, source + distance * normal, -down], window
 
 
-@jax.jit
-def _zoomed(window: Scalar, factor: Scalar, center: Scalar) -> Scalar:
-    """1/`factor` of a window."""
-    left, right, bottom, top = window
+def _zoomed(xp: Any, of: Any) -> Any:
+    """1/`factor` of a window. `of`: the window, factor and center."""
+    (left, right, bottom, top), factor, center = of
     x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
     half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
-    return jnp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
+    return xp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
 
 
 def _is_valid(height: Any, is_angle: bool, up: Any, forward: Any) -> Any:

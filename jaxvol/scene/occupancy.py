@@ -6,6 +6,7 @@ gradients.
 """
 
 import itertools
+import operator
 from collections.abc import Callable
 from functools import cache, partial, reduce
 from typing import Any
@@ -14,13 +15,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Integer, Shaped, UInt8, UInt32
+from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8, UInt32
 
 from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
 from ..xla.memory import gather
-from ..xla.platform import is_traced, on_gpu, platform
+from ..xla.platform import on_gpu
 from ..xla.sharding import varying
 from ..xla.trees import unchecked
 from .volume import Volume
@@ -56,8 +57,12 @@ class Blocks(eqx.Module):
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False, side: int = BLOCK) -> "Blocks":
         """The blocks of a volume, computed once for each array; ranges of `slopes` only where asked for."""
-        labels = None if volume.labels is None else memoized(volume.labels, _for(side, _label_bits))
-        low, high = map(volume.in_grid_order, memoized(volume.data, _for(side, _ranges)))
+        bits, ends = _for(side, _label_bits), _for(side, _ranges)
+        labels = (
+            None if volume.labels is None else memoized(volume.labels, bits, partial(_label_bits, side=side))
+        )
+        low, high = memoized(volume.data, ends, partial(_ranges_in_numpy, side=side))
+        low, high = map(volume.in_grid_order, (low, high))
         if volume.field is not None:  # its values need not lie between those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
@@ -102,14 +107,15 @@ class Sums(eqx.Module):
 
     @classmethod
     def of(cls, occupied: Bool[Array, "cx cy cz"] | np.ndarray) -> "Sums":
+        """Of a NumPy array, in NumPy."""
         sizes = np.asarray(occupied.shape, np.int32)
         if isinstance(occupied, np.ndarray):
-            table = np.pad(occupied.astype(np.int32), ((1, 0),) * 3)
+            entries = np.pad(occupied.astype(np.int32), ((1, 0),) * 3)
             for axis in range(3):
-                np.cumsum(table, axis=axis, out=table)
+                np.cumsum(entries, axis=axis, out=entries)
             # of one of a few lengths, so that few programs read it
-            table = np.pad(table.reshape(-1), (0, (1 << (table.size - 1).bit_length()) - table.size))
-            return cls(jax.device_put(table), sizes)
+            more = (1 << (entries.size - 1).bit_length()) - entries.size
+            return cls(jax.device_put(np.pad(entries.reshape(-1), (0, more))), sizes)
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
         for axis in range(3):
             if on_gpu():  # a loop launches a kernel for each layer
@@ -202,33 +208,23 @@ def _with_both_sides(plane: Array, axis: int) -> Array:
 @cache
 def _for(side: int, compute: Callable[..., Any]) -> Callable[..., Any]:
     """A function of an array for blocks of this side: the same one each time, as `memoized` needs it."""
-    if compute is not _ranges:
-        return jax.jit(partial(compute, side=side))
-    jitted = jax.jit(partial(compute, side=side))
-
-    def ranges(data: Array) -> tuple[Array, Array]:
-        """In NumPy on a CPU, which compiles nothing."""
-        if is_traced(data) or platform() != "cpu" or data.dtype.kind not in "uif":
-            return jitted(data)
-        return jax.device_put(_ranges(np.asarray(data), side))
-
-    return ranges
+    return jax.jit(partial(compute, side=side))
 
 
-def _ranges(data: Any, side: int) -> tuple[Any, Any]:
+def _ranges(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
     low, high = widened(*extremes(data, side))
-    return (low, high) if data.ndim == 3 else tuple(np.moveaxis(end, -1, 0) for end in (low, high))
+    return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
 
 
-def extremes(data: Any, side: int = BLOCK) -> tuple[Any, Any]:
-    """Least and greatest node of each block; NaN where a node is."""
-    if isinstance(data, np.ndarray):
-        return over_blocks(data, np.minimum, side=side), over_blocks(data, np.maximum, side=side)
-    return _extremes(data, side)
+def _ranges_in_numpy(data: Shaped[np.ndarray, "nx ny nz *c"], side: int) -> tuple[np.ndarray, np.ndarray]:
+    low, high = (over_blocks(data, combine, side=side) for combine in (np.minimum, np.maximum))
+    low, high = _widened(low, high, np)
+    return (low, high) if data.ndim == 3 else (np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0))
 
 
 @partial(jax.jit, static_argnums=1)
-def _extremes(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
+def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Array, Array]:
+    """Least and greatest node of each block; NaN where a node is."""
 
     def of(nodes: Array) -> tuple[Array, Array]:
         return over_blocks(nodes, jnp.minimum, side=side), over_blocks(nodes, jnp.maximum, side=side)
@@ -247,11 +243,15 @@ def _extremes(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Arr
     return low, high
 
 
-def widened(low: Any, high: Any) -> tuple[Any, Any]:
+@jax.jit
+def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"]) -> tuple[Array, Array]:
     """Ranges of the values interpolated between nodes, from those of the nodes."""
+    return _widened(low, high, jnp)
+
+
+def _widened(low: Any, high: Any, xp: Any) -> tuple[Any, Any]:
     low, high = low.astype(np.float32), high.astype(np.float32)
-    xp = np if isinstance(low, np.ndarray) else jnp
-    slack = np.float32(ROUNDING) * xp.maximum(abs(low), abs(high))
+    slack = ROUNDING * xp.maximum(abs(low), abs(high))
     return low - slack, high + slack
 
 
@@ -311,19 +311,18 @@ def _lengths(
     return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
 
 
-def _label_bits(labels: Integer[Array, "nx ny nz"], side: int) -> UInt32[Array, "bx by bz"]:
-    bits = jnp.uint32(1) << (labels.astype(jnp.int32) % 32).astype(jnp.uint32)
-    return over_blocks(bits, jnp.bitwise_or, side=side)
+def _label_bits(labels: Any, side: int) -> Any:
+    bits = np.uint32(1) << (labels.astype(np.int32) % 32).astype(np.uint32)
+    return over_blocks(bits, operator.or_, side=side)
 
 
 def over_blocks(values: Any, combine: Callable[[Any, Any], Any], *, side: int) -> Any:
-    """Combines all nodes of each block, axis by axis."""
+    """Combines all nodes of each block, axis by axis, in the library of the array."""
+    known = isinstance(values, np.ndarray)
+    join, part = (np.concatenate, _part) if known else (jnp.concatenate, jax.lax.slice_in_dim)
     for axis in range(min(values.ndim, 3)):  # channels stay
-        cells, xp = values.shape[axis] - 1, np if isinstance(values, np.ndarray) else jnp
-
-        def along(first: int, end: int, step: int = 1, axis: int = axis, values: Any = values) -> Any:
-            return values[(slice(None),) * axis + (slice(first, end, step),)]
-
+        cells = values.shape[axis] - 1
+        along = partial(part, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
         whole, rest = divmod(cells, side)
         found = []
@@ -332,5 +331,9 @@ def over_blocks(values: Any, combine: Callable[[Any, Any], Any], *, side: int) -
             found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
         if rest:
             found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))
-        values = xp.concatenate(found, axis)
+        values = join(found, axis)
     return values
+
+
+def _part(values: np.ndarray, start: int, end: int, step: int = 1, *, axis: int) -> np.ndarray:
+    return values[(slice(None),) * axis + (slice(start, end, step),)]

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import described
 from .._util.srgb import displayed, linear_color, png_of, warn_of_8_bits
-from ..xla.platform import is_traced
+from ..xla.platform import is_traced, on_gpu
 from ..xla.trees import PyTree
 
 
@@ -120,7 +120,10 @@ class Rendering(eqx.Module):
         if background.shape not in ((3,), shape := (*self.rgba.shape[:-1], 3)):
             expected = f"one colour (3,) or an image {shape}"
             raise ValueError(f"background must be {expected}; got shape {background.shape}.")
-        return _over(self.rgba, background)
+        if is_traced(self.rgba, background) or on_gpu():
+            return _over(self.rgba, background)
+        rgba, background = np.asarray(self.rgba), np.asarray(background)
+        return jnp.asarray(rgba[..., :3] + (1 - rgba[..., 3:]) * background, rgba.dtype)
 
     def show(self) -> None:
         """Shows the image over its background: under the cell of a notebook, at once, or else in a window of

@@ -10,27 +10,37 @@ from functools import cache
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .compiling import computed_now
-from .platform import is_traced
+from .platform import is_traced, on_gpu
 from .trees import PyTree
 
 
 T = TypeVar("T")
 
 
-def memoized(array: Array | np.ndarray, compute: Callable[[Any], T]) -> T:
+def memoized(
+    array: Array | np.ndarray, compute: Callable[[Any], T], in_numpy: Callable[[Any], Any] | None = None
+) -> T:
     """`compute(array)`, computed once in the lifetime of a concrete array; it carries no gradient. Under
-    `jax.vmap`, it is computed once in the lifetime of the batch."""
+    `jax.vmap`, it is computed once in the lifetime of the batch. `in_numpy`: the same function of a NumPy
+    array, which needs no program; it is used on CPU, unless the array was put on a device."""
     if not isinstance(array, jax.Array):  # NumPy arrays are mutable
         return compute(array)
     if is_traced(array):
         return _of_batch(compute)(jax.lax.stop_gradient(array))
     key = id(array), compute
     if key not in _MEMORY:
-        _MEMORY[key] = computed_now(compute, array)
+        if in_numpy is None or array.committed or on_gpu():
+            _MEMORY[key] = computed_now(compute, array)
+        else:
+            with jax.ensure_compile_time_eval():
+                _MEMORY[key] = jax.tree.map(
+                    lambda part: jnp.asarray(part, part.dtype), in_numpy(np.asarray(array))
+                )
         weakref.finalize(array, _MEMORY.pop, key, None)
     return _MEMORY[key]
 

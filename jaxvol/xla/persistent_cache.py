@@ -1,6 +1,7 @@
 """Where are compiled programs kept, so that the next process need not compile them again?"""
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import jax
@@ -22,10 +23,11 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     """Keeps compiled programs in a folder, so that the first image of the next process takes less time.
 
     XLA compiles a program for each kind of scene (sizes, transforms, light), which takes some 4 s. Call this
-    before the first image, in a script or a notebook: it turns on JAX's persistent compilation cache for this
-    process. The command `jaxvol` does so by itself, and so do `view` and the page of `jaxvol view`, unless
-    JAX has a folder already. The programs are those of this machine, this version of jaxvol and of JAX;
-    others are added. To be rid of them, delete the folder.
+    before the first image of a script: it turns on JAX's persistent compilation cache for this
+    process. The command `jaxvol` does so by itself, and so do notebooks, `show`, `view` and the page of
+    `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. The programs are those
+    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the
+    folder.
 
     Args:
         folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
@@ -47,9 +49,16 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
 
 
 def keep_programs_by_default() -> None:
-    """`keep_programs()`, unless JAX keeps them somewhere already."""
+    """`keep_programs()`, unless JAX keeps them somewhere already, or the folder cannot be made."""
     if not _folder():
-        keep_programs()
+        with suppress(OSError):
+            keep_programs()
+
+
+def kept_folder() -> Path | None:
+    """Where JAX keeps compiled programs in this process; None where it keeps none."""
+    folder = _folder()
+    return Path(folder) if folder and getattr(jax.config, "jax_enable_compilation_cache", True) else None
 
 
 def _folder() -> str | None:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 
@@ -51,3 +52,9 @@ def while_loop(
 def is_traced(*values: Any) -> bool:
     """Whether any of the values is a tracer."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def in_numpy(*values: Any) -> tuple[Any, Any]:
+    """`numpy`, which compiles nothing, and the values as its arrays, where they are known; else `jax.numpy`
+    and the values themselves."""
+    return (jnp, values) if is_traced(*values) else (np, jax.tree.map(np.asarray, values))

@@ -114,12 +114,6 @@ FAULTS: list[Fault] = [
         ("planning/test_probe.py::test_from_a_part_the_error_is_a_bound_in_most_cases",),
     ),
     Fault(
-        "plan: faces that a clip cuts are not looked at",
-        "march.transforms.clip:_Clipped.visible_at_faces",
-        lambda faces: lambda self, visible: faces(self, visible)[:6],
-        ("planning/test_plan.py::test_faces_that_a_clip_cuts_are_aligned_where_something_is_visible",),
-    ),
-    Fault(
         "scan conversion: the grid begins at the middle of the sector",
         "io.scan_conversion:_grid",
         lambda grid: lambda probe, *how: (grid(probe, *how)[0], probe.center),

@@ -298,7 +298,7 @@ def test_texts_can_be_pasted():
         jv.Camera((1, 2, 3), (0, 0, 1), (0, 0, 1), 45, size=(8, 4), parallel_scale=2, window=(-1, 0, 0, 1)),
         jv.TransferFunction([0, 0.1], [[1, 0, 0.3], [1, 1, 1]], [0, 3], per_voxel=True),
     ):
-        again = eval(repr(made), dict(vars(jv)))
+        again = eval(repr(made), {name: getattr(jv, name) for name in dir(jv)})
         assert all(map(np.array_equal, jax.tree.leaves(again), jax.tree.leaves(made)))
     long = jv.TransferFunction(np.arange(20), np.ones((20, 3)), np.arange(20))
     assert "values=f32[20]" in repr(long)

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import jax
+from jax._src import compilation_cache
 
 from jaxvol.xla.persistent_cache import default_programs, keep_programs, keep_programs_by_default
 
@@ -34,6 +35,19 @@ def test_programs_are_kept_in_the_folder_that_is_given(tmp_path):
     assert ran.returncode == 0, ran.stderr[-2000:]
     assert ran.stdout.strip() == str(folder)
     assert list(folder.glob("*-cache"))
+
+
+def test_programs_are_compressed_alike_whatever_else_is_installed():
+    """JAX compresses by zstandard where it is installed, under other keys; so it is a dependency."""
+    assert compilation_cache.compress_executable(b"program").startswith(b"\x28\xb5\x2f\xfd")
+
+
+def test_a_folder_that_cannot_be_made_is_no_fault(tmp_path):
+    (tmp_path / "file").touch()
+    code = "from jaxvol.xla.persistent_cache import keep_programs_by_default as keep; keep()"
+    quiet = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    quiet["XDG_CACHE_HOME"] = str(tmp_path / "file")
+    subprocess.run([sys.executable, "-c", code], env=quiet, check=True)
 
 
 def test_the_default_folder_is_jaxs_own_or_the_users(tmp_path, monkeypatch):

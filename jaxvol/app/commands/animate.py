@@ -16,9 +16,11 @@ from ..._util.checks import integer, output_file
 from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
 from ...scene.camera import Camera
+from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import scene_of, with_march
+from ..progress import progress
 from ..show import why_empty
-from .options import add_command, add_output, add_scene, add_vector
+from .options import Parser, add_output, add_scene, add_vector
 
 
 FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
@@ -41,6 +43,7 @@ def _animate(options: argparse.Namespace) -> None:
         axis = camera.view_up if options.axis is None else options.axis
         return [turned(camera, angle, axis) for angle in angles_of(options.degrees, count)]
 
+    keep_programs_by_default()
     scene = scene_of(options, lambda camera: views(camera, FRAMED_VIEWS))
     begun = time.perf_counter()
     scene = with_march(scene, options, views(scene.camera, PLANNED_VIEWS))
@@ -51,10 +54,10 @@ def _animate(options: argparse.Namespace) -> None:
         empty.append(why_empty(scene, rendering))
         return displayed(np.asarray(rendering.image(scene.background), np.float32))
 
-    images = map(image_of, views(scene.camera, count))
-    with whole_file(path) as part:
+    with progress("drawing", count, quiet=options.quiet) as drawn, whole_file(path) as part:
         write = _write_gif if kind == ".gif" else _write_mp4
-        write(part, images, options.fps)
+        images = map(image_of, views(scene.camera, count))
+        write(part, (image for image in images if drawn() or True), options.fps)
     took = time.perf_counter() - begun
     print(f"{path}: {count} frames of {' x '.join(map(str, options.size))} pixels in {took:.1f} s")
     if all(empty):
@@ -100,9 +103,8 @@ def _write_mp4(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]]
         file.write(images, is_batch=True, fps=fps, ffmpeg_log_level="error", **how)
 
 
-def add_animate(commands: Any) -> None:
-    text = "render a volume file from a camera that turns about it"
-    parser = add_command(commands, "animate", text, _animate)
+def add_animate(parser: Parser) -> None:
+    parser.set_defaults(execute=_animate)
     add_scene(parser)
     add_output(parser, "orbit.gif", "what to write: .gif, or .mp4, which needs jaxvol[video]")
     text = "what the camera turns about, through its focal point (default: --view-up)"

@@ -1,15 +1,15 @@
 """`jaxvol fit`: a transfer function that makes given images of a volume."""
 
 import argparse
-import sys
 import warnings
 from pathlib import Path
-from typing import Any
 
 from ..._util.checks import output_file
 from ...fitting import ImageResidual, fit, flat_grey, read_views, write_transfer
+from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import background_of, quick_march, volume_of
-from .options import add_clim, add_command, add_output, add_sampling, add_volume, refuse_to_replace
+from ..progress import progress
+from .options import Parser, add_clim, add_output, add_quiet, add_sampling, add_volume, refuse_to_replace
 
 
 def _fit(options: argparse.Namespace) -> None:
@@ -19,18 +19,21 @@ def _fit(options: argparse.Namespace) -> None:
     views = read_views(options.images, options.cameras)
     if options.labels is not None:
         raise ValueError("--labels: fit finds one transfer function of the values, not one for each label.")
+    keep_programs_by_default()
     background = background_of(options)
-    volume = volume_of(options)
+    with progress(f"reading {options.file}", quiet=options.quiet):
+        volume = volume_of(options)
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     march = quick_march(step)
-    with warnings.catch_warnings(record=True) as warned:
+    shown = progress("fitting", options.max_steps, quiet=options.quiet)
+    with warnings.catch_warnings(record=True) as warned, shown as done:
         warnings.simplefilter("always", UserWarning)
         result = fit(
             ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
             flat_grey(volume, options.points, options.clim),
             max_steps=options.max_steps,
             checkpoint=options.checkpoint,
-            callback=_show_step if sys.stderr.isatty() else None,
+            callback=lambda *_: done(),
         )
     path = write_transfer(options.output, result.parameters)
     error = (2 * result.loss) ** 0.5
@@ -39,12 +42,8 @@ def _fit(options: argparse.Namespace) -> None:
         print(f"{path}: {warning.message}")
 
 
-def _show_step(step: int, parameters: Any, loss: float) -> None:
-    print(f"\rstep {step}, loss {loss:.4g}", end="", file=sys.stderr, flush=True)
-
-
-def add_fit(commands: Any) -> None:
-    parser = add_command(commands, "fit", "fit a transfer function to images of a volume", _fit)
+def add_fit(parser: Parser) -> None:
+    parser.set_defaults(execute=_fit)
     add_volume(parser)
     add_sampling(parser)
     text = "sRGB, as PNG"
@@ -59,5 +58,6 @@ def add_fit(commands: Any) -> None:
     parser.add_argument("--points", type=int, default=8, metavar="N", help=text)
     add_clim(parser)
     parser.add_argument("--max-steps", type=int, default=100, metavar="N", help="at most (default: 100)")
+    add_quiet(parser)
     text = "save the fit here as it goes on; resume from here after an interruption"
     parser.add_argument("--checkpoint", type=Path, metavar="FILE", help=text)

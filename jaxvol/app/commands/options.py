@@ -1,5 +1,5 @@
 """Options of the subcommands of `jaxvol`: of the command line, or else of the file that `--config` names, or
-else of the picture that `--like` names."""
+else of the picture that `--like` names. What takes long to import is imported where it is used."""
 
 import argparse
 import re
@@ -10,27 +10,30 @@ from os.path import realpath  # unlike `Path.resolve`, it raises nothing for lin
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..._util.checks import shortened
-from ..._util.srgb import linear_color
-from ..._util.texts import near
-from ...compositing.modes import MODES, MODES_ELSEWHERE
-from ...io.formats import files_of
-from ...scene.presets import PRESETS, SLICER
-from ..picture import DEFAULTS, ELSEWHERE, OVERRIDES, check_exclusive
-from ..recorded import recorded_in, volume_of_picture, words_of
+from ..settings import DEFAULTS, ELSEWHERE, OVERRIDES, check_exclusive
 
 
 SWITCH = argparse.BooleanOptionalAction
 
 
 class Parser(argparse.ArgumentParser):
-    """Raises `ValueError` for errors."""
+    """Raises `ValueError` for errors. `add_options` adds its options when they are first asked for."""
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    def __init__(self, *args: Any, add_options: Callable[["Parser"], None] | None = None, **kwargs: Any):
         super().__init__(*args, **kwargs)
+        self._add_options = add_options
         self._negative_number_matcher = re.compile(r"^-(\d|\.\d)")  # argparse's own takes -1e-5 for a flag
 
+    def parse_known_args(self, *args: Any, **kwargs: Any) -> Any:
+        add, self._add_options = self._add_options, None
+        if add is not None:
+            add(self)
+        return super().parse_known_args(*args, **kwargs)
+
     def error(self, message: str) -> NoReturn:
+        from ..._util.texts import near
+        from ...compositing.modes import MODES_ELSEWHERE
+
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             message += "." + near(
                 MODES_ELSEWHERE.get(wrong[1].lower(), wrong[1]), re.split("[', ]+", wrong[2])
@@ -85,6 +88,8 @@ def in_full(words: Sequence[str]) -> list[str]:
         elif name == "--size" and not "".join(words[number + 2 : number + 3]).isdecimal():
             found.insert(number + 1, value)
         elif name == "--background" and not re.match(r"[-+.\d]", value):
+            from ..._util.srgb import linear_color
+
             found[number + 1 : number + 2] = map(str, linear_color(name, value).tolist())
     return found
 
@@ -99,6 +104,8 @@ def _over(settings: dict[str, Any], weaker: dict[str, Any]) -> dict[str, Any]:
 
 def _of_toml(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     """The options in a TOML file, by their names."""
+    from ..recorded import words_of
+
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as fault:
@@ -114,6 +121,9 @@ def _of_toml(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
 
 def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
+    from ..._util.checks import shortened
+    from ..recorded import recorded_in, volume_of_picture
+
     found = recorded_in(path)
     own = [action for action in command._actions if action.type is not Path]
     known = [action for action in own if action.dest not in ("help", "others")]
@@ -136,6 +146,8 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     """Refuse to write a file (an option of these names) that is read, such as a slice of the volume, or
     another one."""
+    from ...io.formats import files_of
+
     read = [getattr(options, name, None) for name in ("file", "labels", "transfer", "config")]
     read += [Path(row[0]) for row in getattr(options, "others", [])]
     used = [path for each in read if each for path in (each, *(files_of(each) if each.is_dir() else []))]
@@ -155,16 +167,14 @@ def memory_size(text: str) -> int:
     return count
 
 
-def add_command(commands: Any, name: str, help: str, execute: Callable[[argparse.Namespace], None]) -> Parser:
-    """Add a subcommand, with its function."""
-    parser = commands.add_parser(name, help=help, description=f"{help[0].upper()}{help[1:]}.")
-    parser.set_defaults(execute=execute, parser=parser)
-    return parser
-
-
 def add_output(parser: Parser, default: str, help: str) -> None:
     text = f"{help} (default: %(default)s)"
     parser.add_argument("-o", "--output", type=Path, default=Path(default), help=text)
+
+
+def add_quiet(parser: Parser) -> None:
+    text = "do not show what is being done, on stderr, as where that is no terminal"
+    parser.add_argument("-q", "--quiet", action="store_true", default=False, help=text)
 
 
 def add_vector(group: Any, flag: str, names: str, help: str, **more: Any) -> None:
@@ -209,6 +219,8 @@ def add_clim(group: Any, default: str = "all") -> None:
 
 
 def add_transfer(parser: Parser) -> None:
+    from ...scene.presets import PRESETS, SLICER
+
     group = parser.add_argument_group("transfer function (default: what the histogram suggests)")
     own = {name: text for name, (text, _, _) in PRESETS.items() if not text.startswith(SLICER)}
     presets = "; ".join(f"{name}: {text}" for name, text in own.items())
@@ -236,6 +248,8 @@ def add_others(parser: Parser) -> None:
 
 def add_scene(parser: Parser) -> None:
     """Add a volume that is looked at through a camera."""
+    from ...compositing.modes import MODES
+
     add_volume(parser, nargs="?")
     add_sampling(parser)
     add_size(parser)
@@ -289,4 +303,5 @@ def add_scene(parser: Parser) -> None:
     add_vector(group, "--clip-plane", "X Y Z NX NY NZ", text, action="append")
     text = "cut away what is inside the box and on that side of all planes, and show the rest"
     group.add_argument("--clip-inside-out", action=SWITCH, help=text)
+    add_quiet(parser)
     parser.set_defaults(**DEFAULTS)

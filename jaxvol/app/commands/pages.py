@@ -9,10 +9,8 @@ import shutil
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from ..._util.checks import output_file
-from .options import SWITCH, add_command, add_output, add_size
+from .options import SWITCH, Parser, add_output, add_quiet, add_size
 
 
 def head(folder: Path, size: tuple[int, int], resolution: int) -> None:
@@ -78,13 +76,19 @@ PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit
 
 
 def _demo(options: argparse.Namespace) -> None:
+    from ..._util.checks import output_file
+    from ...xla.persistent_cache import keep_programs_by_default
+    from ..progress import progress
+
+    keep_programs_by_default()
     page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'
     output_file("--output", options.output / "index.html")
     with TemporaryDirectory() as made:  # after an error nothing has changed
         folder = Path(made)
         for section, pictures in PICTURES.items():
             print(f"{options.output}: {', '.join(pictures)}", flush=True)
-            section(folder, tuple(options.size), options.resolution)
+            with progress(f"drawing {', '.join(pictures)}", quiet=options.quiet):
+                section(folder, tuple(options.size), options.resolution)
             images = "".join(f'<img src="{name}.png" alt="{name}" width="32%"> ' for name in pictures)
             page += f"{images}<pre>{html.escape(inspect.getsource(section))}</pre>\n"
         (folder / "index.html").write_text(page, encoding="utf-8")
@@ -94,15 +98,17 @@ def _demo(options: argparse.Namespace) -> None:
     print(f"open {options.output / 'index.html'}")
 
 
-def add_demo(commands: Any) -> None:
-    text = "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them"
-    parser = add_command(commands, "demo", text, _demo)
+def add_demo(parser: Parser) -> None:
+    parser.set_defaults(execute=_demo)
     add_output(parser, "jaxvol-demo", "folder to write")
+    add_quiet(parser)
     add_size(parser)
     parser.add_argument("--resolution", type=int, default=320, metavar="N", help="voxels along the head")
 
 
 def _figures(options: argparse.Namespace) -> None:
+    from ..._util.checks import output_file
+
     folder = output_file("--output", options.output / "index.html").parent
     sys.path.insert(0, str(checkout()))
     index = importlib.import_module("paper_figs.index")
@@ -117,9 +123,8 @@ def checkout() -> Path:
     raise ValueError("the figures are drawn by scripts of the repository. Run this in a checkout of it.")
 
 
-def add_figures(commands: Any) -> None:
-    text = "make the figures and tables of the source papers, and a page of them, from recorded results"
-    parser = add_command(commands, "figures", text, _figures)
+def add_figures(parser: Parser) -> None:
+    parser.set_defaults(execute=_figures)
     add_output(parser, "jaxvol-figures", "folder to write")
     text = "some of them, such as fig09"
     parser.add_argument("--only", nargs="+", default=(), metavar="NAME", help=text)

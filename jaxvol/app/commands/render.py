@@ -3,17 +3,18 @@
 import argparse
 import time
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 from ...io.display import image_file, save_image
 from ...scene.rendering import Rendering
+from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import Scene, scene_of, with_march
+from ..progress import progress
 from ..recorded import text_of_options
 from ..show import why_empty
-from .options import SWITCH, add_command, add_output, add_scene, refuse_to_replace
+from .options import SWITCH, Parser, add_output, add_scene, refuse_to_replace
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -22,10 +23,11 @@ def _render(options: argparse.Namespace) -> None:
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
+    keep_programs_by_default()
     scene = scene_of(options)
     scene = with_march(scene, options, [scene.camera])
     ready = time.perf_counter()
-    rendering = scene.render(scene.camera)
+    rendering = scene.picture(options.quiet)
     ended = time.perf_counter()
     before = "reading and planning" if options.step is None else "reading"
     steps = f"{before} {ready - begun:.2f} s, compiling and rendering {ended - ready:.2f} s"
@@ -52,12 +54,12 @@ def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> 
         bricks = rendering.bricks
         counts = " x ".join(map(str, bricks.counts))
         print(f"{path}: {bricks.loads} of {counts} bricks read, {bricks.bytes_read} bytes")
-    if np.any(rendering.exhausted):
+    if np.asarray(rendering.exhausted).any():
         print(f"{path}: incomplete: rays used up their {scene.march.most_samples} samples; use a longer step")
 
 
-def add_render(commands: Any) -> None:
-    parser = add_command(commands, "render", "render a volume file to an image", _render)
+def add_render(parser: Parser) -> None:
+    parser.set_defaults(execute=_render)
     add_scene(parser)
     text = (
         "image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32). A .png holds the "
@@ -73,10 +75,13 @@ def add_render(commands: Any) -> None:
 def _plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
+    keep_programs_by_default()
     scene = scene_of(options)
-    print(*scene.plans([scene.camera], options.tolerance))
+    with progress("planning", quiet=options.quiet):
+        plans = scene.plans([scene.camera], options.tolerance)
+    print(*plans)
 
 
-def add_plan(commands: Any) -> None:
-    text = "show the cheapest way to render a volume file within a tolerance, and why"
-    add_scene(add_command(commands, "plan", text, _plan))
+def add_plan(parser: Parser) -> None:
+    parser.set_defaults(execute=_plan)
+    add_scene(parser)

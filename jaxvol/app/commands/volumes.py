@@ -1,5 +1,5 @@
 """`jaxvol datasets`, `jaxvol info` and `jaxvol view`: volumes to fetch, what a file holds, and a page of the
-browser on which it is turned and changed."""
+browser on which it is turned and changed. What takes long to import is imported where it is used."""
 
 import argparse
 import sys
@@ -9,15 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ...io import datasets
-from ...io.formats import labelled, read
-from ...scene.volume import Volume
-from ..picture import header_of, is_automatic, look_of, other_of, volume_of
-from ..viewer import serve
-from .options import SWITCH, add_command, add_others, add_transfer, add_volume
+from ..settings import header_of
+from .options import SWITCH, Parser, add_others, add_transfer, add_volume
 
 
 def _datasets(options: argparse.Namespace) -> None:
+    from ...io import datasets
+
     if options.action == "list":
         for dataset in map(datasets.info, datasets.names()):
             shape, size = " x ".join(map(str, dataset.shape)), f"{dataset.nbytes / 1e6:.3g} MB"
@@ -33,14 +31,16 @@ def _datasets(options: argparse.Namespace) -> None:
         print(f"jaxvol render {path} --spacing {_numbers(dataset.spacing)}", file=sys.stderr)
 
 
-def add_datasets(commands: Any) -> None:
-    text = "list the public Open SciVis volumes; or print the path of one, downloaded if need be"
-    parser = add_command(commands, "datasets", text, _datasets)
+def add_datasets(parser: Parser) -> None:
+    parser.set_defaults(execute=_datasets)
     parser.add_argument("action", choices=("list", "fetch"), help="what to do")
     parser.add_argument("name", nargs="?", help="of the volume to fetch, as listed")
 
 
 def _info(options: argparse.Namespace) -> None:
+    from ...io.formats import labelled, read
+    from ...scene.volume import Volume
+
     arguments = read(options.file, **header_of(options))
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
@@ -55,8 +55,10 @@ def _info(options: argparse.Namespace) -> None:
     counts, bars = np.log1p(np.histogram(data, 64)[0]), " ▁▂▃▄▅▆▇█"
     heights = np.ceil(counts / counts.max() * (len(bars) - 1)).astype(int)
     low, high = f"{float(data.min()):g}", f"{float(data.max()):g}"
-    bounds = zip("xyz", np.asarray(volume.bounds).reshape(3, 2), strict=True)
     turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
+    reach = turn * ((np.array(volume.shape) - 1) * np.asarray(volume.spacing))
+    ends = [np.asarray(volume.origin) + end(reach, 0).sum(axis=1) for end in (np.minimum, np.maximum)]
+    bounds = zip("xyz", np.transpose(ends), strict=True)
     axes = (f"{name} along ({_numbers(column, ', ')})" for name, column in zip("xyz", turn.T, strict=True))
     rows = {
         "shape": f"{_numbers(volume.shape, ' x ')} voxels (x, y, z), {data.size / 1e6:.3g} million",
@@ -83,12 +85,15 @@ def _numbers(values: Any, between: str = " ") -> str:
     return between.join(f"{value:.6g}" for value in np.asarray(values))
 
 
-def add_info(commands: Any) -> None:
-    text = "print shape, type, place in the world and values of a volume file, as jaxvol loads it"
-    add_volume(add_command(commands, "info", text, _info))
+def add_info(parser: Parser) -> None:
+    parser.set_defaults(execute=_info)
+    add_volume(parser)
 
 
 def _view(options: argparse.Namespace) -> None:
+    from ..picture import is_automatic, look_of, other_of, volume_of
+    from ..viewer import serve
+
     how = {name: getattr(options, name) for name in ("port", "host", "token")}
     others = tuple(map(other_of, options.others or ()))
     told = any(value is not None for value in header_of(options).values())
@@ -102,9 +107,8 @@ def _view(options: argparse.Namespace) -> None:
     threading.Event().wait()
 
 
-def add_view(commands: Any) -> None:
-    text = "look at a volume file in the browser; without --host only on this machine; Ctrl-C ends it"
-    parser = add_command(commands, "view", text, _view)
+def add_view(parser: Parser) -> None:
+    parser.set_defaults(execute=_view)
     add_volume(parser)
     add_transfer(parser)
     add_others(parser)

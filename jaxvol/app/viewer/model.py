@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from ..._util.srgb import png_of
 from ...scene.transfer import TransferFunction
+from ..progress import every_second
 from ..recorded import text_of
 from .marks import with_marks
 from .state import PROGRAM, Scene, State, Vector
@@ -262,8 +263,10 @@ class Model:
         """Yields after the coarse image, and after each tile of the fine one."""
         renderer = TileRenderer(self.scene, request)
         if renderer.program_key not in self._compiled and self._last is None:
-            self._set_status("compiling …\nthe first image; the program is kept for the next time")
-            renderer.overview()
+            told = "compiling …{}\nthe first image; the program is kept for the next time"
+            self._set_status(told.format(""))
+            with every_second(lambda seconds: self._set_status(told.format(f" {seconds:.0f} s"))):
+                renderer.overview()
             self._compiled.add(renderer.program_key)
         elif renderer.program_key not in self._compiled:
             assert self._last is not None

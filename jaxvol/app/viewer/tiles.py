@@ -20,8 +20,7 @@ from ...render import render
 from ...scene.camera import Camera
 from ...scene.rendering import Rendering
 from ...scene.several import with_others
-from ..padding import padded
-from .editing import MAX_POINTS
+from ...scene.transfer import with_shared_points
 from .state import PROGRAM, Scene, State
 
 
@@ -92,7 +91,7 @@ class TileRenderer:
     def __init__(self, scene: Scene, state: State, step_factor: float = 1.0):
         self.scene, self.volume, self.state = scene, scene.volume, state
         self.march = scene.march(state, step_factor)
-        self.transfer = padded(state.transfer, MAX_POINTS)
+        self.transfer = state.transfer
         self.others = scene.others
         self.background = np.asarray(state.background, np.float32)
         self.how = {"compositing": scene.compositing(state), "lighting": scene.light(state)}
@@ -100,7 +99,7 @@ class TileRenderer:
     @property
     def program_key(self) -> tuple[Any, ...]:
         """Equal for states that one compiled program draws."""
-        leaves, structure = jax.tree.flatten(self.transfer)
+        leaves, structure = jax.tree.flatten(with_shared_points(self.transfer))
         return *(getattr(self.state, name) for name in PROGRAM), structure, *map(np.shape, leaves)
 
     def camera(self, window: object, corner: object = None) -> Camera:

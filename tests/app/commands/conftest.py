@@ -31,5 +31,4 @@ class Drawn:
 def drawn(monkeypatch):
     drawn = Drawn()
     monkeypatch.setattr("jaxvol.app.picture.render", drawn)
-    monkeypatch.setattr("jaxvol.app.picture.padded", lambda transfer, *_: transfer)
     return drawn

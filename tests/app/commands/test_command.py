@@ -32,6 +32,16 @@ def test_version_and_help_are_told(capsys):
         assert word in told["render"]
 
 
+def test_help_and_version_import_nothing_that_takes_long():
+    code = "import sys, jaxvol.app.cli as cli; cli.main([sys.argv[1]])"
+    code = (
+        f"import atexit, sys; atexit.register(lambda: print({{'jax', 'scipy'}} & sys.modules.keys())); {code}"
+    )
+    for word in ("--version", "--help"):
+        ran = subprocess.run([sys.executable, "-c", code, word], capture_output=True, text=True)
+        assert ran.stdout.endswith("\nset()\n"), ran
+
+
 BAD = [
     (["render", "x.raw", "--size", "many", "few"], "render: error: argument --size: invalid int value: 'm"),
     (["fit", "x.raw", "--images", "a.png"], "fit: error: the following arguments are required: --cameras (j"),

@@ -11,8 +11,7 @@ import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
 from jaxvol.app.framing import framed, visible_points
-from jaxvol.app.padding import padded
-from jaxvol.app.picture import DEFAULTS
+from jaxvol.app.settings import DEFAULTS
 
 from .test_render import render, same
 
@@ -122,9 +121,6 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn, monkeypatc
     assert same(drawn.scenes[-1][2], framed(whole, visible_points(left, seen)))
     jv.show(volume, step=0.4, clip_box=(90, 99, 90, 99, 90, 99))  # which holds nothing
     assert same(drawn.scenes[-1][2], whole)
-    monkeypatch.setattr("jaxvol.app.picture.padded", padded)
-    jv.show(volume, step=0.4, preset="CT-AAA", clim=(0, 255))
-    assert drawn.scenes[-1][1].values.shape == (8,)  # of 6 points, in the program of others
     for odd, message in (
         (jv.Volume(np.full((4, 4, 4), 7.0)), "all voxels have the value 7"),
         (

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.app.padding import padded
 from jaxvol.app.viewer.editing import (
     MAX_POINTS,
     colored_as,
@@ -23,6 +22,7 @@ from jaxvol.app.viewer.editing import (
     with_window_level,
     without_point,
 )
+from jaxvol.scene.transfer import with_shared_points
 
 
 GIVEN = jv.TransferFunction(
@@ -41,16 +41,13 @@ def assert_same_function(one, other):
     np.testing.assert_allclose(looked_up(one), looked_up(other), atol=1e-6)
 
 
-def test_padding_changes_nothing_and_gives_one_shape():
-    assert padded(GIVEN, MAX_POINTS).values.shape == (MAX_POINTS,)
-    assert_same_function(padded(GIVEN, MAX_POINTS), GIVEN)
-    assert padded(without_point(GIVEN, 3), MAX_POINTS).values.shape == (MAX_POINTS,)
-    more = padded(GIVEN, 3, 8, MAX_POINTS)
-    assert more.values.shape == (8,)
-    assert padded(more, 4) is padded(more, 8) is more
-    many = jv.colormap("gray", (0, 1), n_colors=40)
-    assert padded(many, MAX_POINTS) is many
-    assert padded(jv.colormap("gray", (0, 1), n_colors=3), 8).per_voxel
+def test_shared_numbers_of_points_change_nothing():
+    for given in (GIVEN, jv.colormap("gray", (0, 1), n_colors=40, unit_distance=1.0)):
+        shared = with_shared_points(given)
+        assert shared.values.shape == ((8,) if given is GIVEN else (256,))
+        assert_same_function(shared, given)
+        assert with_shared_points(shared) is shared
+    assert with_shared_points(jv.colormap("gray", (0, 1), n_colors=3)).per_voxel
 
 
 def test_window_and_level_move_all_points():
@@ -92,11 +89,11 @@ def test_a_point_that_is_added_changes_nothing():
     with pytest.raises(ValueError, match="at least 2"):
         without_point(without_point(without_point(GIVEN, 0), 0), 0)
     with pytest.raises(ValueError, match="no room for another"):
-        with_points_at(padded(GIVEN, MAX_POINTS), [30])
+        with_points_at(GIVEN, np.linspace(1, 9, MAX_POINTS))
 
 
 def test_a_colormap_leaves_the_opacity():
-    colored = padded(recolored(GIVEN, "gray"), MAX_POINTS)
+    colored = recolored(GIVEN, "gray")
     np.testing.assert_allclose(looked_up(colored)[:, 3], looked_up(GIVEN)[:, 3], atol=1e-6)
     grey = np.clip((np.asarray(colored.values) - 10) / 40, 0, 1)[:, None]
     linear = np.where(grey < 0.04, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
@@ -107,11 +104,10 @@ def test_a_colormap_leaves_the_opacity():
     assert_same_function(colored_as(recolored(plain, "gray"), plain), plain)
 
 
-def test_a_step_alone_is_padded_and_moved():
+def test_a_step_alone_is_shared_and_moved():
     for value in (0.0, 20.0, -1e6):
         step = jv.TransferFunction([value, value], [(1, 0, 0), (0, 0, 1)], [0, 2])
-        assert padded(step, MAX_POINTS).values.shape == (MAX_POINTS,)
-        np.testing.assert_array_equal(looked_up(padded(step, MAX_POINTS)), looked_up(step))
+        np.testing.assert_array_equal(looked_up(with_shared_points(step)), looked_up(step))
         assert with_window_level(step, 0, 7).values.tolist() == [7, 7]
 
 

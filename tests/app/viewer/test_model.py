@@ -19,10 +19,9 @@ from PIL import Image
 import jaxvol as jv
 from jaxvol import to_srgb
 from jaxvol.app.cli import parser_of_all
-from jaxvol.app.padding import padded
 from jaxvol.app.recorded import recorded_in
 from jaxvol.app.viewer.controls import controls_of
-from jaxvol.app.viewer.editing import MAX_POINTS, with_color, with_opacity, with_points_at, with_window_level
+from jaxvol.app.viewer.editing import with_color, with_opacity, with_points_at, with_window_level
 from jaxvol.app.viewer.model import BUDGET, LEVELS, Model, adapted
 from jaxvol.app.viewer.state import initial
 from jaxvol.app.viewer.tiles import Grid, TileRenderer, estimated_error
@@ -86,7 +85,7 @@ def test_a_coarse_image_is_followed_by_the_fine_one_of_render(shown, side, monke
     assert last.shape == (27, 38, 3)
     for left, top in ((0, 0), (38 - side, 27 - side)):  # by the program of a tile
         camera = state.orbit.camera(state.size).crop(left, top, side, side)
-        rendering = jv.render(BALL, padded(state.transfer, MAX_POINTS), camera, scene.march(state))
+        rendering = jv.render(BALL, state.transfer, camera, scene.march(state))
         expected = np.round(255 * np.asarray(to_srgb(rendering.image((0.2, 0.5, 0.8)))))
         difference = np.abs(last[top : top + side, left : left + side].astype(int) - expected)
         assert difference.max() <= 1
@@ -508,7 +507,7 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
 def test_a_table_is_shown_and_not_edited(controlled):
     given = jv.TransferFunction2D.from_points([(0.5, 10.0, (1, 0, 0), 0.5, (0.5, 8.0))])
     model, controls = controlled(BALL, given)
-    assert padded(model.state.transfer, MAX_POINTS) is given
+    assert model.state.transfer is given
     assert not {"window", "level", "point"} & controls.keys()
     assert "not edited" in controls["pad"].get()
 
@@ -564,7 +563,7 @@ def test_another_volume_is_in_the_image(side):
     assert scene.light(state) is None
     assert state.step * scene.voxel == pytest.approx(0.25)
     red = TileRenderer(scene, state).rgba(Grid(1, 1, (side, side)), 0, 0)[..., 0]
-    volumes, transfers = zip((BALL, padded(LOOK)), other, strict=True)
+    volumes, transfers = zip((BALL, LOOK), other, strict=True)
     camera = state.orbit.camera((side, side), (-SIZE[0] / SIZE[1], SIZE[0] / SIZE[1], -1, 1))
     expected = jv.render(volumes, transfers, camera, scene.march(state)).rgba[..., 0]
     np.testing.assert_allclose(red, expected, atol=1e-5)

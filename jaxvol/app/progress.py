@@ -1,0 +1,89 @@
+"""What a program is doing, shown by tqdm on standard error while it takes longer than a second."""
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import jax
+
+
+INTERVAL = 1.0
+"""Seconds until a task is shown, and from one update to the next."""
+
+COMPILING = "/jax/core/compile/backend_compile_duration"
+"""JAX's event of a program that is compiled: a number when it begins, and a duration when it has ended."""
+
+
+@contextmanager
+def every_second(tell: Callable[[float], object]) -> Iterator[None]:
+    """Call a function once a second, in another thread, with the seconds since the block began."""
+    begun, ended = time.monotonic(), threading.Event()
+
+    def run() -> None:
+        while not ended.wait(INTERVAL):
+            tell(time.monotonic() - begun)
+
+    thread = threading.Thread(target=run, daemon=True, name="jaxvol progress")
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+@cache  # JAX 0.8 forgets no listener
+def _compiled_now() -> list[str]:
+    """Names of the programs that are being compiled, from now on."""
+    names: list[str] = []
+
+    def begin(event: str, value: float | int, **about: Any) -> None:
+        if event == COMPILING:
+            names.append(str(about.get("fun_name", "")).removeprefix("jit").strip("(_)").replace("_", " "))
+
+    def end(event: str, duration_secs: float, **about: Any) -> None:
+        if event == COMPILING and names:
+            names.pop()
+
+    jax.monitoring.register_scalar_listener(begin)
+    jax.monitoring.register_event_duration_secs_listener(end)
+    return names
+
+
+@contextmanager
+def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Iterator[Callable[[], object]]:
+    """Show a task while it takes longer than a second, and which of its programs is being compiled.
+
+    Args:
+        task: what is done, such as "reading engine.raw".
+        total: steps of the task. With it, a bar shows how many are done, and the time that is left.
+        quiet: whether nothing is shown. Nothing is shown either where standard error is no terminal, but in
+            notebooks.
+
+    Returns:
+        A context, which gives a function to be called after each step.
+    """
+    from tqdm import tqdm
+
+    kernel = "ipykernel" in sys.modules
+    if kernel and find_spec("ipywidgets") is not None:
+        from tqdm.notebook import tqdm
+    how: dict[str, Any] = {"bar_format": "{desc}: {elapsed}"} if total is None else {}
+    disable = quiet or not (kernel or sys.stderr.isatty())
+    with tqdm(desc=task, total=total, delay=INTERVAL, disable=disable, leave=False, **how) as bar:
+        if disable:
+            yield bar.update
+            return
+        programs = _compiled_now()
+
+        def tell(seconds: float) -> None:
+            bar.last_print_t = time.time()  # else a bar with a delay is not cleared at the end
+            bar.set_description_str(f"{task}, compiling {programs[-1]}" if programs else task)
+
+        with every_second(tell):
+            yield bar.update
