@@ -87,7 +87,7 @@ class RayTiles(eqx.Module):
     def shared(source: Camera | GivenRays, tiling: Tiling) -> tuple[int, int]:
         """Beams of a tile, one of three numbers, so that most images share programs; and how many tiles hold
         all rays."""
-        beams = _beams_of(source, tiling)
+        beams = max(_beams_of(source, tiling), tiling.least)
         for size in (tiling.tile // 16, tiling.tile // 4):
             if beams <= 2 * size:
                 return size, max(-(-beams // size), 1)

@@ -16,7 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
 from .._util.piecewise_linear import positive_between
 from ..compositing.blending import Compositing, Outputs
@@ -108,12 +108,13 @@ def staged_image(
     seams = _only(scene.march, "start", "shift", "locate", "clip")
     place = _without_voxels(scene.volume, seams)
     size, number = RayTiles.shared(source, tiling)
+    tiling = tiling._replace(least=0)
     most = np.asarray(scene.march.most_samples, np.int32)
-    position = source.position if isinstance(source, Camera) else None
+    corners = isinstance(source, Camera) and index is not None
     passed = []
     for tile in range(number):
         lines = _lines(scene.source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
-        started = _start(*lines, position, seams, place, index, fault, tiling)
+        started = _start(*lines, corners, seams, place, index, fault, tiling)
         none, zero, never, nowhere = _nothing(*started.rays.length.shape, started.rays.length.dtype)
         offset, shift = started.track.offset, started.track.shift
         offset, shift = (none if part is None else part for part in (offset, shift))
@@ -176,34 +177,28 @@ def _lines(
 ) -> tuple[Line, Bool[Array, "groups rays"]]:
     """The rays of a tile before they meet the volume, and which of them are of the image."""
     tiles = RayTiles.of(source, tiling, tiles=(number, size))
-    line, wanted = tiles.ending_lines(source, tile, jnp.zeros((), bool))
-    # the rays of a camera begin at one point
-    camera = isinstance(without_ends(source), Camera)
-    return line._replace(origin=None) if camera else line, wanted
+    return tiles.ending_lines(source, tile, jnp.zeros((), bool))
 
 
 @program
 def _start(
     line: Line,
     wanted: Bool[Array, "groups rays"],
-    position: Float[Array, "3"] | None,
+    corners: bool,
     seams: March,
     place: Volume,
     index: EmptySpaceIndex | None,
     fault: Bool[Array, ""],
     tiling: Tiling,
 ) -> Started:
-    """Cuts the rays of a tile to the volume. `position`: of the camera."""
-    if position is not None:
-        x, y, z = (jnp.broadcast_to(part, wanted.shape) for part in position)
-        line = line._replace(origin=(x, y, z))
+    """Cuts the rays of a tile to the volume. `corners`: whether those at the corners of a beam bound it, as of
+    a camera's."""
     x, y, z = line.origin
     line = line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z))
     rays = entering(seams.locate(place), line, wanted, tiling.searched)
     track = vmap_rays(partial(track_of, seams))(rays)
     offset = track.offset if seams.overriding("start") else None
-    # of rays of one's own, neighbours need not be near each other
-    box = box_of_corners if position is not None else box_of_rays
+    box = box_of_corners if corners else box_of_rays
     skips = None if index is None else index.skips(partial(box, tiling, rays), tiling.cells * seams.step)
     track = unchecked(track, offset=offset, shifted=None, until=None)
     return Started(rays, track, skips, seams.locate(place))

@@ -41,6 +41,7 @@ class Tiling(NamedTuple):
         searched: groups whose entries and exits are searched at a time, where a search is needed. It takes
             as many steps as the slowest ray among them.
         chunk: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
+        least: beams of a tile at least, so that a few rays are marched by the program of an image.
         devices: between which beams are sharded, a mesh of one axis; None where JAX decides.
     """
 
@@ -54,6 +55,7 @@ class Tiling(NamedTuple):
     direct_tile: int = 64
     searched: int = 16
     chunk: int = CHUNK
+    least: int = 0
     devices: Mesh | None = None
 
     def batch_of(self, groups: int) -> int:

@@ -12,6 +12,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, along, apart
 from ..engine.image import render_scene
+from ..engine.rays import RayTiles
+from ..engine.tiling import Tiling
 from ..march.march import March
 from ..ray import Scene
 from ..scene.camera import Camera, GivenRays, axes_of
@@ -173,7 +175,10 @@ class Probe(NamedTuple):
 
 def rendered(rays: GivenRays, scene: Scene, march: March) -> Rendering:
     """As many rays as a probe has, of the scene's image under another march."""
-    return render_scene(scene._replace(source=rays, march=march), "all", "replay")
+    tiling = Tiling.of_backend()
+    if isinstance(scene.source, Camera):  # by the program of its image
+        tiling = tiling._replace(least=RayTiles.shared(scene.source, tiling)[0])
+    return render_scene(scene._replace(source=rays, march=march), "all", "replay", tiling)
 
 
 def is_empty(image: Rendering) -> bool:
