@@ -1,6 +1,7 @@
 """Checks the sizes of files against their headers: before memory is allocated or, if only decompressing
 tells, while a file is read, never further than one byte past the expected size."""
 
+import importlib
 import re
 import zipfile
 import zlib
@@ -8,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BufferedIOBase
 from pathlib import Path
-from typing import IO, Literal, TypeAlias
+from typing import IO, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -74,6 +75,14 @@ def reason(fault: BaseException) -> str:
     last = str(fault).strip().rpartition("\n")[2]
     told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
     return printable(told).rstrip(".") or type(fault).__name__
+
+
+def library(name: str, path: Path) -> Any:
+    """A module that reads files. Raises `ImportError` that says what to install for `path`."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as fault:
+        raise ImportError(f"{path} needs {name}: pip install 'jaxvol[io]' ({fault})") from fault
 
 
 def as_array(

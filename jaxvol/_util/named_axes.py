@@ -1,80 +1,180 @@
-"""Reads images that say where they lie: of xarray, nibabel, SimpleITK and VTK, none of which is imported."""
+"""Records of images that say where they lie: of xarray, nibabel, SimpleITK, itk and VTK, none of which is
+imported unless an image of it comes."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from .affine import place_of
+from .image_record import ImageRecord, volume_arguments
+from .units import axis_letters
 
 
-def is_named(value: Any) -> bool:
-    """Whether a value is an image of one of these libraries."""
-    return _reader(value) is not None
+EVEN = 1e-3
+"""Part of a step by which a coordinate may be away from evenly spaced ones."""
 
 
-def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The values as data[x, y, z] or data[x, y, z, channel], and `spacing`, `origin` and `direction` where
-    the image tells them. Raises `ValueError` for one without three axes, or with uneven coordinates."""
-    read = _reader(value)
-    assert read is not None
-    return read(value)
-
-
-def _reader(value: Any) -> Callable[[Any], tuple[np.ndarray, dict[str, np.ndarray]]] | None:
+def record_of(value: Any) -> ImageRecord | None:
+    """The record of an image of one of these libraries; None for anything else."""
     kind, placed = type(value), ("GetSpacing", "GetOrigin")
-    marks = {
+    marks: dict[Callable[[Any], ImageRecord], tuple[str, ...]] = {
         _xarray: ("dims", "coords", "transpose", "to_numpy"),
-        _nibabel: ("dataobj", "affine", "header"),
-        _simple_itk: (*placed, "GetDirection", "GetNumberOfComponentsPerPixel"),
+        nibabel_record: ("dataobj", "affine", "header"),
+        _itk: (*placed, "GetDirection", "GetNumberOfComponentsPerPixel"),
         _vtk: (*placed, "GetDirectionMatrix", "GetPointData"),
     }
-    return next((read for read, names in marks.items() if all(hasattr(kind, name) for name in names)), None)
+    read = next((read for read, names in marks.items() if all(hasattr(kind, name) for name in names)), None)
+    return None if read is None else read(value)
 
 
-def _nibabel(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Its world is right, front, head; ours left, back, head."""
-    return np.asanyarray(image.dataobj), place_of("data.affine", np.diag([-1.0, -1, 1, 1]) @ image.affine)
+def object_arguments(value: Any) -> dict[str, Any] | None:
+    """Arguments of `Volume` for an image of these libraries; None for anything else. An axis of channels
+    becomes the volume's."""
+    if (record := record_of(value)) is None:
+        return None
+    letters = record.letters()
+    if "s" not in letters:
+        record.axes = letters.replace("c", "s")
+    return volume_arguments(record)
 
 
-def _simple_itk(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    if image.GetDimension() != 3:
-        raise ValueError(f"data must be a 3-D image; got one of size {image.GetSize()}. Extract one volume.")
-    data = sys.modules["SimpleITK"].GetArrayFromImage(image)
-    turn = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
-    return np.swapaxes(data, 0, 2), place_of("data", np.column_stack([turn, image.GetOrigin()]))
+def grid_of(affine: Any) -> dict[str, Any]:
+    """`steps`, `origin` and `direction` of a record whose voxel (i, j, k) lies at `affine @ (i, j, k, 1)`."""
+    columns, origin = np.asarray(affine, float)[:3, :3], np.asarray(affine, float)[:3, 3]
+    steps = np.linalg.norm(columns, axis=0)
+    with np.errstate(invalid="ignore"):
+        direction = columns / np.where(steps > 0, steps, 1)
+    return {"steps": dict(zip("xyz", steps.tolist(), strict=True)), "origin": origin, "direction": direction}
 
 
-def _vtk(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def nibabel_record(image: Any, stored: Any = None, what: str = "data") -> ImageRecord:
+    """Its world is right, front, head. Where a NIfTI has neither an sform nor a qform, axes are left as they
+    are in the file, from 0 on, as by SimpleITK; nibabel itself reverses one of them and centres all.
+    `stored`: its numbers, if they were read before."""
+    header, proxy, place = image.header, image.dataobj, grid_of(image.affine) | {"convention": "RAS"}
+    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header.keys()]
+    if codes and not any(codes):
+        place = {"steps": dict(zip("xyz", map(float, header["pixdim"][1:4]), strict=True))}
+    unit = header.get_xyzt_units()[0] if hasattr(header, "get_xyzt_units") else "mm"
+    data = stored
+    if data is None:
+        data = np.asanyarray(proxy.get_unscaled() if hasattr(proxy, "get_unscaled") else proxy)
+    colors = data.dtype.names is not None
+    data = np.stack([data[name] for name in data.dtype.names or ()], axis=-1) if colors else data
+    while data.ndim > 5 + colors and data.shape[-1 - colors] == 1:
+        data = np.squeeze(data, data.ndim - 1 - colors)
+    axes = "xyztc"[: data.ndim - colors] + "s" * colors
+    # of objects in memory, a fourth axis is the volume's channels
+    axes = axes if colors or stored is not None else axes.replace("t", "s")
+    scale = (
+        {} if colors else {"slope": getattr(proxy, "slope", 1.0), "intercept": getattr(proxy, "inter", 0.0)}
+    )
+    return ImageRecord(data, axes, units=None if unit == "unknown" else unit, what=what, **place, **scale)
+
+
+def _itk(image: Any) -> ImageRecord:
+    """An image of SimpleITK, or of the package `itk`."""
+    simple = hasattr(image, "GetDimension")
+    n = image.GetDimension() if simple else image.GetImageDimension()
+    if n != 3:
+        raise ValueError(f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
+    library = sys.modules.get("SimpleITK" if simple else "itk")
+    if library is None:  # a class that only looks like theirs
+        raise ValueError(f"data must be an image of SimpleITK or itk; got {type(image).__name__}.")
+    data = (library.GetArrayFromImage if simple else library.array_from_image)(image)
+    turn = np.asarray(image.GetDirection() if simple else library.array_from_matrix(image.GetDirection()))
+    spacing, origin = (list(map(float, each)) for each in (image.GetSpacing(), image.GetOrigin()))
+    steps, axes = dict(zip("xyz", spacing, strict=True)), "zyx" + "s" * (data.ndim > 3)
+    return ImageRecord(data, axes, steps, "mm", origin, np.reshape(turn, (3, 3)), "LPS")
+
+
+def _vtk(image: Any) -> ImageRecord:
     scalars, matrix = image.GetPointData().GetScalars(), image.GetDirectionMatrix()
+    cells = scalars is None and image.GetCellData().GetScalars()
+    scalars = cells or scalars
     if scalars is None:
-        raise ValueError("data must be an image with scalars at its points; got a vtkImageData without.")
-    shape = (scalars.GetNumberOfComponents(), *image.GetDimensions())
-    data = np.moveaxis(np.ravel(memoryview(scalars)).reshape(shape, order="F"), 0, -1)
-    entries = [matrix.GetElement(i, j) for i in range(3) for j in range(3)]
-    turn = np.reshape(entries, (3, 3)) * image.GetSpacing()
-    origin = image.GetOrigin() + turn @ image.GetExtent()[::2]
-    place = place_of("data", np.column_stack([turn, origin]))
-    return data[..., 0] if shape[0] == 1 else data, place
+        raise ValueError("data must be an image with scalars at its points or cells; got one without.")
+    sizes = np.array(image.GetDimensions()) - (1 if cells else 0)
+    data = np.ravel(memoryview(scalars)).reshape(*sizes[::-1], scalars.GetNumberOfComponents())
+    turn = np.reshape([matrix.GetElement(i, j) for i in range(3) for j in range(3)], (3, 3))
+    first = np.array(image.GetExtent()[::2]) + (0.5 if cells else 0)
+    affine = np.column_stack(
+        [turn * image.GetSpacing(), image.GetOrigin() + turn * image.GetSpacing() @ first]
+    )
+    several = data.shape[3] > 1
+    return ImageRecord(data if several else data[..., 0], "zyx" + "s" * several, **grid_of(affine))
 
 
-def _xarray(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Axes named x, y and z are put in this order. Coordinates that fall are reversed, with the data. Axes
-    without coordinates have spacing 1 from 0 on."""
-    if sorted(map(str, value.dims)) == ["x", "y", "z"]:
-        value = value.transpose("x", "y", "z")
-    data, spacing, origin = value.to_numpy(), np.ones(3), np.zeros(3)
-    named = [(axis, name) for axis, name in enumerate(value.dims) if name in value.coords]
-    if data.ndim != 3 or not named:
-        return data, {}
-    for axis, name in named:
-        at = np.asarray(value.coords[name])
-        even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" else np.zeros(2)
-        step = even[1] - even[0] if at.size > 1 else 0.0
-        if not (step and np.abs(at - even).max() <= 1e-3 * abs(step)):  # NaN, too
-            raise ValueError(f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
-        if step < 0:
-            data, at = np.flip(data, axis), at[::-1]
-        spacing[axis], origin[axis] = abs(step), at[0]
-    return data, {"spacing": spacing, "origin": origin}
+def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """`slope`, `intercept` and `missing` of a record by attributes of the CF convention."""
+    slope, intercept = (
+        float(attributes.get(name, k)) for name, k in (("scale_factor", 1), ("add_offset", 0))
+    )
+    fills = [attributes[name] for name in ("_FillValue", "missing_value") if attributes.get(name) is not None]
+    numbers = [float(n) for fill in fills if not isinstance(fill, str) for n in np.ravel(fill)]
+    return {"slope": slope, "intercept": intercept, "missing": tuple(n for n in numbers if n == n)}
+
+
+def _xarray(value: Any) -> ImageRecord:
+    """Axes by name, or by `axis` of the CF convention; places by their coordinates, which must be evenly
+    spaced, also by those of several axes; `direction` as `itk.xarray_from_image` keeps it."""
+    own = {name: value.coords[name] for name in value.dims if name in value.coords}
+    names = [str(getattr(own.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
+    assumed: list[str] = []
+    data = value.to_numpy()
+    if not 3 <= data.ndim <= 5:
+        return ImageRecord(data, names)
+    letters = axis_letters("data", names, assumed)
+    space = [letters.index(letter) for letter in "xyz" if letter in letters]
+    record = ImageRecord(data, names, assumed=assumed, **cf_scale(value.attrs))
+    positions = [value.coords.get(letter) for letter in "xyz"]
+    if all(each is not None and len(each.dims) >= 1 for each in positions) and len(space) == 3:
+        apart = any(each.dims != (value.dims[at],) for each, at in zip(positions, space, strict=True))
+        if apart:  # positions along x, y, z at each voxel, or of axes of other names
+            dims = [value.dims[at] for at in space]
+            world = [each.broadcast_like(value.isel({d: 0 for d in value.dims if d not in dims}))
+                     .transpose(*dims).to_numpy() for each in positions]  # fmt: skip
+            record.units = {a: each.attrs.get("units") for a, each in zip("xyz", positions, strict=True)}
+            return _with(record, grid_of(_affine(np.stack(world))))
+    units, steps, origin = {}, dict.fromkeys("xyz", 1.0) if own else {}, [0.0, 0.0, 0.0]
+    for letter, name in ((letters[at], value.dims[at]) for at in space if value.dims[at] in own):
+        steps[letter], origin["xyz".index(letter)] = even_step(np.asarray(own[name]), name)
+        units[letter] = own[name].attrs.get("units")
+    record = _with(record, {"steps": steps, "origin": np.array(origin), "units": units})
+    if (turn := value.attrs.get("direction")) is not None and len(space) == 3:
+        rank = [sorted(space).index(at) for at in space]
+        record.direction = np.reshape(np.asarray(turn, float), (3, 3))[np.ix_(rank, rank)]
+        record.convention = "LPS"
+    return record
+
+
+def even_step(at: np.ndarray, name: Any) -> tuple[float, float]:
+    """The distance between evenly spaced numbers, and the first. Raises `ValueError` for others."""
+    even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" and at.size else np.zeros(2)
+    step = float(even[1] - even[0]) if at.size > 1 else 0.0
+    if not (step and np.abs(at - even).max() <= EVEN * abs(step)):  # NaN, too
+        raise ValueError(f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
+    return step, float(at[0])
+
+
+def _affine(world: np.ndarray) -> np.ndarray:
+    """The affine map of positions [3, x, y, z]. Raises `ValueError` where they are none's."""
+    first = world[:, 0, 0, 0]
+    last = np.maximum(np.array(world.shape[1:]) - 1, 1)
+    columns = [(np.take(world, -1, k + 1)[:, 0, 0] - first) / last[k] for k in range(3)]
+    at = np.indices(world.shape[1:])
+    exact = first[:, None, None, None] + sum(
+        c[:, None, None, None] * n for c, n in zip(columns, at, strict=True)
+    )
+    if not np.abs(world - exact).max() <= EVEN * min(np.linalg.norm(c) for c in columns):  # NaN, too
+        raise ValueError(
+            "data must have evenly spaced numbers as coordinates; got positions on a curved grid."
+        )
+    return np.column_stack([*columns, first])
+
+
+def _with(record: ImageRecord, place: Mapping[str, Any]) -> ImageRecord:
+    for name, part in place.items():
+        setattr(record, name, part)
+    return record

@@ -57,7 +57,7 @@ def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
 POINTS = 8, 16
 """Those that the transfer functions of pictures are padded to: most presets have up to 8."""
 
-OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
+OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel", "offset"
 OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
 OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
 DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))

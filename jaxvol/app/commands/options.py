@@ -191,6 +191,7 @@ def add_volume(parser: Parser, **more: Any) -> None:
     add_vector(group, "--spacing", "X Y Z", "world length between voxels")
     text = "of voxels that are NaN or infinite in the file, such as the value of what is transparent"
     group.add_argument("--nan", type=float, metavar="VALUE", help=text)
+    group.add_argument("--offset", type=int, metavar="BYTES", help="before the voxels of a raw file")
     for name in ("time", "channel"):
         group.add_argument(f"--{name}", type=int, metavar="N", help="which one, from 0, of a file of several")
 

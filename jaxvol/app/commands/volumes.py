@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...io import datasets
-from ...io.formats import labelled, read
+from ...io.formats import labelled, read, read_record
 from ...scene.volume import Volume
 from ..picture import header_of, is_automatic, look_of, other_of, volume_of
 from ..viewer import serve
@@ -41,7 +41,10 @@ def add_datasets(commands: Any) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    arguments = read(options.file, **header_of(options))
+    told = header_of(options)
+    how = {name: told.pop(name) for name in ("nan", "channel")} | {"time": told["time"]}
+    record = read_record(options.file, **told)
+    arguments = read(record, **how | ({"time": None} if record.format.endswith("at each place") else {}))
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)
@@ -58,7 +61,7 @@ def _info(options: argparse.Namespace) -> None:
     bounds = zip("xyz", np.asarray(volume.bounds).reshape(3, 2), strict=True)
     turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
     axes = (f"{name} along ({_numbers(column, ', ')})" for name, column in zip("xyz", turn.T, strict=True))
-    rows = {
+    rows = record.rows() | {
         "shape": f"{_numbers(volume.shape, ' x ')} voxels (x, y, z), {data.size / 1e6:.3g} million",
         "type": f"{data.dtype}, {data.nbytes / 1e6:.3g} MB of memory",
         "spacing": _numbers(volume.spacing) + (" (assumed: the file does not say)" if assumed else ""),
