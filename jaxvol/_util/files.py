@@ -3,6 +3,7 @@ tells, while a file is read, never further than one byte past the expected size.
 
 import importlib
 import re
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -68,6 +69,22 @@ def decoding(path: Path) -> Iterator[None]:
     except CORRUPT as fault:
         told = f"corrupt, cut short or incomplete ({reason(fault)})"
         raise ValueError(f"path: {path} cannot be read: {told}.") from fault
+
+
+@contextmanager
+def refusing(path: Path) -> Iterator[None]:
+    """Turn whatever a library raises within the context into a `ValueError` that says what is wrong."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (MemoryError, ImportError):
+        raise
+    except Exception as fault:
+        if isinstance(fault, ValueError) and str(fault).startswith("path:"):
+            raise
+        told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
+        raise ValueError(f"path: {path} cannot be read: {told}") from fault
 
 
 def reason(fault: BaseException) -> str:

@@ -3,6 +3,7 @@ makes the arguments of `Volume` of it."""
 
 import itertools
 import math
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,12 +15,16 @@ from .affine import directions
 from .checks import finite_array, integer, shortened
 from .files import MOST_VOXELS
 from .units import axis_letters, length_of
-from .voxels import WHOLE, within
+from .voxels import WHOLE, check_shape, within
 
 
 ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
+
+
+INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"
+"""Modules between a caller and the reader of a file."""
 
 
 @dataclass
@@ -59,9 +64,18 @@ class ImageRecord:
     what: str = "data"
     format: str = ""
 
+    @property
     def letters(self) -> str:
         """The letter of each axis. Raises `ValueError` for axes that are not known."""
-        return axis_letters(self.what, self.axes)
+        return axis_letters(self.what, self.axes, self.note)
+
+    @property
+    def is_scaled(self) -> bool:
+        return (self.slope, self.intercept) != (1, 0)
+
+    def note(self, text: str) -> None:
+        """Append to `assumed`, once."""
+        self.assumed += [] if text in self.assumed else [text]
 
     def unit(self, letter: str) -> str | None:
         """The unit of the step along an axis, as it is stored."""
@@ -72,117 +86,102 @@ class ImageRecord:
         1, and `assumed` says so."""
         told = {letter: self.unit(letter) for letter in "xyz"}
         known = {letter: length_of(unit) for letter, unit in told.items()}
-        usual = next((length for length in known.values() if length), 1.0)
+        usual = next((length for length in known.values() if length), None)
         for unit in dict.fromkeys(unit for letter, unit in told.items() if unit and not known[letter]):
-            taken = "1" if not any(known.values()) else f"{usual:g} mm, as of the other axes"
-            self.note(f"unit {shortened(unit)}: taken as {taken}")
-        return np.array([length or usual for length in known.values()])
-
-    def note(self, text: str) -> None:
-        """Append to `assumed`, once."""
-        self.assumed += [] if text in self.assumed else [text]
+            taken = "taken as 1" if usual is None else f"taken as {usual:g} mm, as along other axes"
+            self.note(f"unit {shortened(unit)}: {taken}")
+        return np.array([length or usual or 1.0 for length in known.values()])
 
     def decode(self, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """The values of stored numbers, and where there are none, if anywhere. Whole numbers stay so under a
         scale of whole numbers; others are scaled in float64, and rounded once to float32."""
         mask = None
         for number in self.missing:
-            with np.errstate(over="ignore", invalid="ignore"):
-                at = stored == np.array(number).astype(stored.dtype, copy=False)
-            exact = stored.dtype.kind == "f" or (math.isfinite(number) and number == int(number))
-            if exact and (stored.dtype.kind == "f" or within_type(number, stored.dtype)) and at.any():
-                mask = at if mask is None else mask | at
+            if stored.dtype.kind == "f" or holds(stored.dtype, number):
+                at = stored == stored.dtype.type(number)
+                mask = (at if mask is None else mask | at) if at.any() else mask
         slope, intercept = float(self.slope), float(self.intercept)
-        if (slope, intercept) == (1.0, 0.0):
+        if not self.is_scaled:
             return stored, mask
-        if stored.dtype.kind in "iu" and slope.is_integer() and intercept.is_integer():
-            ends = [int(end) * int(slope) + int(intercept) for end in (stored.min(), stored.max())]
-            kind = np.int32 if max(map(abs, ends)) < 2**31 else np.int64
-            if max(map(abs, ends)) < 2**62:
-                return stored.astype(kind) * kind(slope) + kind(intercept), mask
+        if stored.dtype.kind in "iu" and slope.is_integer() and intercept.is_integer() and stored.size:
+            most = max(abs(int(end) * int(slope) + int(intercept)) for end in (stored.min(), stored.max()))
+            if most < 2**62:
+                kind = (
+                    np.int32 if most < 2**31 and abs(slope) < 2**31 and abs(intercept) < 2**31 else np.int64
+                )
+                return (stored.astype(np.int64) * int(slope) + int(intercept)).astype(kind), mask
         values = np.empty(stored.shape, np.float64 if stored.dtype == np.float64 else np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # what is infinite is refused, or replaced, later
-            for plane, into in zip(np.atleast_1d(stored), np.atleast_1d(values), strict=True):  # saves memory
+            for plane, into in zip(stored, values, strict=True):  # which saves memory
                 into[...] = plane * np.float64(slope) + intercept
         return values, mask
 
-    def place(self) -> tuple[list[int], list[int], dict[str, np.ndarray]]:
-        """How axes are brought along the world's (left, back and head, where a convention is known): which of
-        x, y, z becomes each, the sign of its direction, and spacing (mm), origin of the turned array for a
-        first voxel at its `origin`, and the direction that is left, if any. No voxel is interpolated."""
-        lengths, given = (
-            self.millimetres(),
-            np.array([self.steps.get(letter, 1.0) for letter in "xyz"], float),
-        )
+    def oriented(
+        self, sizes: Sequence[int], *, turned: bool = True
+    ) -> tuple[list[int], list[int], dict[str, Any]]:
+        """How axes of so many voxels are brought along the world's: which of x, y, z becomes each, its sign, and
+        spacing (mm), origin and direction of `Volume`, missing where the file says nothing. Not `turned`: axes
+        stay in order, and only those along which steps are negative are reversed. No voxel is interpolated."""
+        lengths, given = self.millimetres(), np.array([self.steps.get(a, 1.0) for a in "xyz"], float)
         if self.steps and (unknown := [letter for letter in "xyz" if letter not in self.steps]):
             self.note(f"the distance along {', '.join(unknown)}: taken as 1, in the unit of the others")
         world = np.array([1.0 if axis in "LPS" else -1.0 for axis in self.convention or "LPS"])
         turn = np.eye(3) if self.direction is None else np.asarray(self.direction, float)
-        if not (
-            np.all(given != 0) and np.all(np.isfinite([*given, *self.origin])) and np.isfinite(turn).all()
-        ):
-            got = f"{np.asarray(given).tolist()} from {np.asarray(self.origin).tolist()}"
-            raise ValueError(f"{self.what} must be finite, with steps longer than 0; got {got}.")
-        turn = directions(self.what, turn) * np.sign(given) * world[:, None]
-        # the axis of the data that is nearest to each axis of the world, all three at once
-        orders = map(list, itertools.permutations(range(3)))
-        order = max(orders, key=lambda p: np.abs(turn[range(3), p]).sum())
+        what, origin = f"{self.what}: its place", np.asarray(self.origin, float)
+        if not (given.all() and np.isfinite([*given, *origin, *turn.flat]).all()):
+            got = f"{given.tolist()} from {origin.tolist()}"
+            raise ValueError(f"{what} must be finite, with steps longer than 0; got {got}.")
+        turn = directions(what, turn) * world[:, None] * np.sign(given)
+        order, signs = [0, 1, 2], np.sign(given).astype(int)
+        if turned:  # the axis of the data that is nearest to each axis of the world, all three at once
+            orders = map(list, itertools.permutations(range(3)))
+            order = max(orders, key=lambda p: np.abs(turn[range(3), p]).sum())
+            signs = np.where(np.diag(turn[:, order]) >= 0, 1, -1)
         turn, steps = turn[:, order], (np.abs(given) * lengths)[order]
-        signs = np.where(np.diag(turn) >= 0, 1, -1)
-        place = {"spacing": steps, "origin": world * self.origin * lengths, "turn": turn}
+        last = [sizes[axis] - 1 if sign < 0 else 0 for axis, sign in zip(order, signs, strict=True)]
+        place = {"spacing": steps, "origin": world * origin * lengths + turn @ (steps * last)}
         if not np.allclose(turn * signs, np.eye(3), rtol=0, atol=ALONG_AXES):
             place["direction"] = turn * signs
-        return order, signs.tolist(), place
-
-    def oriented(self, sizes: Sequence[int]) -> tuple[list[int], list[int], dict[str, Any]]:
-        """As `place`, for an array of so many voxels along its x, y, z: order, signs, and spacing, origin and
-        direction of `Volume`, which are missing where the file says nothing."""
-        order, signs, place = self.place()
-        last = np.array([sizes[axis] - 1 if sign < 0 else 0 for axis, sign in zip(order, signs, strict=True)])
-        place["origin"] = place["origin"] + place.pop("turn") @ (place["spacing"] * last)
-        known = (
-            bool(self.steps) or self.direction is not None or np.any(place["origin"]) or bool(self.convention)
-        )
-        return order, signs, place if known else {}
+        known = self.steps or self.convention or self.direction is not None or place["origin"].any()
+        return order, signs.tolist(), place if known else {}
 
     def rows(self) -> dict[str, str]:
         """The record in words, by what they are about, for `jaxvol info`."""
         lengths = {a: f" of {step:.6g} {self.unit(a) or ''}".rstrip() for a, step in self.steps.items()}
-        axes = zip(self.axes, self.data.shape, self.letters(), strict=True)
-        told = [f"{name} {n}{lengths.get(letter, '')}" for name, n, letter in axes]
-        rows = {"format": self.format, "stored": f"{self.data.dtype}, {', '.join(told)}"}
-        if (self.slope, self.intercept) != (1, 0):
-            rows["scale"] = f"value = {self.slope:.9g} x stored + {self.intercept:.9g}"
-        if self.missing:
-            rows["missing"] = f"stored {', '.join(f'{number:g}' for number in self.missing)}"
-        if self.convention:
-            rows["world"] = f"{self.convention}, read as LPS (left, back, head)"
-        if self.labels:
-            rows["names"] = ", ".join(f"{value} {name}" for value, name in list(self.labels.items())[:8])
+        axes = zip(self.axes, self.data.shape, self.letters, strict=True)
+        told = ", ".join(f"{name} {n}{lengths.get(letter, '')}" for name, n, letter in axes)
+        rows = {"format": self.format, "stored": f"{self.data.dtype}, {told}"}
+        rows |= (
+            {"scale": f"value = {self.slope:.9g} x stored + {self.intercept:.9g}"} if self.is_scaled else {}
+        )
+        rows |= {"missing": f"stored {', '.join(f'{n:g}' for n in self.missing)}"} if self.missing else {}
+        rows |= {"world": f"{self.convention}, shown as LPS (left, back, head)"} if self.convention else {}
+        named = ", ".join(f"{value} {name}" for value, name in self.labels.items())
+        rows |= {"names": shortened(named)} if named else {}
         return rows | ({"assumed": "; ".join(self.assumed)} if self.assumed else {})
 
 
-def within_type(number: float, dtype: np.dtype) -> bool:
+def holds(dtype: np.dtype, number: float) -> bool:
     """Whether a type of integers holds a number."""
-    limits = np.iinfo(dtype)
-    return bool(limits.min <= number <= limits.max)
+    if dtype.kind not in "iu" or not float(number).is_integer():
+        return False
+    return bool(np.iinfo(dtype).min <= number <= np.iinfo(dtype).max)
 
 
-def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[Any, str]:
+def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[tuple[Any, ...], str]:
     """An index of the array that chooses an image of several, and the letters of the axes that are left: x, y
     and z, and s of several values in a voxel. Raises `ValueError` where the choice is missing or wrong."""
-    letters, shape, where = record.letters(), record.data.shape, record.what.removeprefix("path: ")
+    letters, shape, where = record.letters, record.data.shape, record.what.removeprefix("path: ")
     given = {"time": time, "channel": channel}
     own = {"time": "t", "channel": "c" if "c" in letters else "s"}
-    sizes = ", ".join(f"{axis} {n}" for axis, n in sorted(zip(letters, shape, strict=True), key=_rank))
+    axes = sorted(zip(letters, shape, strict=True), key=lambda axis: "xyztcs".index(axis[0]))
+    sizes = ", ".join(f"{axis} {n}" for axis, n in axes)
     for name, letter in own.items():
         if given[name] is not None and letter not in letters:
             raise ValueError(f"{name}: {where} has no such axis; it holds {sizes}.")
-    if not {*"xyz"} <= {*letters}:
-        raise ValueError(f"{record.what} must be a 3-D image; got one of {sizes}.")
     index: list[Any] = [slice(None)] * len(letters)
     for letter in sorted({*letters} - {*"xyz"}):
-        name, at = ("time" if letter == "t" else "channel"), letters.index(letter)
+        name, at = "time" if letter == "t" else "channel", letters.index(letter)
         number = given[name] if own[name] == letter else None
         if number is None and shape[at] > 1:
             if letter == "s":
@@ -192,14 +191,15 @@ def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[
     return tuple(index), "".join(a for a, i in zip(letters, index, strict=True) if isinstance(i, slice))
 
 
-def _rank(axis: tuple[str, int]) -> int:
-    return "xyztcs".index(axis[0])
-
-
 def volume_arguments(
-    record: ImageRecord, *, time: int | None = None, channel: int | None = None, nan: float | None = None
+    record: ImageRecord,
+    *,
+    time: int | None = None,
+    channel: int | None = None,
+    nan: float | None = None,
+    turned: bool = True,
 ) -> dict[str, Any]:
-    """Arguments of `Volume` for an image: axes in order along the world's, lengths in mm, values scaled, and
+    """Arguments of `Volume` for an image: axes along the world's (if `turned`), lengths in mm, values scaled, and
     those that are missing replaced by `nan`, by default by the least one that is there.
 
     Raises:
@@ -208,36 +208,39 @@ def volume_arguments(
 
     Warns of what was taken in place of what the file does not say (`ImageRecord.assumed`).
     """
-    record.assumed += [] if record.assumed else _of_axes(record)
     index, letters = choose(record, time, channel)
-    shape = [n for n, i in zip(record.data.shape, index, strict=True) if isinstance(i, slice)]
+    shape = [n for n, part in zip(record.data.shape, index, strict=True) if isinstance(part, slice)]
     if math.prod(shape) > MOST_VOXELS:
         raise ValueError(f"{record.what} must hold 1 to 2**31 - 1 voxels; got shape {tuple(shape)}.")
-    order, signs, place = record.oriented([shape[letters.index(letter)] for letter in "xyz"])
+    if not {*"xyz"} <= {*letters}:
+        check_shape(tuple(shape[:2]))
+    order, signs, place = record.oriented([shape[letters.index(a)] for a in "xyz"], turned=turned)
     stored = np.asarray(record.data[index])
-    stored = stored if stored.dtype.isnative else stored.astype(stored.dtype.newbyteorder("="))
-    data, mask = record.decode(stored)
+    data, mask = record.decode(
+        stored if stored.dtype.isnative else stored.astype(stored.dtype.newbyteorder("="))
+    )
+    also = dict(record.also)
     if mask is not None:
         data = _filled(record, data, mask, nan)
     if nan is not None and data.dtype.kind == "f":
-        nan = np.asarray(finite_array("nan", nan, ())).item()
-        data = np.where(np.isfinite(data), data, data.dtype.type(nan))
-    if (record.slope, record.intercept) != (1, 0) and data.dtype.kind in "iu" and data.dtype.itemsize > 2:
-        if not within(data, WHOLE["float32"]) and len(np.unique(data)) <= 2**16:
-            record.note("whole numbers beyond 2**24, which float32 rounds: numbered, see label_ids")
-            record.also = record.also | numbered(data)
-            data = record.also.pop("data")
+        data = np.where(np.isfinite(data), data, data.dtype.type(np.asarray(finite_array("nan", nan, ()))))
+    if record.is_scaled and data.dtype.kind in "iu" and not within(data, WHOLE["float32"]):
+        record.note("whole numbers beyond 2**24, which float32 would round: numbered, see label_ids")
+        also |= numbered(data)
+        data = also.pop("data")
     axes = [letters.index("xyz"[axis]) for axis in order] + [k for k, a in enumerate(letters) if a == "s"]
-    turned = np.transpose(data, axes)[tuple(slice(None, None, sign) for sign in signs)]
+    data = np.transpose(data, axes)[tuple(slice(None, None, sign) for sign in signs)]
     for text in record.assumed:
-        warnings.warn(f"{record.what.removeprefix('path: ')}: {text}", stacklevel=4)
-    return {"data": np.ascontiguousarray(turned), **place, **record.also}
+        warn_caller(f"{record.what.removeprefix('path: ')}: {text}")
+    return {"data": np.ascontiguousarray(data), **place, **also}
 
 
-def _of_axes(record: ImageRecord) -> list[str]:
-    assumed: list[str] = []
-    axis_letters(record.what, record.axes, assumed)
-    return assumed
+def warn_caller(text: str) -> None:
+    """Warn of something at the line that called the library."""
+    level, frame = 1, sys._getframe()
+    while frame is not None and frame.f_globals.get("__name__", "").startswith(INNER):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, stacklevel=level)
 
 
 def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float | None) -> np.ndarray:
@@ -246,12 +249,8 @@ def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float 
         if mask.all():
             raise ValueError(f"{record.what} must hold values; all {mask.size} are missing. Give nan=VALUE.")
         nan = data[~mask].min().item()
-        count = np.count_nonzero(mask)
-        record.note(
-            f"{count} of {mask.size} values are missing: shown as the least, {nan:g}; nan= is another"
-        )
-    whole = data.dtype.kind in "iu" and float(nan).is_integer() and within_type(nan, data.dtype)
-    data = np.array(data, data.dtype if whole or data.dtype.kind == "f" else np.float32)
+        record.note(f"{np.count_nonzero(mask)} of {mask.size} values are missing: shown as {nan:g}; see nan")
+    data = np.array(data, data.dtype if data.dtype.kind == "f" or holds(data.dtype, nan) else np.float32)
     data[mask] = nan
     return data
 
@@ -263,23 +262,14 @@ def numbered(ids: np.ndarray) -> dict[str, Any]:
 
 
 class DecodedArray:
-    """The array of a record, of which boxes are read as values, with some axes reversed: for bricks.
-
-    Args:
-        record: its array has `shape`, `dtype` and `array[box]`.
-        reverse: axes of the array that are reversed.
-    """
+    """The array of a record, of which boxes are read as values, with some of its axes reversed: for bricks."""
 
     def __init__(self, record: ImageRecord, reverse: Sequence[int], nan: float | None):
         self.record, self.reverse, self.nan, self.shape = record, reverse, nan, record.data.shape
         stored = np.dtype(getattr(record.data.dtype, "numpy_dtype", record.data.dtype))
-        scaled = (record.slope, record.intercept) != (1, 0) or record.missing
-        self.dtype = np.dtype(np.float32) if scaled else stored
-
-    def __getattr__(self, name: str) -> Any:  # chunks, chunk_layout
-        if name in ("chunks", "chunk_layout"):
-            return getattr(self.record.data, name)
-        raise AttributeError(name)
+        self.dtype = np.dtype(np.float32) if record.is_scaled or record.missing else stored
+        if (chunks := getattr(record.data, "chunks", None)) is not None:
+            self.chunks = chunks
 
     def __getitem__(self, box: tuple[Any, ...]) -> np.ndarray:
         index = list(box)
@@ -288,7 +278,7 @@ class DecodedArray:
         values, mask = self.record.decode(np.asarray(self.record.data[tuple(index)]))
         if mask is not None:
             if self.nan is None:
-                raise ValueError("values are missing: give nan=VALUE, --nan")
+                raise ValueError("values are missing: give nan=VALUE")
             values = np.where(mask, self.nan, values)
         kept = [axis for axis, part in enumerate(box) if isinstance(part, slice)]
         return values[tuple(slice(None, None, -1 if axis in self.reverse else 1) for axis in kept)]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from .image_record import ImageRecord, volume_arguments
-from .units import axis_letters
 
 
 EVEN = 1e-3
@@ -33,10 +32,9 @@ def object_arguments(value: Any) -> dict[str, Any] | None:
     becomes the volume's."""
     if (record := record_of(value)) is None:
         return None
-    letters = record.letters()
-    if "s" not in letters:
+    if "s" not in (letters := record.letters):
         record.axes = letters.replace("c", "s")
-    return volume_arguments(record)
+    return volume_arguments(record, turned=False)
 
 
 def grid_of(affine: Any) -> dict[str, Any]:
@@ -53,7 +51,7 @@ def nibabel_record(image: Any, stored: Any = None, what: str = "data") -> ImageR
     are in the file, from 0 on, as by SimpleITK; nibabel itself reverses one of them and centres all.
     `stored`: its numbers, if they were read before."""
     header, proxy, place = image.header, image.dataobj, grid_of(image.affine) | {"convention": "RAS"}
-    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header.keys()]
+    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
     if codes and not any(codes):
         place = {"steps": dict(zip("xyz", map(float, header["pixdim"][1:4]), strict=True))}
     unit = header.get_xyzt_units()[0] if hasattr(header, "get_xyzt_units") else "mm"
@@ -121,13 +119,12 @@ def _xarray(value: Any) -> ImageRecord:
     spaced, also by those of several axes; `direction` as `itk.xarray_from_image` keeps it."""
     own = {name: value.coords[name] for name in value.dims if name in value.coords}
     names = [str(getattr(own.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
-    assumed: list[str] = []
-    data = value.to_numpy()
+    data = value.variable  # which may be read from a file later
     if not 3 <= data.ndim <= 5:
         return ImageRecord(data, names)
-    letters = axis_letters("data", names, assumed)
+    record = ImageRecord(data, names, **cf_scale(value.attrs))
+    letters = record.letters
     space = [letters.index(letter) for letter in "xyz" if letter in letters]
-    record = ImageRecord(data, names, assumed=assumed, **cf_scale(value.attrs))
     positions = [value.coords.get(letter) for letter in "xyz"]
     if all(each is not None and len(each.dims) >= 1 for each in positions) and len(space) == 3:
         apart = any(each.dims != (value.dims[at],) for each, at in zip(positions, space, strict=True))

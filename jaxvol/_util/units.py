@@ -2,7 +2,7 @@
 
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from .checks import shortened
 
@@ -37,27 +37,26 @@ def length_of(unit: str | None) -> float | None:
     return next((LENGTHS[word] for word in (name, name.removesuffix("s")) if word in LENGTHS), None)
 
 
-def axis_letters(what: str, names: Sequence[str], assumed: list[str] | None = None) -> str:
+def axis_letters(what: str, names: Sequence[str], note: Callable[[str], None]) -> str:
     """The letter of each axis: x, y and z of space, t of time, c of channels, s of values in a voxel.
 
-    Where as many names are unknown as axes of space are missing, they are taken as these in order, and
-    `assumed` says so, but of names that only count. Raises `ValueError`, which begins with `what`, for an
-    axis that is not known otherwise, and for two of one kind.
+    Where as many names are unknown as axes of space are missing, they are taken as these in order, and so
+    are three of which none is known. `note` is told so, but of names that only count. Raises `ValueError`,
+    which begins with `what`, for an axis that is not known otherwise, and for two of one kind.
     """
     words = [str(name).strip().lower() for name in names]
     found = [AXES.get(word) or AXES.get(word.removesuffix("s")) for word in words]
     if "height" in words:  # of an image, or above the ground
         found[words.index("height")] = "y" if "y" not in found else "z"
-    unknown = [at for at, letter in enumerate(found) if letter is None]
     missing = [letter for letter in "xyz" if letter not in found]
+    if len(words) == len(missing) == 3:
+        found = [None] * 3
+    unknown = [at for at, letter in enumerate(found) if letter is None]
     if unknown and len(unknown) == len(missing):
         for at, letter in zip(unknown, missing, strict=True):
             found[at] = letter
-        told = ", ".join(repr(str(names[at])) for at in unknown)
-        if assumed is not None and not all(
-            re.fullmatch(r"(dim|axis|phony_dim)_?\d+", words[at]) for at in unknown
-        ):
-            assumed.append(f"axes {told}: taken as {', '.join(missing)}")
+        if not all(re.fullmatch(r"(dim|axis|phony_dim)_?\d+", words[at]) for at in unknown):
+            note(f"axes {', '.join(repr(str(names[at])) for at in unknown)}: taken as {', '.join(missing)}")
     letters = "".join(letter or "?" for letter in found)
     if "?" in letters or len({*letters}) < len(letters):
         raise ValueError(

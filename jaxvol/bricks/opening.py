@@ -8,7 +8,6 @@ A voxel's position is that of its centre; `orientation` (RFC 4) is as ngff-zarr 
 import json
 import math
 import os
-import warnings
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -18,10 +17,11 @@ import numpy as np
 
 from .._util.checks import Arrayable, described, shortened
 from .._util.files import MOST_VOXELS
-from .._util.image_record import DecodedArray, ImageRecord
+from .._util.image_record import DecodedArray, ImageRecord, warn_caller
 from .._util.memory import memory_of_device, require_room
 from .._util.named_axes import cf_scale, even_step, record_of
 from .._util.units import axis_letters
+from .._util.voxels import check_shape
 from ..io.formats import FOLDERS, hdf5, mrc, read_record
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume, check_one_channel
@@ -100,18 +100,21 @@ def levels_of(
         own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
         return (VoxelSource(thing.data, **(own | place), axes="xyz", **options, name="volume"),)
     if (record := record_of(thing)) is not None:
+        if "axes" in options:
+            raise TypeError(f"axes: the {type(thing).__name__} has its own.")
         return (_source(record, place, **options),)
     if not isinstance(thing, str | os.PathLike):
         return (VoxelSource(thing, **place, **options),)
     path = Path(thing)
     if is_zarr(path):
-        if (is_image := not _is_zarr_array(path)) and (own := [*place, *({"axes"} & options.keys())]):
+        is_image = not _is_zarr_array(path)
+        if is_image and (own := [name for name in ("spacing", "origin", "axes") if name in place | options]):
             raise TypeError(f"{', '.join(own)}: the OME-Zarr image {path} has its own.")
         fills = {"missing": options.pop("missing")} if "missing" in options else {}
         records = _ome_records(path, **fills) if is_image else [_zarr_record(path, **fills)]
         return tuple(_source(record, place, **options) for record in records)
     name = path.name.lower()
-    if path.exists() and not name.endswith(READ_IN_BOXES) and "shape" not in options:
+    if path.exists() and (name.endswith(".gz") or not (name.endswith(READ_IN_BOXES) or "shape" in options)):
         raise ValueError(
             f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, MRC, "
             "HDF5, or the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as DICOM "
@@ -130,10 +133,12 @@ def _source(
     name, array = record.what.removeprefix("path: "), record.data
     if axes is not None or not record.axes:
         return VoxelSource(array, **place, axes=axes, nan=nan, name=name, **index)
-    letters = record.letters()
+    letters = record.letters
+    if not {*SPACE} <= {*letters}:
+        check_shape(tuple(array.shape[:2]))
     order, signs, own = record.oriented([array.shape[letters.index(letter)] for letter in "xyz"])
     for text in record.assumed:
-        warnings.warn(f"{name}: {text}", stacklevel=4)
+        warn_caller(f"{name}: {text}")
     at = [letters.index("xyz"[axis]) for axis in order]
     names = [*letters]
     for axis, letter in zip(at, "xyz", strict=True):
@@ -154,7 +159,7 @@ def read_zarr(path: Path) -> ImageRecord:
     records = [_zarr_record(path)] if _is_zarr_array(path) else _ome_records(path)
     room, sizes = memory_of_device() // 4, []
     for record in records:
-        shape = dict(zip(record.letters() if record.axes else "xyz", record.data.shape, strict=False))
+        shape = dict(zip(record.letters if record.axes else "xyz", record.data.shape, strict=False))
         sizes = [n for letter, n in shape.items() if letter in "xyzs"]
         voxels, stored = math.prod(sizes), record.data.dtype.numpy_dtype
         if voxels <= MOST_VOXELS and voxels * voxel_type(stored).itemsize <= room:
@@ -216,7 +221,7 @@ def _zarr_record(path: Path, missing: Any = "fill") -> ImageRecord:
     try:
         for name, value in cf_scale(attributes).items():
             setattr(record, name, value)
-        for letter, name in zip(record.letters() if names else "", names, strict=True):
+        for letter, name in zip(record.letters if names else "", names, strict=True):
             beside = path.parent / name  # a coordinate of xarray
             if letter in "xyz" and beside != path and is_zarr(beside) and _is_zarr_array(beside):
                 coordinate = _zarr_record(beside)
@@ -254,7 +259,10 @@ def _ome_records(path: Path, **options: Any) -> list[ImageRecord]:
             "array in it, such as its folder 0."
         ) from fault
     names = [axis.name for axis in image.axes]
-    letters = axis_letters(f"path: {path}", names)
+    unknown: list[str] = []
+    letters = axis_letters(f"path: {path}", names, unknown.append)
+    if unknown or not {*SPACE} <= {*letters}:
+        raise ValueError(f"path: {path} must have axes x, y and z; got {names}.")
     units = {letter: getattr(axis, "unit", None) for letter, axis in zip(letters, image.axes, strict=True)}
     told = [axis.get("orientation") for axis in content["multiscales"][0]["axes"]]
     sides = [str(each.get("value")) if isinstance(each, dict) else "" for each in told]

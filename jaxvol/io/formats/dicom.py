@@ -3,37 +3,59 @@
 import math
 import mmap
 import re
-import warnings
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..._util.affine import directions
-from ..._util.checks import finite_array, shortened
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, reason
+from ..._util.checks import finite_array, integer, shortened
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, refusing
 from ..._util.image_record import ImageRecord
 
 
 UID = "1.2.840.10008."
-PLAIN = {UID + end for end in ("1.2", "1.2.1", "1.2.2", "1.2.1.99")}
-JPEG = "ljpeg" if False else "jpeg"
-PACKED = dict.fromkeys((f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70)), "jpeg_decode")
+PLAIN = {UID + end for end in ("1.2", "1.2.1", "1.2.2")}
+PACKED = {UID + "1.2.1.99": "", UID + "1.2.5": ""}
+PACKED |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70)), "jpeg_decode")
 PACKED |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (80, 81)), "jpegls_decode")
 PACKED |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (90, 91)), "jpeg2k_decode")
-"""Transfer syntaxes, and what decodes them in imagecodecs; run lengths (1.2.5) by pydicom."""
+"""Transfer syntaxes, and what decodes them in imagecodecs; "": pydicom does."""
 
 STORAGE = UID + "5.1.4.1.1."
 NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "481.5"))
 """Presentation states, reports, documents, contours and plans, which often lie in a series' folder."""
 
-TIMES = "AcquisitionNumber", "TemporalPositionIdentifier", "TriggerTime", "DiffusionBValue", "EchoTime"
-TIMES += "ContentTime", "InstanceNumber"
-"""Elements that tell images of one place apart."""
+KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
+"""Elements of the meta information with which a file begins."""
+
+TIMES = (
+    *("TemporalPositionIndex", "TemporalPositionIdentifier", "AcquisitionNumber", "TriggerTime"),
+    *("DiffusionBValue", "EchoTime", "AcquisitionTime", "ContentTime", "InstanceNumber"),
+)
+"""Elements that tell images at one place apart."""
 
 AWAY = 0.1
 """The part of a voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
+
+
+class Slice(NamedTuple):
+    """One image of a series. `parts`: what holds its elements, the first that has one counts. `place`: its
+    position. `grid`: distances between rows and between columns, and the directions of both."""
+
+    file: Path
+    frame: int
+    parts: list[Any]
+    shape: tuple[int, int, int]
+    place: np.ndarray
+    grid: np.ndarray
+
+    @property
+    def name(self) -> str:
+        return self.file.name if self.shape[0] == 1 else f"frame {self.frame + 1}"
+
+    def told(self, name: str) -> Any:
+        return next((part[name].value for part in self.parts if name in part), None)
 
 
 def is_dicom(path: Path) -> bool:
@@ -47,20 +69,12 @@ def dicom_files(folder: Path) -> list[Path]:
     files = sorted(file for file in folder.iterdir() if file.is_file() and file.name.upper() != "DICOMDIR")
     named = [file for file in files if file.suffix.lower() == ".dcm" and not file.name.startswith(".")]
     images = [file for file in files if file in named or is_dicom(file)]
-    return [file for file in images if not _kind(file).startswith(NO_IMAGES)]
-
-
-def _kind(path: Path) -> str:
-    """The class of what a file holds, from the meta information at its begin; "" if it is not there."""
-    with path.open("rb") as stream:
-        found = re.search(rb"\x02\x00\x02\x00UI(.)\x00([0-9.]{1,64})", stream.read(2**16), re.DOTALL)
-    return found[2].decode() if found else ""
+    return [file for file in images if not _meta(file, KIND).startswith(NO_IMAGES)]
 
 
 def folders_below(folder: Path) -> list[Path]:
-    """Folders that hold DICOM images, up to 4 levels down, 1000 at most."""
-    found: list[Path] = []
-    below = [folder]
+    """Folders that hold DICOM images, up to 4 levels down, of 1000 a level at most."""
+    below, found = [folder], []
     for _ in range(4):
         below = [each for parent in below for each in sorted(parent.iterdir()) if each.is_dir()][:1000]
         found += [each for each in below if dicom_files(each)]
@@ -69,7 +83,7 @@ def folders_below(folder: Path) -> list[Path]:
 
 def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> ImageRecord:
     """Reader for a folder that holds one series, for one file of a series, whose others are in its folder, for
-    a disc by its DICOMDIR, and for a file of several frames.
+    a file of several frames, and for the DICOMDIR of a disc with one series.
 
     Args:
         path: the folder, or the file.
@@ -77,96 +91,84 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
         time: which one of several images at each place.
 
     Raises:
-        ValueError: for several series, and for slices that are missing, of different sizes or directions,
-            without spacing, shifted unevenly, cut short, or compressed in a way that is not read.
+        ValueError: for several series, and for slices that are missing, there twice, of different sizes or
+            directions, without spacing, shifted unevenly, cut short, or compressed in a way that is not read.
     """
     if path.name.upper() == "DICOMDIR":
         folders = folders_below(path.parent)
         if len(folders) != 1:
-            told = ", ".join(str(folder.relative_to(path.parent)) for folder in folders[:8]) or "no folder"
+            told = ", ".join(str(each.relative_to(path.parent)) for each in folders[:8]) or "no folder"
             raise ValueError(
                 f"path: {path}: {told} beside it holds DICOM images. Give the path of one of them."
             )
         path = folders[0]
-    headers = series_headers(path)
-    frames = [frame for file, header in headers.items() for frame in _frames(file, header, spacing)]
-    shapes = {frame["shape"] for frame in frames}
-    if len(frames) < 2 or len(frames) * math.prod(max(shapes)) > MOST_VOXELS:
+    slices = [
+        each for file, header in series_headers(path).items() for each in _slices(file, header, spacing)
+    ]
+    if not 2 <= len(slices) <= MOST_VOXELS // math.prod(slices[0].shape[1:] if slices else (1,)):
         raise ValueError(
-            f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got {len(frames)}."
+            f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got {len(slices)}."
         )
-    first = frames[0]
-    for frame in frames:
-        same = np.allclose(frame["grid"], first["grid"], rtol=1e-4, atol=1e-4)
-        if not same or frame["shape"] != first["shape"]:
+    first = slices[0]
+    for each in slices:
+        if each.shape[1:] != first.shape[1:] or not np.allclose(each.grid, first.grid, rtol=1e-4, atol=1e-4):
+            grids = (f"{each.shape[1:]} {each.grid.tolist()}" for each in (first, each))
             raise ValueError(
-                f"path: {path}: slices of one series must agree in size, spacing and directions; {first['name']} and "
-                f"{frame['name']} do not: {first['shape']} {first['grid']} and {frame['shape']} {frame['grid']}. Is one an "
-                "overview?"
+                f"path: {path}: slices of one series must agree in size, spacing and directions; {first.name} "
+                f"and {each.name} do not: {' and '.join(grids)}. Is one an overview?"
             )
-    down, across = first["grid"][:2]
-    turn = np.reshape(first["grid"][2:], (2, 3)).T
-    turn = np.column_stack([turn, np.cross(*turn.T)])
-    turn = directions(f"path: {path}: rows and columns of {first['name']}", turn)
-    frames, count = _one_time(
-        path, sorted(frames, key=lambda frame: float(frame["at"] @ turn[:, 2])), turn[:, 2], time
+    (down, across), turn = first.grid[:2].tolist(), first.grid[2:].reshape(2, 3)
+    turn = directions(
+        f"path: {path}: rows and columns of {first.name}", np.column_stack([*turn, np.cross(*turn)])
     )
-    step, length = _even(path, frames, turn[:, 2], min(across, down))
-    turn[:, 2] = step / length
-    # the last step is a list of planes, since each may have its own scale
-    planes = [frame["values"]() for frame in frames]
+    slices = sorted(slices, key=lambda each: float(each.place @ turn[:, 2]))
+    slices, several = _at_one_time(path, slices, turn[:, 2], time)
+    step = _even_step(path, slices, turn[:, 2], min(across, down))
+    turn[:, 2] = step / np.linalg.norm(step)
+    steps = {"x": across, "y": down, "z": float(np.linalg.norm(step))}
+    what, told = f"path: {path}", f"DICOM, {len(slices)} slices{several}"
     return ImageRecord(
-        np.stack(planes),
-        "zyx",
-        {"x": across, "y": down, "z": length},
-        "mm",
-        frames[0]["at"],
-        turn,
-        "LPS",
-        what=f"path: {path}: rows, columns and slices",
-        format=f"DICOM, {len(frames)} slices" + (f", {count} at each place" if count > 1 else ""),
+        _values(slices), "zyx", steps, "mm", slices[0].place, turn, "LPS", what=what, format=told
     )
 
 
-def _one_time(path: Path, frames: list[Any], normal: np.ndarray, time: int | None) -> tuple[list[Any], int]:
-    """One image at each place, by `time` where there are as many at each; and how many there are."""
-    along = np.array([frame["at"] @ normal for frame in frames])
-    apart = np.flatnonzero(np.diff(along) > 1e-3 * max(np.ptp(along) / len(along), 1e-6)) + 1
-    groups = np.split(np.arange(len(frames)), apart)
+def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any) -> tuple[list[Slice], str]:
+    """One image at each place, by `time` where there are as many at each; and words on how many there are."""
+    along = np.array([each.place @ normal for each in slices])
+    cuts = np.flatnonzero(np.diff(along) > 1e-3 * np.ptp(along) / len(along)) + 1
+    groups = [slices[a:b] for a, b in zip([0, *cuts], [*cuts, len(slices)], strict=True)]
     count = len(groups[0])
-    if count == 1 or len({len(group) for group in groups}) > 1 or len(groups) < 2:
+    if count == 1 or len(groups) == 1 or len({len(group) for group in groups}) > 1:
         if time is not None:
             raise ValueError(f"time: {path} has no such axis; it holds one image at each place.")
-        return frames, 1
-    keys = [name for name in TIMES if len({str(frames[i]["told"].get(name)) for i in groups[0]}) == count]
-    key = keys[0] if keys else ""
-    told = sorted({frames[i]["told"].get(key) for i in groups[0]}, key=_number) if key else []
+        return slices, ""
+    key = next(
+        (name for name in TIMES if len({str(each.told(name)) for each in groups[0]}) == count), TIMES[-1]
+    )
+    ordered = [
+        sorted(group, key=lambda each: (_float(each.told(key)), str(each.told(key)))) for group in groups
+    ]
     if time is None:
-        by = (
-            f" ({re.sub('(?<!^)([A-Z])', lambda m: ' ' + m[1].lower(), key)} {', '.join(map(str, told[:6]))})"
-            if key
-            else ""
-        )
+        words = re.sub("(?<=[a-z])(?=[A-Z])", " ", key).lower()
+        by = f"{words} {', '.join(str(each.told(key)) for each in ordered[0][:6])}"
         raise ValueError(
-            f"path: {path} holds {count} images at each of {len(groups)} places{by}: time must be given, from 0 to "
-            f"{count - 1}."
+            f"path: {path} holds {count} images at each of {len(groups)} places ({by}): time must be given, from 0 "
+            f"to {count - 1}."
         )
-    if not 0 <= time < count:
-        raise ValueError(f"time must be an integer from 0 to {count - 1}; got {time!r}.")
-    chosen = [sorted(group, key=lambda i: _number(frames[i]["told"].get(key)))[time] for group in groups]
-    return [frames[i] for i in chosen], count
+    at = integer("time", time, 0, count - 1)
+    return [group[at] for group in ordered], f", one of {count} at each place"
 
 
-def _number(value: Any) -> tuple[float, str]:
+def _float(value: Any) -> float:
     try:
-        return float(value), ""
+        return float(value)
     except (TypeError, ValueError):
-        return math.inf, str(value)
+        return math.inf
 
 
-def _even(path: Path, frames: list[Any], normal: np.ndarray, pixel: float) -> tuple[np.ndarray, float]:
-    """The step from slice to slice, and its length. The gantry may be tilted."""
-    at = np.array([frame["at"] for frame in frames])
+def _even_step(path: Path, slices: list[Slice], normal: np.ndarray, pixel: float) -> np.ndarray:
+    """The step from slice to slice. The gantry may be tilted."""
+    at, names = np.array([each.place for each in slices]), [each.name for each in slices]
     mean = (at[-1] - at[0]) / (len(at) - 1)
     for step in (normal * (mean @ normal), mean):
         away = at - at[0] - np.outer(np.arange(len(at)), step)
@@ -174,26 +176,22 @@ def _even(path: Path, frames: list[Any], normal: np.ndarray, pixel: float) -> tu
         sideways = np.abs(away - np.outer(along, normal)).max(axis=1)
         even = (np.abs(along) <= AWAY * (mean @ normal)) & (sideways <= AWAY * pixel)
         if even.all() and mean @ normal >= 1e-6:
-            return step, float(np.linalg.norm(step))
-    told, steps = f"path: {path} must hold slices evenly spaced along a line", np.diff(at @ normal)
-    usual, names = float(np.median(steps)), [frame["name"] for frame in frames]
-    for k in np.flatnonzero(np.abs(steps - usual) > 2 * AWAY * usual)[:1] if usual > 0 else []:
-        between = f"between {names[k]} and {names[k + 1]}"
-        if (missing := round(steps[k] / usual) - 1) > 0:
-            raise ValueError(
-                f"{told}: {missing} of {usual:.4g} mm {'is' if missing == 1 else 'are'} missing {between}."
-            )
-        fault = (
-            "two are there twice, at one place:"
-            if steps[k] < 0.01 * usual
-            else f"{steps[k]:.4g} mm in place of {usual:.4g}"
-        )
-        raise ValueError(f"{told}: {fault} {between}.")
-    i = int(np.argmin(even))
-    raise ValueError(
-        f"{told}; of {len(at)}, {names[i]} lies {along[i]:.4g} too far along their normal, and {sideways[i]:.4g} "
-        "sideways. Are slices missing or there twice?"
+            return step
+    steps = np.diff(at @ normal)
+    usual = float(np.median(steps))
+    k = int(np.argmax(np.abs(steps - usual)))
+    told, missing = (
+        f"at {along[k]:.4g} and {sideways[k]:.4g}",
+        round(steps[k] / usual) - 1 if usual > 1e-6 else 0,
     )
+    if abs(steps[k] - usual) > AWAY * usual and missing > 0:
+        told = f"{missing} of {usual:.4g} mm {'is' if missing == 1 else 'are'} missing between {names[k]} and"
+    elif abs(steps[k] - usual) > AWAY * usual:
+        told = f"{steps[k]:.4g} mm in place of {usual:.4g}: one is there twice, or shifted, between {names[k]} and"
+    else:
+        k = int(np.argmin(even)) - 1
+        told = f"{along[k + 1]:.4g} too far along their normal, and {sideways[k + 1]:.4g} sideways, lies"
+    raise ValueError(f"path: {path} must hold slices evenly spaced along a line; {told} {names[k + 1]}.")
 
 
 def series_headers(path: Path) -> dict[Path, Any]:
@@ -217,159 +215,117 @@ def series_headers(path: Path) -> dict[Path, Any]:
 
 def _header(path: Path, *, pixels: bool = False) -> Any:
     """The elements of a file, through a map of it: pydicom asks for as many bytes as lengths say."""
-    pydicom = library("pydicom", path)
     if not is_dicom(path):
         raise ValueError(
             f'path: {path} is no DICOM file: it has no "DICM" at byte 128. Remove it from there.'
         )
-    return _trying(path, lambda: pydicom.dcmread(_mapped(path), stop_before_pixels=not pixels))
+    with refusing(path), path.open("rb") as stream:
+        content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        return library("pydicom", path).dcmread(content, stop_before_pixels=not pixels)
 
 
-def _mapped(path: Path) -> mmap.mmap:
+def _meta(path: Path, element: bytes) -> str:
+    """A UID from the meta information, which is some hundred bytes; "" if it is not there."""
     with path.open("rb") as stream:
-        return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        content = stream.read(2**16)
+    at = content.find(element, 132)
+    length = int.from_bytes(content[at + 6 : at + 8], "little") if at >= 0 else 0
+    return content[at + 8 : at + 8 + length].rstrip(b"\0 ").decode("latin-1") if length <= 64 else ""
 
 
-def _trying(path: Path, read: Callable[[], Any]) -> Any:
-    """What a function of pydicom returns; any of its many errors as one that says what is wrong."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return read()
-    except MemoryError:
-        raise
-    except Exception as fault:
-        if str(fault).startswith("path:"):
-            raise
-        told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
-        raise ValueError(f"path: {path} cannot be read: {told}") from fault
-
-
-def _numbers(path: Path, parts: list[Any], name: str, count: int) -> np.ndarray:
-    """The numbers of an element of the first of these parts that has it; none if it holds something else."""
-    for part in parts:
-        try:
-            value = np.asarray(part[name].value, float) if name in part else np.empty(0)
-        except Exception:  # of numbers that are none
-            value = np.empty(0)
-        if value.shape == (count,) and np.isfinite(value).all():
-            return value
-    return np.empty(0)
-
-
-def _frames(path: Path, header: Any, spacing: Any) -> list[dict[str, Any]]:
-    """The slices of a file: where each lies, and a function that returns its values."""
-    return _trying(path, lambda: _slices(path, header, spacing))
-
-
-def _slices(path: Path, header: Any, spacing: Any) -> list[dict[str, Any]]:
-    syntax = str(header.file_meta.get("TransferSyntaxUID", ""))
-    if syntax not in PLAIN | PACKED.keys() | {UID + "1.2.5"}:
+def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
+    """The images of a file."""
+    if (syntax := _meta(path, SYNTAX)) not in PLAIN | PACKED.keys():
         raise ValueError(
             f"path: {path} is stored in the transfer syntax {syntax}, which is not read. Decompress the series "
             "first, for example with gdcmconv --raw."
         )
-    count, shape = int(header.get("NumberOfFrames") or 1), (int(header.Rows), int(header.Columns))
-    channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.BitsAllocated)
-    if channels != 1 or count < 1 or min(shape) < 1 or bits not in (1, 8, 16, 32, 64):
-        raise ValueError(
-            f"path: {path} must hold slices of one value per pixel; got {count} of {shape}, {channels} values of {bits} bits."
-        )
-    held = file_size(path) * (1 if syntax in PLAIN and not syntax.endswith(".99") else MOST_COMPRESSED)
-    check_size(path, held, count * math.prod(shape) * bits // 8, more=True)
-    shared = list(header.get("SharedFunctionalGroupsSequence") or [])[:1]
-    single = list(header.get("PerFrameFunctionalGroupsSequence") or [])
-    if len(single) not in ((0, 1, count) if count == 1 else (count,)):
-        raise ValueError(f"path: {path}: {count} frames must say where they lie; {len(single)} do.")
-    pixels: list[np.ndarray] = []
-
-    def values(k: int, parts: list[Any]) -> np.ndarray:
-        if not pixels:
-            pixels.append(_trying(path, lambda: _pixels(path, syntax, (count, *shape))))
-        plane, pixels[0:] = pixels[0][k], pixels if k < count - 1 else []
-        return _trying(path, lambda: _scaled(path, plane, parts))
-
-    found = []
-    for k in range(count):
-        groups = [*(single[k : k + 1]), *shared]
-        parts = [item for group in groups for e in group if e.VR == "SQ" for item in e.value[:1]] + [header]
-        at, turn = (
-            _numbers(path, parts, "ImagePositionPatient", 3),
-            _numbers(path, parts, "ImageOrientationPatient", 6),
-        )
-        for name, tag, told, n in (
-            ("ImagePositionPatient", "0020|0032", at, 3),
-            ("ImageOrientationPatient", "0020|0037", turn, 6),
-        ):
-            if told.size != n:
-                raw = header.get_item(name) if name in header else None
-                got = shortened(
-                    ""
-                    if raw is None
-                    else raw.value.decode("latin-1")
-                    if isinstance(raw.value, bytes)
-                    else raw.value
-                )
-                raise ValueError(
-                    f"path: {path} must say where it lies: element ({tag}) must be {n} numbers; got {got}."
-                )
-        pixel = next(
-            (
-                p
-                for name in ("PixelSpacing", "ImagerPixelSpacing")
-                if (p := _numbers(path, parts, name, 2)).size
-            ),
-            None,
-        )
-        if pixel is None or not np.all(pixel > 0):
+    with refusing(path):
+        shape = int(header.get("NumberOfFrames") or 1), int(header.Rows), int(header.Columns)
+        channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.BitsAllocated)
+        if channels != 1 or min(shape) < 1 or bits not in (1, 8, 16, 32, 64):
+            got = f"{shape} of {channels} values of {bits} bits"
+            raise ValueError(f"path: {path} must hold slices of one value per pixel; got {got}.")
+        held = file_size(path) * (1 if syntax in PLAIN else MOST_COMPRESSED)
+        check_size(path, held, math.prod(shape) * bits // 8, more=True)
+        shared = list(header.get("SharedFunctionalGroupsSequence") or [])[:1]
+        single = list(header.get("PerFrameFunctionalGroupsSequence") or [])
+        if len(single) != shape[0] and (single or shape[0] > 1):
+            raise ValueError(
+                f"path: {path}: each of {shape[0]} frames must say where it lies; {len(single)} do."
+            )
+        found = []
+        for k in range(shape[0]):
+            groups = [
+                element.value[:1]
+                for each in single[k : k + 1] + shared
+                for element in each
+                if element.VR == "SQ"
+            ]
+            parts = [*(item for group in groups for item in group), header]
+            place = _numbers(path, parts, ("ImagePositionPatient",), 3, "must say where it lies", "")
+            turn = _numbers(path, parts, ("ImageOrientationPatient",), 6, "must say where it lies", "")
             if spacing is None:
-                texts = [
-                    shortened(getattr(header.get_item(n), "value", b"") if n in header else "")
-                    for n in ("PixelSpacing", "ImagerPixelSpacing")
-                ]
-                raise ValueError(
-                    f"path: {path} does not say how far its pixels are apart: PixelSpacing (0028|0030) and "
-                    f"ImagerPixelSpacing (0018|1164) must be 2 positive numbers; got {texts[0]} and {texts[1]}. "
-                    "Give spacing=(x, y, z), --spacing."
-                )
-            # of the axes as loaded, to which rows and columns are nearest
-            x_and_y = np.abs(turn.reshape(2, 3)).argmax(axis=1)
-            pixel = np.asarray(finite_array("spacing", spacing, (3,)))[x_and_y[::-1]]
-        told = {name: part[name].value for name in TIMES for part in parts[::-1] if name in part}
-        name = path.name if count == 1 else f"frame {k + 1}"
-        found.append(
-            {"name": name, "shape": shape, "at": at, "grid": [*map(float, pixel), *turn], "told": told}
-        )
-        found[-1]["values"] = lambda k=k, parts=parts: values(k, parts)
+                apart = "does not say how far its pixels are apart", " Give spacing=(x, y, z), --spacing."
+                pixel = _numbers(path, parts, ("PixelSpacing", "ImagerPixelSpacing"), 2, *apart)
+            else:  # of the axes as loaded, to which rows and columns are nearest
+                x_and_y = np.abs(turn.reshape(2, 3)).argmax(axis=1)
+                pixel = np.asarray(finite_array("spacing", spacing, (3,)))[x_and_y[::-1]]
+            found.append(Slice(path, k, parts, shape, place, np.array([*pixel, *turn], float)))
     return found
 
 
-def _pixels(path: Path, syntax: str, shape: tuple[int, int, int]) -> np.ndarray:
-    """Stored numbers of all frames. `imagecodecs` decodes what is compressed."""
-    whole = _header(path, pixels=True)
-    if syntax not in PACKED:
-        return whole.pixel_array.reshape(shape)
-    import imagecodecs
-    from pydicom.encaps import generate_frames
-
-    decode = getattr(imagecodecs, PACKED[syntax])
-    frames = [decode(frame) for frame in generate_frames(whole.PixelData, number_of_frames=shape[0])]
-    found = np.stack(frames).reshape(shape)
-    bits, stored = whole.BitsAllocated, int(whole.BitsStored)
-    if whole.PixelRepresentation == 1 and found.dtype.kind == "u":  # signed numbers, of fewer bits
-        found = (found.astype(np.int32) << (32 - stored) >> (32 - stored)).astype(f"i{bits // 8}")
-    return found
-
-
-def _scaled(path: Path, plane: np.ndarray, parts: list[Any]) -> np.ndarray:
-    """Values by the Modality LUT, a table or a line."""
-    from pydicom.pixels import apply_modality_lut
-
-    header = next((part for part in parts if "ModalityLUTSequence" in part), None)
-    if header is not None:
-        return apply_modality_lut(plane, header)
-    slope, intercept = (
-        float(next((part[n].value for part in parts if n in part and part[n].value is not None), k))
-        for n, k in (("RescaleSlope", 1), ("RescaleIntercept", 0))
+def _numbers(
+    path: Path, parts: list[Any], names: tuple[str, ...], count: int, fault: str, hint: str
+) -> np.ndarray:
+    """The numbers of the first of these elements that has as many."""
+    texts = []
+    for name in names:
+        raw: Any = next((part.get_item(name) for part in parts if name in part), None)
+        value = b"" if raw is None else raw.value
+        text = value.decode("latin-1") if isinstance(value, bytes) else "\\".join(map(str, value or ()))
+        texts.append(shortened(text.strip()))
+        try:
+            numbers = np.array(text.strip("\0 ").split("\\"), float)
+        except ValueError:
+            continue
+        if numbers.shape == (count,) and np.isfinite(numbers).all() and (count > 2 or np.all(numbers > 0)):
+            return numbers
+    told = (
+        f"{' or '.join(names)} must be {count} {'positive ' * (count == 2)}numbers; got {' and '.join(texts)}"
     )
-    return ImageRecord(plane, "yx", slope=slope or 1.0, intercept=intercept).decode(plane)[0]
+    raise ValueError(f"path: {path} {fault}: {told}.{hint}")
+
+
+def _values(slices: list[Slice]) -> np.ndarray:
+    """Values [z, y, x], of a type that holds those of all slices: each may have a scale or a table of its own."""
+    planes, pixels, last = [], np.empty(0), None
+    for each in slices:
+        with refusing(each.file):
+            if each.file != last:
+                pixels, last = _pixels(each), each.file
+            plane = pixels[each.frame]
+            if each.told("ModalityLUTSequence"):
+                header = next(part for part in each.parts if "ModalityLUTSequence" in part)
+                plane = library("pydicom.pixels", each.file).apply_modality_lut(plane, header)
+            slope, intercept = (each.told(name) for name in ("RescaleSlope", "RescaleIntercept"))
+            scale = {"slope": float(slope or 1), "intercept": float(intercept or 0)}
+            planes.append(ImageRecord(plane, "yx", **scale).decode(plane)[0])
+    return np.stack(planes)
+
+
+def _pixels(image: Slice) -> np.ndarray:
+    """Stored numbers of all frames of a file."""
+    whole, decoder = _header(image.file, pixels=True), PACKED.get(_meta(image.file, SYNTAX))
+    if not decoder:
+        return whole.pixel_array.reshape(image.shape)
+    decode, encaps = (
+        getattr(library("imagecodecs", image.file), decoder),
+        library("pydicom.encaps", image.file),
+    )
+    frames = encaps.generate_frames(whole.PixelData, number_of_frames=image.shape[0])
+    pixels = np.stack([decode(frame) for frame in frames]).reshape(image.shape)
+    if whole.PixelRepresentation == 1 and pixels.dtype.kind == "u":  # signed numbers of fewer bits
+        unused = 32 - int(whole.BitsStored)
+        return (pixels.astype(np.int32) << unused >> unused).astype(f"i{pixels.itemsize}")
+    return pixels

@@ -9,7 +9,16 @@ from typing import Any
 import numpy as np
 
 from ..._util.affine import SHEARED
-from ..._util.files import MOST_COMPRESSED, as_array, check_size, decoding, file_size, library, read_all, reason
+from ..._util.files import (
+    MOST_COMPRESSED,
+    as_array,
+    check_size,
+    decoding,
+    file_size,
+    library,
+    read_all,
+    reason,
+)
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import nibabel_record
 from .text_headers import check_volume
@@ -27,10 +36,14 @@ def read_nifti(path: Path) -> ImageRecord:
     read here: nibabel takes memory as headers say."""
     file_size(path)
     nibabel = library("nibabel", path)
-    nibabel.imageglobals.logger.disabled = True  # what it mends is checked below
     try:
-        image: Any = nibabel.load(path)
+        with nibabel.imageglobals.ErrorLevel(31):  # what it would mend
+            image: Any = nibabel.load(path)
         proxy, header, shape = image.dataobj, image.header, image.shape
+        raw, holder = header, image.file_map.get("header", image.file_map["image"]).filename
+        if "pixdim" in header:  # as it is in the file
+            with nibabel.openers.ImageOpener(holder) as stream:
+                raw = type(header).from_fileobj(stream, check=False)
     except Exception as fault:  # of many kinds
         told = "a NIfTI file begins with a header of 348 or 540 bytes, and these with that number"
         raise ValueError(f"path: {path} cannot be read: {reason(fault)} ({told}). Is it whole?") from fault
@@ -39,8 +52,8 @@ def read_nifti(path: Path) -> ImageRecord:
         if not holds:  # also of NaN
             raise ValueError(f"path: {path}: {name} must be {expected}; got {header[name].tolist()!r}.")
 
-    pixdim = header["pixdim"][1:4].astype(float) if "pixdim" in header.keys() else np.ones(3)
-    if "sform_code" not in header.keys() or header["sform_code"] <= 0:
+    pixdim = header["pixdim"][1:4].astype(float) if "pixdim" in header else np.ones(3)
+    if "sform_code" not in header or header["sform_code"] <= 0:
         check("pixdim", np.all(pixdim > 0) and np.all(np.isfinite(pixdim)), "positive lengths")
     while len(shape) > 5 and shape[-1] == 1:
         shape = shape[:-1]
@@ -54,8 +67,8 @@ def read_nifti(path: Path) -> ImageRecord:
         check_size(path, file_size(body) * MOST_COMPRESSED, expected, more=True)
         with decoding(path):
             data = np.asanyarray(proxy)
-        return nibabel_record(image, data, f"path: {path}: its place")
-    if "vox_offset" in header.keys():
+        return nibabel_record(image, data, f"path: {path}")
+    if "vox_offset" in header:
         check(
             "vox_offset",
             0 <= header["vox_offset"] < 2**31,
@@ -67,7 +80,7 @@ def read_nifti(path: Path) -> ImageRecord:
         stream.seek(proxy.offset)
         content = read_all(path, stream, expected, more=True)
     data = as_array(content, shape[::-1], stored, "C").T
-    return nibabel_record(image, data, f"path: {path}: its place")
+    return nibabel_record(image, data, f"path: {path}")
 
 
 def write_nifti(path: Path, arrays: dict[str, np.ndarray], *, packed: bool) -> None:

@@ -112,7 +112,7 @@ def read_nrrd(path: Path) -> ImageRecord:
     fields, begin, source = nrrd_header(path)
     if not next(iter(fields), "").startswith("nrrd00") or not source.is_file():
         raise ValueError(
-            f"path: {path} must be a NRRD file that holds its voxels, or names one file of them; got "
+            f"path: {path} cannot be read: it must be a NRRD file that holds its voxels, or names one file of them; got "
             f"{shortened(next(iter(fields), ''))} and {shortened(str(source))}."
         )
     encoding, kind = fields.get("encoding", "").lower(), fields.get("type", "").lower()
@@ -172,18 +172,18 @@ def read_nrrd(path: Path) -> ImageRecord:
     letters = (
         "".join(word[:1] for word in words).upper()
         if {*words} <= {*SIDES.split()}
-        else fields["space"].upper()
+        else fields.get("space", "").upper()
     )
     record.convention = letters if re.fullmatch("(?=.*[LR])(?=.*[PA])(?=.*[SI])[LRPASI]{3}", letters) else ""
     if directions:
         text = " ".join(directions[k] for k in inside)
         fields["spacedirections"] = text
-        columns, origin = numbers("spacedirections", "", 3), numbers("spaceorigin", "0 0 0", 3)
+        columns, origin = numbers("spacedirections", "", 3)[:, :3], numbers("spaceorigin", "0 0 0", 1)[0, :3]
         if columns.shape != (3, 3) or origin.size != 3:
             raise ValueError(
                 f"path: {path}: space directions must be three vectors of 3 numbers; got {text[:80]}."
             )
-        for name, part in grid_of(np.column_stack([columns.T, origin.ravel()])).items():
+        for name, part in grid_of(np.column_stack([columns.T, origin])).items():
             setattr(record, name, part)
     elif "spacings" in fields or "axismins" in fields:
         spacings = numbers("spacings", "1 " * n, n)[inside, 0]
@@ -245,7 +245,7 @@ def read_metaimage(path: Path) -> ImageRecord:
         _numbers(path, fields, ("Offset", "Position", "Origin"), np.zeros(n))[:3],
         turn,
         "LPS",
-        what=f"path: {path}: TransformMatrix",
+        what=f"path: {path}",
     )
 
 

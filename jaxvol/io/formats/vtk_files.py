@@ -12,172 +12,142 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..._util.checks import shortened
-from ..._util.files import as_array, check_size, file_size, reason
+from ..._util.files import as_array, check_size, file_size, refusing
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import grid_of
 
 
-LEGACY = {"char": "i1", "unsigned_char": "u1", "short": "i2", "unsigned_short": "u2", "int": "i4"}
-LEGACY |= {"unsigned_int": "u4", "long": "i8", "unsigned_long": "u8", "float": "f4", "double": "f8"}
-LEGACY |= {"vtktypeint64": "i8", "vtktypeuint64": "u8"}
-NUMBER = re.compile(r"(U?Int|Float)(8|16|32|64)")
+LEGACY = {"char": "i1", "short": "i2", "int": "i4", "long": "i8", "vtktypeint64": "i8"}
+LEGACY |= {f"unsigned_{name}": f"u{code[1]}" for name, code in LEGACY.items()}
+LEGACY |= {"vtktypeuint64": "u8", "float": "f4", "double": "f8"}
+KINDS = {"Int": "i", "UInt": "u", "Float": "f"}
 
 
 def read_vtk(path: Path) -> ImageRecord:
     """Reader for both: the scalars at points, else the first array; of cells, at their centres."""
     file_size(path)
     content = path.read_bytes()
-    try:
+    with refusing(path):
         return (_xml if content.lstrip()[:1] == b"<" else _legacy)(path, content)
-    except Exception as fault:  # of many kinds
-        told = (
-            str(fault) if str(fault).startswith("path:") else f"path: {path} cannot be read: {reason(fault)}."
-        )
-        raise ValueError(told) from fault
 
 
-def _record(path: Path, array: np.ndarray, sizes: list[int], place: Any, of_cells: bool) -> ImageRecord:
-    """`array`: flat, x fastest. `place`: extent's first point, spacing, origin, direction."""
-    first, spacing, origin, turn = (np.asarray(part, float) for part in place)
-    columns = turn.reshape(3, 3) * spacing
-    affine = np.column_stack([columns, origin + columns @ (first + 0.5 * of_cells)])
-    components = array.size // math.prod(sizes)
-    data = array.reshape(*sizes[::-1], components)
-    several = components > 1
-    return ImageRecord(
-        data if several else data[..., 0],
-        "zyx" + "s" * several,
-        what=f"path: {path}: its place",
-        **grid_of(affine),
+def _record(
+    path: Path, held: Any, dtype: np.dtype, count: Any, extent: Any, place: Any, *, of_cells: bool
+) -> ImageRecord:
+    """`held`: bytes, or words of text, x fastest. `place`: spacing, origin, direction."""
+    first, last = np.array(extent, int).reshape(3, 2).T
+    sizes = np.maximum(last - first + (0 if of_cells else 1), 1).tolist()[::-1]
+    sizes, total = [*sizes, int(count)], math.prod(sizes) * int(count)
+    if isinstance(held, list):
+        check_size(path, len(held), total)
+        data = np.array(held, float).astype(dtype.newbyteorder("=")).reshape(sizes)
+    else:
+        check_size(path, len(held), total * dtype.itemsize)
+        data = as_array(held, sizes, dtype, "C")
+    spacing, origin, turn = (
+        np.array(part.split() if isinstance(part, str) else part, float) for part in place
     )
-
-
-def _counts(path: Path, points: list[int], of_cells: bool) -> list[int]:
-    sizes = [max(n - 1, 1) if of_cells else n for n in points]
-    if len(sizes) != 3 or min(sizes) < 1 or math.prod(sizes) >= 2**40:
-        raise ValueError(f"path: {path} must be a 3-D image of voxels; its header says {points} points.")
-    return sizes
+    columns = turn.reshape(3, 3) * spacing
+    grid = grid_of(np.column_stack([columns, origin + columns @ (first + 0.5 * of_cells)]))
+    several = sizes[3] > 1
+    return ImageRecord(data if several else data[..., 0], "zyx" + "s" * several, what=f"path: {path}", **grid)
 
 
 def _legacy(path: Path, content: bytes) -> ImageRecord:
-    if not content.startswith(b"# vtk DataFile"):
-        raise ValueError(f"path: {path} must begin with '# vtk DataFile'; got {shortened(content[:20])}.")
-    end = re.search(rb"\n(LOOKUP_TABLE[^\n]*|COLOR_SCALARS[^\n]*|(?:[\w]+ \d+ \d+ \w+))[ \t]*\r?\n", content)
+    end = re.search(
+        rb"\n(LOOKUP_TABLE[^\n]*|COLOR_SCALARS[^\n]*|(?:\w+ \d+ \d+ [a-zA-Z]\w+))[ \t]*\r?\n", content
+    )
     head = content[: end.end() if end else 2**12].decode("latin-1")
     words = {line.split()[0].upper(): line.split()[1:] for line in head.splitlines()[2:] if line.split()}
-    if words.get("DATASET") != ["STRUCTURED_POINTS"] or end is None:
+    if not head.startswith("# vtk DataFile") or words.get("DATASET") != ["STRUCTURED_POINTS"] or end is None:
         kind = shortened(" ".join(words.get("DATASET", ["none"])))
         raise ValueError(f"path: {path} must hold a DATASET of STRUCTURED_POINTS with scalars; got {kind}.")
+    _, kind, count = [
+        *words.get("SCALARS", ["", "unsigned_char", words.get("COLOR_SCALARS", "11")[-1]]),
+        "1",
+    ][:3]
+    if "SCALARS" not in words and "COLOR_SCALARS" not in words:  # a field's first array
+        _, count, _, kind = end[1].decode().split()
+    dtype, counts = np.dtype(LEGACY[kind.lower()]).newbyteorder(">"), [int(n) for n in words["DIMENSIONS"]]
     of_cells = "CELL_DATA" in words and "POINT_DATA" not in words
-    sizes = _counts(path, [int(word) for word in words["DIMENSIONS"]], of_cells)
-    if "SCALARS" in words:
-        kind, count = words["SCALARS"][1], int((words["SCALARS"] + ["1"])[2])
-    elif "COLOR_SCALARS" in words:
-        kind, count = "unsigned_char", int(words["COLOR_SCALARS"][1])
-    else:  # a field's first array
-        _, components, _, kind = end[1].decode().split()
-        count = int(components)
-    dtype = np.dtype(LEGACY[kind.lower()]).newbyteorder(">")
-    total = math.prod(sizes) * count
-    if "BINARY" in words:
-        held = content[end.end() : end.end() + total * dtype.itemsize]
-        check_size(path, len(held), total * dtype.itemsize)
-        array = as_array(held, (total,), dtype, "C")
-    else:
-        numbers = content[end.end() :].split(None, total)[:total]
-        check_size(path, len(numbers) * dtype.itemsize, total * dtype.itemsize)
-        array = np.array(numbers, float).astype(dtype.newbyteorder("="))
-    spacing = words.get("SPACING") or words.get("ASPECT_RATIO") or ["1", "1", "1"]
-    place = (0, 0, 0), spacing, words.get("ORIGIN", ["0", "0", "0"]), np.eye(3)
-    return _record(path, array, sizes, [[float(n) for n in np.ravel(part)] for part in place], of_cells)
+    total = math.prod(n - of_cells if n > 1 else 1 for n in counts) * int(count)
+    binary = "BINARY" in words
+    held = (
+        content[end.end() : end.end() + total * dtype.itemsize]
+        if binary
+        else content[end.end() :].split(None, total)[:total]
+    )
+    place = (
+        words.get("SPACING") or words.get("ASPECT_RATIO") or np.ones(3),
+        words.get("ORIGIN", np.zeros(3)),
+        np.eye(3),
+    )
+    return _record(
+        path, held, dtype, count, [e for n in counts for e in (0, n - 1)], place, of_cells=of_cells
+    )
 
 
 def _xml(path: Path, content: bytes) -> ImageRecord:
     """Of arrays in ASCII, base64 or appended, also compressed by zlib."""
     raw = re.search(rb"<AppendedData[^>]*>\s*_", content)
-    end = content.rfind(b"</AppendedData>") if raw else -1
-    appended = content[raw.end() : end if end > 0 else len(content)] if raw else b""
+    appended = content[raw.end() :] if raw else b""
     text = content[: raw.end() - 1] + b"</AppendedData></VTKFile>" if raw else content
-    if b"<!DOCTYPE" in text[:4096] or b"<!ENTITY" in text:  # which may expand without end
+    if b"<!DOCTYPE" in text or b"<!ENTITY" in text:  # which may expand without end
         raise ValueError(f"path: {path} must be XML without a DOCTYPE.")
     root = ElementTree.fromstring(text)
-    image, order = (
-        root.find("ImageData"),
-        "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">",
-    )
-    pieces = image.findall("Piece") if image is not None else []
-    if image is None or len(pieces) != 1:
+    image = root.find("ImageData")
+    pieces = [] if image is None else image.findall("Piece")
+    if (
+        image is None
+        or len(pieces) != 1
+        or root.get("compressor", "vtkZLibDataCompressor") != "vtkZLibDataCompressor"
+    ):
+        told = f"{root.get('type')} of {len(pieces)} pieces, {root.get('compressor')}"
         raise ValueError(
-            f"path: {path} must hold one Piece of ImageData; got {root.get('type')}, {len(pieces)} pieces."
+            f"path: {path} must hold one Piece of ImageData, plain or compressed by zlib; got {told}."
         )
-    extent = [int(word) for word in pieces[0].get("Extent", image.get("WholeExtent", "")).split()]
-    parts = [(kind, pieces[0].find(kind)) for kind in ("PointData", "CellData")]
-    of_cells, part = next(
-        (kind == "CellData", p) for kind, p in parts if p is not None and p.find("DataArray") is not None
-    )
-    arrays = part.findall("DataArray")
-    array = next((each for each in arrays if each.get("Name") == part.get("Scalars")), arrays[0])
-    sizes = _counts(path, [b - a + 1 for a, b in zip(extent[::2], extent[1::2], strict=True)], of_cells)
-    letters, bits = NUMBER.fullmatch(array.get("type", "")).groups()  # pyright: ignore[reportOptionalMemberAccess]
-    dtype = np.dtype({"Int": "i", "UInt": "u", "Float": "f"}[letters] + str(int(bits) // 8)).newbyteorder(
-        order
-    )
-    total = math.prod(sizes) * int(array.get("NumberOfComponents", "1"))
-    form, compressor = array.get("format"), root.get("compressor")
-    if compressor not in (None, "vtkZLibDataCompressor"):
-        raise ValueError(f"path: {path} must be compressed by zlib, or not; got {shortened(compressor)}.")
-    if form == "ascii":
-        numbers = (array.text or "").split(None, total)[:total]
-        check_size(path, len(numbers) * dtype.itemsize, total * dtype.itemsize)
-        flat = np.array(numbers, float).astype(dtype.newbyteorder("="))
+    array, part = next((a, part) for part in pieces[0] for a in [_chosen(part)] if a is not None)
+    letters, bits = re.match(r"(U?Int|Float)(\d+)$", array.get("type", "")).groups()  # pyright: ignore[reportOptionalMemberAccess]
+    order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
+    dtype, count = np.dtype(f"{order}{KINDS[letters]}{int(bits) // 8}"), array.get("NumberOfComponents", "1")
+    extent, of_cells = pieces[0].get("Extent", image.get("WholeExtent", "")).split(), part.tag == "CellData"
+    if array.get("format") == "ascii":
+        held: Any = (array.text or "").split()
     else:
-        store = (
-            appended[int(array.get("offset", "0")) :]
-            if form == "appended"
-            else (array.text or "").strip().encode()
-        )
-        data = root.find("AppendedData")
-        is_raw = form == "appended" and data is not None and data.get("encoding") == "raw"
+        inside = array.get("format") == "appended"
+        store = appended[int(array.get("offset", "0")) :] if inside else (array.text or "").strip().encode()
+        is_raw = inside and root.find("AppendedData").get("encoding") == "raw"  # pyright: ignore[reportOptionalMemberAccess]
         word = np.dtype("u8" if root.get("header_type") == "UInt64" else "u4").newbyteorder(order)
-        flat = as_array(
-            _blocks(path, store, word, is_raw, compressor, total * dtype.itemsize), (total,), dtype, "C"
-        )
+        held = _bytes(store, word, is_raw=is_raw, packed=root.get("compressor") is not None)
     place = (
-        extent[::2],
         image.get("Spacing", "1 1 1"),
         image.get("Origin", "0 0 0"),
-        image.get("Direction", IDENTITY),
+        image.get("Direction", "1 0 0 0 1 0 0 0 1"),
     )
-    numbers_of = [[float(n) for n in (part.split() if isinstance(part, str) else part)] for part in place]
-    return _record(path, flat, sizes, numbers_of, of_cells)
+    return _record(path, held, dtype, count, extent, place, of_cells=of_cells)
 
 
-IDENTITY = "1 0 0 0 1 0 0 0 1"
+def _chosen(part: Any) -> Any:
+    arrays = part.findall("DataArray") if part.tag in ("PointData", "CellData") else []
+    return next((a for a in arrays if a.get("Name") == part.get("Scalars")), next(iter(arrays), None))
 
 
-def _blocks(path: Path, store: bytes, word: np.dtype, is_raw: bool, packed: Any, expected: int) -> bytes:
-    """The bytes of an array behind its header: its length, or the numbers and lengths of compressed blocks."""
+def _bytes(store: bytes, word: np.dtype, *, is_raw: bool, packed: bool) -> bytes:
+    """The bytes of an array behind its header: its length, or numbers and lengths of compressed blocks."""
 
-    def taken(begin: int, count: int) -> bytes:  # base64 restarts behind the header
-        if is_raw:
-            return store[begin : begin + count]
-        return base64.b64decode(store[begin : begin + 4 * math.ceil(count / 3)])[:count]
+    def taken(begin: int, count: int) -> bytes:
+        length = count if is_raw else 4 * math.ceil(count / 3)
+        part = store[begin : begin + length]
+        return (part if is_raw else base64.b64decode(part))[:count]
 
-    def length(count: int) -> int:
-        return count if is_raw else 4 * math.ceil(count / 3)
-
+    first = int(np.frombuffer(taken(0, word.itemsize), word)[0])
     if not packed:
-        whole = taken(0, word.itemsize + expected)
-        check_size(path, len(whole) - word.itemsize, expected)
-        return whole[word.itemsize :]
-    count = int(np.frombuffer(taken(0, word.itemsize), word)[0])
-    if not 0 < count <= len(store):
-        raise ValueError(f"path: {path} cannot be read: its header says {count} blocks of voxels.")
-    head = np.frombuffer(taken(0, (3 + count) * word.itemsize), word)
-    content, body = b"", taken(length((3 + count) * word.itemsize), int(sum(map(int, head[3:]))))
-    at = 0
-    for size in map(int, head[3:]):
-        content += zlib.decompressobj().decompress(body[at : at + size], expected + 1 - len(content))
-        at += size
-    check_size(path, len(content), expected)
-    return content
+        return taken(0, word.itemsize + min(first, len(store)))[word.itemsize :]
+    head = taken(0, (3 + min(first, len(store))) * word.itemsize)  # base64 begins again behind it
+    lengths = np.frombuffer(head, word)[3:].tolist()
+    most = int(np.frombuffer(head, word)[1])
+    body = taken(len(head) if is_raw else 4 * math.ceil(len(head) / 3), min(sum(lengths), len(store)))
+    ends = np.cumsum([0, *lengths]).tolist()
+    return b"".join(
+        zlib.decompressobj().decompress(body[a:b], most) for a, b in zip(ends, ends[1:], strict=False)
+    )
