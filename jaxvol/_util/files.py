@@ -2,6 +2,7 @@
 tells, while a file is read, never further than one byte past the expected size."""
 
 import importlib
+import logging
 import re
 import warnings
 import zipfile
@@ -73,8 +74,13 @@ def decoding(path: Path) -> Iterator[None]:
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Turn whatever a library raises within the context into a `ValueError` that says what is wrong."""
+    """Turn whatever a library raises within the context into a `ValueError` that says what is wrong. What it
+    warns of and logs, which may be a line for each of a file's faults, is left out."""
+    loggers = [logging.getLogger(name) for name in ("tifffile", "nibabel.global", "pydicom")]
+    before = [logger.disabled for logger in loggers]
     try:
+        for logger in loggers:
+            logger.disabled = True
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
@@ -85,6 +91,9 @@ def refusing(path: Path) -> Iterator[None]:
             raise
         told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
         raise ValueError(f"path: {path} cannot be read: {told}") from fault
+    finally:
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
 
 
 def reason(fault: BaseException) -> str:

@@ -219,7 +219,10 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
         ({"coordinateTransformations": [{"type": "affine"}]}, "does not follow OME-Zarr"),
         ({"coordinateTransformations": [{"type": "scale", "scale": [1, 2]}]}, "does not follow OME-Zarr"),
         ({"coordinateTransformations": [{"type": "scale", "path": "s"}]}, "does not follow OME-Zarr"),
-        ({"coordinateTransformations": [{"type": "scale", "scale": [1, 0, 1]}]}, "finite, with steps longer than 0"),
+        (
+            {"coordinateTransformations": [{"type": "scale", "scale": [1, 0, 1]}]},
+            "finite, with steps longer than 0",
+        ),
     ],
 )
 def test_metadata_that_do_not_follow_ome_zarr_are_refused(fault, message, tmp_path):

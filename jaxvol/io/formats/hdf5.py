@@ -28,6 +28,7 @@ def read_hdf5(path: Path, name: str | None = None) -> ImageRecord:
             groups = {"/": xarray.open_dataset(path, engine="scipy", **how)}
         else:
             library("h5netcdf", path)
+            library("h5py", path).File(path, "r").close()  # of others, h5netcdf leaves a traceback
             groups = xarray.open_groups(path, engine="h5netcdf", phony_dims="access", **how)
         arrays = {
             f"{g.rstrip('/')}/{key}": each for g, group in groups.items() for key, each in group.items()

@@ -17,7 +17,7 @@ from ..._util.files import (
     file_size,
     library,
     read_all,
-    reason,
+    refusing,
 )
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import nibabel_record
@@ -36,51 +36,43 @@ def read_nifti(path: Path) -> ImageRecord:
     read here: nibabel takes memory as headers say."""
     file_size(path)
     nibabel = library("nibabel", path)
-    try:
+    with refusing(path):
         with nibabel.imageglobals.ErrorLevel(31):  # what it would mend
             image: Any = nibabel.load(path)
-        proxy, header, shape = image.dataobj, image.header, image.shape
-        raw, holder = header, image.file_map.get("header", image.file_map["image"]).filename
+        proxy, header, stored, shape = image.dataobj, image.header, image.get_data_dtype(), image.shape
+        holder, raw = image.file_map.get("header", image.file_map["image"]).filename, header
         if "pixdim" in header:  # as it is in the file
             with nibabel.openers.ImageOpener(holder) as stream:
                 raw = type(header).from_fileobj(stream, check=False)
-    except Exception as fault:  # of many kinds
-        told = "a NIfTI file begins with a header of 348 or 540 bytes, and these with that number"
-        raise ValueError(f"path: {path} cannot be read: {reason(fault)} ({told}). Is it whole?") from fault
-
-    def check(name: str, holds: Any, expected: str) -> None:
+    body, in_sform = (
+        Path(image.file_map["image"].filename),
+        "sform_code" in header and header["sform_code"] > 0,
+    )
+    pixdim = np.ones(3) if in_sform or "pixdim" not in header else raw["pixdim"][1:4]
+    offset = raw["vox_offset"] if "vox_offset" in header else 0
+    whole = "header" in image.file_map or "magic" not in header or raw["magic"].tolist()[:2] == b"n+"
+    for name, holds, expected in (
+        ("pixdim", np.all(pixdim > 0) and np.all(np.isfinite(pixdim)), "positive lengths"),
+        ("vox_offset", 0 <= offset < 2**31, "the byte at which voxels begin"),
+        ("magic", whole, "n+1 or n+2, of voxels in the same file"),
+        ("datatype", stored.kind in "iuf" or stored.names, "that of integers, floats, RGB or RGBA"),
+    ):
         if not holds:  # also of NaN
-            raise ValueError(f"path: {path}: {name} must be {expected}; got {header[name].tolist()!r}.")
-
-    pixdim = header["pixdim"][1:4].astype(float) if "pixdim" in header else np.ones(3)
-    if "sform_code" not in header or header["sform_code"] <= 0:
-        check("pixdim", np.all(pixdim > 0) and np.all(np.isfinite(pixdim)), "positive lengths")
+            raise ValueError(f"path: {path}: {name} must be {expected}; got {raw[name].tolist()!r}.")
     while len(shape) > 5 and shape[-1] == 1:
         shape = shape[:-1]
-    body, stored = Path(image.file_map["image"].filename), header.get_data_dtype()
-    channels = len(stored.names or "1")
-    if stored.kind not in "iuf" and channels == 1:
-        check("datatype", False, "one of integers, floats of up to 64 bits, RGB and RGBA")
-    check_volume(path, shape, channels)
+    check_volume(path, shape, len(stored.names or "1"))
     expected, packed = math.prod(shape) * stored.itemsize, body.name.lower().endswith((".gz", ".mgz"))
     if not hasattr(proxy, "offset"):  # MINC, in chunks
         check_size(path, file_size(body) * MOST_COMPRESSED, expected, more=True)
-        with decoding(path):
-            data = np.asanyarray(proxy)
-        return nibabel_record(image, data, f"path: {path}")
-    if "vox_offset" in header:
-        check(
-            "vox_offset",
-            0 <= header["vox_offset"] < 2**31,
-            "the byte behind the header at which voxels begin",
-        )
+        with refusing(path):
+            return nibabel_record(image, np.asanyarray(proxy), f"path: {path}")
+    if not packed:
+        check_size(path, max(file_size(body) - proxy.offset, 0), expected, more=True)
     with decoding(body), gzip.open(body) if packed else body.open("rb") as stream:
-        if not packed:
-            check_size(path, max(file_size(body) - proxy.offset, 0), expected, more=True)
         stream.seek(proxy.offset)
         content = read_all(path, stream, expected, more=True)
-    data = as_array(content, shape[::-1], stored, "C").T
-    return nibabel_record(image, data, f"path: {path}")
+    return nibabel_record(image, as_array(content, shape[::-1], stored, "C").T, f"path: {path}")
 
 
 def write_nifti(path: Path, arrays: dict[str, np.ndarray], *, packed: bool) -> None:

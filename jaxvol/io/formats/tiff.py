@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, reason
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, reason, refusing
 from ..._util.image_record import ImageRecord
 from ..._util.units import AXES
 
@@ -25,19 +25,15 @@ def read_tiff(path: Path) -> ImageRecord:
     metadata, and of plain pages z; lengths and scale are what OME or ImageJ wrote."""
     tifffile = library("tifffile", path)
     file_size(path)
-    try:
-        with tifffile.TiffFile(path) as file:
-            return _series(path, file, tifffile)
-    except MemoryError:
-        raise
-    except Exception as fault:  # of many kinds
-        if "imagecodecs" in str(fault):
-            raise ImportError(
-                f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
-            ) from fault
-        if isinstance(fault, ValueError) and str(fault).startswith("path:"):
+    with refusing(path):
+        try:
+            with tifffile.TiffFile(path) as file:
+                return _series(path, file, tifffile)
+        except Exception as fault:
+            if "imagecodecs" in str(fault):
+                told = f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
+                raise ImportError(told) from fault
             raise
-        raise ValueError(f"path: {path} cannot be read: corrupt, cut short, or {fault}") from fault
 
 
 def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
