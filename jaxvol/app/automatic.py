@@ -1,13 +1,16 @@
 """Default transfer functions: from a volume's histogram, or with a colour for each of its labels."""
 
 import math
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Shaped
 
 from .._util.checks import described
+from .._util.image_record import warn_caller
 from .._util.srgb import from_srgb
 from .._util.voxels import is_flat
 from ..ray import check_arguments
@@ -37,12 +40,69 @@ MOST_LABELS = 256
 """Whole numbers are labels if most equal their neighbour, and no more than so many differ, the lowest among
 them: a `LabelTransferFunction` has no more."""
 
+MANY = 16  # different values that the others have at least, for one to be far from them
+
 SMALL = 0.1  # voxels for which presets, made for some 0.5 to 3 mm, would be nearly transparent
 INSIDE = 255  # value of what has a label, in the volume that is shown
 
 EDGE, SKIN, TISSUE = (70, 30, 18), (214, 130, 92), (190, 92, 62)
 DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 """Colours, 8-bit sRGB: of the border's foot, the border, the object, what is dense, and what is densest."""
+
+
+RARE, FAR, BEYOND = 1e-4, 0.25, 3.0
+"""Fraction of the voxels that are strays at most; gap to the others, as a fraction of their range, from which on
+strays, or one value below all others, count as background; and the same of one value above all others."""
+
+
+class Spread(NamedTuple):
+    """Range of values without strays and fill values. `usual`: a low one, that of one voxel in a hundred. `fill`:
+    the value above the range that means background, or infinity. `told`: words on what was left out, or ""."""
+
+    low: float
+    high: float
+    usual: float
+    fill: float
+    told: str
+
+    def tame(self, data: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+        """The data with what is left out as low as background is, or, of strays above, at the end of the range."""
+        if not self.told:
+            return data
+        usual, high = map(data.dtype.type, (self.usual, self.high))
+        return np.where((data < self.low) | (data >= self.fill), usual, np.minimum(data, high))
+
+
+def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
+    """The range of values but for those that lie far from all others: single voxels, hot or dead, and one value of
+    any number of voxels, such as the padding of CT outside of the circle, or a fill value.
+
+    A value above all others counts as background only if it is farther away than three times their range: a
+    saturated object is no fill value.
+    """
+    kinds, counts = np.unique(values, return_counts=True)
+    kinds, most, left, fill, more = kinds.astype(np.float64), RARE * counts.sum(), [], math.inf, True
+    while more:
+        if more := _strays(kinds, counts, most):
+            left.append((kinds[0], counts[:more].sum()))
+            kinds, counts = kinds[more:], counts[more:]
+        above = _strays(-kinds[::-1], counts[::-1], most)
+        far = above == 1 and kinds[-1] - kinds[-2] > BEYOND * (kinds[-2] - kinds[0])
+        if above and (far or counts[-above:].sum() <= most):
+            left.append((kinds[-1], counts[-above:].sum()))
+            fill = kinds[-1] if far else fill
+            kinds, counts, more = kinds[:-above], counts[:-above], True
+    parts = [f"{n / np.size(values):.2g} of the voxels hold {value:g}" for value, n in left]
+    told = f"{', '.join(parts)}, far from all others: not seen as values" if left else ""
+    usual = kinds[np.searchsorted(np.cumsum(counts), 0.01 * counts.sum())]
+    return Spread(float(kinds[0]), float(kinds[-1]), float(usual), fill, told)
+
+
+def _strays(kinds: Float[np.ndarray, " n"], counts: np.ndarray, most: float) -> int:
+    """How many of the lowest values lie far below the others: one, or as many as `most` voxels have."""
+    n = min(max(int(np.searchsorted(np.cumsum(counts), most, "right")), 1), len(kinds) - MANY)
+    far = np.flatnonzero(np.diff(kinds)[:n] > FAR * (kinds[-1] - kinds[1 : n + 1])) if n > 0 else np.empty(0)
+    return int(far[-1]) + 1 if far.size else 0
 
 
 def stride_of(shape: tuple[int, ...], most: int = SAMPLED) -> int:
@@ -110,6 +170,11 @@ def check_known(caller: str, *values: Any) -> None:
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
     """The same from a copy of every n-th voxel, and a part at full resolution, which shows grain."""
+    spread = spread_of(sampled(copy))
+    if spread.told:
+        warn_caller(spread.told)
+        tame = jnp.asarray(spread.tame(np.asarray(copy.data)))
+        copy, part = eqx.tree_at(lambda v: v.data, copy, tame), spread.tame(part)
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if not low < high:
@@ -129,6 +194,8 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
             points = [*border, (second - d, TISSUE, depth), *points]
         else:
             points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
+    if spread.fill < math.inf:  # transparent, as it is around the object
+        points += [(high + (high - low) / 100, BRIGHT, 0.0)]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
     return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
@@ -177,7 +244,8 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 def range_of_object(volume: Volume) -> tuple[float, float]:
     """From the lower of the `thresholds` to what few values are above; of a single value, as far as that."""
-    values = sampled(volume).ravel().astype(np.float32)
+    values = sampled(volume)
+    values = spread_of(values).tame(values).ravel().astype(np.float32)
     low, least = thresholds(values)[0], float(values.min())
     high = float(np.percentile(values[values >= low], 99.5))
     return (low, high) if low < high else (least, least + max(abs(least), 1.0))

@@ -1,5 +1,6 @@
 """Reads arrays of HDF5 and NetCDF files with xarray: `file.h5::/path`, `file.nc::name`."""
 
+import io
 import math
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ def read_hdf5(path: Path, name: str | None = None) -> ImageRecord:
     how: dict[str, Any] = {"mask_and_scale": False, "decode_times": False, "cache": False}
     with refusing(path):
         if classic:
-            groups = {"/": xarray.open_dataset(path, engine="scipy", **how)}
+            groups = {"/": xarray.open_dataset(io.BytesIO(path.read_bytes()), engine="scipy", **how)}
         else:
             library("h5netcdf", path)
             library("h5py", path).File(path, "r").close()  # of others, h5netcdf leaves a traceback

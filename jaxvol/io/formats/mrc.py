@@ -15,7 +15,11 @@ ENDINGS = (".mrc", ".map", ".ccp4", ".rec")
 def read_mrc(path: Path) -> ImageRecord:
     """Reader, in ångström. Axes are those of MAPC, MAPR, MAPS; the place is `origin`, or else that of the
     numbers of the first column, row and section."""
-    file_size(path)
+    size = file_size(path)
+    with path.open("rb") as stream:
+        extended = stream.read(96)[92:]
+    if min(int.from_bytes(extended, order) for order in ("little", "big")) > size:  # which mrcfile would take
+        raise ValueError(f"path: {path} is cut short: its extended header is longer than its {size} bytes.")
     with refusing(path), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file = library("mrcfile", path).mmap(path, permissive=True)
