@@ -51,13 +51,13 @@ DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 
 
 RARE, FAR, BEYOND = 1e-4, 0.25, 3.0
-"""Fraction of the voxels that are strays at most; gap to the others, as a fraction of their range, from which on
-strays, or one value below all others, count as background; and the same of one value above all others."""
+"""Fraction of the voxels that are strays at most; their gap to the others, as a fraction of the range of these,
+at least, which is also that of a fill value below the others; and the same of one above the others."""
 
 
 class Spread(NamedTuple):
-    """Range of values without strays and fill values. `usual`: a low one, that of one voxel in a hundred. `fill`:
-    the value above the range that means background, or infinity. `told`: words on what was left out, or ""."""
+    """Range of values without strays and fill values. `usual`: their first percentile. `fill`: the value above
+    the range that means background, or infinity. `told`: words on what was left out, or ""."""
 
     low: float
     high: float
@@ -66,7 +66,7 @@ class Spread(NamedTuple):
     told: str
 
     def tame(self, data: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
-        """The data with what is left out as low as background is, or, of strays above, at the end of the range."""
+        """The data with what is left out at `usual`, and strays above the range at its end."""
         if not self.told:
             return data
         usual, high = map(data.dtype.type, (self.usual, self.high))
@@ -74,8 +74,8 @@ class Spread(NamedTuple):
 
 
 def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
-    """The range of values but for those that lie far from all others: single voxels, hot or dead, and one value of
-    any number of voxels, such as the padding of CT outside of the circle, or a fill value.
+    """Find the range of values but for those that lie far from all others: single voxels, hot or dead, and one
+    value of any number of voxels, such as the padding of CT outside of the circle, or a fill value.
 
     A value above all others counts as background only if it is farther away than three times their range: a
     saturated object is no fill value.
@@ -177,7 +177,11 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
         copy, part = eqx.tree_at(lambda v: v.data, copy, tame), spread.tame(part)
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
-    if not low < high:
+    if side := side_of_distance(copy):
+        warn_caller("values on both sides of 0 with a slope of one are a distance: shown where they are 0")
+        d = side * float(voxel_size(copy)) / 2
+        points = [(-d, BRIGHT, 0.9), (d, DENSE, 0.0)][::side]
+    elif not low < high:
         points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
     else:
         first, second = thresholds(values)
@@ -199,6 +203,18 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
     return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
+
+
+def side_of_distance(volume: Volume) -> int:
+    """Sign of the distance to a surface outside of it, if values are such distances of both signs, else 0."""
+    data, step = sampled(volume).astype(np.float32), np.asarray(volume.spacing) * stride_of(volume.shape)
+    if not (data.min() < 0 < data.max()) or min(data.shape) < 3:
+        return 0
+    slope = np.sqrt(sum(np.square(each) for each in np.gradient(data, *step.tolist())))
+    if np.mean(np.abs(slope[slope > 0] - 1) < 0.1) < 0.7:
+        return 0
+    outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
+    return 1 if np.mean(outer > 0) > 0.5 else -1
 
 
 def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float, float]:

@@ -81,7 +81,7 @@ class RadianceField(Transfer):
         return classify
 
     def _activated(self, density: Scalar) -> Scalar:
-        """The density that is seen. Where it is not finite, its slope by JAX would be infinity times 0, NaN."""
+        """The density that is seen. Of an infinite one, JAX's slope is infinity times 0."""
         if isinstance(self.density, _Fixed) and self.density.function is _as_stored:
             return density
         most = jnp.asarray(MOST, density.dtype)
