@@ -169,7 +169,8 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
     width, height = np.broadcast_to(getattr(options.camera, "size", options.size), 2).tolist()
-    require_room(width * height * PIXEL, f"size {width} x {height}")
+    if width * height < 2**31:  # more are refused otherwise
+        require_room(width * height * PIXEL, f"size {width} x {height}")
     is_surface, background = options.compositing == "isosurface", background_of(options)
     if is_surface == (options.isovalue is None):
         raise ValueError("compositing isosurface and isovalue go together; one is missing.")

@@ -89,6 +89,7 @@ def load(
         time: which one of several images, from 0 on, where a file holds an axis of time.
         channel: which channel, from 0 on. Without it, several values in a voxel, as of colours, become the
             channels of the volume; an axis of channels needs it.
+        offset: bytes before the voxels; raw files only.
 
     Returns:
         The `Volume`, with voxels in the file's type except as described above.

@@ -18,8 +18,8 @@ from ..._util.image_record import ImageRecord
 from ..._util.named_axes import grid_of
 
 
-LONGEST = 900
-"""Letters of a field in an NRRD header, at most; comments and pairs (`key:=value`) may be longer."""
+LONGEST, MOST_FIELDS = 900, 1024
+"""Letters of a field in an NRRD header, at most (comments and pairs may be longer); and fields in a header."""
 
 META_TYPES = dict(
     zip(
@@ -60,7 +60,7 @@ def text_header(
     path: Path, separator: str, last: str = "", longest: int = 2**20
 ) -> tuple[dict[str, str], int]:
     """The fields of a header in text, and where in the file it ends: at an empty line, or behind the field
-    `last`. Raises `ValueError` for more than 1024 fields, and fields of more than `longest` letters."""
+    `last`. Raises `ValueError` for more than `MOST_FIELDS`, and fields of more than `longest` letters."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
         while last not in fields:
@@ -69,8 +69,8 @@ def text_header(
                 break
             key, _, value = line.partition(separator)
             long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
-            if long or len(fields) == 2**10:
-                told = f"the field {shortened(line)}" if long else "more than 1024 fields"
+            if long or len(fields) == MOST_FIELDS:
+                told = f"the field {shortened(line)}" if long else f"more than {MOST_FIELDS} fields"
                 raise ValueError(f"path: {path} cannot be read: its header has {told}.")
             fields[key.strip()] = value.strip()
         return fields, stream.tell()

@@ -71,12 +71,12 @@ def _legacy(path: Path, content: bytes) -> ImageRecord:
     dtype, counts = np.dtype(LEGACY[kind.lower()]).newbyteorder(">"), [int(n) for n in words["DIMENSIONS"]]
     of_cells = "CELL_DATA" in words and "POINT_DATA" not in words
     total = math.prod(n - of_cells if n > 1 else 1 for n in counts) * int(count)
-    binary = "BINARY" in words
-    held = (
-        content[end.end() : end.end() + total * dtype.itemsize]
-        if binary
-        else content[end.end() :].split(None, total)[:total]
-    )
+    if "BINARY" in words:
+        held: Any = content[end.end() : end.end() + total * dtype.itemsize]
+    else:
+        held = content[end.end() :].split(None, total)[:total]
+        if "COLOR_SCALARS" in words:  # from 0 to 1
+            held = [round(255 * float(word)) for word in held]
     place = (
         words.get("SPACING") or words.get("ASPECT_RATIO") or np.ones(3),
         words.get("ORIGIN", np.zeros(3)),
