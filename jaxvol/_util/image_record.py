@@ -41,6 +41,7 @@ class ImageRecord:
         convention: where the world's axes point: "LPS" (left, back, head), "RAS" or such, or "" for nowhere.
         slope, intercept: a value is slope times the stored number plus intercept.
         missing: stored numbers that mean that there is no value.
+        unsigned: whether stored integers have no sign, whatever their type (`_Unsigned` of NetCDF).
         labels: the name of each value of a segmentation, where the file has them.
         assumed: what the file does not say, and what was taken in its place.
         also: further arguments of `Volume`.
@@ -58,6 +59,7 @@ class ImageRecord:
     slope: float = 1.0
     intercept: float = 0.0
     missing: tuple[float, ...] = ()
+    unsigned: bool = False
     labels: Mapping[int, str] = field(default_factory=dict)
     assumed: list[str] = field(default_factory=list)
     also: dict[str, Any] = field(default_factory=dict)
@@ -100,6 +102,8 @@ class ImageRecord:
             if stored.dtype.kind == "f" or holds(stored.dtype, number):
                 at = stored == stored.dtype.type(number)
                 mask = (at if mask is None else mask | at) if at.any() else mask
+        if self.unsigned and stored.dtype.kind == "i":
+            stored = stored.view(stored.dtype.str.replace("i", "u"))
         slope, intercept = float(self.slope), float(self.intercept)
         if not self.is_scaled:
             return stored, mask
@@ -267,7 +271,7 @@ class DecodedArray:
     def __init__(self, record: ImageRecord, reverse: Sequence[int], nan: float | None):
         self.record, self.reverse, self.nan, self.shape = record, reverse, nan, record.data.shape
         stored = np.dtype(getattr(record.data.dtype, "numpy_dtype", record.data.dtype))
-        self.dtype = np.dtype(np.float32) if record.is_scaled or record.missing else stored
+        self.dtype = np.dtype(np.float32) if record.is_scaled or record.missing or record.unsigned else stored
         if (chunks := getattr(record.data, "chunks", None)) is not None:
             self.chunks = chunks
 

@@ -17,11 +17,12 @@ EVEN = 1e-3
 def record_of(value: Any) -> ImageRecord | None:
     """The record of an image of one of these libraries; None for anything else."""
     kind, placed = type(value), ("GetSpacing", "GetOrigin")
-    marks: dict[Callable[[Any], ImageRecord], tuple[str, ...]] = {
+    marks: dict[Callable[[Any], ImageRecord | None], tuple[str, ...]] = {
         _xarray: ("dims", "coords", "transpose", "to_numpy"),
         nibabel_record: ("dataobj", "affine", "header"),
         _itk: (*placed, "GetDirection", "GetNumberOfComponentsPerPixel"),
         _vtk: (*placed, "GetDirectionMatrix", "GetPointData"),
+        zarr_record: ("metadata", "attrs", "store", "chunks"),
     }
     read = next((read for read, names in marks.items() if all(hasattr(kind, name) for name in names)), None)
     return None if read is None else read(value)
@@ -111,7 +112,16 @@ def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
     )
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if attributes.get(name) is not None]
     numbers = [float(n) for fill in fills if not isinstance(fill, str) for n in np.ravel(fill)]
-    return {"slope": slope, "intercept": intercept, "missing": tuple(n for n in numbers if n == n)}
+    unsigned = str(attributes.get("_Unsigned")).lower() == "true"
+    missing = tuple(n for n in numbers if n == n)
+    return {"slope": slope, "intercept": intercept, "missing": missing, "unsigned": unsigned}
+
+
+def zarr_record(value: Any) -> ImageRecord | None:
+    """An array of zarr with names of axes: its own, or xarray's in Zarr 2. Without, it is like any other array."""
+    attributes = dict(value.attrs)
+    names = getattr(value.metadata, "dimension_names", None) or attributes.get("_ARRAY_DIMENSIONS") or []
+    return ImageRecord(value, list(names), **cf_scale(attributes)) if len(names) > 2 and all(names) else None
 
 
 def _xarray(value: Any) -> ImageRecord:

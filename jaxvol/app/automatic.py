@@ -93,7 +93,7 @@ def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
             fill = kinds[-1] if far else fill
             kinds, counts, more = kinds[:-above], counts[:-above], True
     parts = [f"{n / np.size(values):.2g} of the voxels hold {value:g}" for value, n in left]
-    told = f"{', '.join(parts)}, far from all others: not seen as values" if left else ""
+    told = f"{', '.join(parts)}, far from all others: taken as background" if left else ""
     usual = kinds[np.searchsorted(np.cumsum(counts), 0.01 * counts.sum())]
     return Spread(float(kinds[0]), float(kinds[-1]), float(usual), fill, told)
 
@@ -261,7 +261,10 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 def range_of_object(volume: Volume) -> tuple[float, float]:
     """From the lower of the `thresholds` to what few values are above; of a single value, as far as that."""
     values = sampled(volume)
-    values = spread_of(values).tame(values).ravel().astype(np.float32)
+    spread = spread_of(values)
+    if spread.told:
+        warn_caller(spread.told)
+    values = spread.tame(values).ravel().astype(np.float32)
     low, least = thresholds(values)[0], float(values.min())
     high = float(np.percentile(values[values >= low], 99.5))
     return (low, high) if low < high else (least, least + max(abs(least), 1.0))

@@ -124,7 +124,8 @@ def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     """The axis that points up, and whether it does so forward or backward."""
     known = is_placed(volume)
     if not known and isinstance(transfer, TransferFunction):  # what is given may be fog
-        transfer = automatic_transfer(volume)
+        with warnings.catch_warnings(action="ignore"):  # which were given before
+            transfer = automatic_transfer(volume)
     visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
     for axis in () if known else (2, 1, 0):
         low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))

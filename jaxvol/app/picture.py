@@ -40,6 +40,7 @@ from .automatic import (
     preset_unit,
     range_of_object,
     sampled,
+    spread_of,
     stride_of,
     transfer_by_copy,
     unit_of,
@@ -375,7 +376,8 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
     if clim is None:
         data, over = np.asarray(volume.data), options.compositing == "over"
         # what is around the object would be fog
-        low, high = float(data.min()), float(data.max())
+        ends = [data.min(), data.max()]  # which `sampled` may leave out
+        low, high = spread_of(np.append(sampled(volume).ravel(), ends))[:2]
         clim = range_of_object(volume) if over else (low, high if high > low else low + 1)
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     if options.compositing == "average" and options.clim is None and options.window is None:

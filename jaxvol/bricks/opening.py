@@ -99,7 +99,7 @@ def levels_of(
         check_one_channel(thing, "bricks")
         own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
         return (VoxelSource(thing.data, **(own | place), axes="xyz", **options, name="volume"),)
-    if (record := record_of(thing)) is not None:
+    if (record := record_of(thing)) is not None and not ("axes" in options and hasattr(thing, "store")):
         if "axes" in options:
             raise TypeError(f"axes: the {type(thing).__name__} has its own.")
         return (_source(record, place, **options),)
@@ -144,7 +144,7 @@ def _source(
     for axis, letter in zip(at, "xyz", strict=True):
         names[axis] = letter
     reverse = [axis for axis, sign in zip(at, signs, strict=True) if sign < 0]
-    if reverse or record.missing or (record.slope, record.intercept) != (1, 0):
+    if reverse or record.missing or record.unsigned or record.is_scaled:
         array = DecodedArray(record, reverse, nan)
     return VoxelSource(array, **(own | place), axes=names, nan=nan, name=name, **index)
 

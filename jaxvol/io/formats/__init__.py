@@ -30,6 +30,8 @@ READERS: dict[str, Callable[[Path], ImageRecord]] = {".npy": read_npy, ".npz": r
 READERS |= dict.fromkeys((".nrrd", ".nhdr"), read_nrrd) | dict.fromkeys((".mha", ".mhd"), read_metaimage)
 READERS |= dict.fromkeys(nifti.ENDINGS, nifti.read_nifti) | dict.fromkeys(tiff.ENDINGS, tiff.read_tiff)
 READERS |= dict.fromkeys(mrc.ENDINGS, mrc.read_mrc) | dict.fromkeys((".vti", ".vtk"), read_vtk)
+VAGUE = (".img", ".hdf", *mrc.ENDINGS[1:])
+"""Endings of voxels without a header, too, if the caller describes these."""
 NAMED: dict[str, Callable[[Path, str | None], ImageRecord]] = dict.fromkeys(hdf5.ENDINGS, hdf5.read_hdf5)
 """Readers of files that hold several arrays, of which one is named: `file.h5::/name`."""
 
@@ -144,6 +146,7 @@ def read_record(
     folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
     ending = next((ending for ending in (*READERS, *NAMED) if lower.endswith(ending)), None)
     is_slices = (path.is_file() and is_dicom(path)) or lower.endswith(".dcm") or lower == "dicomdir"
+    ending = None if ending in VAGUE and shape is not None and dtype is not None else ending
     if lower.endswith(RAW) or (given and not (folder or ending or path.is_dir() or is_slices)):
         record = read_raw(path, shape, dtype, offset or 0)
     elif given:

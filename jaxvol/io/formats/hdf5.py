@@ -45,6 +45,9 @@ def read_hdf5(path: Path, name: str | None = None) -> ImageRecord:
             raise ValueError(
                 f"path: {path}: {found[0]} must be numbers in chunks; got {array.dtype}, {chunk} bytes."
             )
+        labels = [str(label) for label in array.attrs.get("DIMENSION_LABELS", ())]
+        if all(labels) and len({*labels}) == array.ndim:
+            array = array.rename(dict(zip(array.dims, labels, strict=True)))
         if unnamed := [n for n in array.dims if str(n).startswith("phony_dim")]:
             array = array.rename(dict(zip(unnamed, "tczyx"[-len(unnamed) :], strict=True)))
         record = record_of(array)

@@ -59,8 +59,9 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     for at, letter in zip(unknown[::-1], free, strict=False):  # the fastest is z
         axes = axes[:at] + letter + axes[at + 1 :]
     further = axes.translate(str.maketrans("", "", "YXS"))
-    if len(further) == 1 and not file.is_ome and not file.is_shaped:  # ImageJ's stacks may be of times
+    if len(further) == 1 and not file.is_ome:  # ImageJ's stacks may be of times
         axes = axes.replace(further, "Z")
+        notes += [f"axis {further}: taken as z"] if further != "Z" and file.is_shaped else []
     if "Z" not in axes:
         axes, shape = f"Z{axes}", (1, *shape)
     if not 0 < math.prod(shape) < 2**62:
@@ -85,6 +86,9 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     record = ImageRecord(data.reshape(shape), axes, assumed=notes, what=f"path: {path}")
     if "GDAL_NODATA" in first.tags:
         record.missing = (float(first.nodata),)
+    for role in ("scale", "offset") if "GDAL_METADATA" in first.tags else ():
+        if found := re.search(rf'role="{role}"[^>]*>([^<]+)<', str(first.tags["GDAL_METADATA"].value)):
+            setattr(record, {"scale": "slope", "offset": "intercept"}[role], float(found[1]))
     told = file.imagej_metadata or {}
     if file.is_imagej and told.get("cf") not in NO_CURVE:
         if told["cf"] != 0:

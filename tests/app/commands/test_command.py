@@ -118,7 +118,7 @@ def test_bad_files_are_told_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("jaxvol.bricks.opening.LARGE", 32)
     monkeypatch.setattr("jaxvol.bricks.opening.BEYOND", 2)
     monkeypatch.setattr(
-        "jaxvol.bricks.opening.require_room", lambda wanted, of: require_room(wanted * 2**40, of)
+        "jaxvol.bricks.opening.require_room", lambda wanted, of: require_room(wanted * 2**30, of)
     )
     written(tmp_path)
     for words, message in BAD_FILES.items():
