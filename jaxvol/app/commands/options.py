@@ -63,6 +63,10 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
                 weaker = read(command, settings[name], named="file" in settings)
             except ValueError as fault:
                 raise ValueError(f"--{name}: {str(fault)[:400]}") from fault
+            for option in weaker.pop("further", ()):
+                if option not in settings:
+                    told = f"the picture shows {option} of files that it may not name"
+                    raise ValueError(f"--{name}: {told}: give --{option.replace('others', 'with')}, too.")
             settings = _over(settings, weaker)
     check_exclusive(settings)
     defaults = command.defaults()
@@ -127,6 +131,7 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
         raise ValueError(f"{path}: a picture names its volume elsewhere; got {shortened(words)}.")
     if "transfer" in found:
         settings["recorded_transfer"] = found["transfer"]
+    settings |= {"further": found["further"]} if "further" in found else {}
     if not named:
         file = found["file"]
         settings["file"] = volume_of_picture(path, file["name"], file["bytes"], file["sha256"])

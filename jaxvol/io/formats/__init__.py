@@ -233,6 +233,8 @@ def files_of(path: Path) -> list[Path]:
     name = path.name.lower()
     if name.endswith(RAW):
         return [path, *raw_json(path)]
+    if name.endswith((".hdr", ".img")):
+        return sorted(file for ending in (".hdr", ".img") if (file := path.with_suffix(ending)).is_file())
     if name.endswith((".mhd", ".nrrd", ".nhdr")):
         data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
         return [path, data] if data != path and data.is_file() else [path]
