@@ -252,8 +252,11 @@ def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float 
     if nan is None:
         if mask.all():
             raise ValueError(f"{record.what} must hold values; all {mask.size} are missing. Give nan=VALUE.")
-        nan = data[~mask].min().item()
-        record.note(f"{np.count_nonzero(mask)} of {mask.size} values are missing: shown as {nan:g}; see nan")
+        least = data[~mask].min().item()
+        record.note(
+            f"{np.count_nonzero(mask)} of {mask.size} values are missing: shown as {least:g}; see nan"
+        )
+        nan = float(least)
     data = np.array(data, data.dtype if data.dtype.kind == "f" or holds(data.dtype, nan) else np.float32)
     data[mask] = nan
     return data

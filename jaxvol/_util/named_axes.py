@@ -51,25 +51,24 @@ def nibabel_record(image: Any, stored: Any = None, what: str = "data") -> ImageR
     """Its world is right, front, head. Where a NIfTI has neither an sform nor a qform, axes are left as they
     are in the file, from 0 on, as by SimpleITK; nibabel itself reverses one of them and centres all.
     `stored`: its numbers, if they were read before."""
-    header, proxy, place = image.header, image.dataobj, grid_of(image.affine) | {"convention": "RAS"}
+    header, proxy = image.header, image.dataobj
+    data = proxy.get_unscaled() if stored is None and hasattr(proxy, "get_unscaled") else stored
+    data = np.asanyarray(proxy if data is None else data)
     codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
+    place: dict[str, Any] = {"convention": "RAS"} | grid_of(image.affine)
     if codes and not any(codes):
         place = {"steps": dict(zip("xyz", map(float, header["pixdim"][1:4]), strict=True))}
     unit = header.get_xyzt_units()[0] if hasattr(header, "get_xyzt_units") else "mm"
-    data = stored
-    if data is None:
-        data = np.asanyarray(proxy.get_unscaled() if hasattr(proxy, "get_unscaled") else proxy)
-    colors = data.dtype.names is not None
-    data = np.stack([data[name] for name in data.dtype.names or ()], axis=-1) if colors else data
-    while data.ndim > 5 + colors and data.shape[-1 - colors] == 1:
-        data = np.squeeze(data, data.ndim - 1 - colors)
-    axes = "xyztc"[: data.ndim - colors] + "s" * colors
+    if names := data.dtype.names:  # of colours
+        data = np.stack([data[name] for name in names], axis=-1)
+    else:
+        place |= {"slope": getattr(proxy, "slope", 1.0), "intercept": getattr(proxy, "inter", 0.0)}
+    n = data.ndim - bool(names)
+    while n > 5 and data.shape[n - 1] == 1:
+        data, n = np.squeeze(data, n - 1), n - 1
     # of objects in memory, a fourth axis is the volume's channels
-    axes = axes if colors or stored is not None else axes.replace("t", "s")
-    scale = (
-        {} if colors else {"slope": getattr(proxy, "slope", 1.0), "intercept": getattr(proxy, "inter", 0.0)}
-    )
-    return ImageRecord(data, axes, units=None if unit == "unknown" else unit, what=what, **place, **scale)
+    axes = "xyztc"[:n] + "s" if names else "xyztc"[:n].replace("t", "t" if stored is not None else "s")
+    return ImageRecord(data, axes, units=None if unit == "unknown" else unit, what=what, **place)
 
 
 def _itk(image: Any) -> ImageRecord:

@@ -45,7 +45,7 @@ def axis_letters(what: str, names: Sequence[str], note: Callable[[str], None]) -
     which begins with `what`, for an axis that is not known otherwise, and for two of one kind.
     """
     words = [str(name).strip().lower() for name in names]
-    found = [AXES.get(word) or AXES.get(word.removesuffix("s")) for word in words]
+    found: list[str | None] = [AXES.get(word) or AXES.get(word.removesuffix("s")) for word in words]
     if "height" in words:  # of an image, or above the ground
         found[words.index("height")] = "y" if "y" not in found else "z"
     missing = [letter for letter in "xyz" if letter not in found]

@@ -50,7 +50,7 @@ DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 """Colours, 8-bit sRGB: of the border's foot, the border, the object, what is dense, and what is densest."""
 
 
-RARE, FAR, BEYOND = 1e-4, 0.25, 3.0
+RARE, FAR, BEYOND = 1e-4, 0.25, 6.0
 """Fraction of the voxels that are strays at most; their gap to the others, as a fraction of the range of these,
 at least, which is also that of a fill value below the others; and the same of one above the others."""
 
@@ -77,7 +77,7 @@ def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
     """Find the range of values but for those that lie far from all others: single voxels, hot or dead, and one
     value of any number of voxels, such as the padding of CT outside of the circle, or a fill value.
 
-    A value above all others counts as background only if it is farther away than three times their range: a
+    A value above all others counts as background only if it is farther away than six times their range: a
     saturated object is no fill value.
     """
     kinds, counts = np.unique(values, return_counts=True)
@@ -199,7 +199,11 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
         else:
             points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
     if spread.fill < math.inf:  # transparent, as it is around the object
-        points += [(high + (high - low) / 100, BRIGHT, 0.0)]
+        last = max(high, points[-1][0])
+        points += [
+            (last + (high - low) * part, BRIGHT, level)
+            for part, level in ((0.01, points[-1][2]), (0.02, 0.0))
+        ]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
     return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))

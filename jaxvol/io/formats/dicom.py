@@ -119,7 +119,8 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
             )
     (down, across), turn = first.grid[:2].tolist(), first.grid[2:].reshape(2, 3)
     turn = directions(
-        f"path: {path}: rows and columns of {first.name}", np.column_stack([*turn, np.cross(*turn)])
+        f"path: {path}: rows and columns of {first.name}",
+        np.column_stack([*turn, np.cross(turn[0], turn[1])]),
     )
     slices = sorted(slices, key=lambda each: float(each.place @ turn[:, 2]))
     slices, several = _at_one_time(path, slices, turn[:, 2], time)
@@ -309,8 +310,8 @@ def _values(slices: list[Slice]) -> np.ndarray:
                 header = next(part for part in each.parts if "ModalityLUTSequence" in part)
                 plane = library("pydicom.pixels", each.file).apply_modality_lut(plane, header)
             slope, intercept = (each.told(name) for name in ("RescaleSlope", "RescaleIntercept"))
-            scale = {"slope": float(slope or 1), "intercept": float(intercept or 0)}
-            planes.append(ImageRecord(plane, "yx", **scale).decode(plane)[0])
+            record = ImageRecord(plane, "yx", slope=float(slope or 1), intercept=float(intercept or 0))
+            planes.append(record.decode(plane)[0])
     return np.stack(planes)
 
 

@@ -14,6 +14,7 @@ import tempfile
 import time
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import h5py
 import mrcfile
@@ -25,7 +26,7 @@ import vtk
 import xarray
 import zarr
 from PIL import Image
-from vtk.util.numpy_support import numpy_to_vtk
+from vtk.util.numpy_support import numpy_to_vtk  # pyright: ignore[reportMissingImports]
 
 import jaxvol as jv
 from jaxvol import bricks
@@ -123,7 +124,7 @@ def vtk_grid(data):
     return image
 
 
-def vtk_image(ending, mode="Ascii", compress=False):
+def vtk_image(ending, mode: Any = "Ascii", compress: Any = False):
     def write(folder):
         is_xml = ending == ".vti"
         writer = vtk.vtkXMLImageDataWriter() if is_xml else vtk.vtkStructuredPointsWriter()

@@ -2,6 +2,7 @@
 
 import sys
 import warnings
+from typing import Any
 
 import h5py
 import nibabel
@@ -18,6 +19,10 @@ import jaxvol as jv
 from jaxvol._util.units import axis_letters, length_of
 
 from .test_dicom import ORIGIN, SPACING, VALUES, write_series, write_slice
+
+
+def of(name, number) -> Any:
+    return {name: number}
 
 
 RAMP = np.arange(120, dtype=np.int16).reshape(4, 5, 6)  # z, y, x
@@ -86,7 +91,8 @@ def test_a_calibration_of_imagej_and_of_gdal_gives_values(tmp_path):
 def test_pages_are_planes_as_ome_says_also_of_several_files(tmp_path):
     def xml(planes, own, z=4):
         tiff = "".join(
-            f'<TiffData FirstZ="{k}" IFD="{ifd}" PlaneCount="1"><UUID FileName="{name}">urn:uuid:{name}</UUID>'
+            f'<TiffData FirstZ="{k}" IFD="{ifd}" PlaneCount="1">'
+            f'<UUID FileName="{name}">urn:uuid:{name}</UUID>'
             "</TiffData>"
             for k, (name, ifd) in enumerate(planes)
         )
@@ -123,7 +129,7 @@ def test_what_tifffile_knows_of_axes_is_asked_for(tmp_path, axes):
     name = "channel" if axes == "CZYX" else "time"
     with pytest.raises(ValueError, match=f"{name} must be given, from 0 to 2"):
         jv.load(tmp_path / "a.tif")
-    np.testing.assert_array_equal(jv.load(tmp_path / "a.tif", **{name: 2}).data, RAMP.T + 2)
+    np.testing.assert_array_equal(jv.load(tmp_path / "a.tif", **of(name, 2)).data, RAMP.T + 2)
     with tifffile.TiffWriter(tmp_path / "b.tif") as file:
         for stack in data[:2]:
             file.write(stack, photometric="minisblack")
@@ -148,7 +154,7 @@ def test_names_that_count_twice_are_channels_or_times_or_refused(tmp_path):
         path = write(folder, name)
         with pytest.raises(ValueError, match=f"{how} must be given, from 0 to 1"):
             jv.load(path)
-        assert np.asarray(jv.load(path, **{how: 1}).data)[0, 0].tolist() == [20, 21, 22]
+        assert np.asarray(jv.load(path, **of(how, 1)).data)[0, 0].tolist() == [20, 21, 22]
     with pytest.raises(ValueError, match="holds 2 series of 3 images"):
         jv.load(write("d", "{c}_{z:04d}.png"))
     path = write("e", "x{z:03d}_{c}.png")
@@ -161,7 +167,12 @@ def test_names_that_count_twice_are_channels_or_times_or_refused(tmp_path):
 def test_a_chunk_that_is_left_out_has_the_fill_value(tmp_path):
     data = np.full((8, 8, 8), 3, np.uint8)
     data[:4] = 200
-    for name, how in (("2", {"zarr_format": 2}), ("3", {}), ("s", {"shards": (8, 8, 8)})):
+    layouts: list[tuple[str, dict[str, Any]]] = [
+        ("2", {"zarr_format": 2}),
+        ("3", {}),
+        ("s", {"shards": (8, 8, 8)}),
+    ]
+    for name, how in layouts:
         array = zarr.create_array(
             tmp_path / name, shape=(8, 8, 8), chunks=(4, 4, 4), dtype="u1", fill_value=3, **how
         )

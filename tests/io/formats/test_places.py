@@ -2,6 +2,8 @@
 
 Witnesses are a closed form, and the library's own reader where it has one."""
 
+from typing import Any
+
 import h5py
 import mrcfile
 import nibabel
@@ -14,7 +16,7 @@ import vtk
 import xarray
 import zarr
 from hypothesis import given, settings, strategies as st
-from vtk.util.numpy_support import numpy_to_vtk
+from vtk.util.numpy_support import numpy_to_vtk  # pyright: ignore[reportMissingImports]
 
 import jaxvol as jv
 
@@ -38,7 +40,7 @@ def box(draw):
     return data, spacing, origin, turn
 
 
-def center(data, affine, bright=7):
+def center(data, affine, bright=7.0):
     """World position of the middle of what is bright."""
     at = np.argwhere(np.isclose(data, bright)).mean(axis=0)
     return affine[:3, :3] @ at + affine[:3, 3]
@@ -88,7 +90,7 @@ def by_nibabel(draw, folder, data, spacing, origin, turn):
     image = nibabel.Nifti1Pair(data, image.affine, image.header) if path.suffix == ".img" else image
     image.header.set_slope_inter(*scale)
     nibabel.save(image, path)
-    stored = nibabel.load(path)
+    stored: Any = nibabel.load(path)
     length = {"mm": 1.0, "micron": 1e-3, "meter": 1e3}[unit]
     found, values = jv.load(path), stored.get_fdata()
     expected = length * (TO_LPS @ stored.affine)[:3]
@@ -198,8 +200,9 @@ def by_mrcfile(draw, folder, data, spacing, origin, turn):
     with mrcfile.new(folder / "a.mrc", overwrite=True) as file:
         file.set_data(np.ascontiguousarray(stored.T))
         file.voxel_size = tuple(spacing.tolist())
+        header: Any = file.header
         for axis, number in zip("xyz", origin, strict=True):
-            file.header.origin[axis] = number
+            header.origin[axis] = number
     check(jv.load(folder / "a.mrc"), data, 1e-7 * affine_of(spacing, origin, np.eye(3)))
 
 
