@@ -106,9 +106,7 @@ def _vtk(image: Any) -> ImageRecord:
 
 def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """`slope`, `intercept` and `missing` of a record by attributes of the CF convention."""
-    slope, intercept = (
-        float(attributes.get(name, k)) for name, k in (("scale_factor", 1), ("add_offset", 0))
-    )
+    slope, intercept = float(attributes.get("scale_factor", 1)), float(attributes.get("add_offset", 0))
     fills = [attributes[name] for name in ("_FillValue", "missing_value") if attributes.get(name) is not None]
     numbers = [float(n) for fill in fills if not isinstance(fill, str) for n in np.ravel(fill)]
     unsigned = str(attributes.get("_Unsigned")).lower() == "true"
@@ -117,7 +115,7 @@ def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def zarr_record(value: Any) -> ImageRecord | None:
-    """An array of zarr with names of axes: its own, or xarray's in Zarr 2. Without, it is like any other array."""
+    """Of an array with names of axes, its own or xarray's; without, it is like any other array."""
     attributes = dict(value.attrs)
     names = getattr(value.metadata, "dimension_names", None) or attributes.get("_ARRAY_DIMENSIONS") or []
     return ImageRecord(value, list(names), **cf_scale(attributes)) if len(names) > 2 and all(names) else None
@@ -128,28 +126,26 @@ def _xarray(value: Any) -> ImageRecord:
     spaced, also by those of several axes; `direction` as `itk.xarray_from_image` keeps it."""
     own = {name: value.coords[name] for name in value.dims if name in value.coords}
     names = [str(getattr(own.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
-    data = value.variable  # which may be read from a file later
-    if not 3 <= data.ndim <= 5:
-        return ImageRecord(data, names)
-    record = ImageRecord(data, names, **cf_scale(value.attrs))
-    letters = record.letters
-    space = [letters.index(letter) for letter in "xyz" if letter in letters]
-    positions = [value.coords.get(letter) for letter in "xyz"]
-    if all(each is not None and len(each.dims) >= 1 for each in positions) and len(space) == 3:
-        apart = any(each.dims != (value.dims[at],) for each, at in zip(positions, space, strict=True))
-        if apart:  # positions along x, y, z at each voxel, or of axes of other names
-            dims = [value.dims[at] for at in space]
-            world = [each.broadcast_like(value.isel({d: 0 for d in value.dims if d not in dims}))
-                     .transpose(*dims).to_numpy() for each in positions]  # fmt: skip
-            record.units = {a: each.attrs.get("units") for a, each in zip("xyz", positions, strict=True)}
-            return _with(record, grid_of(_affine(np.stack(world))))
-    units, steps, origin = {}, dict.fromkeys("xyz", 1.0) if own else {}, [0.0, 0.0, 0.0]
-    for letter, name in ((letters[at], value.dims[at]) for at in space if value.dims[at] in own):
-        steps[letter], origin["xyz".index(letter)] = even_step(np.asarray(own[name]), name)
-        units[letter] = own[name].attrs.get("units")
-    record = _with(record, {"steps": steps, "origin": np.array(origin), "units": units})
-    if (turn := value.attrs.get("direction")) is not None and len(space) == 3:
-        rank = [sorted(space).index(at) for at in space]
+    record = ImageRecord(value.variable, names, **cf_scale(value.attrs))  # read later, maybe from a file
+    dims = {letter: dim for letter, dim in zip(record.letters, value.dims, strict=True) if letter in "xyz"}
+    named = {letter: value.coords[letter] for letter in "xyz" if letter in value.coords}
+    if len(dims) == len(named) == 3 and any(each.ndim > 1 for each in named.values()):  # of each voxel
+        first = value.isel({dim: 0 for dim in value.dims if dim not in dims.values()})
+        order = [dims[letter] for letter in "xyz"]
+        world = [named[letter].broadcast_like(first).transpose(*order).to_numpy() for letter in "xyz"]
+        record.units = {letter: each.attrs.get("units") for letter, each in named.items()}
+        vars(record).update(grid_of(_affine(np.stack(world))))
+        return record
+    places = {
+        a: named[a] if a in named and named[a].dims == (dim,) else own.get(dim) for a, dim in dims.items()
+    }
+    found = {letter: each for letter, each in places.items() if each is not None}
+    ends = {letter: even_step(each.to_numpy(), each.name) for letter, each in found.items()}
+    record.steps = {letter: ends.get(letter, (1.0, 0.0))[0] for letter in "xyz"} if found else {}
+    record.origin = [ends.get(letter, (1.0, 0.0))[1] for letter in "xyz"]
+    record.units = {letter: each.attrs.get("units") for letter, each in found.items()}
+    if (turn := value.attrs.get("direction")) is not None and len(dims) == 3:
+        rank = [[dim for dim in value.dims if dim in dims.values()].index(dims[letter]) for letter in "xyz"]
         record.direction = np.reshape(np.asarray(turn, float), (3, 3))[np.ix_(rank, rank)]
         record.convention = "LPS"
     return record
@@ -166,21 +162,10 @@ def even_step(at: np.ndarray, name: Any) -> tuple[float, float]:
 
 def _affine(world: np.ndarray) -> np.ndarray:
     """The affine map of positions [3, x, y, z]. Raises `ValueError` where they are none's."""
-    first = world[:, 0, 0, 0]
-    last = np.maximum(np.array(world.shape[1:]) - 1, 1)
-    columns = [(np.take(world, -1, k + 1)[:, 0, 0] - first) / last[k] for k in range(3)]
-    at = np.indices(world.shape[1:])
-    exact = first[:, None, None, None] + sum(
-        c[:, None, None, None] * n for c, n in zip(columns, at, strict=True)
-    )
-    if not np.abs(world - exact).max() <= EVEN * min(np.linalg.norm(c) for c in columns):  # NaN, too
-        raise ValueError(
-            "data must have evenly spaced numbers as coordinates; got positions on a curved grid."
-        )
-    return np.column_stack([*columns, first])
-
-
-def _with(record: ImageRecord, place: Mapping[str, Any]) -> ImageRecord:
-    for name, part in place.items():
-        setattr(record, name, part)
-    return record
+    first, last = world[:, 0, 0, 0], np.maximum(np.array(world.shape[1:]) - 1, 1)
+    ends = world[:, -1, 0, 0], world[:, 0, -1, 0], world[:, 0, 0, -1]
+    columns = (np.stack(ends, axis=1) - first[:, None]) / last
+    exact = first[:, None, None, None] + np.tensordot(columns, np.indices(world.shape[1:]), 1)
+    if not np.abs(world - exact).max() <= EVEN * np.linalg.norm(columns, axis=0).min():  # NaN, too
+        raise ValueError("data must have evenly spaced numbers as coordinates; got those of a curved grid.")
+    return np.column_stack([columns, first])

@@ -232,6 +232,13 @@ def test_directions_and_positions_of_a_data_array_are_read():
     coords = {name: (("k", "j", "i"), numbers) for name, numbers in places.items()}
     volume = jv.Volume(xarray.DataArray(RAMP, dims=("k", "j", "i"), coords=coords))
     np.testing.assert_allclose(volume.bounds, (5, 10, 20, 28, 30, 39))
+    flat = {
+        "z": ("k", 30 + 3.0 * np.arange(4)),
+        "y": ("j", 20 + 2.0 * np.arange(5)),
+        "x": ("i", 10 - np.arange(6.0)),
+    }
+    other = jv.Volume(xarray.DataArray(RAMP, dims=("k", "j", "i"), coords=flat))
+    np.testing.assert_allclose(other.bounds, volume.bounds)
     curved = coords | {"x": (("k", "j", "i"), 10.0 + i**2)}
     with pytest.raises(ValueError, match="curved grid"):
         jv.Volume(xarray.DataArray(RAMP, dims=("k", "j", "i"), coords=curved))
