@@ -123,9 +123,10 @@ class ImageRecord:
     def oriented(
         self, sizes: Sequence[int], *, turned: bool = True
     ) -> tuple[list[int], list[int], dict[str, Any]]:
-        """How axes of so many voxels are brought along the world's: which of x, y, z becomes each, its sign, and
-        spacing (mm), origin and direction of `Volume`, missing where the file says nothing. Not `turned`: axes
-        stay in order, and only those along which steps are negative are reversed. No voxel is interpolated."""
+        """How axes of so many voxels are brought along the world's: which of x, y, z becomes each, its sign,
+        and spacing (mm), origin and direction of `Volume`, missing where the file says nothing. Not `turned`:
+        axes stay in order, and only those along which steps are negative are reversed. No voxel is
+        interpolated."""
         lengths, given = self.millimetres(), np.array([self.steps.get(a, 1.0) for a in "xyz"], float)
         if self.steps and (unknown := [letter for letter in "xyz" if letter not in self.steps]):
             self.note(f"the distance along {', '.join(unknown)}: taken as 1, in the unit of the others")
@@ -203,8 +204,8 @@ def volume_arguments(
     nan: float | None = None,
     turned: bool = True,
 ) -> dict[str, Any]:
-    """Arguments of `Volume` for an image: axes along the world's (if `turned`), lengths in mm, values scaled, and
-    those that are missing replaced by `nan`, by default by the least one that is there.
+    """Arguments of `Volume` for an image: axes along the world's (if `turned`), lengths in mm, values scaled,
+    and those that are missing replaced by `nan`, by default by the least one that is there.
 
     Raises:
         ValueError: for axes that are not known, a choice of `time` or `channel` that is missing or wrong, a
@@ -269,7 +270,8 @@ def numbered(ids: np.ndarray) -> dict[str, Any]:
 
 
 class DecodedArray:
-    """The array of a record, of which boxes are read as values, with some of its axes reversed: for bricks."""
+    """The array of a record, of which boxes are read as values, with some of its axes reversed: for
+    bricks."""
 
     def __init__(self, record: ImageRecord, reverse: Sequence[int], nan: float | None):
         self.record, self.reverse, self.nan, self.shape = record, reverse, nan, record.data.shape

@@ -51,13 +51,13 @@ DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 
 
 RARE, FAR, BEYOND = 1e-4, 0.25, 6.0
-"""Fraction of the voxels that are strays at most; their gap to the others, as a fraction of the range of these,
-at least, which is also that of a fill value below the others; and the same of one above the others."""
+"""Fraction of the voxels that are strays at most; their gap to the others, as a fraction of the range of
+these, at least, which is also that of a fill value below the others; and the same of one above the others."""
 
 
 class Spread(NamedTuple):
-    """Range of values without strays and fill values. `usual`: their first percentile. `fill`: the value above
-    the range that means background, or infinity. `told`: words on what was left out, or ""."""
+    """Range of values without strays and fill values. `usual`: their first percentile. `fill`: the value
+    above the range that means background, or infinity. `told`: words on what was left out, or ""."""
 
     low: float
     high: float
@@ -74,8 +74,8 @@ class Spread(NamedTuple):
 
 
 def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
-    """Find the range of values but for those that lie far from all others: single voxels, hot or dead, and one
-    value of any number of voxels, such as the padding of CT outside of the circle, or a fill value.
+    """Find the range of values but for those that lie far from all others: single voxels, hot or dead, and
+    one value of any number of voxels, such as the padding of CT outside of the circle, or a fill value.
 
     A value above all others counts as background only if it is farther away than six times their range: a
     saturated object is no fill value.

@@ -116,9 +116,9 @@ def levels_of(
     name = path.name.lower()
     if path.exists() and (name.endswith(".gz") or not (name.endswith(READ_IN_BOXES) or "shape" in options)):
         raise ValueError(
-            f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, MRC, "
-            "HDF5, or the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as DICOM "
-            "slices, as jv.load(path) or jv.load_ultrasound(path)."
+            f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, "
+            "MRC, HDF5, or the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as "
+            "DICOM slices, as jv.load(path) or jv.load_ultrasound(path)."
         )
     header = {key: options.pop(key) for key in ("shape", "dtype", "offset") if key in options}
     record = read_record(path, **header)
@@ -128,8 +128,8 @@ def levels_of(
 def _source(
     record: ImageRecord, place: dict[str, Any], axes: Any = None, nan: float | None = None, **index: Any
 ) -> VoxelSource:
-    """The source of a record's array: its axes along the world's, lengths in mm, values scaled. `place`: as the
-    caller has it."""
+    """The source of a record's array: its axes along the world's, lengths in mm, values scaled. `place`: as
+    the caller has it."""
     name, array = record.what.removeprefix("path: "), record.data
     if axes is not None or not record.axes:
         return VoxelSource(array, **place, axes=axes, nan=nan, name=name, **index)
@@ -165,8 +165,8 @@ def read_zarr(path: Path) -> ImageRecord:
         if voxels <= MOST_VOXELS and voxels * voxel_type(stored).itemsize <= room:
             return record
     raise ValueError(
-        f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {tuple(sizes)} voxels. "
-        "Read it in bricks: jv.render_bricks, --memory."
+        f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {tuple(sizes)} "
+        "voxels. Read it in bricks: jv.render_bricks, --memory."
     )
 
 
@@ -180,8 +180,8 @@ def _is_zarr_array(path: Path) -> bool:
 
 
 def _zarr_record(path: Path, missing: Any = "fill") -> ImageRecord:
-    """The record of an array. Its axes, values and lengths are as xarray keeps them; of a Zarr without names of
-    axes, `axes` is empty unless there are three."""
+    """The record of an array. Its axes, values and lengths are as xarray keeps them; of a Zarr without names
+    of axes, `axes` is empty unless there are three."""
     try:
         import tensorstore
     except ImportError as fault:

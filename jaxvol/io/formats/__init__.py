@@ -117,8 +117,8 @@ def load(
 
 
 def read(record: ImageRecord, **how: Any) -> dict[str, Any]:
-    """Arguments of `Volume` for what a file holds; those of which it says nothing are missing. Options: as for
-    `volume_arguments`."""
+    """Arguments of `Volume` for what a file holds; those of which it says nothing are missing. Options: as
+    for `volume_arguments`."""
     arguments = volume_arguments(record, **how)
     data = arguments["data"]
     if data.dtype.kind in "iu" and data.itemsize > 2 and not within(data, WHOLE["float32"]) and _is_ids(data):
@@ -140,7 +140,8 @@ def read_record(
     time: int | None = None,
     offset: int | None = None,
 ) -> ImageRecord:
-    """What a file or folder holds, and says of it. The spacing is that of the volume, if the caller gives it."""
+    """What a file or folder holds, and says of it. The spacing is that of the volume, if the caller gives
+    it."""
     path, name = _existing(path)
     lower, given = path.name.lower(), shape is not None or dtype is not None or offset
     folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
@@ -175,18 +176,18 @@ def _unknown(path: Path) -> str:
             told = ", ".join(str(folder.relative_to(path)) for folder in below[:8])
             return f"path: {path} holds DICOM images in {told}: give the path of one of these folders."
         return (
-            f"path: {path} is a directory without DICOM and TIFF files, and no Zarr; expected a folder of these, "
-            "of PNG or JPEG slices, or a file."
+            f"path: {path} is a directory without DICOM and TIFF files, and no Zarr; expected a folder of "
+            "these, of PNG or JPEG slices, or a file."
         )
     if path.name.lower().endswith(".vol"):
         with path.open("rb") as stream:
             if stream.read(16) == MAGIC:
-                use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...)) or jv.scan_convert"
+                use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
                 return f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}."
     endings = ", ".join(sorted((*RAW, *READERS, *NAMED, ".dcm")))
     return (
-        f"path: {path} has an unknown ending; expected a folder of slices, or a file ending in {endings}. Of voxels "
-        "without a header, give shape=(nx, ny, nz) and dtype."
+        f"path: {path} has an unknown ending; expected a folder of slices, or a file ending in {endings}. Of "
+        "voxels without a header, give shape=(nx, ny, nz) and dtype."
     )
 
 

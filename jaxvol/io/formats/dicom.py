@@ -82,8 +82,8 @@ def folders_below(folder: Path) -> list[Path]:
 
 
 def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> ImageRecord:
-    """Reader for a folder that holds one series, for one file of a series, whose others are in its folder, for
-    a file of several frames, and for the DICOMDIR of a disc with one series.
+    """Reader for a folder that holds one series, for one file of a series, whose others are in its folder,
+    for a file of several frames, and for the DICOMDIR of a disc with one series.
 
     Args:
         path: the folder, or the file.
@@ -106,16 +106,15 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
         each for file, header in series_headers(path).items() for each in _slices(file, header, spacing)
     ]
     if not 2 <= len(slices) <= MOST_VOXELS // math.prod(slices[0].shape[1:] if slices else (1,)):
-        raise ValueError(
-            f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got {len(slices)}."
-        )
+        expected = "at least 2 slices of a series, and fewer than 2**31 voxels"
+        raise ValueError(f"path: {path} must hold {expected}; got {len(slices)}.")
     first = slices[0]
     for each in slices:
         if each.shape[1:] != first.shape[1:] or not np.allclose(each.grid, first.grid, rtol=1e-4, atol=1e-4):
             grids = (f"{each.shape[1:]} {each.grid.tolist()}" for each in (first, each))
             raise ValueError(
-                f"path: {path}: slices of one series must agree in size, spacing and directions; {first.name} "
-                f"and {each.name} do not: {' and '.join(grids)}. Is one an overview?"
+                f"path: {path}: slices of one series must agree in size, spacing and directions; "
+                f"{first.name} and {each.name} do not: {' and '.join(grids)}. Is one an overview?"
             )
     (down, across), turn = first.grid[:2].tolist(), first.grid[2:].reshape(2, 3)
     turn = directions(
@@ -152,10 +151,8 @@ def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any)
     if time is None:
         words = re.sub("(?<=[a-z])(?=[A-Z])", " ", key).lower()
         by = f"{words} {', '.join(str(each.told(key)) for each in ordered[0][:6])}"
-        raise ValueError(
-            f"path: {path} holds {count} images at each of {len(groups)} places ({by}): time must be given, from 0 "
-            f"to {count - 1}."
-        )
+        told = f"path: {path} holds {count} images at each of {len(groups)} places ({by})"
+        raise ValueError(f"{told}: time must be given, from 0 to {count - 1}.")
     at = integer("time", time, 0, count - 1)
     return [group[at] for group in ordered], f", one of {count} at each place"
 
@@ -188,7 +185,7 @@ def _even_step(path: Path, slices: list[Slice], normal: np.ndarray, pixel: float
     if abs(steps[k] - usual) > AWAY * usual and missing > 0:
         told = f"{missing} of {usual:.4g} mm {'is' if missing == 1 else 'are'} missing between {names[k]} and"
     elif abs(steps[k] - usual) > AWAY * usual:
-        told = f"{steps[k]:.4g} mm in place of {usual:.4g}: one is there twice, or shifted, between {names[k]} and"
+        told = f"{steps[k]:.4g} mm for {usual:.4g}: one is there twice, or shifted, between {names[k]} and"
     else:
         k = int(np.argmin(even)) - 1
         told = f"{along[k + 1]:.4g} too far along their normal, and {sideways[k + 1]:.4g} sideways, lies"
@@ -238,8 +235,8 @@ def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
     """The images of a file."""
     if (syntax := _meta(path, SYNTAX)) not in PLAIN | PACKED.keys():
         raise ValueError(
-            f"path: {path} is stored in the transfer syntax {syntax}, which is not read. Decompress the series "
-            "first, for example with gdcmconv --raw."
+            f"path: {path} is stored in the transfer syntax {syntax}, which is not read. Decompress the "
+            "series first, for example with gdcmconv --raw."
         )
     with refusing(path):
         shape = int(header.get("NumberOfFrames") or 1), int(header.Rows), int(header.Columns)
@@ -299,7 +296,8 @@ def _numbers(
 
 
 def _values(slices: list[Slice]) -> np.ndarray:
-    """Values [z, y, x], of a type that holds those of all slices: each may have a scale or a table of its own."""
+    """Values [z, y, x], of a type that holds those of all slices: each may have a scale or a table of its
+    own."""
     planes, pixels, last = [], np.empty(0), None
     for each in slices:
         with refusing(each.file):

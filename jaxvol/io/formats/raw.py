@@ -40,8 +40,8 @@ def read_raw(path: Path, shape: Any = None, dtype: Any = None, offset: int = 0) 
 
 
 def raw_header(path: Path, shape: Any, dtype: Any) -> tuple[tuple[int, int, int], np.dtype, dict[str, Any]]:
-    """Shape (nx, ny, nz), stored type, and spacing and origin where they are known, of a raw file: as given by
-    the caller, else by its JSON file, else by its name."""
+    """Shape (nx, ny, nz), stored type, and spacing and origin where they are known, of a raw file: as given
+    by the caller, else by its JSON file, else by its name."""
     match = SCIVIS_NAME.search(path.name)
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
     given = {"shape": shape, "dtype": dtype}
@@ -68,8 +68,8 @@ def raw_header(path: Path, shape: Any, dtype: Any) -> tuple[tuple[int, int, int]
     found = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
     if found is None:
         raise ValueError(
-            "dtype must be uint8, int8, uint16 to uint64, int16 to int64, float16, float32 or float64, optionally "
-            f"with le or be appended for the byte order; got {dtype!r} for {path}."
+            "dtype must be uint8, int8, uint16 to uint64, int16 to int64, float16, float32 or float64, "
+            f"optionally with le or be appended for the byte order; got {dtype!r} for {path}."
         )
     order = ">" if (found[2] or "").lower() == "be" else "<"
     return (nx, ny, nz), np.dtype(found[1].lower()).newbyteorder(order), fields

@@ -19,7 +19,8 @@ from ..._util.named_axes import grid_of
 
 
 LONGEST, MOST_FIELDS = 900, 1024
-"""Letters of a field in an NRRD header, at most (comments and pairs may be longer); and fields in a header."""
+"""Letters of a field in an NRRD header, at most (comments and pairs may be longer); and fields in a
+header."""
 
 META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8"}
 META_TYPES |= {name.replace("_", "_U", 1): f"u{code[1]}" for name, code in META_TYPES.items()}
@@ -109,7 +110,7 @@ def read_nrrd(path: Path) -> ImageRecord:
     if not magic.startswith("nrrd00") or encoding not in ("raw", "gzip", "gz") or not source.is_file():
         raise ValueError(
             f"path: {path} cannot be read: a NRRD file holds its voxels, or names one file of them, in the "
-            f"encoding raw or gzip; got {shortened(magic)}, {shortened(encoding)} and {shortened(str(source))}."
+            f"encoding raw or gzip; got {shortened(magic)}, {shortened(encoding)}, {shortened(str(source))}."
         )
     kind, shape = fields.get("type", "").lower(), _sizes(path, fields.get("sizes", ""))
     code, found = {"float": "f4", "double": "f8"}.get(kind, ""), NRRD_TYPE.fullmatch(kind)

@@ -45,8 +45,8 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     if (len(several) > 1 and not one_by_one) or not {*series.axes} <= {*"XYZTCSQIAPRHEV"} or not first.dtype:
         told = "; ".join(f"{each.shape} ({each.axes})" for each in several[:4])
         raise ValueError(
-            f"path: {path} must hold one stack of images of one size and type; got {len(several)} stacks, and "
-            f"pages of {len(kinds)} kinds: {told}. Choose one, as by tifffile.imread(path, series=0)."
+            f"path: {path} must hold one stack of images of one size and type; got {len(several)} stacks, "
+            f"and pages of {len(kinds)} kinds: {told}. Choose one, as by tifffile.imread(path, series=0)."
         )
     axes, shape = series.axes, series.shape
     if one_by_one or not {*axes} - {*"YXS"}:
@@ -138,8 +138,8 @@ def _words(file: Path) -> list[Any]:
 
 
 def read_slices(folder: Path) -> ImageRecord:
-    """Reader for a folder of files of one image each, in the order of the numbers in their names; where two of
-    these count, one is that of channels or times. Raises `ValueError` naming the files for images of
+    """Reader for a folder of files of one image each, in the order of the numbers in their names; where two
+    of these count, one is that of channels or times. Raises `ValueError` naming the files for images of
     different sizes or types, for a number that is missing, and for names that count in another way."""
     files = slice_files(folder)
     axes, counts, files = _counted(folder, files)
@@ -198,8 +198,8 @@ def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Seque
         if len({*letters}) < len(letters) or math.prod(sizes.values()) != len(files):
             n = max(sizes.values())
             raise ValueError(
-                f"path: {folder} holds {len(files) // n} series of {n} images: names such as {files[0].name} and "
-                f"{files[-1].name} count by {len(sizes)} numbers. {elsewhere}"
+                f"path: {folder} holds {len(files) // n} series of {n} images: names such as {files[0].name} "
+                f"and {files[-1].name} count by {len(sizes)} numbers. {elsewhere}"
             )
         return (
             "".join(letters),

@@ -5,6 +5,7 @@ import base64
 import math
 import re
 import zlib
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -148,6 +149,4 @@ def _bytes(store: bytes, word: np.dtype, *, is_raw: bool, packed: bool) -> bytes
     most = int(np.frombuffer(head, word)[1])
     body = taken(len(head) if is_raw else 4 * math.ceil(len(head) / 3), min(sum(lengths), len(store)))
     ends = np.cumsum([0, *lengths]).tolist()
-    return b"".join(
-        zlib.decompressobj().decompress(body[a:b], most) for a, b in zip(ends, ends[1:], strict=False)
-    )
+    return b"".join(zlib.decompressobj().decompress(body[a:b], most) for a, b in pairwise(ends))
