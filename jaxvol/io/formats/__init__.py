@@ -171,14 +171,14 @@ def read_record(
 def _unknown(path: Path) -> str:
     """Why a path is not read."""
     if path.is_dir():
-        below = folders_below(path)
-        if below:
-            told = ", ".join(str(folder.relative_to(path)) for folder in below[:8])
-            return f"path: {path} holds DICOM images in {told}: give the path of one of these folders."
-        return (
-            f"path: {path} is a directory without DICOM and TIFF files, and no Zarr; expected a folder of "
-            "these, of PNG or JPEG slices, or a file."
-        )
+        inside = sorted(path.iterdir())
+        images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
+        files = [each for each in inside if each.name.lower().endswith((*RAW, *READERS, *NAMED, ".zarr"))]
+        if found := folders_below(path) or images or files:
+            kind = "" if found in (images, files) else "DICOM images in "
+            told = ", ".join(str(each.relative_to(path)) for each in found[:8])
+            return f"path: {path} holds {kind}{told}: give its path."
+        return f"path: {path} is a directory without DICOM and TIFF files, other slices, and no Zarr."
     if path.name.lower().endswith(".vol"):
         with path.open("rb") as stream:
             if stream.read(16) == MAGIC:

@@ -340,7 +340,7 @@ def test_a_disc_is_read_by_its_index_or_its_folders_are_named(tmp_path):
     (tmp_path / "DICOMDIR").write_bytes(bytes(200))
     np.testing.assert_array_equal(jv.load(tmp_path / "DICOMDIR").data, VALUES)
     for folder, name in ((tmp_path, "IMAGES/SE1"), (tmp_path / "IMAGES", "SE1")):
-        with pytest.raises(ValueError, match=f"holds DICOM images in {name}: give the path"):
+        with pytest.raises(ValueError, match=f"holds DICOM images in {name}: give its path"):
             jv.load(folder)
 
 
