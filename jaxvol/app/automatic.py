@@ -40,6 +40,7 @@ MOST_LABELS = 256
 """Whole numbers are labels if most equal their neighbour, and no more than so many differ, the lowest among
 them: a `LabelTransferFunction` has no more."""
 
+SPARSE = 0.06  # fraction of voxels that are no background, at most, of angiograms
 MANY = 16  # different values that the others have at least, for one to be far from them
 
 SMALL = 0.1  # voxels for which presets, made for some 0.5 to 3 mm, would be nearly transparent
@@ -197,7 +198,10 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
                 border = [(first, EDGE, 0.0), (min(usual, second - 2 * d), SKIN, depth)]
             points = [*border, (second - d, TISSUE, depth), *points]
         else:
-            points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
+            foot, opacity = (second - 2 * d, 0.02)
+            if np.mean(values > first) < SPARSE:  # vessels, of which the thin ones are darker
+                foot, opacity = first, 0.2
+            points = [(foot, EDGE, 0.0), (second - d, TISSUE, opacity), *points]
     if spread.fill < math.inf:  # transparent, as it is around the object
         last = max(high, points[-1][0])
         points += [

@@ -1,5 +1,6 @@
 """Reads stacks of images: TIFF with tifffile, and folders of TIFF, PNG and JPEG."""
 
+import io
 import math
 import re
 import struct
@@ -171,7 +172,7 @@ def _picture(path: Path) -> ImageRecord:
     from PIL import Image
 
     file_size(path)
-    with refusing(path), Image.open(path) as image:
+    with refusing(path), Image.open(io.BytesIO(path.read_bytes())) as image:  # lengths within it may be any
         if image.width * image.height > path.stat().st_size * MOST_COMPRESSED:
             raise ValueError(f"its header says {image.size}, more than its bytes can hold")
         data = np.asarray(image)
