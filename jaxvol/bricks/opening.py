@@ -208,9 +208,7 @@ def _zarr_record(path: Path, missing: Any = "fill") -> ImageRecord:
             f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
         )
     require_room(of_chunk, f"path: {path}: a chunk of {tuple(chunk)} voxels")  # tensorstore ends the process
-    file = path / (".zattrs" if version_2 else "zarr.json")
-    attributes = _read_json(file) if file.is_file() else {}
-    attributes = attributes if version_2 else attributes.get("attributes") or {}
+    attributes = _attributes(path)
     names: Any = list(store.domain.labels)  # Zarr 3
     if not any(names):  # xarray's in Zarr 2
         names = attributes.get("_ARRAY_DIMENSIONS") or []
@@ -221,23 +219,26 @@ def _zarr_record(path: Path, missing: Any = "fill") -> ImageRecord:
     try:
         for name, value in cf_scale(attributes).items():
             setattr(record, name, value)
+        units, steps, origin = dict[str, Any](), dict[str, float](), np.zeros(3)
         for letter, name in zip(record.letters if names else "", names, strict=True):
             beside = path.parent / name  # a coordinate of xarray
-            if letter in "xyz" and beside != path and is_zarr(beside) and _is_zarr_array(beside):
-                coordinate = _zarr_record(beside)
-                at = (
-                    np.asarray(coordinate.data[:], float) if coordinate.data.shape[0] < 2**20 else np.zeros(0)
-                )
-                step, first = even_step(at, name)
-                record.steps = {**record.steps, letter: step}
-                record.origin = np.where(np.array([*"xyz"]) == letter, first, record.origin)
-                record.units = {**(record.units or {}), letter: coordinate.also.get("units")}
-        record.also = (
-            {"units": attributes["units"]} if len(store.shape) == 1 and "units" in attributes else {}
-        )
+            known = letter in "xyz" and Path(name).name == name and beside != path
+            if known and is_zarr(beside) and _is_zarr_array(beside):
+                at, units[letter] = _zarr_record(beside).data, _attributes(beside).get("units")
+                if len(at.shape) != 1 or at.shape[0] > 2**20:
+                    raise ValueError(f"the coordinate {name} must have one axis; got shape {at.shape}.")
+                steps[letter], origin["xyz".index(letter)] = even_step(np.asarray(at), name)
+        record.steps, record.units, record.origin = steps, units, origin
     except (TypeError, ValueError) as fault:
         raise ValueError(f"path: {path}: {fault}") from fault
     return record
+
+
+def _attributes(path: Path) -> dict[str, Any]:
+    """The attributes of a Zarr array."""
+    if (path / ".zarray").is_file():
+        return _read_json(path / ".zattrs") if (path / ".zattrs").is_file() else {}
+    return _read_json(path / "zarr.json").get("attributes") or {}
 
 
 def _ome_records(path: Path, **options: Any) -> list[ImageRecord]:

@@ -240,7 +240,7 @@ def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
         )
     with refusing(path):
         shape = int(header.get("NumberOfFrames") or 1), int(header.Rows), int(header.Columns)
-        channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.BitsAllocated)
+        channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.get("BitsAllocated", 0))
         if channels != 1 or min(shape) < 1 or bits not in (1, 8, 16, 32, 64):
             got = f"{shape} of {channels} values of {bits} bits"
             raise ValueError(f"path: {path} must hold slices of one value per pixel; got {got}.")
