@@ -68,6 +68,8 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     files = {page.parent.filehandle.path for page in series.pages if page is not None} if pixels else {path}
     held = sum(Path(each).stat().st_size for each in files) * (MOST_COMPRESSED if packed else 1)
     check_size(path, held, math.prod(shape) * first.dtype.itemsize * (pages - missing) // pages, more=True)
+    strips = [n for each in several for page in each.pages if page is not None for n in page.databytecounts]
+    check_size(path, held, max(strips, default=0), more=True)  # of which tifffile reads as many
     data = np.stack([each.asarray() for each in several]) if one_by_one else series.asarray()
     record.data, record.axes = data.reshape(shape), axes
     record.missing = (float(first.nodata),) if "GDAL_NODATA" in first.tags else ()
