@@ -155,7 +155,8 @@ class ImageRecord:
         lengths = {a: f" of {step:.6g} {self.unit(a) or ''}".rstrip() for a, step in self.steps.items()}
         axes = zip(self.axes, self.data.shape, self.letters, strict=True)
         told = ", ".join(f"{name} {n}{lengths.get(letter, '')}" for name, n, letter in axes)
-        rows = {"format": self.format, "stored": f"{self.data.dtype}, {told}"}
+        stored = getattr(self.data.dtype, "numpy_dtype", self.data.dtype)  # of tensorstore
+        rows = {"format": self.format, "stored": f"{stored}, {told}"}
         rows |= (
             {"scale": f"value = {self.slope:.9g} x stored + {self.intercept:.9g}"} if self.is_scaled else {}
         )
