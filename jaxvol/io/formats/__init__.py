@@ -177,7 +177,7 @@ def _unknown(path: Path) -> str:
         if found := folders_below(path) or images or files:
             kind = "" if found in (images, files) else "DICOM images in "
             told = ", ".join(str(each.relative_to(path)) for each in found[:8])
-            return f"path: {path} holds {kind}{told}: give its path."
+            return f"path: {path} is a directory that holds {kind}{told}: give its path."
         return f"path: {path} is a directory without DICOM and TIFF files, other slices, and no Zarr."
     if path.name.lower().endswith(".vol"):
         with path.open("rb") as stream:
