@@ -1,14 +1,17 @@
 """Checks the sizes of files against their headers: before memory is allocated or, if only decompressing
 tells, while a file is read, never further than one byte past the expected size."""
 
+import importlib
+import logging
 import re
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from io import BufferedIOBase
 from pathlib import Path
-from typing import IO, Literal, TypeAlias
+from typing import IO, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -69,11 +72,43 @@ def decoding(path: Path) -> Iterator[None]:
         raise ValueError(f"path: {path} cannot be read: {told}.") from fault
 
 
+@contextmanager
+def refusing(path: Path) -> Iterator[None]:
+    """Turn whatever a library raises within the context into a `ValueError` that says what is wrong. What it
+    warns of and logs, which may be a line for each of a file's faults, is left out."""
+    loggers = [logging.getLogger(name) for name in ("tifffile", "nibabel.global", "pydicom")]
+    before = [logger.disabled for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.disabled = True
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except (MemoryError, ImportError):
+        raise
+    except Exception as fault:
+        if isinstance(fault, ValueError) and str(fault).startswith("path:"):
+            raise
+        told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
+        raise ValueError(f"path: {path} cannot be read: {told}") from fault
+    finally:
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
+
+
 def reason(fault: BaseException) -> str:
     """The last line of an error, without the place in ITK's source with which its errors begin."""
     last = str(fault).strip().rpartition("\n")[2]
     told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
     return printable(told).rstrip(".") or type(fault).__name__
+
+
+def library(name: str, path: Path) -> Any:
+    """A module that reads files. Raises `ImportError` that says what to install for `path`."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as fault:
+        raise ImportError(f"{path} needs {name}: pip install 'jaxvol[io]' ({fault})") from fault
 
 
 def as_array(

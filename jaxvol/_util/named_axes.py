@@ -1,80 +1,171 @@
-"""Reads images that say where they lie: of xarray, nibabel, SimpleITK and VTK, none of which is imported."""
+"""Records of images that say where they lie: of xarray, nibabel, SimpleITK, itk and VTK, none of which is
+imported unless an image of it comes."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from .affine import place_of
+from .image_record import ImageRecord, volume_arguments
 
 
-def is_named(value: Any) -> bool:
-    """Whether a value is an image of one of these libraries."""
-    return _reader(value) is not None
+EVEN = 1e-3
+"""Part of a step by which a coordinate may be away from evenly spaced ones."""
 
 
-def along_xyz(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The values as data[x, y, z] or data[x, y, z, channel], and `spacing`, `origin` and `direction` where
-    the image tells them. Raises `ValueError` for one without three axes, or with uneven coordinates."""
-    read = _reader(value)
-    assert read is not None
-    return read(value)
-
-
-def _reader(value: Any) -> Callable[[Any], tuple[np.ndarray, dict[str, np.ndarray]]] | None:
+def record_of(value: Any) -> ImageRecord | None:
+    """The record of an image of one of these libraries; None for anything else."""
     kind, placed = type(value), ("GetSpacing", "GetOrigin")
-    marks = {
+    marks: dict[Callable[[Any], ImageRecord | None], tuple[str, ...]] = {
         _xarray: ("dims", "coords", "transpose", "to_numpy"),
-        _nibabel: ("dataobj", "affine", "header"),
-        _simple_itk: (*placed, "GetDirection", "GetNumberOfComponentsPerPixel"),
+        nibabel_record: ("dataobj", "affine", "header"),
+        _itk: (*placed, "GetDirection", "GetNumberOfComponentsPerPixel"),
         _vtk: (*placed, "GetDirectionMatrix", "GetPointData"),
+        zarr_record: ("metadata", "attrs", "store", "chunks"),
     }
-    return next((read for read, names in marks.items() if all(hasattr(kind, name) for name in names)), None)
+    read = next((read for read, names in marks.items() if all(hasattr(kind, name) for name in names)), None)
+    return None if read is None else read(value)
 
 
-def _nibabel(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Its world is right, front, head; ours left, back, head."""
-    return np.asanyarray(image.dataobj), place_of("data.affine", np.diag([-1.0, -1, 1, 1]) @ image.affine)
+def object_arguments(value: Any) -> dict[str, Any] | None:
+    """Arguments of `Volume` for an image of these libraries; None for anything else. An axis of channels
+    becomes the volume's."""
+    if (record := record_of(value)) is None:
+        return None
+    if "s" not in (letters := record.letters):
+        record.axes = letters.replace("c", "s")
+    return volume_arguments(record, turned=False)
 
 
-def _simple_itk(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    if image.GetDimension() != 3:
-        raise ValueError(f"data must be a 3-D image; got one of size {image.GetSize()}. Extract one volume.")
-    data = sys.modules["SimpleITK"].GetArrayFromImage(image)
-    turn = np.reshape(image.GetDirection(), (3, 3)) * image.GetSpacing()
-    return np.swapaxes(data, 0, 2), place_of("data", np.column_stack([turn, image.GetOrigin()]))
+def grid_of(affine: Any) -> dict[str, Any]:
+    """`steps`, `origin` and `direction` of a record whose voxel (i, j, k) lies at `affine @ (i, j, k, 1)`."""
+    columns, origin = np.asarray(affine, float)[:3, :3], np.asarray(affine, float)[:3, 3]
+    steps = np.linalg.norm(columns, axis=0)
+    with np.errstate(invalid="ignore"):
+        direction = columns / np.where(steps > 0, steps, 1)
+    return {"steps": dict(zip("xyz", steps.tolist(), strict=True)), "origin": origin, "direction": direction}
 
 
-def _vtk(image: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def nibabel_record(image: Any, stored: Any = None, what: str = "data") -> ImageRecord:
+    """Its world is right, front, head. Where a NIfTI has neither an sform nor a qform, axes are left as they
+    are in the file, from 0 on, as by SimpleITK; nibabel itself reverses one of them and centres all.
+    `stored`: its numbers, if they were read before."""
+    header, proxy = image.header, image.dataobj
+    data = proxy.get_unscaled() if stored is None and hasattr(proxy, "get_unscaled") else stored
+    data = np.asanyarray(proxy if data is None else data)
+    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
+    place: dict[str, Any] = {"convention": "RAS"} | grid_of(image.affine)
+    if codes and not any(codes):
+        place = {"steps": dict(zip("xyz", map(float, header["pixdim"][1:4]), strict=True))}
+    unit = header.get_xyzt_units()[0] if hasattr(header, "get_xyzt_units") else "mm"
+    if names := data.dtype.names:  # of colours
+        data = np.stack([data[name] for name in names], axis=-1)
+    else:
+        place |= {"slope": getattr(proxy, "slope", 1.0), "intercept": getattr(proxy, "inter", 0.0)}
+    n = data.ndim - bool(names)
+    while n > 5 and data.shape[n - 1] == 1:
+        data, n = np.squeeze(data, n - 1), n - 1
+    # of objects in memory, a fourth axis is the volume's channels
+    axes = "xyztc"[:n] + "s" if names else "xyztc"[:n].replace("t", "t" if stored is not None else "s")
+    return ImageRecord(data, axes, units=None if unit == "unknown" else unit, what=what, **place)
+
+
+def _itk(image: Any) -> ImageRecord:
+    """An image of SimpleITK, or of the package `itk`."""
+    simple = hasattr(image, "GetDimension")
+    n = image.GetDimension() if simple else image.GetImageDimension()
+    if n != 3:
+        raise ValueError(f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
+    library = sys.modules.get("SimpleITK" if simple else "itk")
+    if library is None:  # a class that only looks like theirs
+        raise ValueError(f"data must be an image of SimpleITK or itk; got {type(image).__name__}.")
+    data = (library.GetArrayFromImage if simple else library.array_from_image)(image)
+    turn = np.asarray(image.GetDirection() if simple else library.array_from_matrix(image.GetDirection()))
+    spacing, origin = (list(map(float, each)) for each in (image.GetSpacing(), image.GetOrigin()))
+    steps, axes = dict(zip("xyz", spacing, strict=True)), "zyx" + "s" * (data.ndim > 3)
+    return ImageRecord(data, axes, steps, "mm", origin, np.reshape(turn, (3, 3)), "LPS")
+
+
+def _vtk(image: Any) -> ImageRecord:
     scalars, matrix = image.GetPointData().GetScalars(), image.GetDirectionMatrix()
+    cells = scalars is None and image.GetCellData().GetScalars()
+    scalars = cells or scalars
     if scalars is None:
-        raise ValueError("data must be an image with scalars at its points; got a vtkImageData without.")
-    shape = (scalars.GetNumberOfComponents(), *image.GetDimensions())
-    data = np.moveaxis(np.ravel(memoryview(scalars)).reshape(shape, order="F"), 0, -1)
-    entries = [matrix.GetElement(i, j) for i in range(3) for j in range(3)]
-    turn = np.reshape(entries, (3, 3)) * image.GetSpacing()
-    origin = image.GetOrigin() + turn @ image.GetExtent()[::2]
-    place = place_of("data", np.column_stack([turn, origin]))
-    return data[..., 0] if shape[0] == 1 else data, place
+        raise ValueError("data must be an image with scalars at its points or cells; got one without.")
+    sizes = np.array(image.GetDimensions()) - (1 if cells else 0)
+    data = np.ravel(memoryview(scalars)).reshape(*sizes[::-1], scalars.GetNumberOfComponents())
+    turn = np.reshape([matrix.GetElement(i, j) for i in range(3) for j in range(3)], (3, 3))
+    first = np.array(image.GetExtent()[::2]) + (0.5 if cells else 0)
+    affine = np.column_stack(
+        [turn * image.GetSpacing(), image.GetOrigin() + turn * image.GetSpacing() @ first]
+    )
+    several = data.shape[3] > 1
+    return ImageRecord(data if several else data[..., 0], "zyx" + "s" * several, **grid_of(affine))
 
 
-def _xarray(value: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Axes named x, y and z are put in this order. Coordinates that fall are reversed, with the data. Axes
-    without coordinates have spacing 1 from 0 on."""
-    if sorted(map(str, value.dims)) == ["x", "y", "z"]:
-        value = value.transpose("x", "y", "z")
-    data, spacing, origin = value.to_numpy(), np.ones(3), np.zeros(3)
-    named = [(axis, name) for axis, name in enumerate(value.dims) if name in value.coords]
-    if data.ndim != 3 or not named:
-        return data, {}
-    for axis, name in named:
-        at = np.asarray(value.coords[name])
-        even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" else np.zeros(2)
-        step = even[1] - even[0] if at.size > 1 else 0.0
-        if not (step and np.abs(at - even).max() <= 1e-3 * abs(step)):  # NaN, too
-            raise ValueError(f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
-        if step < 0:
-            data, at = np.flip(data, axis), at[::-1]
-        spacing[axis], origin[axis] = abs(step), at[0]
-    return data, {"spacing": spacing, "origin": origin}
+def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """`slope`, `intercept` and `missing` of a record by attributes of the CF convention."""
+    slope, intercept = float(attributes.get("scale_factor", 1)), float(attributes.get("add_offset", 0))
+    fills = [attributes[name] for name in ("_FillValue", "missing_value") if attributes.get(name) is not None]
+    numbers = [float(n) for fill in fills if not isinstance(fill, str) for n in np.ravel(fill)]
+    unsigned = str(attributes.get("_Unsigned")).lower() == "true"
+    missing = tuple(n for n in numbers if n == n)
+    return {"slope": slope, "intercept": intercept, "missing": missing, "unsigned": unsigned}
+
+
+def zarr_record(value: Any) -> ImageRecord | None:
+    """Of an array with names of axes, its own or xarray's; without, it is like any other array."""
+    attributes = dict(value.attrs)
+    names = getattr(value.metadata, "dimension_names", None) or attributes.get("_ARRAY_DIMENSIONS") or []
+    return ImageRecord(value, list(names), **cf_scale(attributes)) if len(names) > 2 and all(names) else None
+
+
+def _xarray(value: Any) -> ImageRecord:
+    """Axes by name, or by `axis` of the CF convention; places by their coordinates, which must be evenly
+    spaced, also by those of several axes; `direction` as `itk.xarray_from_image` keeps it."""
+    own = {name: value.coords[name] for name in value.dims if name in value.coords}
+    names = [str(getattr(own.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
+    record = ImageRecord(value.variable, names, **cf_scale(value.attrs))  # read later, maybe from a file
+    dims = {letter: dim for letter, dim in zip(record.letters, value.dims, strict=True) if letter in "xyz"}
+    named = {letter: value.coords[letter] for letter in "xyz" if letter in value.coords}
+    if len(dims) == len(named) == 3 and any(each.ndim > 1 for each in named.values()):  # of each voxel
+        first = value.isel({dim: 0 for dim in value.dims if dim not in dims.values()})
+        order = [dims[letter] for letter in "xyz"]
+        world = [named[letter].broadcast_like(first).transpose(*order).to_numpy() for letter in "xyz"]
+        record.units = {letter: each.attrs.get("units") for letter, each in named.items()}
+        vars(record).update(grid_of(_affine(np.stack(world))))
+        return record
+    places = {
+        a: named[a] if a in named and named[a].dims == (dim,) else own.get(dim) for a, dim in dims.items()
+    }
+    found = {letter: each for letter, each in places.items() if each is not None}
+    ends = {letter: even_step(each.to_numpy(), each.name) for letter, each in found.items()}
+    record.steps = {letter: ends.get(letter, (1.0, 0.0))[0] for letter in "xyz"} if found else {}
+    record.origin = [ends.get(letter, (1.0, 0.0))[1] for letter in "xyz"]
+    record.units = {letter: each.attrs.get("units") for letter, each in found.items()}
+    if (turn := value.attrs.get("direction")) is not None and len(dims) == 3:
+        rank = [[dim for dim in value.dims if dim in dims.values()].index(dims[letter]) for letter in "xyz"]
+        record.direction = np.reshape(np.asarray(turn, float), (3, 3))[np.ix_(rank, rank)]
+        record.convention = "LPS"
+    return record
+
+
+def even_step(at: np.ndarray, name: Any) -> tuple[float, float]:
+    """The distance between evenly spaced numbers, and the first. Raises `ValueError` for others."""
+    even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" and at.size else np.zeros(2)
+    step = float(even[1] - even[0]) if at.size > 1 else 0.0
+    if not (step and np.abs(at - even).max() <= EVEN * abs(step)):  # NaN, too
+        raise ValueError(f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
+    return step, float(at[0])
+
+
+def _affine(world: np.ndarray) -> np.ndarray:
+    """The affine map of positions [3, x, y, z]. Raises `ValueError` where they are none's."""
+    first, last = world[:, 0, 0, 0], np.maximum(np.array(world.shape[1:]) - 1, 1)
+    ends = world[:, -1, 0, 0], world[:, 0, -1, 0], world[:, 0, 0, -1]
+    columns = (np.stack(ends, axis=1) - first[:, None]) / last
+    exact = first[:, None, None, None] + np.tensordot(columns, np.indices(world.shape[1:]), 1)
+    if not np.abs(world - exact).max() <= EVEN * np.linalg.norm(columns, axis=0).min():  # NaN, too
+        raise ValueError("data must have evenly spaced numbers as coordinates; got those of a curved grid.")
+    return np.column_stack([columns, first])

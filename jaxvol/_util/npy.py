@@ -6,21 +6,26 @@ from pathlib import Path
 
 import numpy as np
 
-from .files import CORRUPT, MOST_VOXELS, Stream, as_array, check_size, decoding, file_size, read_all
+from .files import CORRUPT, Stream, as_array, check_size, decoding, file_size, read_all
+from .image_record import ImageRecord
 
 
 VOLUME = ("data", "spacing", "origin", "direction", "labels", "label_ids")
 """Arguments of `Volume` that a `.npz` file may hold."""
 
 
-def read_npy(path: Path) -> dict[str, np.ndarray]:
-    """Reader for `.npy`: one array, the data."""
+def read_npy(path: Path) -> ImageRecord:
+    """Reader for `.npy`: one array, the data, which is mapped."""
     size = file_size(path)
     with decoding(path), path.open("rb") as stream:
-        return {"data": _array(path, stream, size)}
+        shape, fortran, dtype = npy_header(path, stream)
+        begin = stream.tell()
+    check_size(path, size - begin, math.prod(shape) * dtype.itemsize)
+    data = np.memmap(path, dtype, "r", begin, shape, "F" if fortran else "C")
+    return ImageRecord(data, "xyzs"[: data.ndim], what=f"path: {path}")
 
 
-def read_npz(path: Path) -> dict[str, np.ndarray]:
+def read_npz(path: Path) -> ImageRecord:
     """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
     file_size(path)
     with decoding(path), zipfile.ZipFile(path) as archive:
@@ -35,8 +40,13 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
         arrays = {}
         for name in filter(members.__contains__, VOLUME):
             with archive.open(members[name]) as stream:
-                arrays[name] = _array(path, stream, members[name].file_size)
-    return arrays
+                shape, fortran, dtype = npy_header(path, stream)
+                expected = math.prod(shape) * dtype.itemsize
+                check_size(path, members[name].file_size - stream.tell(), expected)
+                content = read_all(path, stream, expected)
+            arrays[name] = as_array(content, shape, dtype, "F" if fortran else "C")
+    data = arrays.pop("data")
+    return ImageRecord(data, "xyzs"[: data.ndim], what=f"path: {path}", also=arrays)
 
 
 def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -56,13 +66,6 @@ def npy_header(path: Path, stream: Stream) -> tuple[tuple[int, ...], bool, np.dt
             f"path: {path} holds an array of type {dtype}; expected integers or floats. "
             "Arrays of objects are pickles, which are never read."
         )
-    return shape, fortran, dtype
-
-
-def _array(path: Path, stream: Stream, size: int) -> np.ndarray:
-    shape, fortran, dtype = npy_header(path, stream)
-    if min(shape, default=1) < 1 or math.prod(shape) > MOST_VOXELS:
+    if min(shape, default=1) < 1 or math.prod(shape) >= 2**48:
         raise ValueError(f"path: {path} must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
-    expected = math.prod(shape) * dtype.itemsize
-    check_size(path, size - stream.tell(), expected)
-    return as_array(read_all(path, stream, expected), shape, dtype, "F" if fortran else "C")
+    return shape, fortran, dtype

@@ -1,13 +1,16 @@
 """Default transfer functions: from a volume's histogram, or with a colour for each of its labels."""
 
 import math
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Shaped
 
 from .._util.checks import described
+from .._util.image_record import warn_caller
 from .._util.srgb import from_srgb
 from .._util.voxels import is_flat
 from ..ray import check_arguments
@@ -37,12 +40,70 @@ MOST_LABELS = 256
 """Whole numbers are labels if most equal their neighbour, and no more than so many differ, the lowest among
 them: a `LabelTransferFunction` has no more."""
 
+SPARSE = 0.06  # fraction of voxels that are no background, at most, of angiograms
+MANY = 16  # different values that the others have at least, for one to be far from them
+
 SMALL = 0.1  # voxels for which presets, made for some 0.5 to 3 mm, would be nearly transparent
 INSIDE = 255  # value of what has a label, in the volume that is shown
 
 EDGE, SKIN, TISSUE = (70, 30, 18), (214, 130, 92), (190, 92, 62)
 DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 """Colours, 8-bit sRGB: of the border's foot, the border, the object, what is dense, and what is densest."""
+
+
+RARE, FAR, BEYOND = 1e-4, 0.25, 6.0
+"""Fraction of the voxels that are strays at most; their gap to the others, as a fraction of the range of
+these, at least, which is also that of a fill value below the others; and the same of one above the others."""
+
+
+class Spread(NamedTuple):
+    """Range of values without strays and fill values. `usual`: their first percentile. `fill`: the value
+    above the range that means background, or infinity. `told`: words on what was left out, or ""."""
+
+    low: float
+    high: float
+    usual: float
+    fill: float
+    told: str
+
+    def tame(self, data: Shaped[np.ndarray, "..."]) -> Shaped[np.ndarray, "..."]:
+        """The data with what is left out at `usual`, and strays above the range at its end."""
+        if not self.told:
+            return data
+        usual, high = map(data.dtype.type, (self.usual, self.high))
+        return np.where((data < self.low) | (data >= self.fill), usual, np.minimum(data, high))
+
+
+def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
+    """Find the range of values but for those that lie far from all others: single voxels, hot or dead, and
+    one value of any number of voxels, such as the padding of CT outside of the circle, or a fill value.
+
+    A value above all others counts as background only if it is farther away than six times their range: a
+    saturated object is no fill value.
+    """
+    kinds, counts = np.unique(values, return_counts=True)
+    kinds, most, left, fill, more = kinds.astype(np.float64), RARE * counts.sum(), [], math.inf, True
+    while more:
+        if more := _strays(kinds, counts, most):
+            left.append((kinds[0], counts[:more].sum()))
+            kinds, counts = kinds[more:], counts[more:]
+        above = _strays(-kinds[::-1], counts[::-1], most)
+        far = above == 1 and kinds[-1] - kinds[-2] > BEYOND * (kinds[-2] - kinds[0])
+        if above and (far or counts[-above:].sum() <= most):
+            left.append((kinds[-1], counts[-above:].sum()))
+            fill = kinds[-1] if far else fill
+            kinds, counts, more = kinds[:-above], counts[:-above], True
+    parts = [f"{n / np.size(values):.2g} of the voxels hold {value:g}" for value, n in left]
+    told = f"{', '.join(parts)}, far from all others: taken as background" if left else ""
+    usual = kinds[np.searchsorted(np.cumsum(counts), 0.01 * counts.sum())]
+    return Spread(float(kinds[0]), float(kinds[-1]), float(usual), fill, told)
+
+
+def _strays(kinds: Float[np.ndarray, " n"], counts: np.ndarray, most: float) -> int:
+    """How many of the lowest values lie far below the others: one, or as many as `most` voxels have."""
+    n = min(max(int(np.searchsorted(np.cumsum(counts), most, "right")), 1), len(kinds) - MANY)
+    far = np.flatnonzero(np.diff(kinds)[:n] > FAR * (kinds[-1] - kinds[1 : n + 1])) if n > 0 else np.empty(0)
+    return int(far[-1]) + 1 if far.size else 0
 
 
 def stride_of(shape: tuple[int, ...], most: int = SAMPLED) -> int:
@@ -113,9 +174,18 @@ def check_known(caller: str, *values: Any) -> None:
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
     """The same from a copy of every n-th voxel, and a part at full resolution, which shows grain."""
+    spread = spread_of(sampled(copy))
+    if spread.told:
+        warn_caller(spread.told)
+        tame = jnp.asarray(spread.tame(np.asarray(copy.data)))
+        copy, part = eqx.tree_at(lambda v: v.data, copy, tame), spread.tame(part)
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
-    if not low < high:
+    if side := side_of_distance(copy):
+        warn_caller("values on both sides of 0 with a slope of one are a distance: shown where they are 0")
+        d = side * float(voxel_size(copy)) / 2
+        points = [(-d, BRIGHT, 0.9), (d, DENSE, 0.0)][::side]
+    elif not low < high:
         points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
     else:
         first, second = thresholds(values)
@@ -131,10 +201,31 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
                 border = [(first, EDGE, 0.0), (min(usual, second - 2 * d), SKIN, depth)]
             points = [*border, (second - d, TISSUE, depth), *points]
         else:
-            points = [(second - 2 * d, EDGE, 0.0), (second - d, TISSUE, 0.02), *points]
+            foot, opacity = (second - 2 * d, 0.02)
+            if np.mean(values > first) < SPARSE:  # vessels, of which the thin ones are darker
+                foot, opacity = first, 0.2
+            points = [(foot, EDGE, 0.0), (second - d, TISSUE, opacity), *points]
+    if spread.fill < math.inf:  # transparent, as it is around the object
+        last = max(high, points[-1][0])
+        points += [
+            (last + (high - low) * part, BRIGHT, level)
+            for part, level in ((0.01, points[-1][2]), (0.02, 0.0))
+        ]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
     return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
+
+
+def side_of_distance(volume: Volume) -> int:
+    """Sign of the distance to a surface outside of it, if values are such distances of both signs, else 0."""
+    data, step = sampled(volume).astype(np.float32), np.asarray(volume.spacing) * stride_of(volume.shape)
+    if not (data.min() < 0 < data.max()) or min(data.shape) < 3:
+        return 0
+    slope = np.sqrt(sum(np.square(each) for each in np.gradient(data, *step.tolist())))
+    if np.mean(np.abs(slope[slope > 0] - 1) < 0.1) < 0.7:
+        return 0
+    outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
+    return 1 if np.mean(outer > 0) > 0.5 else -1
 
 
 def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float, float]:
@@ -180,7 +271,11 @@ def thresholds(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 def range_of_object(volume: Volume) -> tuple[float, float]:
     """From the lower of the `thresholds` to what few values are above; of a single value, as far as that."""
-    values = sampled(volume).ravel().astype(np.float32)
+    values = sampled(volume)
+    spread = spread_of(values)
+    if spread.told:
+        warn_caller(spread.told)
+    values = spread.tame(values).ravel().astype(np.float32)
     low, least = thresholds(values)[0], float(values.min())
     high = float(np.percentile(values[values >= low], 99.5))
     return (low, high) if low < high else (least, least + max(abs(least), 1.0))

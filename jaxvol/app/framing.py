@@ -34,6 +34,9 @@ FRONT = (0.5, -1.0, 0.4)
 """From the volume to the camera, where z is up: to the right, in front, and higher."""
 
 
+SLAB = 0.2
+"""Shortest side of a volume, as a fraction of the middle one, below which it is seen from its broad side."""
+
 CUT_FACE, OTHER_FACE = 0.1, 1 / 3
 """An object stands on a face of the volume that cuts through so much of it, if the opposite one cuts through
 at most that part as much: the neck, or the pot of a plant."""
@@ -95,6 +98,14 @@ def upright(
     axis, sign = (2, 1.0) if view_up is not None else _up(volume, transfer)
     front = np.roll(FRONT, axis + 1)  # so that what is above lies along this axis
     front[axis] *= sign
+    extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
+    if (thin := int(np.argmin(extent))) >= 0 and extent[thin] < SLAB * np.median(
+        extent
+    ):  # seen from its side
+        front = 0.3 * front
+        front[thin] = 1.0 if front[thin] >= 0 else -1.0
+        axis, sign = (axis, sign) if axis != thin else (1, 1.0)
+        front = front if volume.direction is None else np.asarray(volume.direction) @ front
     toward = np.asarray(finite_array("direction", front if direction is None else direction, (3,)))
     up = np.asarray(finite_array("view_up", sign * np.eye(3)[axis] if view_up is None else view_up, (3,)))
     along = np.linalg.norm(np.cross(toward, up)) <= 1e-3 * np.linalg.norm(toward) * np.linalg.norm(up)
@@ -113,7 +124,8 @@ def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
     """The axis that points up, and whether it does so forward or backward."""
     known = is_placed(volume)
     if not known and isinstance(transfer, TransferFunction):  # what is given may be fog
-        transfer = automatic_transfer(volume)
+        with warnings.catch_warnings(action="ignore"):  # which were given before
+            transfer = automatic_transfer(volume)
     visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
     for axis in () if known else (2, 1, 0):
         low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))
@@ -146,6 +158,22 @@ def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -
         grid = np.clip(around.reshape(-1, 3), 0, last)
     turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction, np.float64)
     return np.asarray(volume.origin, np.float64) + (grid * np.asarray(volume.spacing, np.float64)) @ turn.T
+
+
+def clipped_points(
+    points: Float[np.ndarray, "n 3"], planes: Sequence[tuple[Any, Any]]
+) -> Float[np.ndarray, "m 3"]:
+    """Points whose hull is that of the given ones on the sides of all planes (point, normal): those that lie
+    there, and where lines to the others cross. None where nothing is left."""
+    for at, normal in planes:
+        height = (points - np.asarray(at, float)) @ np.asarray(normal, float)
+        kept, cut = points[height >= 0], points[height < 0]
+        share = height[height >= 0][:, None] / np.maximum(
+            height[height >= 0][:, None] - height[height < 0], 1e-30
+        )
+        crossing = kept[:, None] + share[..., None] * (cut[None] - kept[:, None])
+        points = np.concatenate([kept, crossing.reshape(-1, 3)])
+    return points
 
 
 def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarray, "nx ny nz"]:

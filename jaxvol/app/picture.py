@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from .._util.checks import described, finite_array, flag, integer, number
+from .._util.memory import require_room
 from .._util.srgb import linear_color
 from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
@@ -39,12 +40,21 @@ from .automatic import (
     preset_unit,
     range_of_object,
     sampled,
+    spread_of,
     stride_of,
     transfer_by_copy,
     unit_of,
     xray_transfer,
 )
-from .framing import FAINT, VISIBLE, automatic_camera, framed, visible_points, warn_of_distance
+from .framing import (
+    FAINT,
+    VISIBLE,
+    automatic_camera,
+    clipped_points,
+    framed,
+    visible_points,
+    warn_of_distance,
+)
 from .progress import progress
 from .settings import OF_COLORS, header_of
 
@@ -53,6 +63,10 @@ def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
     """Of a step that is given."""
     fast = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
     return March(step, (*transforms, *fast), "midpoint")
+
+
+PIXEL = 160
+"""Bytes that an image takes for each pixel, while it is rendered and written."""
 
 
 class Scene(NamedTuple):
@@ -110,6 +124,9 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
             a `Transfer`, and entries of `others` what `other_of` takes.
         orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
     """
+    width, height = np.broadcast_to(getattr(options.camera, "size", options.size), 2).tolist()
+    if width * height < 2**31:  # more are refused otherwise
+        require_room(width * height * PIXEL, f"size {width} x {height}")
     is_surface, background = options.compositing == "isosurface", background_of(options)
     if is_surface == (options.isovalue is None):
         raise ValueError("compositing isosurface and isovalue go together; one is missing.")
@@ -157,6 +174,11 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
 def look_of(options: Namespace) -> tuple[Volume, Transfer]:
     """The volume, which may be another one where labels are shown, and its transfer function."""
     volume, automatic = volume_of(options), is_automatic(options)
+    if volume.channels > 1 and not isinstance(options.transfer, Transfer):
+        told = f"0 to {volume.channels - 1}" if volume.channels > 2 else "0 or 1"
+        raise ValueError(
+            f"{volume.channels} values in each voxel: choose one by channel, {told}. (--channel 0)"
+        )
     transfer = None if automatic else transfer_of(options, volume)
     if volume.labels is not None and not np.any(volume.labels):
         warnings.warn("labels: all voxels have the label 0, which stands for what is around", stacklevel=4)
@@ -184,21 +206,29 @@ def _camera(
         height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
-    if options.compositing == "isosurface":  # seen is what lies within
-        step = np.full(2, options.isovalue)
-        transfer = TransferFunction(step, np.ones((2, 3)), [0.0, 1e6 / unit_of(volume)])
+    if options.compositing == "isosurface":  # seen is what lies within, which most of the faces do not
+        step, data = np.full(2, options.isovalue), np.asarray(volume.data)
+        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
+        opacity = np.array([0.0, 1e6 / unit_of(volume)])[:: -1 if np.mean(outer > step[0]) > 0.5 else 1]
+        transfer = TransferFunction(step, np.ones((2, 3)), opacity)
     given["parallel"] = options.parallel
     given["least"] = least = VISIBLE if is_automatic(options) else FAINT
     what = with_others(volume, transfer, others)
     camera = automatic_camera(*what, options.direction, options.view_up, **given)
     clipped = options.clip_box is not None and not options.clip_inside_out
-    if orbit is None and not clipped:
+    planes = (
+        []
+        if options.clip_inside_out
+        else [(each[:3], each[3:]) for each in np.reshape(options.clip_plane, (-1, 6))]
+    )
+    if orbit is None and not clipped and not planes:
         return camera
     points = []
     for each, its in ((volume, transfer), *others):
         with suppress(ValueError):  # of a box that holds nothing of it
             points.append(visible_points(each.crop(options.clip_box) if clipped else each, its, least))
-    return framed(camera, np.concatenate(points), orbit(camera) if orbit else ()) if points else camera
+    seen = clipped_points(np.concatenate(points), planes) if points else np.empty((0, 3))
+    return framed(camera, seen, orbit(camera) if orbit else ()) if len(seen) else camera
 
 
 def other_of(each: Any) -> tuple[Volume, Transfer]:
@@ -299,7 +329,8 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
     if clim is None:
         data, over = np.asarray(volume.data), options.compositing == "over"
         # what is around the object would be fog
-        low, high = float(data.min()), float(data.max())
+        ends = [data.min(), data.max()]  # which `sampled` may leave out
+        low, high = spread_of(np.append(sampled(volume).ravel(), ends))[:2]
         clim = range_of_object(volume) if over else (low, high if high > low else low + 1)
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     if options.compositing == "average" and options.clim is None and options.window is None:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +32,15 @@ def words_of(name: str, value: Any) -> list[str]:
     return [word for row in rows for word in (f"--{flag}", *map(str, row))]
 
 
-def text_of(settings: Mapping[str, Any], file: Path | None, transfer: Any = None) -> dict[str, str]:
+def text_of(
+    settings: Mapping[str, Any], file: Path | None, transfer: Any = None, further: Sequence[str] = ()
+) -> dict[str, str]:
     """The text that a PNG carries, by its keyword: options, as words of a command line; the volume's file, if
     it has one; and a transfer function of points, if it holds one."""
     words = [word for name, value in settings.items() for word in words_of(name, value)]
     content: dict[str, Any] = {"options": words, "file": NO_FILE if file is None else fields_of(file)}
+    if further:
+        content["further"] = list(further)
     if isinstance(transfer, TransferFunction):
         content["transfer"] = transfer_fields(transfer)
     return {KEYWORD: json.dumps(content, sort_keys=True)}
@@ -44,14 +48,14 @@ def text_of(settings: Mapping[str, Any], file: Path | None, transfer: Any = None
 
 def text_of_options(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
     """That of the options that are not at their defaults, with a transfer function that a file or a picture
-    held. None of a picture with volumes of other files, which it may not name."""
-    if options.labels is not None or options.others:
-        return {}
+    held; and which options held other files, which a picture may not name."""
+    further = [name for name in ("labels", "others") if getattr(options, name)]
     given = {name: getattr(options, name) for name in options.defaults.keys() - {"quiet"}}
     changed = {name: value for name, value in given.items() if value != options.defaults[name]}
-    settings = {name: value for name, value in changed.items() if not isinstance(value, Path)}
+    kept = {name: value for name, value in changed.items() if name not in further}
+    settings = {name: value for name, value in kept.items() if not isinstance(value, Path)}
     from_file = options.transfer is not None or options.recorded_transfer is not None
-    return text_of(settings, options.file, transfer if from_file else None)
+    return text_of(settings, options.file, transfer if from_file else None, further)
 
 
 def fields_of(file: Path) -> dict[str, Any]:
@@ -72,8 +76,7 @@ def recorded_in(path: Path) -> dict[str, Any]:
     except Exception as fault:  # of Pillow's many kinds
         raise ValueError(f"{path} cannot be read as a PNG: {shortened(str(fault))}") from fault
     if not isinstance(text, str):
-        why = "it shows labels or volumes of further files, or another program saved it"
-        raise ValueError(f"{path} holds no settings of jaxvol: {why}.")
+        raise ValueError(f"{path} holds no settings of jaxvol: another program saved it.")
     content: Any = None
     try:
         content = json.loads(text)
@@ -81,6 +84,7 @@ def recorded_in(path: Path) -> dict[str, Any]:
         known = known and all(isinstance(word, str) for word in content["options"])
         known = known and re.fullmatch("[0-9a-f]{64}", content["file"]["sha256"])
         known = known and isinstance(content["file"]["bytes"], int)
+        known = known and all(name in ("labels", "others") for name in content.get("further", ()))
     except (ValueError, RecursionError, KeyError, TypeError):
         known = False
     if not known:
@@ -94,7 +98,7 @@ def volume_of_picture(picture: Path, name: str, size: int, sha256: str) -> Path:
     """The volume that a picture shows, unchanged: where it was, or in the picture's folder. Of what the
     picture names, only files of as many `size` bytes in all are read, and it is said which."""
     for path in (Path(name), picture.parent / Path(name).name):
-        if path.exists():
+        if Path(str(path).partition("::")[0]).exists():
             found = sum(file.stat().st_size for file in _files(path))
             print(f"{picture} names the volume {shortened(str(path))}, {found} bytes", flush=True)
             if found == size and checksum(path) == sha256:
@@ -127,7 +131,7 @@ def _files(path: Path) -> list[Path]:
 
 def _is_ordinary(path: Path) -> bool:
     """Whether a path is a folder, or a file that holds something, and not of the kernel."""
-    real = Path(os.path.realpath(path))
+    real = Path(os.path.realpath(str(path).partition("::")[0]))
     # of /dev only its devices, which are no files: in /dev/shm are ordinary ones
     ours = not any(real.is_relative_to(folder) for folder in ("/proc", "/sys"))
     return ours and (real.is_dir() or (real.is_file() and real.stat().st_size > 0))

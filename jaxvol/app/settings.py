@@ -4,7 +4,7 @@ from argparse import Namespace
 from typing import Any
 
 
-OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel"
+OF_FILES = "shape", "dtype", "spacing", "nan", "time", "channel", "offset"
 OF_COLORS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
 OF_VIEWS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
 DEFAULTS: dict[str, Any] = dict.fromkeys((*OF_FILES, *OF_COLORS, *OF_VIEWS, "labels", "memory"))

@@ -1,5 +1,6 @@
 """One line from a volume to a picture, the one that `jaxvol render` makes."""
 
+import inspect
 import os
 import warnings
 from argparse import Namespace
@@ -52,12 +53,12 @@ def show(
             `shade`, `background`. Camera: `camera`, a `Camera` or six numbers, `direction`, `view_up`,
             `view_angle`, `parallel`, `zoom`, `size`. What is cut away: `clip_box`, `clip_plane`,
             `clip_inside_out`. How it is computed: `step` or `tolerance`, `memory`, `quiet`. Of a raw file:
-            `shape`, `dtype`, `spacing`, `nan`, `time`, `channel`.
+            `shape`, `dtype`, `offset`, `spacing`, `nan`, `time`, `channel`.
             `jaxvol render --help` describes each.
 
     Returns:
         The `Rendering`. In a notebook it shows itself as the last line of a cell; elsewhere it has been shown
-        in a window.
+        in a window, or, without a display, written to a file, of which a warning says where.
 
     Raises:
         ValueError: for an unknown option, those that exclude each other, and as `jv.load` and `jv.render` do.
@@ -94,6 +95,16 @@ def show(
     if not in_notebook():
         open_window(rendering)
     return rendering
+
+
+_known = [
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=value)
+    for name, value in DEFAULTS.items()
+    if name != "transfer"
+]
+_positional = [*inspect.signature(show).parameters.values()][:2]
+show.__signature__ = inspect.Signature([*_positional, *_known])  # pyright: ignore[reportFunctionMemberAccess]
+"""What editors and notebooks complete."""
 
 
 def why_empty(scene: Scene, rendering: Rendering) -> str | None:

@@ -2,7 +2,7 @@
 
 tensorstore reads Zarr arrays. yaozarrs checks the `multiscales` of OME-Zarr 0.4 (Zarr 2, in .zattrs) and 0.5
 (Zarr 3, in zarr.json), which say where levels of detail lie in the world: https://ngff.openmicroscopy.org/0.5/.
-A voxel's position is that of its centre.
+A voxel's position is that of its centre; `orientation` (RFC 4) is as ngff-zarr writes it.
 """
 
 import json
@@ -16,20 +16,23 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._util.checks import Arrayable, described, shortened
-from .._util.files import MOST_VOXELS, check_size, file_size
+from .._util.files import MOST_VOXELS
+from .._util.image_record import DecodedArray, ImageRecord, warn_caller
 from .._util.memory import memory_of_device, require_room
-from .._util.named_axes import along_xyz, is_named
-from ..io.formats import FOLDERS
-from ..io.formats.raw import raw_header
+from .._util.named_axes import cf_scale, even_step, record_of
+from .._util.units import axis_letters
+from .._util.voxels import check_shape
+from ..io.formats import FOLDERS, hdf5, mrc, read_record
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume, check_one_channel
-from .sources import SPACE, VoxelSource
+from .sources import SPACE, VoxelSource, voxel_type
 
 
 Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")  # a Zarr array or group has at least one of them
 LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
+READ_IN_BOXES = (".raw", ".npy", *mrc.ENDINGS, *hdf5.ENDINGS)
 CACHE = 2**24  # bytes of decoded chunks and indices of shards that are kept, for boxes that share them
 
 
@@ -58,9 +61,8 @@ def levels_of(
     | `thing` | read |
     |---|---|
     | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
-    | an xarray `DataArray`; an image of nibabel, SimpleITK, VTK | as by `Volume`; lazy: pass `.data` |
-    | path of a `.raw` file, x fastest; header as for `jv.load` | by `np.memmap` |
-    | path of a `.npy` file, data[x, y, z] | by `np.lib.format.open_memmap` |
+    | an xarray `DataArray`; an image of nibabel, SimpleITK, itk, VTK | as by `Volume`; lazy: pass `.data` |
+    | path of a raw file, `.npy`, MRC, HDF5 (`file.h5::/name`); as for `jv.load` | mapped, or by h5py |
     | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
     | a `Volume` without labels and field, or a `VoxelSource` | as it is |
 
@@ -71,8 +73,8 @@ def levels_of(
         **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes`, `index` and `nan`: see
             `VoxelSource`; the axes of Zarr are by default its own (`dimension_names`, or xarray's
             `_ARRAY_DIMENSIONS` in version 2). `missing`: what it means if a chunk of a path's Zarr array is
-            not there: `"error"`, the default, that the data are incomplete; `"fill"`, that all its voxels
-            have the fill value, as where programs leave out such chunks.
+            not there: `"fill"`, the default, as Zarr specifies, that all its voxels have the fill value;
+            `"error"`, that the data are incomplete.
 
     Returns:
         A source for each level.
@@ -97,34 +99,54 @@ def levels_of(
         check_one_channel(thing, "bricks")
         own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
         return (VoxelSource(thing.data, **(own | place), axes="xyz", **options, name="volume"),)
-    if is_named(thing):
-        thing, own = along_xyz(thing)
-        return (VoxelSource(thing, **(own | place), axes="xyz", **options),)
+    if (record := record_of(thing)) is not None and not ("axes" in options and hasattr(thing, "store")):
+        if "axes" in options:
+            raise TypeError(f"axes: the {type(thing).__name__} has its own.")
+        return (_source(record, place, **options),)
     if not isinstance(thing, str | os.PathLike):
         return (VoxelSource(thing, **place, **options),)
     path = Path(thing)
-    if not path.exists():
-        raise ValueError(f"path: there is no file {path} (working directory {Path.cwd()}).")
-    if _is_zarr_array(path):
-        return (_zarr_array(path, **place, **options),)
     if is_zarr(path):
-        return _ome_zarr_levels(path, **place, **options)
-    if path.suffix.lower() == ".raw":
-        size, stored, own = raw_header(path, options.pop("shape", None), options.pop("dtype", None), 48)
-        check_size(path, file_size(path), math.prod(size) * stored.itemsize)
-        mapped = np.memmap(path, stored, "r", shape=size, order="F")
-        return (VoxelSource(mapped, **(own | place), **options, name=str(path)),)
-    if path.suffix.lower() == ".npy":
-        try:
-            mapped = np.lib.format.open_memmap(path, "r")
-        except Exception as fault:  # NumPy raises different errors for different faults
-            raise ValueError(f"path: {path} cannot be opened as .npy ({fault}).") from fault
-        return (VoxelSource(mapped, **place, **options, name=str(path)),)
-    raise ValueError(
-        f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, or "
-        "the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as DICOM slices, as "
-        "jv.load(path) or jv.load_ultrasound(path), and of HDF5 the array h5py.File(path)[name]."
-    )
+        is_image = not _is_zarr_array(path)
+        if is_image and (own := [name for name in ("spacing", "origin", "axes") if name in place | options]):
+            raise TypeError(f"{', '.join(own)}: the OME-Zarr image {path} has its own.")
+        fills = {"missing": options.pop("missing")} if "missing" in options else {}
+        records = _ome_records(path, **fills) if is_image else [_zarr_record(path, **fills)]
+        return tuple(_source(record, place, **options) for record in records)
+    name = path.name.lower()
+    if path.exists() and (name.endswith(".gz") or not (name.endswith(READ_IN_BOXES) or "shape" in options)):
+        raise ValueError(
+            f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, "
+            "MRC, HDF5, or the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as "
+            "DICOM slices, as jv.load(path) or jv.load_ultrasound(path)."
+        )
+    header = {key: options.pop(key) for key in ("shape", "dtype", "offset") if key in options}
+    record = read_record(path, **header)
+    return (_source(record, record.also | place, **options),)
+
+
+def _source(
+    record: ImageRecord, place: dict[str, Any], axes: Any = None, nan: float | None = None, **index: Any
+) -> VoxelSource:
+    """The source of a record's array: its axes along the world's, lengths in mm, values scaled. `place`: as
+    the caller has it."""
+    name, array = record.what.removeprefix("path: "), record.data
+    if axes is not None or not record.axes:
+        return VoxelSource(array, **place, axes=axes, nan=nan, name=name, **index)
+    letters = record.letters
+    if not {*SPACE} <= {*letters}:
+        check_shape(tuple(array.shape[:2]))
+    order, signs, own = record.oriented([array.shape[letters.index(letter)] for letter in "xyz"])
+    for text in record.assumed:
+        warn_caller(f"{name}: {text}")
+    at = [letters.index("xyz"[axis]) for axis in order]
+    names = [*letters]
+    for axis, letter in zip(at, "xyz", strict=True):
+        names[axis] = letter
+    reverse = [axis for axis, sign in zip(at, signs, strict=True) if sign < 0]
+    if reverse or record.missing or record.unsigned or record.is_scaled:
+        array = DecodedArray(record, reverse, nan)
+    return VoxelSource(array, **(own | place), axes=names, nan=nan, name=name, **index)
 
 
 def is_zarr(path: Path) -> bool:
@@ -132,25 +154,19 @@ def is_zarr(path: Path) -> bool:
     return any((path / name).is_file() for name in METADATA)
 
 
-def read_zarr(
-    path: Path, *, time: int | None = None, channel: int | None = None, nan: float | None = None
-) -> dict[str, Any]:
-    """Reader of `jv.load`, for the finest level that takes at most a quarter of the memory."""
-    index = {axis: at for axis, at in (("t", time), ("c", channel)) if at is not None}
-    try:
-        levels = levels_of(path, index=index, nan=nan)
-    except ValueError as fault:
-        hint = f"path: {path}: time= or channel= is needed: " if "index['" in str(fault) else ""
-        raise ValueError(f"{hint}{fault}") from fault
-    room = memory_of_device() // 4
-    for level in levels:
-        voxels = math.prod(level.shape)
-        if voxels <= MOST_VOXELS and voxels * level.dtype.itemsize <= room:
-            place = {} if _is_zarr_array(path) else {"spacing": level.spacing, "origin": level.origin}
-            return {"data": level.read((0, 0, 0), level.shape)} | place
+def read_zarr(path: Path) -> ImageRecord:
+    """Reader of `jv.load`, for the finest level of which an image takes at most a quarter of the memory."""
+    records = [_zarr_record(path)] if _is_zarr_array(path) else _ome_records(path)
+    room, sizes = memory_of_device() // 4, []
+    for record in records:
+        shape = dict(zip(record.letters if record.axes else "xyz", record.data.shape, strict=False))
+        sizes = [n for letter, n in shape.items() if letter in "xyzs"]
+        voxels, stored = math.prod(sizes), record.data.dtype.numpy_dtype
+        if voxels <= MOST_VOXELS and voxels * voxel_type(stored).itemsize <= room:
+            return record
     raise ValueError(
-        f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {levels[-1].shape} "
-        f"voxels of {levels[-1].dtype}. Read it in bricks: jv.render_bricks, --memory."
+        f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {tuple(sizes)} "
+        "voxels. Read it in bricks: jv.render_bricks, --memory."
     )
 
 
@@ -163,15 +179,18 @@ def _is_zarr_array(path: Path) -> bool:
     return (path / ".zarray").is_file()
 
 
-def _zarr_array(path: Path, *, axes: Any = None, missing: Any = "error", **how: Any) -> VoxelSource:
+def _zarr_record(path: Path, missing: Any = "fill") -> ImageRecord:
+    """The record of an array. Its axes, values and lengths are as xarray keeps them; of a Zarr without names
+    of axes, `axes` is empty unless there are three."""
     try:
         import tensorstore
     except ImportError as fault:
         raise ImportError(f'{path} is read by tensorstore: pip install "jaxvol[bricks]".') from fault
     if missing not in ("error", "fill"):
         raise ValueError(f'missing must be "error" or "fill"; got {missing!r}.')
+    version_2 = (path / ".zarray").is_file()
     spec = {
-        "driver": "zarr" if (path / ".zarray").is_file() else "zarr3",
+        "driver": "zarr" if version_2 else "zarr3",
         "kvstore": {"driver": "file", "path": f"{path.resolve()}{os.sep}"},
         "fill_missing_data_reads": missing == "fill",
         "context": {"cache_pool": {"total_bytes_limit": CACHE}},
@@ -189,21 +208,41 @@ def _zarr_array(path: Path, *, axes: Any = None, missing: Any = "error", **how: 
             f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
         )
     require_room(of_chunk, f"path: {path}: a chunk of {tuple(chunk)} voxels")  # tensorstore ends the process
+    attributes = _attributes(path)
     names: Any = list(store.domain.labels)  # Zarr 3
-    if (path / ".zattrs").is_file():  # xarray's in Zarr 2
-        names = _read_json(path / ".zattrs").get("_ARRAY_DIMENSIONS") or []
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"path: {path}: _ARRAY_DIMENSIONS must be names; got {shortened(names)}.")
-    names = [str(name).lower() for name in names]
-    if axes is None and {*SPACE} <= {*names}:
-        axes = names
-    return VoxelSource(store, axes=axes, name=str(path), **how)
+    if not any(names):  # xarray's in Zarr 2
+        names = attributes.get("_ARRAY_DIMENSIONS") or []
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"path: {path}: _ARRAY_DIMENSIONS must be names; got {shortened(names)}.")
+    names = names if any(names) else ["x", "y", "z"] * (len(store.shape) == 3)
+    record = ImageRecord(store, names, what=f"path: {path}")
+    try:
+        for name, value in cf_scale(attributes).items():
+            setattr(record, name, value)
+        units, steps, origin = dict[str, Any](), dict[str, float](), np.zeros(3)
+        for letter, name in zip(record.letters if names else "", names, strict=True):
+            beside = path.parent / name  # a coordinate of xarray
+            known = letter in "xyz" and Path(name).name == name and beside != path
+            if known and is_zarr(beside) and _is_zarr_array(beside):
+                at, units[letter] = _zarr_record(beside).data, _attributes(beside).get("units")
+                if len(at.shape) != 1 or at.shape[0] > 2**20:
+                    raise ValueError(f"the coordinate {name} must have one axis; got shape {at.shape}.")
+                steps[letter], origin["xyz".index(letter)] = even_step(np.asarray(at), name)
+        record.steps, record.units, record.origin = steps, units, origin
+    except (TypeError, ValueError) as fault:
+        raise ValueError(f"path: {path}: {fault}") from fault
+    return record
 
 
-def _ome_zarr_levels(path: Path, **options: Any) -> tuple[VoxelSource, ...]:
-    """The levels of the first image in an OME-Zarr group, finest first, in the unit of the file."""
-    if own := [name for name in ("spacing", "origin", "axes") if name in options]:
-        raise TypeError(f"{', '.join(own)}: the OME-Zarr image {path} has its own.")
+def _attributes(path: Path) -> dict[str, Any]:
+    """The attributes of a Zarr array."""
+    if (path / ".zarray").is_file():
+        return _read_json(path / ".zattrs") if (path / ".zattrs").is_file() else {}
+    return _read_json(path / "zarr.json").get("attributes") or {}
+
+
+def _ome_records(path: Path, **options: Any) -> list[ImageRecord]:
+    """The levels of the first image in an OME-Zarr group, finest first."""
     try:
         from yaozarrs import v04, v05
     except ImportError as fault:
@@ -221,10 +260,19 @@ def _ome_zarr_levels(path: Path, **options: Any) -> tuple[VoxelSource, ...]:
             "array in it, such as its folder 0."
         ) from fault
     names = [axis.name for axis in image.axes]
-    units = {axis.name: getattr(axis, "unit", None) for axis in image.axes if axis.name in SPACE}
-    if len(units) < 3 or len({*units.values()}) > 1:
-        raise ValueError(f"path: {path} must have axes x, y and z of the same unit; got {names}, {units}.")
-    at, levels = [names.index(axis) for axis in SPACE], []
+    unknown: list[str] = []
+    letters = axis_letters(f"path: {path}", names, unknown.append)
+    if unknown or not {*SPACE} <= {*letters}:
+        raise ValueError(f"path: {path} must have axes x, y and z; got {names}.")
+    units = {letter: getattr(axis, "unit", None) for letter, axis in zip(letters, image.axes, strict=True)}
+    told = [axis.get("orientation") for axis in content["multiscales"][0]["axes"]]
+    sides = [str(each.get("value")) if isinstance(each, dict) else "" for each in told]
+    ends = [side.partition("-to-")[2][:1].upper() for side in sides]
+    at = [letters.index(letter) for letter in SPACE if letter in letters]
+    turn = np.array(
+        [[(ends[k] == end) - (ends[k] == other) for k in at] for end, other in ("LR", "PA", "SI")]
+    )
+    placed, records = np.abs(turn).sum() == len(at) == 3, []
     for dataset in image.datasets:
         scale, offset = np.ones(len(names)), np.zeros(len(names))
         for described_by in (dataset, image):  # those of all levels come last
@@ -235,9 +283,15 @@ def _ome_zarr_levels(path: Path, **options: Any) -> tuple[VoxelSource, ...]:
                     offset = offset + each.translation
         if not _is_zarr_array(path / dataset.path):
             raise ValueError(f"path: {path}: {dataset.path} is no Zarr array within the group.")
-        place = {"spacing": scale[at], "origin": offset[at]}
-        levels.append(_zarr_array(path / dataset.path, axes=names, **place, **options))
-    return tuple(levels)
+        record = _zarr_record(path / dataset.path, **options)
+        record.axes, record.units, record.format = names, units, "OME-Zarr"
+        record.steps, record.origin = dict(zip(SPACE, scale[at].tolist(), strict=False)), offset[at]
+        if placed:
+            record.direction, record.convention = turn.astype(float), "LPS"
+        elif any(sides):
+            record.note(f"orientation {', '.join(side for side in sides if side)}: not read")
+        records.append(record)
+    return records
 
 
 def _read_json(path: Path) -> dict[str, Any]:

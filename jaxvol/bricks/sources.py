@@ -208,8 +208,7 @@ class VoxelSource:
             found = np.asarray(given)
         except Exception as fault:  # of whatever library
             raise ValueError(
-                f"{self.name}: the voxels {where} cannot be read ({fault}). Fetch it again; or, where Zarr "
-                'left out chunks of only the fill value, pass missing="fill" to jv.bricks.source_of.'
+                f"{self.name}: the voxels {where} cannot be read ({fault}). Fetch it again."
             ) from fault
         expected = tuple(size[axis] for axis in sorted(size))
         if found.shape != expected:

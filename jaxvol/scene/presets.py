@@ -196,7 +196,10 @@ def fitted_range(
         return (0.0, high), f"{told}. Another clim stretches it otherwise."
     if name.upper().startswith("CT") and (low >= 0 or high < 200):
         told = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to {most:g}"
-        return None, f"{told}. Of those stored + 1024, clim is ({first + 1024:g}, {last + 1024:g})."
+        stored = (
+            f" Of those stored + 1024, clim is ({first + 1024:g}, {last + 1024:g})." if most > 1000 else ""
+        )
+        return None, f"{told}.{stored or ' Another preset, or clim, suits them.'}"
     return None, None
 
 

@@ -17,6 +17,9 @@ from .transfer import Classify, Measured, Transfer
 
 Activation = Callable[[Scalar], Scalar]
 
+MOST = 1e30
+"""Activated density that counts as opaque."""
+
 
 class RadianceField(Transfer):
     """Colour and extinction as the volume itself stores them, in four channels: `data[x, y, z]` is
@@ -28,8 +31,8 @@ class RadianceField(Transfer):
     Args:
         scale: extinction (1/length) where the activated density is 1, at least 0. Differentiable.
         density: from a stored density to the one that is seen: a function of one number that does not
-            decrease, such as `jax.nn.softplus`; by default as it is stored. Below 0 it counts as 0, and has
-            no gradient.
+            decrease, such as `jax.nn.softplus`; by default as it is stored. Below 0 it counts as 0, above
+            1e30, as where `jnp.exp` overflows, as that; both have no gradient.
         color: from a stored channel to linear colour, such as `jax.nn.sigmoid`; by default as it is stored,
             also where that is an integer: of 8 bits, divide by 255, and give `scale` in these units.
 
@@ -71,9 +74,21 @@ class RadianceField(Transfer):
     def classifier(self) -> Classify:
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
             r, g, b, density = measured
-            return (self.color(r), self.color(g), self.color(b)), self.scale * clipped(self.density(density))
+            return (self.color(r), self.color(g), self.color(b)), self.scale * clipped(
+                self._activated(density)
+            )
 
         return classify
+
+    def _activated(self, density: Scalar) -> Scalar:
+        """The density that is seen. Of an infinite one, JAX's slope is infinity times 0."""
+        if isinstance(self.density, _Fixed) and self.density.function is _as_stored:
+            return density
+        most = jnp.asarray(MOST, density.dtype)
+        saturated = self.density(jax.lax.stop_gradient(density)) >= most  # NaN stays
+        return jnp.where(
+            saturated, most, self.density(jnp.where(saturated, jnp.zeros_like(density), density))
+        )
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         bound = jax.lax.stop_gradient(self.scale * clipped(self._greatest(blocks)))

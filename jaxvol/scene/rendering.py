@@ -4,6 +4,7 @@ import os
 import sys
 import warnings
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -162,9 +163,10 @@ def open_window(rendering: Rendering, stacklevel: int = 3) -> None:
     import matplotlib.pyplot as plt
 
     if plt.get_backend().lower() == "agg" and "MPLBACKEND" not in os.environ:  # as without a display
-        told = "matplotlib opens no window (agg); jaxvol.save_png(path, rendering.image()) writes the image"
-        warnings.warn(told, stacklevel=stacklevel)
-
+        path = next(p for k in range(1000) if not (p := Path(f"jaxvol-{k}.png").resolve()).exists())
+        path.write_bytes(png_of(displayed(np.asarray(rendering.image(), np.float32))))
+        warnings.warn(f"matplotlib opens no window (agg): the image is in {path}", stacklevel=stacklevel)
+        return
     pixels = displayed(np.asarray(rendering.image(), np.float32))
     figure = plt.figure(figsize=np.divide(pixels.shape[1::-1], 100).tolist(), dpi=100)
     figure.figimage(pixels)

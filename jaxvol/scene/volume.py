@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, Integer, Shaped
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
 from .._util.checks import Arrayable, described, finite_array, integers, require, shortened
-from .._util.named_axes import along_xyz, is_named
+from .._util.named_axes import object_arguments
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
@@ -100,8 +100,8 @@ class Volume(eqx.Module):
         label_ids: Arrayable | None = None,
         field: Field | Any | None = None,
     ):
-        data, place = along_xyz(data) if is_named(data) else (data, {})
-        self.data = voxel_array(data)
+        place: dict[str, Any] = object_arguments(data) or {"data": data}
+        self.data = voxel_array(place["data"])
         spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
         origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin
         spacing = finite_array("spacing", spacing, (3,))

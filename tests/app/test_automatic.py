@@ -9,9 +9,18 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import jaxvol as jv
-from jaxvol.app.automatic import INSIDE, SAMPLED, is_body, labels_if_any, preset_unit, thresholds
+from jaxvol.app.automatic import (
+    INSIDE,
+    SAMPLED,
+    is_body,
+    labels_if_any,
+    preset_unit,
+    range_of_object,
+    spread_of,
+    thresholds,
+)
 from jaxvol.app.commands.animate import turned
-from jaxvol.app.framing import MARGIN, framed, visible_points
+from jaxvol.app.framing import MARGIN, clipped_points, framed, visible_points
 from jaxvol.app.picture import _transfer_of_bricks, copy_of
 from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
@@ -305,3 +314,78 @@ def test_what_is_thin_is_dense_and_what_hides_is_not():
     assert opacity_at(thin, 90, 64 * 3**0.5 / 100) > 3 * opacity_at(thick, 100, 32 * 3**0.5 / 100)
     assert opacity_at(thin, 45, 64 * 3**0.5 / 100) < 0.05  # noise above the threshold
     assert opacity_at(thin, 39, 64 * 3**0.5) == 0
+
+
+def padded(kind, value):
+    """A head in air of -1000, and the same with a value in place of some voxels."""
+    head = np.asarray(jv.phantom("head", 32).data)
+    noise = np.random.default_rng(0).normal(0, 15, head.shape)
+    data = (np.select([head > 150, head > 20], [900, 40], -1000) + noise).astype(np.float32)
+    x, y, z = np.meshgrid(*[np.linspace(-1, 1, 32)] * 3, indexing="ij")
+    where = {
+        "circle": x * x + y * y > 1.05,
+        "ball": x * x + y * y + z * z > 1.5,
+        "voxel": (abs(x) + abs(y) + abs(z)) < 0.1,
+    }
+    return data, np.where(where[kind], np.float32(value), data)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        *(("circle", v) for v in (-2000, -3024, -9999, 1e20)),
+        *(("ball", v) for v in (-3024, -32768, 9.97e36)),
+        *(("voxel", v) for v in (-1e30, 1e30, 1e5)),
+    ],
+)
+def test_padding_fill_values_and_strays_are_no_class(kind, value):
+    data, spiked = padded(kind, value)
+    whole = jv.automatic_transfer(jv.Volume(data))
+    with pytest.warns(UserWarning, match="far from all others: taken as background"):
+        found = jv.automatic_transfer(jv.Volume(spiked))
+    at = np.linspace(-1100, 930, 200)
+
+    def opacity(transfer):
+        return -np.expm1(-np.interp(at, transfer.values, transfer.extinction))
+
+    assert np.abs(opacity(found) - opacity(whole)).max() < 0.1
+    if value > 1e10 and kind != "voxel":  # a fill value is as transparent as what it stands for
+        assert np.interp(value, found.values, found.extinction) == 0
+    low, high = range_of_object(jv.Volume(data))
+    with pytest.warns(UserWarning, match="far from all others"):
+        found = range_of_object(jv.Volume(spiked))
+    np.testing.assert_allclose(found, (low, high), atol=0.02 * (high - low))
+
+
+def test_values_of_objects_are_no_strays():
+    rng = np.random.default_rng(0)
+    noise, two = rng.normal(0, 5, (24, 24, 24)), np.zeros((24, 24, 24))
+    bright = np.where(np.indices(noise.shape).sum(0) > 50, 255.0, noise.clip(-20, 20) + 60)  # saturated
+    two[6:12], two[12:18] = 100, 200
+    for data in (noise, bright, two, labels()):
+        assert spread_of(data).told == ""
+
+
+def test_a_distance_is_shown_where_it_is_0():
+    x = np.linspace(-1, 1, 32)
+    distance = np.sqrt(sum(np.square(each) for each in np.meshgrid(x, x, x))) - 0.5
+    for sign in (1, -1):
+        volume = jv.Volume((sign * distance).astype(np.float32), (2 / 31,) * 3)
+        with pytest.warns(UserWarning, match="slope of one are a distance: shown where they are 0"):
+            transfer = jv.automatic_transfer(volume)
+        inside, outside = (opacity_at(transfer, sign * at, 1.0) for at in (-0.2, 0.2))
+        assert inside > 0.9
+        assert outside == 0
+
+
+def test_a_slab_is_seen_from_its_broad_side_and_a_plane_cuts_the_points():
+    data = np.asarray(ball(0.8, 0.35).data)
+    for axis in range(3):
+        slab = jv.Volume(data.take(range(14, 18), axis))
+        camera = jv.automatic_camera(slab, jv.automatic_transfer(slab), size=(32, 32))
+        away = np.asarray(camera.position - camera.focal_point)
+        assert abs(away[axis]) > 0.8 * np.linalg.norm(away)
+    cube = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
+    cut = clipped_points(cube, [((0.25, 0, 0), (1, 0, 0)), ((0, 0, 0.5), (0, 0, -1))])
+    np.testing.assert_allclose([cut.min(0), cut.max(0)], [(0.25, 0, 0), (1, 1, 0.5)])
+    assert clipped_points(cube, [((2, 0, 0), (1, 0, 0))]).shape == (0, 3)

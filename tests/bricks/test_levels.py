@@ -56,7 +56,7 @@ def test_an_axis_along_which_levels_are_as_fine_does_not_count():
 
 def test_an_image_of_ome_zarr_takes_the_level_of_its_pixels_or_the_one_that_is_asked_for(tmp_path):
     data = np.random.default_rng(0).integers(0, 255, (N, N, N)).astype(np.uint8)
-    ome_written(tmp_path / "a.zarr", pyramid(data, 3), "0.5", (1.0, 1.0, 1.0), axes="zyx")
+    ome_written(tmp_path / "a.zarr", pyramid(data, 3), "0.5", (1e3, 1e3, 1e3), axes="zyx")  # µm
     found, march = levels_of(tmp_path / "a.zarr"), jv.March(1.0)
     near, far = camera(50), camera(150)
     assert _level(found, "auto", near, march) is found[0]

@@ -173,7 +173,7 @@ def test_what_an_array_returns_is_checked():
         with pytest.raises(ValueError, match=message):
             VoxelSource(array, **options)
     named = pytest.importorskip("xarray").DataArray(data, dims=("z", "y", "x"))
-    with pytest.raises(TypeError, match="multiple values for keyword argument 'axes'"):
+    with pytest.raises(TypeError, match="axes: the DataArray has its own"):
         source_of(named, axes="zyx")
 
 
@@ -297,7 +297,7 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
     bad: list[tuple[Any, dict[str, Any], str]] = [
         ("data.raw", {"shape": (10**4, 10**5, 10**5)}, "cut short: it holds 99 bytes"),
         ("data.raw", {"shape": (4, 4, 4)}, "oversized"),
-        ("cut.npy", {}, r"cannot be opened as \.npy"),
+        ("cut.npy", {}, r"is cut short"),
         ("flat.npy", {}, r"data must be data\[x, y, z\] with at least 2 voxels"),
         (np.zeros((1, 4, 4)), {}, r"data must be data\[x, y, z\] with at least 2 voxels"),
         ("data.raw.gz", {"shape": (2, 2, 2)}, r"not of a kind that is read box by box.*gunzip"),
@@ -306,8 +306,8 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
         ("nothing.raw", {}, "there is no file"),
         (3, {}, "source must be an array, a Volume, a VoxelSource or a path"),
         (jv.Volume(np.zeros(SHAPE), labels=np.zeros(SHAPE, np.uint8)), {}, "a Volume without labels"),
-        ("data.npy", {"shape": SHAPE}, "unexpected keyword argument 'shape'"),
-        ("data.h5", {}, r"h5py\.File\(path\)\[name\]"),
+        ("data.npy", {"shape": SHAPE}, "shape and dtype are for raw files"),
+        ("data.h5", {}, "data.h5 cannot be read"),
         (np.zeros(SHAPE), {"axes": "xyc"}, "axes must name each of the 3 axes of array once"),
         (np.zeros(SHAPE), {"missing": "fill"}, "unexpected keyword argument 'missing'"),
         ([[[1, 2], [3, 4]]], {}, "source must be an array, .* got "),

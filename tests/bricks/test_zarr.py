@@ -34,12 +34,12 @@ def written(path, data, chunks=(8, 8, 16), **options):
     return path
 
 
-def test_no_memory_is_taken_for_chunks_far_larger_than_the_array(tmp_path):
-    path = written(tmp_path / "a", np.zeros((5, 4, 3), np.uint8), (3, 4, 3))
-    metadata = json.loads((path / "zarr.json").read_text())
-    metadata["chunk_grid"]["configuration"]["chunk_shape"][1] = 10**9
-    (path / "zarr.json").write_text(json.dumps(metadata))
-    with pytest.raises(ValueError, match=r"got chunks of \(3, 1000000000, 3\) voxels, 9000000000 bytes"):
+def test_no_memory_is_taken_for_chunks_far_larger_than_the_array(tmp_path, monkeypatch):
+    path = written(tmp_path / "a", np.zeros((5, 4, 3), np.uint8), (10, 10, 3))
+    assert source_of(path).shape == (5, 4, 3)
+    monkeypatch.setattr(opening, "LARGE", 64)
+    monkeypatch.setattr(opening, "BEYOND", 2)
+    with pytest.raises(ValueError, match=r"got chunks of \(10, 10, 3\) voxels, 300 bytes"):
         source_of(path)
 
 
@@ -56,14 +56,14 @@ def test_zarr_arrays_of_every_layout_and_their_damage(layout, tmp_path):
     assert_reads(source, data)
     first, *_, last = chunk_files(path)
     first.unlink()
-    with pytest.raises(ValueError, match=r'cannot be read .*missing="fill"'):
-        source_of(path).read((0, 0, 0), SHAPE)
-    filled, expected = source_of(path, missing="fill").read((0, 0, 0), SHAPE), data.copy()
+    with pytest.raises(ValueError, match=r"from .* to .* cannot be read .* Fetch it again"):
+        source_of(path, missing="error").read((0, 0, 0), SHAPE)
+    filled, expected = source_of(path).read((0, 0, 0), SHAPE), data.copy()
     expected[(slice(16), slice(16), slice(32)) if "sharded" in layout else np.s_[:8, :8, :16]] = 7
     np.testing.assert_array_equal(filled, expected)
     last.write_bytes(last.read_bytes()[:-20])
     with pytest.raises(ValueError, match=r"from .* to .* cannot be read .* Fetch it again"):
-        source_of(path, missing="fill").read((0, 0, 0), SHAPE)
+        source_of(path).read((0, 0, 0), SHAPE)
 
 
 @pytest.mark.parametrize(
@@ -191,8 +191,8 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
     image = ome_written(path, levels, version, axes=axes)
     for number, (source, data) in enumerate(zip(levels_of(path), levels, strict=True)):
         assert_reads(source, data)
-        np.testing.assert_allclose(source.spacing, np.array([0.3, 0.4, 2.0]) * 2**number)
-        np.testing.assert_allclose(source.origin, np.array([0.3, 0.4, 2.0]) * (2**number - 1) / 2)
+        np.testing.assert_allclose(source.spacing, np.array([3e-4, 4e-4, 2e-3]) * 2**number)  # mm
+        np.testing.assert_allclose(source.origin, np.array([3e-4, 4e-4, 2e-3]) * (2**number - 1) / 2)
     with pytest.raises(TypeError, match=r"^spacing, origin: the OME-Zarr image .* has its own"):
         levels_of(path, spacing=(3, 4, 10), origin=(1, 1, 1))
     # transformations of all levels come after their own
@@ -200,10 +200,7 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
     outer += [{"type": "translation", "translation": [3] * len(axes)}]
     write_image(path, image | {"coordinateTransformations": outer}, version)
     second = levels_of(path)[1]
-    np.testing.assert_allclose((second.spacing, second.origin), ((6, 8, 40), (4.5, 5, 13)))
-
-
-UNITS = (("z", "meter"), ("y", "micrometer"), ("x", "micrometer"))
+    np.testing.assert_allclose((second.spacing, second.origin), ((6e-3, 8e-3, 40e-3), (4.5e-3, 5e-3, 13e-3)))
 
 
 @pytest.mark.parametrize(
@@ -213,11 +210,7 @@ UNITS = (("z", "meter"), ("y", "micrometer"), ("x", "micrometer"))
         ({"axes": ["z", "y", "x"]}, "does not follow OME-Zarr"),
         (
             {"axes": [{"name": a, "type": "space"} for a in "abc"]},
-            "must have axes x, y and z of the same unit",
-        ),
-        (
-            {"axes": [{"name": a, "unit": u, "type": "space"} for a, u in UNITS]},
-            "must have axes x, y and z of the same unit",
+            "must have axes x, y and z; got",
         ),
         ({"datasets": []}, "does not follow OME-Zarr"),
         ({"datasets": [{"path": "../other"}]}, "does not follow OME-Zarr.*not a valid Zarr node name"),
@@ -226,7 +219,10 @@ UNITS = (("z", "meter"), ("y", "micrometer"), ("x", "micrometer"))
         ({"coordinateTransformations": [{"type": "affine"}]}, "does not follow OME-Zarr"),
         ({"coordinateTransformations": [{"type": "scale", "scale": [1, 2]}]}, "does not follow OME-Zarr"),
         ({"coordinateTransformations": [{"type": "scale", "path": "s"}]}, "does not follow OME-Zarr"),
-        ({"coordinateTransformations": [{"type": "scale", "scale": [1, 0, 1]}]}, "spacing must be positive"),
+        (
+            {"coordinateTransformations": [{"type": "scale", "scale": [1, 0, 1]}]},
+            "finite, with steps longer than 0",
+        ),
     ],
 )
 def test_metadata_that_do_not_follow_ome_zarr_are_refused(fault, message, tmp_path):
@@ -255,7 +251,7 @@ def test_load_reads_the_finest_level_that_fits(tmp_path, monkeypatch):
     data = np.stack([voxels("uint8"), voxels("uint8") // 2])
     written(tmp_path / "a", data, (1, 8, 8, 16), dimension_names=["c", "x", "y", "z"])
     np.testing.assert_array_equal(load(tmp_path / "a", channel=1).data, data[1])
-    with pytest.raises(ValueError, match=r"channel= is needed: index\['c'\] must be an integer from 0 to 1"):
+    with pytest.raises(ValueError, match="channel must be given, from 0 to 1"):
         load(tmp_path / "a")
 
 

@@ -21,6 +21,19 @@ FEW, MANY = 8, 40
 """Numbers of control points: few are compared with a value, many are searched."""
 
 
+def test_an_activation_that_overflows_has_no_gradient():
+    field = jv.RadianceField(2.0, density=jnp.exp)
+
+    def extinction(density):
+        zero = jnp.zeros((), jnp.float32)
+        return field.classifier()((zero, zero, zero, density))[1]
+
+    for stored, value, slope in ((2.0, 2 * np.exp(2), 2 * np.exp(2)), (95.0, 2e30, 0.0), (80.0, 2e30, 0.0)):
+        found = jax.value_and_grad(extinction)(jnp.asarray(stored, jnp.float32))
+        np.testing.assert_allclose(found, (value, slope), rtol=1e-5)
+    assert np.isnan(extinction(jnp.asarray(np.nan, jnp.float32)))
+
+
 def table(n, seed=0, *steps):
     """A random transfer function; at these indices, points are at the value of the one before."""
     random = np.random.default_rng(seed)

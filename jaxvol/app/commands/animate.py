@@ -36,6 +36,8 @@ def _animate(options: argparse.Namespace) -> None:
     fastest = 50 if kind == ".gif" else 240  # browsers show GIF frames of less than 2/100 s for 10/100 s
     if not 0.01 <= options.fps <= fastest:
         raise ValueError(f"--fps of a {kind} must be from 0.01 to {fastest}; got {options.fps:g}.")
+    if kind == ".mp4" and any(n % 2 for n in options.size):
+        raise ValueError(f"--size of an .mp4 must be even; got {' x '.join(map(str, options.size))}.")
     if kind == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise ImportError('--output: an .mp4 needs imageio-ffmpeg: pip install "jaxvol[video]".')
 

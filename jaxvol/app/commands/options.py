@@ -66,6 +66,10 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
                 weaker = read(command, settings[name], named="file" in settings)
             except ValueError as fault:
                 raise ValueError(f"--{name}: {str(fault)[:400]}") from fault
+            for option in weaker.pop("further", ()):
+                if option not in settings:
+                    told = f"the picture shows {option} of files that it may not name"
+                    raise ValueError(f"--{name}: {told}: give --{option.replace('others', 'with')}, too.")
             settings = _over(settings, weaker)
     check_exclusive(settings)
     defaults = command.defaults()
@@ -137,6 +141,7 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
         raise ValueError(f"{path}: a picture names its volume elsewhere; got {shortened(words)}.")
     if "transfer" in found:
         settings["recorded_transfer"] = found["transfer"]
+    settings |= {"further": found["further"]} if "further" in found else {}
     if not named:
         file = found["file"]
         settings["file"] = volume_of_picture(path, file["name"], file["bytes"], file["sha256"])
@@ -201,6 +206,7 @@ def add_volume(parser: Parser, **more: Any) -> None:
     add_vector(group, "--spacing", "X Y Z", "world length between voxels")
     text = "of voxels that are NaN or infinite in the file, such as the value of what is transparent"
     group.add_argument("--nan", type=float, metavar="VALUE", help=text)
+    group.add_argument("--offset", type=int, metavar="BYTES", help="before the voxels of a raw file")
     for name in ("time", "channel"):
         group.add_argument(f"--{name}", type=int, metavar="N", help="which one, from 0, of a file of several")
 

@@ -7,9 +7,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from ..._util.srgb import displayed
 from ...io.display import image_file, save_image
+from ...scene.labels import LabelTransferFunction
 from ...scene.rendering import Rendering
 from ...xla.persistent_cache import keep_programs_by_default
+from ...scene.volume import Volume
 from ..picture import Scene, scene_of, with_march
 from ..progress import progress
 from ..recorded import text_of_options
@@ -32,6 +35,8 @@ def _render(options: argparse.Namespace) -> None:
     before = "reading and planning" if options.step is None else "reading"
     steps = f"{before} {ready - begun:.2f} s, compiling and rendering {ended - ready:.2f} s"
     _print_facts(options.output, scene, rendering, f"{ended - begun:.2f} s ({steps})")
+    if isinstance(scene.transfer, LabelTransferFunction):
+        print(f"{options.output}: {legend(scene.volume, scene.transfer)}")
     image = rendering.rgba if options.transparent else rendering.image(scene.background)
     is_png = options.output.suffix.lower() == ".png"
     save_image(options.output, image, text=text_of_options(options, scene.transfer) if is_png else {})
@@ -39,6 +44,17 @@ def _render(options: argparse.Namespace) -> None:
         print(f"{save_image(options.depth, rendering.depth)}: distances, world length")
     if why := why_empty(scene, rendering):
         print(f"{options.output}: {why}")
+
+
+def legend(volume: Volume, transfer: LabelTransferFunction) -> str:
+    """The labels that a volume has, each with its colour."""
+    kinds, colors = (
+        np.unique(np.asarray(volume.labels)),
+        displayed(np.asarray(transfer.stacked.colors, np.float32)[None, :, -1])[0],
+    )
+    ids = volume.label_ids or range(256)
+    told = [f"{ids[kind]} #{bytes(colors[kind]).hex()}" for kind in kinds.tolist() if 0 < kind < len(colors)]
+    return f"labels {', '.join(told[:24])}{', …' * (len(told) > 24)}"
 
 
 def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> None:

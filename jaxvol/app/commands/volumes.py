@@ -38,10 +38,13 @@ def add_datasets(parser: Parser) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from ...io.formats import labelled, read
+    from ...io.formats import labelled, read, read_record
     from ...scene.volume import Volume
 
-    arguments = read(options.file, **header_of(options))
+    told = header_of(options)
+    how = {name: told.pop(name) for name in ("nan", "channel")} | {"time": told["time"]}
+    record = read_record(options.file, **told)
+    arguments = read(record, **how | ({"time": None} if record.format.endswith("at each place") else {}))
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)
@@ -60,7 +63,7 @@ def _info(options: argparse.Namespace) -> None:
     ends = [np.asarray(volume.origin) + end(reach, 0).sum(axis=1) for end in (np.minimum, np.maximum)]
     bounds = zip("xyz", np.transpose(ends), strict=True)
     axes = (f"{name} along ({_numbers(column, ', ')})" for name, column in zip("xyz", turn.T, strict=True))
-    rows = {
+    rows = record.rows() | {
         "shape": f"{_numbers(volume.shape, ' x ')} voxels (x, y, z), {data.size / 1e6:.3g} million",
         "type": f"{data.dtype}, {data.nbytes / 1e6:.3g} MB of memory",
         "spacing": _numbers(volume.spacing) + (" (assumed: the file does not say)" if assumed else ""),

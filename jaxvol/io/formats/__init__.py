@@ -1,9 +1,7 @@
 """Loads volumes from files, with a reader chosen by the ending of the file's name, and saves them.
 
-A reader returns the arguments of `Volume` that the file holds, and as `axes` a letter for each axis of its
-data: x, y, z, then t of time, c of channels, s of several values in a voxel (by default as many of "xyzs" as
-there are). Nothing is unpickled, and the content of a file is checked against its header before memory is
-allocated for it.
+A reader returns an `ImageRecord`: the array as it is stored, and what the file says of it. Nothing is
+unpickled, and the content of a file is checked against its header before memory is allocated for it.
 """
 
 import os
@@ -13,37 +11,32 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.checks import Arrayable, described, integer, number
+from ..._util.checks import Arrayable, described
+from ..._util.image_record import ImageRecord, numbered, volume_arguments
 from ..._util.npy import read_npy, read_npz
 from ..._util.voxels import WHOLE, is_flat, within
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
-from .dicom import dicom_files, is_dicom, read_dicom, series_headers
-from .kretz import read_kretz
-from .medical import nrrd_header, read_nrrd
-from .metaimage import metaimage_header, read_metaimage
-from .nifti import read_nifti
+from . import hdf5, mrc, nifti, tiff
+from .dicom import dicom_files, folders_below, is_dicom, read_dicom, series_headers
+from .kretz import MAGIC, read_kretz
 from .raw import ENDINGS as RAW, raw_json, read_raw
 from .save import save as save
-from .tiff import read_tiff, read_tiff_folder, tiff_files
+from .text_headers import metaimage_header, nrrd_header, read_metaimage, read_nrrd
+from .vtk_files import read_vtk
 
 
-READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
-    ".npy": read_npy,
-    ".npz": read_npz,
-    ".nii": read_nifti,
-    ".nii.gz": read_nifti,
-    ".nrrd": read_nrrd,
-    ".nhdr": read_nrrd,
-    ".mha": read_metaimage,
-    ".mhd": read_metaimage,
-    ".tif": read_tiff,
-    ".tiff": read_tiff,
-}
+READERS: dict[str, Callable[[Path], ImageRecord]] = {".npy": read_npy, ".npz": read_npz}
+READERS |= dict.fromkeys((".nrrd", ".nhdr"), read_nrrd) | dict.fromkeys((".mha", ".mhd"), read_metaimage)
+READERS |= dict.fromkeys(nifti.ENDINGS, nifti.read_nifti) | dict.fromkeys(tiff.ENDINGS, tiff.read_tiff)
+READERS |= dict.fromkeys(mrc.ENDINGS, mrc.read_mrc) | dict.fromkeys((".vti", ".vtk"), read_vtk)
+VAGUE = (".img", ".hdf", *mrc.ENDINGS[1:])
+"""Endings of voxels without a header, too, if the caller describes these."""
+NAMED: dict[str, Callable[[Path, str | None], ImageRecord]] = dict.fromkeys(hdf5.ENDINGS, hdf5.read_hdf5)
+"""Readers of files that hold several arrays, of which one is named: `file.h5::/name`."""
 
-FOLDERS: list[tuple[Callable[[Path], bool], Callable[..., dict[str, Any]]]] = []
-"""What knows a kind of folder, and its reader, which is given the path, `time`, `channel` and `nan`.
-`bricks.opening` adds that of Zarr."""
+FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
+"""What knows a kind of folder, and its reader. `bricks.opening` adds that of Zarr."""
 
 
 def load(
@@ -58,53 +51,47 @@ def load(
     nan: float | None = None,
     time: int | None = None,
     channel: int | None = None,
+    offset: int | None = None,
 ) -> Volume:
     """Load a volume from a file, whose format is given by the ending of its name, or from a folder of slices.
 
-    | ending | header |
-    |---|---|
-    | `.raw`, `.raw.gz` | the arguments; else a JSON file beside it; else the name `name_XxYxZ_dtype.raw` |
-    | `.npy` | its own; the array is data[x, y, z] |
-    | `.npz` | its own; `data` and, if any, `spacing`, `origin`, `direction`, `labels`; or any one array |
-    | `.mha`, `.mhd` | its own |
-    | `.nii`, `.nii.gz` | its own: the sform if its code is positive, else the qform, else `pixdim`; in mm |
-    | `.nrrd`, `.nhdr` | its own; read by SimpleITK (`pip install "jaxvol[io]"`) |
-    | a folder of DICOM slices, or one of them, of any ending: its series | their own; read by SimpleITK |
-    | `.tif`, `.tiff` | its own; several images, row y of image z holds data[:, y, z]; read by tifffile |
-    | a folder of `.tif`, `.tiff` | their own; one image each, in the order of the numbers in their names |
-    | the folder of a Zarr array, or of an OME-Zarr image | its own; by tensorstore (`jaxvol[bricks]`) |
+    Formats: raw voxels (`name_XxYxZ_dtype.raw`, `.raw.gz`, or of any name with `shape` and `dtype`), `.npy`,
+    `.npz`, NIfTI, Analyze, MGH, MINC, NRRD, MetaImage, TIFF, MRC, VTK's images, HDF5 and NetCDF
+    (`file.h5::/name`), DICOM, folders of slices (DICOM, TIFF, PNG, JPEG), Zarr and OME-Zarr. The page "Files"
+    of the documentation has a table of what is read of each.
 
-    Raw files store x fastest, like those of the Open SciVis datasets. The JSON file has the raw file's name
-    with `.json` appended, or in place of `.raw` or `.raw.gz`, and the datasets' keys `size`, `type`,
-    `spacing`, `origin`, any of which may be missing. An argument overrides the JSON, and the JSON the name.
+    Values are scaled as the file says (CT in HU), lengths become mm where their unit is known, and axes are
+    exchanged and reversed so that x, y, z increase along the world's: of medical images, towards the
+    patient's left, back and head (LPS). An oblique image keeps its voxels, and the turn that is left is the
+    volume's `direction`, with the shear of a tilted gantry. What a file does not say, and what was taken in
+    its place, is told in a warning. Integers of 32 and 64 bits are converted to smaller types, float64 to
+    float32, as described in `Volume`. Of the levels of an OME-Zarr image, the finest is read that takes at
+    most a quarter of the memory; `render_bricks` takes finer ones.
 
-    Medical images are rescaled (CT in HU), float64 becomes float32, and axes are exchanged and reversed so
-    that x, y, z increase towards the patient's left, back and head (LPS). An oblique image keeps its voxels,
-    and the turn that is left is the volume's `direction`, with the shear of a tilted gantry; one below 1e-4,
-    which headers' rounding makes, is left out. DICOM slices are sorted by where they lie, and keep their
-    values where the lowest is to be shown white (MONOCHROME1). Integers of 32 and 64 bits, from any kind of
-    file, are converted to smaller types, as described in `Volume`. Of the levels of an OME-Zarr image, the
-    finest is read that takes at most a quarter of the memory; `render_bricks` takes finer ones.
+    A raw file stores x fastest. A JSON file with its name and `.json` appended, or in place of `.raw` or
+    `.raw.gz`, may hold `size`, `type`, `spacing` and `origin`. An argument overrides the JSON, and the JSON
+    the name.
 
     Ids of segments (labels) that are too large are replaced by 0, 1, 2, … in their order, and kept as
     `volume.label_ids`: those beyond 2**24 in a file whose voxels mostly equal their neighbours along an
-    axis, and those of `labels` that do not lie from 0 to 255, as `LabelTransferFunction` wants them. (Of
-    Zarr, ids beyond 2**24 are refused.)
+    axis, and those of `labels` that do not lie from 0 to 255, as `LabelTransferFunction` wants them.
 
     Args:
-        path: the file.
+        path: the file, or the folder.
         shape: number of voxels along x, y, z; raw files only.
-        dtype: uint8, int8, uint16, int16, float16, float32 or float64, little-endian unless it ends in `be`
-            (`uint16be`); raw files only.
+        dtype: an integer or float type of NumPy, little-endian unless it ends in `be` (`uint16be`); raw files
+            only.
         spacing: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
         origin: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
         direction: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
         labels: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
             at the same place: it becomes the volume's labels.
-        nan: the value of voxels that are NaN or infinite in the file; by default, these are refused.
+        nan: the value of voxels that are NaN or infinite in the file, which are refused by default, and of
+            those that it calls missing, which take the least value by default.
         time: which one of several images, from 0 on, where a file holds an axis of time.
         channel: which channel, from 0 on. Without it, several values in a voxel, as of colours, become the
             channels of the volume; an axis of channels needs it.
+        offset: bytes before the voxels; raw files only.
 
     Returns:
         The `Volume`, with voxels in the file's type except as described above.
@@ -114,9 +101,12 @@ def load(
             header says, or without a header; for an image that is not 3-D; where it holds several, and
             `time` or `channel` does not say which; for several DICOM series in a folder, or slices that do
             not fit together; for labels that lie elsewhere; and for anything that `Volume` rejects.
-        ImportError: for a format that needs SimpleITK, tifffile, imagecodecs or tensorstore if it is missing.
+        ImportError: for a format that needs a library that is missing: pip install "jaxvol[io]".
     """
-    arguments = read(path, shape, dtype, spacing=spacing, nan=nan, time=time, channel=channel)
+    index: dict[str, Any] = {"time": time, "channel": channel}
+    record = read_record(path, shape, dtype, spacing=spacing, time=time, offset=offset)
+    index |= {"time": None} if record.format.endswith("at each place") else {}
+    arguments = read(record, nan=nan, **index)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arguments |= {name: value for name, value in given.items() if value is not None}
     try:
@@ -126,30 +116,13 @@ def load(
         raise ValueError(f"{path}: {fault}") from fault
 
 
-def read(
-    path: str | os.PathLike[str] | Any,
-    shape: Any = None,
-    dtype: Any = None,
-    *,
-    spacing: Any = None,
-    nan: float | None = None,
-    time: int | None = None,
-    channel: int | None = None,
-) -> dict[str, Any]:
-    """What a file or folder holds, as arguments of `Volume`; those of which it says nothing are missing. The
-    spacing is that of the volume, if the caller gives it."""
-    path = _existing(path)
-    index = {"time": time, "channel": channel}
-    read_folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
-    if read_folder is None or shape is not None or dtype is not None:
-        arguments = _one(path, _content(path, shape, dtype, spacing), index)
-    else:
-        arguments = read_folder(path, **index, nan=nan)
+def read(record: ImageRecord, **how: Any) -> dict[str, Any]:
+    """Arguments of `Volume` for what a file holds; those of which it says nothing are missing. Options: as
+    for `volume_arguments`."""
+    arguments = volume_arguments(record, **how)
     data = arguments["data"]
-    if nan is not None and data.dtype.kind == "f":
-        arguments["data"] = np.where(np.isfinite(data), data, data.dtype.type(number("nan", nan)))
     if data.dtype.kind in "iu" and data.itemsize > 2 and not within(data, WHOLE["float32"]) and _is_ids(data):
-        arguments |= _numbered(data)
+        arguments |= numbered(data)
     return arguments
 
 
@@ -158,57 +131,70 @@ def _is_ids(data: np.ndarray) -> bool:
     return any(is_flat(np.moveaxis(data, axis, 0)) for axis in range(3))
 
 
-def _content(path: Path, shape: Any, dtype: Any, spacing: Any) -> dict[str, Any]:
-    name = path.name.lower()
-    if name.endswith(RAW):
-        return read_raw(path, shape, dtype)
-    if shape is not None or dtype is not None:
+def read_record(
+    path: str | os.PathLike[str] | Any,
+    shape: Any = None,
+    dtype: Any = None,
+    *,
+    spacing: Any = None,
+    time: int | None = None,
+    offset: int | None = None,
+) -> ImageRecord:
+    """What a file or folder holds, and says of it. The spacing is that of the volume, if the caller gives
+    it."""
+    path, name = _existing(path)
+    lower, given = path.name.lower(), shape is not None or dtype is not None or offset
+    folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
+    ending = next((ending for ending in (*READERS, *NAMED) if lower.endswith(ending)), None)
+    is_slices = (path.is_file() and is_dicom(path)) or lower.endswith(".dcm") or lower == "dicomdir"
+    ending = None if ending in VAGUE and shape is not None and dtype is not None else ending
+    if lower.endswith(RAW) or (given and not (folder or ending or path.is_dir() or is_slices)):
+        record = read_raw(path, shape, dtype, offset or 0)
+    elif given:
         raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
-    if name.endswith(".vol"):
-        use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...)) or jv.scan_convert"
-        raise ValueError(f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}.")
-    for ending, reader in READERS.items():
-        if name.endswith(ending):
-            return reader(path)
-    if name.endswith(".dcm") or (dicom_files(path) if path.is_dir() else path.is_file() and is_dicom(path)):
-        return read_dicom(path, spacing)  # on discs their names often have no ending
-    if path.is_dir() and tiff_files(path):
-        return read_tiff_folder(path)
-    fault = (
-        "is a directory without DICOM and TIFF files, and no Zarr"
-        if path.is_dir()
-        else "has an unknown ending"
-    )
-    raise ValueError(
-        f"path: {path} {fault}; expected a folder of these, or a file ending in "
-        f"{', '.join(sorted((*RAW, *READERS, '.dcm')))}."
-    )
+    elif folder:
+        record = folder(path)
+    elif ending in NAMED:
+        record = NAMED[ending](path, name)
+    elif ending:
+        record = READERS[ending](path)
+    elif is_slices or (path.is_dir() and dicom_files(path)):
+        record = read_dicom(path, spacing, time)  # on discs their names often have no ending
+    elif path.is_dir() and tiff.slice_files(path):
+        record = tiff.read_slices(path)
+    else:
+        raise ValueError(_unknown(path))
+    record.format = record.format or lower.rpartition(".")[2] or "folder"
+    return record
 
 
-def _one(path: Path, arguments: dict[str, Any], given: dict[str, int | None]) -> dict[str, Any]:
-    """The arguments with the volume that these indices choose, by `axes`, which are left out."""
-    data = arguments["data"]
-    axes = arguments.pop("axes", "xyzs"[: data.ndim])
-    letters = {"time": "t", "channel": "c" if "c" in axes else "s"}
-    sizes = ", ".join(f"{axis} {n}" for axis, n in zip(axes, data.shape, strict=False))
-    for name, letter in letters.items():
-        if given[name] is not None and letter not in axes:
-            raise ValueError(f"{name}: {path} has no such axis; it holds {sizes}.")
-    for at in reversed(range(3, len(axes))):
-        name = "time" if axes[at] == "t" else "channel"
-        index, count = given[name] if letters[name] == axes[at] else None, data.shape[at]
-        if index is None and count > 1:
-            if axes[at] == "s":
-                continue  # the volume's channels
-            raise ValueError(f"{name} must be given, from 0 to {count - 1}: {path} holds {sizes}.")
-        data = data[(slice(None),) * at + (integer(name, index or 0, 0, count - 1),)]
-    return arguments | {"data": data}
+def _unknown(path: Path) -> str:
+    """Why a path is not read."""
+    if path.is_dir():
+        inside = sorted(path.iterdir())
+        images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
+        files = [each for each in inside if each.name.lower().endswith((*RAW, *READERS, *NAMED, ".zarr"))]
+        if found := folders_below(path) or images or files:
+            kind = "" if found in (images, files) else "DICOM images in "
+            told = ", ".join(str(each.relative_to(path)) for each in found[:8])
+            return f"path: {path} is a directory that holds {kind}{told}: give its path."
+        return f"path: {path} is a directory without DICOM and TIFF files, other slices, and no Zarr."
+    if path.name.lower().endswith(".vol"):
+        with path.open("rb") as stream:
+            if stream.read(16) == MAGIC:
+                use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
+                return f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}."
+    endings = ", ".join(sorted((*RAW, *READERS, *NAMED, ".dcm")))
+    return (
+        f"path: {path} has an unknown ending; expected a folder of slices, or a file ending in {endings}. Of "
+        "voxels without a header, give shape=(nx, ny, nz) and dtype."
+    )
 
 
 def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
     try:
-        found = read(path)
+        found = read(read_record(path))
     except ValueError as fault:
         raise ValueError(f"labels: {str(fault).removeprefix('path: ')}") from fault
     if (values := found["data"]).dtype.kind == "f":
@@ -216,7 +202,7 @@ def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
             raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
         found["data"] = values.astype(np.int64)
     if "label_ids" not in found and not within(found["data"], WHOLE["uint8"]):
-        found |= _numbered(found["data"])
+        found |= numbered(found["data"])
     labels = Volume(**found)
     here, there = map(_corners, (volume, labels))
     if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
@@ -230,12 +216,6 @@ def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     return Volume(volume.data, *place, numbers, direction=volume.direction, label_ids=labels.label_ids)
 
 
-def _numbered(ids: np.ndarray) -> dict[str, Any]:
-    """Arguments of `Volume`: numbers in the order of the ids, in place of these, and the ids."""
-    kinds, numbers = np.unique(ids, return_inverse=True)
-    return {"data": numbers.reshape(ids.shape), "label_ids": kinds.tolist()}
-
-
 def _corners(volume: Volume) -> np.ndarray:
     """Where the first voxel lies in the world, and the last one along each axis."""
     direction = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
@@ -246,13 +226,16 @@ def _corners(volume: Volume) -> np.ndarray:
 def files_of(path: Path) -> list[Path]:
     """The files that `load` reads for a volume: of a folder, its slices; with a header, what it names; of one
     DICOM file, those of its series. None where there is no volume. Raises as `load` for a bad header."""
+    path = Path(str(path).partition("::")[0])
     if path.is_dir():
-        return dicom_files(path) or tiff_files(path)
+        return dicom_files(path) or tiff.slice_files(path)
     if not path.is_file():  # a device may have no end
         return []
     name = path.name.lower()
     if name.endswith(RAW):
         return [path, *raw_json(path)]
+    if name.endswith((".hdr", ".img")):
+        return sorted(file for ending in (".hdr", ".img") if (file := path.with_suffix(ending)).is_file())
     if name.endswith((".mhd", ".nrrd", ".nhdr")):
         data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
         return [path, data] if data != path and data.is_file() else [path]
@@ -279,16 +262,20 @@ def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, Toroida
             lacks an item; for angles that are not evenly spaced to 0.01 of a step; and for what
             `ToroidalMap` and `Volume` reject.
     """
-    data, probe = read_kretz(_existing(path))
+    data, probe = read_kretz(_existing(path)[0])
     return Volume(data), probe
 
 
-def _existing(path: str | os.PathLike[str] | Any) -> Path:
+def _existing(path: str | os.PathLike[str] | Any) -> tuple[Path, str | None]:
+    """The file of a path, and the name of what is meant in it, behind `::`."""
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")
-    path = Path(path)
-    if not path.exists():
+    file, name = Path(path), None
+    if not file.exists() and "::" in str(path):
+        before, _, name = str(path).rpartition("::")
+        file = Path(before)
+    if not file.exists():
         raise ValueError(
-            f"path: there is no file {path} (working directory {Path.cwd()}). Check the spelling."
+            f"path: there is no file {file} (working directory {Path.cwd()}). Check the spelling."
         )
-    return path
+    return file, name

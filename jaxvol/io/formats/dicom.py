@@ -1,23 +1,26 @@
-"""Reads series of DICOM slices with SimpleITK, sorted by where they lie."""
+"""Reads series of DICOM slices, and files of several frames, with pydicom, sorted by where they lie."""
 
 import math
+import mmap
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..._util.affine import directions
-from ..._util.checks import finite_array
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, decoding
-from .medical import simple_itk, toward_axes
+from ..._util.checks import finite_array, integer, shortened
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, refusing
+from ..._util.image_record import ImageRecord
 
 
 UID = "1.2.840.10008."
-
 PLAIN = {UID + end for end in ("1.2", "1.2.1", "1.2.2")}
-PACKED = {UID + end for end in ("1.2.1.99", "1.2.5")}
-PACKED |= {f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70, 80, 81, 90, 91)}
-"""Transfer syntaxes that SimpleITK reads: deflated, run-length encoded, JPEG, JPEG-LS and JPEG 2000."""
+PACKED = {UID + "1.2.1.99": "", UID + "1.2.5": ""}
+PACKED |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70)), "jpeg_decode")
+PACKED |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (80, 81)), "jpegls_decode")
+PACKED |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (90, 91)), "jpeg2k_decode")
+"""Transfer syntaxes, and what decodes them in imagecodecs; "": pydicom does."""
 
 STORAGE = UID + "5.1.4.1.1."
 NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "481.5"))
@@ -26,16 +29,33 @@ NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "48
 KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
 """Elements of the meta information with which a file begins."""
 
-SERIES, DESCRIPTION, BITS = "0020|000e", "0008|103e", "0028|0100"
-PLACE = ("0020|0032", "0020|0037")
-"""Position, and directions of rows and columns."""
-SPACINGS = ("0028|0030", "0018|1164")
-"""Between rows and columns: in the patient, else on the detector (ImagerPixelSpacing)."""
-INTERPRETATION, STORED, SIGNED = "0028|0004", "0028|0101", "0028|0103"
-INTERCEPT, SLOPE = "0028|1052", "0028|1053"
+TIMES = (
+    *("TemporalPositionIndex", "TemporalPositionIdentifier", "AcquisitionNumber", "TriggerTime"),
+    *("DiffusionBValue", "EchoTime", "AcquisitionTime", "ContentTime", "InstanceNumber"),
+)
+"""Elements that tell images at one place apart."""
 
 AWAY = 0.1
 """The part of a voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
+
+
+class Slice(NamedTuple):
+    """One image of a series. `parts`: what holds its elements, the first that has one counts. `place`: its
+    position. `grid`: distances between rows and between columns, and the directions of both."""
+
+    file: Path
+    frame: int
+    parts: list[Any]
+    shape: tuple[int, int, int]
+    place: np.ndarray
+    grid: np.ndarray
+
+    @property
+    def name(self) -> str:
+        return self.file.name if self.shape[0] == 1 else f"frame {self.frame + 1}"
+
+    def told(self, name: str) -> Any:
+        return next((part[name].value for part in self.parts if name in part), None)
 
 
 def is_dicom(path: Path) -> bool:
@@ -52,109 +72,138 @@ def dicom_files(folder: Path) -> list[Path]:
     return [file for file in images if not _meta(file, KIND).startswith(NO_IMAGES)]
 
 
-def read_dicom(path: Path, spacing: Any = None) -> dict[str, Any]:
-    """Reader for a folder that holds one series, or for one file of a series, whose others are in its folder.
+def folders_below(folder: Path) -> list[Path]:
+    """Folders that hold DICOM images, up to 4 levels down, of 1000 a level at most."""
+    below, found = [folder], []
+    for _ in range(4):
+        below = [each for parent in below for each in sorted(parent.iterdir()) if each.is_dir()][:1000]
+        found += [each for each in below if dicom_files(each)]
+    return found
+
+
+def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> ImageRecord:
+    """Reader for a folder that holds one series, for one file of a series, whose others are in its folder,
+    for a file of several frames, and for the DICOMDIR of a disc with one series.
 
     Args:
         path: the folder, or the file.
         spacing: of the volume, if the caller knows it; for slices that do not say theirs.
+        time: which one of several images at each place.
 
     Raises:
         ValueError: for several series, and for slices that are missing, there twice, of different sizes or
-            directions, without spacing, shifted unevenly, cut short, or compressed in a way that SimpleITK
-            does not read.
+            directions, without spacing, shifted unevenly, cut short, or compressed in a way that is not read.
     """
-    headers = series_headers(path)
-    for file, header in headers.items():
-        _check_slice(file, header)
-    if not 2 <= len(headers) <= MOST_VOXELS // math.prod(next(iter(headers.values())).GetSize()):
-        raise ValueError(
-            f"path: {path} must hold at least 2 slices of a series, and fewer than 2**31 voxels; got "
-            f"{len(headers)}."
-        )
-    apart = {file: _apart(file, header, spacing) for file, header in headers.items()}
-    grids = {file: [*h.GetSize(), *apart[file], *h.GetDirection()] for file, h in headers.items()}
-    first = next(iter(grids))
-    for file, grid in grids.items():
-        if not np.allclose(grid, grids[first], rtol=1e-4, atol=1e-4):
+    if path.name.upper() == "DICOMDIR":
+        folders = folders_below(path.parent)
+        if len(folders) != 1:
+            told = ", ".join(str(each.relative_to(path.parent)) for each in folders[:8]) or "no folder"
+            raise ValueError(
+                f"path: {path}: {told} beside it holds DICOM images. Give the path of one of them."
+            )
+        path = folders[0]
+    slices = [
+        each for file, header in series_headers(path).items() for each in _slices(file, header, spacing)
+    ]
+    if not 2 <= len(slices) <= MOST_VOXELS // math.prod(slices[0].shape[1:] if slices else (1,)):
+        expected = "at least 2 slices of a series, and fewer than 2**31 voxels"
+        raise ValueError(f"path: {path} must hold {expected}; got {len(slices)}.")
+    first = slices[0]
+    for each in slices:
+        if each.shape[1:] != first.shape[1:] or not np.allclose(each.grid, first.grid, rtol=1e-4, atol=1e-4):
+            grids = (f"{each.shape[1:]} {each.grid.tolist()}" for each in (first, each))
             raise ValueError(
                 f"path: {path}: slices of one series must agree in size, spacing and directions; "
-                f"{first.name} and {file.name} do not: {grids[first]} and {grid}. Is one an overview?"
+                f"{first.name} and {each.name} do not: {' and '.join(grids)}. Is one an overview?"
             )
-    rows_and_columns = np.reshape(headers[first].GetDirection(), (3, 3))
-    turn = directions(f"path: {path}: rows and columns of {first.name}", rows_and_columns)
-    normal = np.cross(turn[:, 0], turn[:, 1])
-    files = sorted(headers, key=lambda file: float(np.array(headers[file].GetOrigin()) @ normal))
-    positions = np.array([headers[file].GetOrigin() for file in files])
-    down, across = apart[first]
-    mean = (positions[-1] - positions[0]) / (len(files) - 1)
-    for step in (normal * (mean @ normal), mean):  # the second: the gantry was tilted
-        away = positions - positions[0] - np.outer(np.arange(len(files)), step)
+    (down, across), turn = first.grid[:2].tolist(), first.grid[2:].reshape(2, 3)
+    turn = directions(
+        f"path: {path}: rows and columns of {first.name}",
+        np.column_stack([*turn, np.cross(turn[0], turn[1])]),
+    )
+    slices = sorted(slices, key=lambda each: float(each.place @ turn[:, 2]))
+    slices, several = _at_one_time(path, slices, turn[:, 2], time)
+    step = _even_step(path, slices, turn[:, 2], min(across, down))
+    turn[:, 2] = step / np.linalg.norm(step)
+    steps = {"x": across, "y": down, "z": float(np.linalg.norm(step))}
+    what, told = f"path: {path}", f"DICOM, {len(slices)} slices{several}"
+    return ImageRecord(
+        _values(slices), "zyx", steps, "mm", slices[0].place, turn, "LPS", what=what, format=told
+    )
+
+
+def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any) -> tuple[list[Slice], str]:
+    """One image at each place, by `time` where there are as many at each; and words on how many there are."""
+    along = np.array([each.place @ normal for each in slices])
+    cuts = np.flatnonzero(np.diff(along) > 1e-3 * np.ptp(along) / len(along)) + 1
+    groups = [slices[a:b] for a, b in zip([0, *cuts], [*cuts, len(slices)], strict=True)]
+    count = len(groups[0])
+    if count == 1 or len(groups) == 1 or len({len(group) for group in groups}) > 1:
+        if time is not None:
+            raise ValueError(f"time: {path} has no such axis; it holds one image at each place.")
+        return slices, ""
+    key = next(
+        (name for name in TIMES if len({str(each.told(name)) for each in groups[0]}) == count), TIMES[-1]
+    )
+    ordered = [
+        sorted(group, key=lambda each: (_float(each.told(key)), str(each.told(key)))) for group in groups
+    ]
+    if time is None:
+        words = re.sub("(?<=[a-z])(?=[A-Z])", " ", key).lower()
+        by = f"{words} {', '.join(str(each.told(key)) for each in ordered[0][:6])}"
+        told = f"path: {path} holds {count} images at each of {len(groups)} places ({by})"
+        raise ValueError(f"{told}: time must be given, from 0 to {count - 1}.")
+    at = integer("time", time, 0, count - 1)
+    return [group[at] for group in ordered], f", one of {count} at each place"
+
+
+def _float(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return math.inf
+
+
+def _even_step(path: Path, slices: list[Slice], normal: np.ndarray, pixel: float) -> np.ndarray:
+    """The step from slice to slice. The gantry may be tilted."""
+    at, names = np.array([each.place for each in slices]), [each.name for each in slices]
+    mean = (at[-1] - at[0]) / (len(at) - 1)
+    for step in (normal * (mean @ normal), mean):
+        away = at - at[0] - np.outer(np.arange(len(at)), step)
         along = away @ normal
         sideways = np.abs(away - np.outer(along, normal)).max(axis=1)
-        even = (np.abs(along) <= AWAY * (mean @ normal)) & (sideways <= AWAY * min(across, down))
-        if even.all():
-            break
-    if mean @ normal < 1e-6 or not even.all():
-        i = int(np.argmin(even))
-        raise ValueError(
-            f"path: {path} must hold slices evenly spaced along a line; of {len(files)}, {files[i].name} "
-            f"lies {along[i]:.4g} too far along their normal, and {sideways[i]:.4g} sideways. Are slices "
-            "missing or there twice?"
-        )
-    length = float(np.linalg.norm(step))
-    turn = directions(
-        f"path: {path}: rows, columns and slices", np.column_stack([turn[:, :2], step / length])
+        even = (np.abs(along) <= AWAY * (mean @ normal)) & (sideways <= AWAY * pixel)
+        if even.all() and mean @ normal >= 1e-6:
+            return step
+    steps = np.diff(at @ normal)
+    usual = float(np.median(steps))
+    k = int(np.argmax(np.abs(steps - usual)))
+    told, missing = (
+        f"at {along[k]:.4g} and {sideways[k]:.4g}",
+        round(steps[k] / usual) - 1 if usual > 1e-6 else 0,
     )
-    return toward_axes(_pixels(headers, files), (across, down, length), positions[0], turn)
-
-
-def _apart(path: Path, header: Any, given: Any) -> np.ndarray:
-    """The distances between rows and between columns."""
-    for tag in SPACINGS:
-        told = _numbers(_text(header, tag))
-        if told.shape == (2,) and np.all(told > 0):
-            return told
-    if given is None:
-        texts = [_text(header, tag)[:80] for tag in SPACINGS]
-        raise ValueError(
-            f"path: {path} does not say how far its pixels are apart: PixelSpacing (0028|0030) and "
-            f"ImagerPixelSpacing (0018|1164) must be 2 positive numbers; got {texts[0]!r} and {texts[1]!r}. "
-            "Give spacing=(x, y, z), --spacing."
-        )
-    # of the axes as loaded, to which rows and columns are nearest
-    x_and_y = np.abs(np.reshape(header.GetDirection(), (3, 3))).argmax(axis=0)[:2]
-    return np.asarray(finite_array("spacing", given, (3,)))[x_and_y[::-1]]
-
-
-def _pixels(headers: dict[Path, Any], files: list[Path]) -> np.ndarray:
-    """Rescaled values [x, y, z], of a type that holds those of all slices: each may have its own scale."""
-    planes = []
-    for file in files:
-        with decoding(file):
-            plane = simple_itk(file).GetArrayFromImage(headers[file].Execute())[0].T
-        if _text(headers[file], INTERPRETATION) == "MONOCHROME1":  # the lowest is shown as white
-            plane = _as_stored(plane, headers[file])
-        planes.append(plane.astype(np.float32) if plane.dtype == np.float64 else plane)
-    return np.stack(planes, axis=2)
-
-
-def _as_stored(plane: np.ndarray, header: Any) -> np.ndarray:
-    """Rescaled values of MONOCHROME1, of which SimpleITK inverts the stored ones before."""
-    slope, intercept = (float(_text(header, tag) or default) for tag, default in ((SLOPE, 1), (INTERCEPT, 0)))
-    highest = -1 if _text(header, SIGNED) == "1" else 2 ** int(_text(header, STORED)) - 1
-    return (slope * highest + 2 * intercept - plane).astype(plane.dtype)
+    if abs(steps[k] - usual) > AWAY * usual and missing > 0:
+        told = f"{missing} of {usual:.4g} mm {'is' if missing == 1 else 'are'} missing between {names[k]} and"
+    elif abs(steps[k] - usual) > AWAY * usual:
+        told = f"{steps[k]:.4g} mm for {usual:.4g}: one is there twice, or shifted, between {names[k]} and"
+    else:
+        k = int(np.argmin(even)) - 1
+        told = f"{along[k + 1]:.4g} too far along their normal, and {sideways[k + 1]:.4g} sideways, lies"
+    raise ValueError(f"path: {path} must hold slices evenly spaced along a line; {told} {names[k + 1]}.")
 
 
 def series_headers(path: Path) -> dict[Path, Any]:
     """Headers, by file, of the only series in a folder, or of the one that a file belongs to."""
     headers = {file: _header(file) for file in dicom_files(path if path.is_dir() else path.parent)}
+    series = {file: str(header.get("SeriesInstanceUID", "")) for file, header in headers.items()}
     if path.is_file():
-        series = _text(_header(path), SERIES)
-        return {file: header for file, header in headers.items() if _text(header, SERIES) == series}
-    examples = {_text(header, SERIES): file for file, header in headers.items()}
+        own = str(_header(path).get("SeriesInstanceUID", ""))
+        return {file: header for file, header in headers.items() if series[file] == own}
+    examples = {uid: file for file, uid in series.items()}
     if len(examples) > 1:
-        told = [f"{_text(headers[file], DESCRIPTION)} (as {file.name})" for file in examples.values()]
+        told = [
+            f"{headers[file].get('SeriesDescription', '')} (as {file.name})" for file in examples.values()
+        ]
         raise ValueError(
             f"path: {path} holds several series: {', '.join(told)}. Give the path of one file of the series "
             "that you want, or put each into a folder of its own."
@@ -162,58 +211,15 @@ def series_headers(path: Path) -> dict[Path, Any]:
     return headers
 
 
-def _header(path: Path) -> Any:
-    """SimpleITK's reader of a file, whose header has been read."""
+def _header(path: Path, *, pixels: bool = False) -> Any:
+    """The elements of a file, through a map of it: pydicom asks for as many bytes as lengths say."""
     if not is_dicom(path):
         raise ValueError(
             f'path: {path} is no DICOM file: it has no "DICM" at byte 128. Remove it from there.'
         )
-    reader = simple_itk(path).ImageFileReader()
-    reader.SetImageIO("GDCMImageIO")
-    reader.SetFileName(str(path))
-    with decoding(path):
-        reader.ReadImageInformation()
-    return reader
-
-
-def _check_slice(path: Path, header: Any) -> None:
-    syntax = _meta(path, SYNTAX)
-    if syntax not in PLAIN | PACKED:  # SimpleITK would take compressed bytes for pixels
-        raise ValueError(
-            f"path: {path} is stored in the transfer syntax {syntax}, which SimpleITK does not read. "
-            "Decompress the series first, for example with gdcmconv --raw."
-        )
-    size, channels = header.GetSize(), header.GetNumberOfComponents()
-    if channels != 1 or len(size) != 3 or size[2] != 1:
-        raise ValueError(
-            f"path: {path} must hold one slice of one value per pixel; got size {size} and {channels} "
-            "values. Files of several frames are not supported: save it as NRRD or NIfTI."
-        )
-    n_bytes = int(_text(header, BITS)) // 8 if _text(header, BITS).isdecimal() else 1
-    held = path.stat().st_size * (1 if syntax in PLAIN else MOST_COMPRESSED)
-    check_size(path, held, math.prod(size) * n_bytes, more=True)
-    rows_and_columns = np.reshape(header.GetDirection(), (3, 3))[:, :2].T.ravel()
-    for tag, taken in zip(PLACE, (header.GetOrigin(), rows_and_columns), strict=True):
-        text = _text(header, tag)
-        told = _numbers(text)
-        # in place of what it cannot read, SimpleITK takes other numbers
-        if told.shape != (len(taken),) or not np.allclose(told, taken, rtol=1e-3, atol=1e-3):
-            raise ValueError(
-                f"path: {path} must say where it lies: element ({tag}) must be {len(taken)} numbers; got "
-                f"{text[:80]!r}, which SimpleITK takes for {np.round(taken, 4).tolist()}."
-            )
-
-
-def _numbers(text: str) -> np.ndarray:
-    """The numbers of an element; none if it holds something else."""
-    try:
-        return np.array(text.split("\\"), float)
-    except ValueError:
-        return np.empty(0)
-
-
-def _text(header: Any, tag: str) -> str:
-    return header.GetMetaData(tag).strip() if header.HasMetaDataKey(tag) else ""
+    with refusing(path), path.open("rb") as stream:
+        content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        return library("pydicom", path).dcmread(content, stop_before_pixels=not pixels)
 
 
 def _meta(path: Path, element: bytes) -> str:
@@ -223,3 +229,102 @@ def _meta(path: Path, element: bytes) -> str:
     at = content.find(element, 132)
     length = int.from_bytes(content[at + 6 : at + 8], "little") if at >= 0 else 0
     return content[at + 8 : at + 8 + length].rstrip(b"\0 ").decode("latin-1") if length <= 64 else ""
+
+
+def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
+    """The images of a file."""
+    if (syntax := _meta(path, SYNTAX)) not in PLAIN | PACKED.keys():
+        raise ValueError(
+            f"path: {path} is stored in the transfer syntax {syntax}, which is not read. Decompress the "
+            "series first, for example with gdcmconv --raw."
+        )
+    with refusing(path):
+        shape = int(header.get("NumberOfFrames") or 1), int(header.Rows), int(header.Columns)
+        channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.get("BitsAllocated", 0))
+        if channels != 1 or min(shape) < 1 or bits not in (1, 8, 16, 32, 64):
+            got = f"{shape} of {channels} values of {bits} bits"
+            raise ValueError(f"path: {path} must hold slices of one value per pixel; got {got}.")
+        held = file_size(path) * (1 if syntax in PLAIN else MOST_COMPRESSED)
+        check_size(path, held, math.prod(shape) * bits // 8, more=True)
+        shared = list(header.get("SharedFunctionalGroupsSequence") or [])[:1]
+        single = list(header.get("PerFrameFunctionalGroupsSequence") or [])
+        if len(single) != shape[0] and (single or shape[0] > 1):
+            raise ValueError(
+                f"path: {path}: each of {shape[0]} frames must say where it lies; {len(single)} do."
+            )
+        found = []
+        for k in range(shape[0]):
+            groups = [
+                element.value[:1]
+                for each in single[k : k + 1] + shared
+                for element in each
+                if element.VR == "SQ"
+            ]
+            parts = [*(item for group in groups for item in group), header]
+            place = _numbers(path, parts, ("ImagePositionPatient",), 3, "must say where it lies", "")
+            turn = _numbers(path, parts, ("ImageOrientationPatient",), 6, "must say where it lies", "")
+            if spacing is None:
+                apart = "does not say how far its pixels are apart", " Give spacing=(x, y, z), --spacing."
+                pixel = _numbers(path, parts, ("PixelSpacing", "ImagerPixelSpacing"), 2, *apart)
+            else:  # of the axes as loaded, to which rows and columns are nearest
+                x_and_y = np.abs(turn.reshape(2, 3)).argmax(axis=1)
+                pixel = np.asarray(finite_array("spacing", spacing, (3,)))[x_and_y[::-1]]
+            found.append(Slice(path, k, parts, shape, place, np.array([*pixel, *turn], float)))
+    return found
+
+
+def _numbers(
+    path: Path, parts: list[Any], names: tuple[str, ...], count: int, fault: str, hint: str
+) -> np.ndarray:
+    """The numbers of the first of these elements that has as many."""
+    texts = []
+    for name in names:
+        raw: Any = next((part.get_item(name) for part in parts if name in part), None)
+        value = b"" if raw is None else raw.value
+        text = value.decode("latin-1") if isinstance(value, bytes) else "\\".join(map(str, value or ()))
+        texts.append(shortened(text.strip()))
+        try:
+            numbers = np.array(text.strip("\0 ").split("\\"), float)
+        except ValueError:
+            continue
+        if numbers.shape == (count,) and np.isfinite(numbers).all() and (count > 2 or np.all(numbers > 0)):
+            return numbers
+    told = (
+        f"{' or '.join(names)} must be {count} {'positive ' * (count == 2)}numbers; got {' and '.join(texts)}"
+    )
+    raise ValueError(f"path: {path} {fault}: {told}.{hint}")
+
+
+def _values(slices: list[Slice]) -> np.ndarray:
+    """Values [z, y, x], of a type that holds those of all slices: each may have a scale or a table of its
+    own."""
+    planes, pixels, last = [], np.empty(0), None
+    for each in slices:
+        with refusing(each.file):
+            if each.file != last:
+                pixels, last = _pixels(each), each.file
+            plane = pixels[each.frame]
+            if each.told("ModalityLUTSequence"):
+                header = next(part for part in each.parts if "ModalityLUTSequence" in part)
+                plane = library("pydicom.pixels", each.file).apply_modality_lut(plane, header)
+            slope, intercept = (each.told(name) for name in ("RescaleSlope", "RescaleIntercept"))
+            record = ImageRecord(plane, "yx", slope=float(slope or 1), intercept=float(intercept or 0))
+            planes.append(record.decode(plane)[0])
+    return np.stack(planes)
+
+
+def _pixels(image: Slice) -> np.ndarray:
+    """Stored numbers of all frames of a file."""
+    whole, decoder = _header(image.file, pixels=True), PACKED.get(_meta(image.file, SYNTAX))
+    if not decoder:
+        return whole.pixel_array.reshape(image.shape)
+    decode, encaps = (
+        getattr(library("imagecodecs", image.file), decoder),
+        library("pydicom.encaps", image.file),
+    )
+    frames = encaps.generate_frames(whole.PixelData, number_of_frames=image.shape[0])
+    pixels = np.stack([decode(frame) for frame in frames]).reshape(image.shape)
+    if whole.PixelRepresentation == 1 and pixels.dtype.kind == "u":  # signed numbers of fewer bits
+        unused = 32 - int(whole.BitsStored)
+        return (pixels.astype(np.int32) << unused >> unused).astype(f"i{pixels.itemsize}")
+    return pixels

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 
 from ..._util.checks import described, output_file
-from ..._util.files import reason
+from ..._util.files import library, reason
 from ..._util.npy import VOLUME
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume, check_one_channel
-from .medical import simple_itk
 from .nifti import write_nifti
 
 
@@ -84,7 +83,7 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
 
 
 def _write_medical(arrays: dict[str, np.ndarray], path: Path) -> None:
-    sitk = simple_itk(path)
+    sitk = library("SimpleITK", path)
     image = sitk.GetImageFromArray(np.ascontiguousarray(arrays["data"].T))
     image.SetSpacing(arrays["spacing"].astype(float).tolist())
     image.SetOrigin(arrays["origin"].astype(float).tolist())

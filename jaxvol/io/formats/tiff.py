@@ -1,112 +1,114 @@
-"""Reads stacks of TIFF images with tifffile: the pages of one file, or the files of a folder."""
+"""Reads stacks of images: TIFF with tifffile, and folders of TIFF, PNG and JPEG."""
 
+import io
 import math
 import re
 import struct
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, refusing
+from ..._util.image_record import ImageRecord
+from ..._util.units import AXES
 
 
 ENDINGS = (".tif", ".tiff")
-
-LENGTHS = {"mm": 1.0, "millimeter": 1.0, "cm": 10.0, "inch": 25.4, "nm": 1e-6}
-LENGTHS |= dict.fromkeys(("µm", "um", "micron", "\\u00b5m"), 1e-3)
-"""Units of length that ImageJ and OME write, in mm."""
+PICTURES = (".png", ".jpg", ".jpeg")
 
 
-def read_tiff(path: Path) -> dict[str, Any]:
-    """Reader for a file of several pages. Spacing is what ImageJ or OME wrote, if they did."""
-    images, axes, spacing = _images(path)
-    order = [axis for axis in "XYZTCS" if axis in axes]
-    data = images.transpose([axes.index(axis) for axis in order])
-    return {"data": data, "axes": "".join(order).lower()} | spacing
-
-
-def tiff_files(folder: Path) -> list[Path]:
-    """The TIFF files in a folder, with numbers in their names in numeric order."""
-    files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS and file.is_file()]
-
-    def key(file: Path) -> list[Any]:
-        words: list[Any] = re.split(r"([0-9]+)", file.name.lower())
-        words[1::2] = map(int, words[1::2])
-        return words
-
-    return sorted(files, key=key)
-
-
-def read_tiff_folder(folder: Path) -> dict[str, Any]:
-    """Reader for a folder of files of one page each, in the order of the numbers in their names. Raises
-    `ValueError` naming the files for images of different sizes or types, and for a number that is missing."""
-    files, slices = tiff_files(folder), []
-    numbers = [int(found[-1]) for file in files if (found := re.findall(r"[0-9]+", file.stem))]
-    steps = np.diff(numbers).tolist()
-    if len(numbers) == len(files) and len(set(steps)) > 1 and min(steps) > 0:
-        i = int(np.argmax(steps))
-        raise ValueError(
-            f"path: slices are missing in {folder}: {files[i].name} is followed by {files[i + 1].name}."
-        )
-    for file in files:
-        image, axes, _ = _images(file)
-        slices.append(image)
-        first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (slices[0], image))
-        if axes != "ZYX" or len(image) != 1 or first != last or len(slices) * image.size > MOST_VOXELS:
-            raise ValueError(
-                f"path: each file in {folder} must hold one image of the same size and type, fewer than "
-                f"2**31 voxels in all; {files[0].name} has {first}, and {file.name} {len(image)} of {last}."
-            )
-    return {"data": np.concatenate(slices).transpose(2, 1, 0)}
-
-
-def _images(path: Path) -> tuple[np.ndarray, str, dict[str, Any]]:
-    """The images in a file, the letters of their axes, with one Z at least, and spacing where it is known."""
-    try:
-        import tifffile  # pyright: ignore[reportMissingImports]
-    except ImportError as fault:
-        raise ImportError(f"reading {path} needs tifffile: pip install 'jaxvol[io]'") from fault
+def read_tiff(path: Path) -> ImageRecord:
+    """Reader for the first series of a file: axes are those of OME's XML, of ImageJ, or of tifffile's own
+    metadata, and of plain pages z; lengths and scale are what OME or ImageJ wrote."""
+    tifffile = library("tifffile", path)
     file_size(path)
-    try:
-        with tifffile.TiffFile(path) as file:
-            _check_last(path, file)
-            pages = [page.aspage() for page in file.pages]
-            first, kinds = pages[0], {(page.shape, page.dtype) for page in pages}
-            series, whole = file.series[0], file.is_imagej or len(pages) == 1
-            told = whole or file.is_ome  # ImageJ may hold a stack in its only page
-            axes, shape = series.axes, series.shape
-            if not told:
-                axes, shape = f"Z{first.axes}", (len(pages), *first.shape)
-            further = axes.translate(str.maketrans("", "", "YXS"))
-            if len(further) == 1 and not file.is_ome:  # ImageJ's stacks may be of times
-                axes = axes.replace(further, "Z")
-            if "Z" not in axes:
-                axes, shape = f"Z{axes}", (1, *shape)
-            strange = (
-                len(kinds) > 1 or (file.is_ome and len(file.series) > 1) or not set(axes) <= set("XYZTCS")
-            )
-            if strange or first.dtype is None or not 0 < math.prod(shape) <= MOST_VOXELS:
-                raise ValueError(
-                    f"path: {path} must hold one stack of images of one size and type, and fewer than 2**31 "
-                    f"voxels; got {len(file.series)} stacks, the first of shape {series.shape} "
-                    f"({series.axes}), and pages of {len(kinds)} kinds."
-                )
-            packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
-            held = path.stat().st_size * (MOST_COMPRESSED if packed else 1)
-            check_size(path, held, math.prod(shape) * first.dtype.itemsize, more=True)
-            images = file.asarray() if whole else np.stack([page.asarray() for page in pages])
-            return images.reshape(shape), axes, _spacing(tifffile, file)
-    except MemoryError:
-        raise
-    except Exception as fault:
-        if "imagecodecs" in str(fault):
-            raise ImportError(
-                f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
-            ) from fault
-        if isinstance(fault, ValueError) and str(fault).startswith("path:"):
+    with refusing(path):
+        try:
+            with tifffile.TiffFile(path) as file:
+                return _series(path, file, tifffile)
+        except Exception as fault:
+            if "imagecodecs" in str(fault):
+                told = f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
+                raise ImportError(told) from fault
             raise
-        raise ValueError(f"path: {path} cannot be read: corrupt, cut short, or {fault}") from fault
+
+
+def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
+    pixels: dict[str, Any] = _ome_pixels(path, file, tifffile) if file.is_ome else {}
+    if not pixels:  # pages of OME may lie in other files
+        _check_last(path, file)
+    several, first = list(file.series), file.pages[0].aspage()
+    series, kinds = several[0], {(each.shape, each.dtype) for each in several}
+    one_by_one = len(several) > 1 and len(kinds) == 1 and {*series.axes} <= {*"YXS"}
+    if (len(several) > 1 and not one_by_one) or not {*series.axes} <= {*"XYZTCSQIAPRHEV"} or not first.dtype:
+        told = "; ".join(f"{each.shape} ({each.axes})" for each in several[:4])
+        raise ValueError(
+            f"path: {path} must hold one stack of images of one size and type; got {len(several)} stacks, "
+            f"and pages of {len(kinds)} kinds: {told}. Choose one, as by tifffile.imread(path, series=0)."
+        )
+    axes, shape = series.axes, series.shape
+    if one_by_one or not {*axes} - {*"YXS"}:
+        axes, shape = "I" + axes, (len(several), *shape)
+    record, further = ImageRecord(None, "", what=f"path: {path}"), [a for a in axes if a not in "YXS"]
+    if len(further) == 1 and not pixels:  # ImageJ's stacks may be of times
+        _ = record.note(f"axis {further[0]}: taken as z") if further[0] in "TC" and file.is_shaped else None
+        axes = axes.replace(further[0], "Z")
+    free = iter(letter for letter in "ZTC" if letter not in axes)
+    axes = "".join(a if a in "ZTCYXS" else next(free, a) for a in axes[::-1])[::-1]  # the fastest is z
+    pages = len(series.pages) * len(several)
+    missing = sum(page is None for page in series.pages) if pixels else 0
+    if missing:
+        record.note(f"{missing} of {pages} planes are not in the file: filled with 0")
+    if not 0 < math.prod(shape) < 2**62:
+        raise ValueError(f"path: {path} must hold images; its header says {shape}.")
+    packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
+    files = {page.parent.filehandle.path for page in series.pages if page is not None} if pixels else {path}
+    held = sum(Path(each).stat().st_size for each in files) * (MOST_COMPRESSED if packed else 1)
+    check_size(path, held, math.prod(shape) * first.dtype.itemsize * (pages - missing) // pages, more=True)
+    strips = [n for each in several for page in each.pages if page is not None for n in page.databytecounts]
+    check_size(path, held, max(strips, default=0), more=True)  # of which tifffile reads as many
+    data = np.stack([each.asarray() for each in several]) if one_by_one else series.asarray()
+    record.data, record.axes = data.reshape(shape), axes
+    record.missing = (float(first.nodata),) if "GDAL_NODATA" in first.tags else ()
+    for role, name in (("scale", "slope"), ("offset", "intercept")) if "GDAL_METADATA" in first.tags else ():
+        if found := re.search(rf'role="{role}"[^>]*>([^<]+)<', str(first.tags["GDAL_METADATA"].value)):
+            setattr(record, name, float(found[1]))
+    told = (file.imagej_metadata or {}) if file.is_imagej else {}
+    if told.get("cf") == 0:  # a line; 20 and 22 are none
+        record.slope, record.intercept = float(told.get("c1", 1)), float(told.get("c0", 0))
+    elif told.get("cf", 20) not in (20, 22):
+        record.note(f"ImageJ's calibration function {told['cf']} is not read: stored numbers are shown")
+    steps, units = _imagej_steps(told, first.tags)
+    if pixels:
+        steps = {a.lower(): float(pixels[f"PhysicalSize{a}"]) for a in "XYZ" if f"PhysicalSize{a}" in pixels}
+        units = {a.lower(): pixels.get(f"PhysicalSize{a}Unit", "µm") for a in "XYZ"}
+    if all(0 < abs(step) < math.inf for step in steps.values()):
+        record.steps, record.units = {axis: abs(step) for axis, step in steps.items()}, units
+    return record
+
+
+def _ome_pixels(path: Path, file: Any, tifffile: Any) -> dict[str, Any]:
+    """The pixels of the first image of OME's XML. Raises `ValueError` for a file of it that is not there."""
+    own = re.search(r'<OME [^>]*UUID="([^"]*)"', file.ome_metadata)
+    for name, uuid in {*re.findall(r'<UUID FileName="([^"]*)">\s*([^<\s]*)', file.ome_metadata)}:
+        is_other = own is None or uuid != own[1]
+        if is_other and (Path(name).name != name or not (path.parent / name).is_file()):
+            raise ValueError(f"path: {path} is one of several files of an image: {name} is not beside it.")
+    image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+    return (image[0] if isinstance(image, list) else image)["Pixels"]
+
+
+def _imagej_steps(told: dict[str, Any], tags: Any) -> tuple[dict[str, float], dict[str, str | None]]:
+    """Steps and units of ImageJ, which leaves out a step of 1 along z; none where it tells neither."""
+    units = {axis: told.get(f"{axis}unit", told.get("unit")) for axis in "xyz"}
+    steps = {"z": float(told.get("spacing", 1.0))} if {"spacing", "unit"} & told.keys() else {}
+    for axis in "xy" if steps else "":
+        numerator, denominator = tags[name].value if (name := f"{axis.upper()}Resolution") in tags else (0, 1)
+        steps |= {axis: denominator / numerator} if numerator > 0 else {}
+    return steps, units
 
 
 def _check_last(path: Path, file: Any) -> None:
@@ -120,19 +122,95 @@ def _check_last(path: Path, file: Any) -> None:
         raise ValueError(f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
 
 
-def _spacing(tifffile: Any, file: Any) -> dict[str, Any]:
-    """Spacing (x, y, z) as OME or ImageJ wrote it, in mm, or in its own unit if that is none of length."""
-    try:
-        if file.is_ome:
-            image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
-            told = (image[0] if isinstance(image, list) else image)["Pixels"]
-            units = [told.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XYZ"]
-            steps = [float(told[f"PhysicalSize{axis}"]) for axis in "XYZ"]
-        else:
-            told, tags = file.imagej_metadata or {}, file.pages[0].aspage().tags
-            (nx, dx), (ny, dy) = (tags[name].value for name in ("XResolution", "YResolution"))
-            units, steps = [told.get("unit", "")] * 3, [dx / nx, dy / ny, float(told["spacing"])]
-        steps = [step * LENGTHS.get(str(unit).lower(), 1.0) for step, unit in zip(steps, units, strict=True)]
-    except (KeyError, IndexError, ZeroDivisionError, TypeError, ValueError):
-        return {}
-    return {"spacing": steps} if all(0 < step < math.inf for step in steps) else {}
+def slice_files(folder: Path) -> list[Path]:
+    """The images in a folder, of the ending that most have, with numbers in their names in numeric order."""
+    images = [
+        file for file in folder.iterdir() if file.suffix.lower() in ENDINGS + PICTURES and file.is_file()
+    ]
+    kinds = [
+        [file for file in images if file.suffix.lower() in kind]
+        for kind in (ENDINGS, *((e,) for e in PICTURES))
+    ]
+    return sorted(max(kinds, key=len), key=_words)
+
+
+def _words(file: Path) -> list[Any]:
+    words: list[Any] = re.split(r"([0-9]+)", file.stem.lower())
+    words[1::2] = map(int, words[1::2])
+    return words
+
+
+def read_slices(folder: Path) -> ImageRecord:
+    """Reader for a folder of files of one image each, in the order of the numbers in their names; where two
+    of these count, one is that of channels or times. Raises `ValueError` naming the files for images of
+    different sizes or types, for a number that is missing, and for names that count in another way."""
+    files = slice_files(folder)
+    axes, counts, files = _counted(folder, files)
+    slices: list[np.ndarray] = []
+    record = ImageRecord(None, "", what=f"path: {folder}")
+    for file in files:
+        image = read_tiff(file) if file.suffix.lower() in ENDINGS else _picture(file)
+        plane = image.decode(np.asarray(image.data))[0]
+        record.steps, record.units = (record.steps, record.units) if slices else (image.steps, image.units)
+        slices.append(plane)
+        first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (slices[0], plane))
+        if (
+            image.axes not in ("ZYX", "ZYXS")
+            or first != last
+            or len(files) * plane.size > MOST_VOXELS
+            or len(plane) > 1
+        ):
+            raise ValueError(
+                f"path: each file in {folder} must hold one image of the same size and type, fewer than "
+                f"2**31 voxels in all; {files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
+            )
+    record.data = np.concatenate(slices).reshape(*counts, *slices[0].shape[1:])
+    record.axes = axes + "yxs"[: record.data.ndim - len(axes)]
+    return record
+
+
+def _picture(path: Path) -> ImageRecord:
+    """One PNG or JPEG, by Pillow."""
+    from PIL import Image
+
+    file_size(path)
+    with refusing(path), Image.open(io.BytesIO(path.read_bytes())) as image:  # lengths within it may be any
+        if image.width * image.height > path.stat().st_size * MOST_COMPRESSED:
+            raise ValueError(f"its header says {image.size}, more than its bytes can hold")
+        data = np.asarray(image)
+    return ImageRecord(data[None], "ZYX" + "S" * (data.ndim > 2))
+
+
+def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Sequence[Path]]:
+    """Axes that the names of files count, sizes along them, and the files in their order."""
+    words = {file: _words(file) for file in files}
+    patterns = Counter("#".join(each[::2]) for each in words.values())
+    elsewhere = "Put each series into a folder of its own."
+    if len(patterns) > 1 and min(patterns.values()) > 1:
+        told = ", ".join(f"{count} named {pattern}" for pattern, count in patterns.most_common(4))
+        raise ValueError(f"path: {folder} holds {len(patterns)} series of images: {told}. {elsewhere}")
+    numbers = [] if len(patterns) > 1 else [*zip(*(each[1::2] for each in words.values()), strict=True)]
+    sizes = {k: len({*column}) for k, column in enumerate(numbers) if len({*column}) > 1}
+    unique = [k for k, size in sizes.items() if size == len(files)]
+    if len(sizes) > 1 and not unique:
+        names = ([*re.findall("[a-z]+", words[files[0]][2 * k]), ""][-2:][0] for k in sizes)
+        letters = [
+            "c" if name == "w" or AXES.get(name) == "c" else "t" if AXES.get(name) == "t" else "z"
+            for name in names
+        ]
+        if len({*letters}) < len(letters) or math.prod(sizes.values()) != len(files):
+            n = max(sizes.values())
+            raise ValueError(
+                f"path: {folder} holds {len(files) // n} series of {n} images: names such as {files[0].name} "
+                f"and {files[-1].name} count by {len(sizes)} numbers. {elsewhere}"
+            )
+        return (
+            "".join(letters),
+            [*sizes.values()],
+            sorted(files, key=lambda file: [words[file][2 * k + 1] for k in sizes]),
+        )
+    steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else []
+    if len({*steps}) > 1 and min(steps) > 0:
+        before, after = files[int(np.argmax(steps))], files[int(np.argmax(steps)) + 1]
+        raise ValueError(f"path: slices are missing in {folder}: {before.name} is followed by {after.name}.")
+    return "z", [len(files)], files

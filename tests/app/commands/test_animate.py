@@ -83,6 +83,7 @@ BAD = {
     "frames": (["--frames", "0"], "--frames must be an integer from 1 to"),
     "fps": (["--fps", "0"], "--fps of a .gif must be from 0.01 to 50"),
     "fps of a gif": (["--fps", "60"], "--fps of a .gif must be from 0.01 to 50; got 60"),
+    "odd size": (["-o", "a.mp4", "--size", "15", "16"], "--size of an .mp4 must be even; got 15 x 16"),
     "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
 }
 

@@ -399,6 +399,8 @@ BAD = {
     "labels and memory": (["FILE", "--with", "FILE", "--memory", "1M"], "memory reads one volume, without"),
     "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
     "size": (["FILE", "--size", "0x5"], "size must be"),
+    "pixels": (["FILE", "--size", "40000", "40000"], "size 40000 x 40000: asks for"),
+    "colours": (["DIR/rgb.npy"], "3 values in each voxel: choose one by channel, 0 to 2"),
     "what others call light": (["FILE", "--lighting"], "--lighting. Did you mean --shade"),
     "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
     "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
@@ -415,6 +417,7 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys
     arguments, message = BAD[case]
     arguments = [a.replace("FILE", str(volume_file)).replace("DIR", str(tmp_path)) for a in arguments]
     (tmp_path / "headless.raw").write_bytes(bytes(8))
+    np.save(tmp_path / "rgb.npy", np.zeros((3, 4, 5, 3), np.uint8))
     monkeypatch.setattr("jaxvol.app.picture.render", None)  # fails if it is called
     assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
     printed = capsys.readouterr()

@@ -1,5 +1,6 @@
 """Is the picture of one line that of the command, and what is said where it shows nothing?"""
 
+import inspect
 import io
 
 import numpy as np
@@ -43,6 +44,19 @@ def test_one_line_makes_the_picture_of_the_command(case, volume_file, tmp_path, 
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(png))), imread(tmp_path / "x.png"))
 
 
+def test_without_a_display_it_writes_a_file_and_says_where(volume_file, tmp_path, drawn, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    for number in range(2):
+        with pytest.warns(UserWarning, match=rf"opens no window .*: the image is in .*jaxvol-{number}\.png"):
+            jv.show(volume_file, size=16, step=0.4)
+        assert imread(tmp_path / f"jaxvol-{number}.png").shape == (16, 16, 3)
+
+
+def test_editors_complete_its_options():
+    assert {*inspect.signature(jv.show).parameters} == {"volume", *DEFAULTS}
+
+
 def test_it_has_the_options_of_the_command():
     found = parsed(parser_of_all(), ["render", "x.raw"]).defaults
     own = {"file", "like", "config", "output", "transparent", "depth"}
@@ -64,7 +78,10 @@ def test_labels_are_shown_in_what_is_around_them(volume_file, tmp_path, drawn):
     assert data[8, 12, 12] == data[16, 12, 12] == np.max(given.data)
     assert kinds[[8, 16], 12, 12].tolist() == [1, 2]
     np.testing.assert_array_equal(data[kinds == 0], np.asarray(given.data)[kinds == 0])
-    assert main(["render", "--like", str(tmp_path / "x.png")]) == 2  # it may name no other file
+    like = ["render", "--like", str(tmp_path / "x.png"), "-o", str(tmp_path / "y.png")]
+    assert main(like) == 2  # it may name no other file
+    assert main([*like, "--labels", str(tmp_path / "labels.npy")]) == 0
+    np.testing.assert_array_equal(imread(tmp_path / "x.png"), imread(tmp_path / "y.png"))
 
 
 def test_several_volumes_are_in_one_picture(volume_file, tmp_path, drawn):

@@ -14,11 +14,19 @@ import tempfile
 import time
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
+import h5py
+import mrcfile
+import nibabel
 import numpy as np
 import tensorstore  # noqa: F401  (before the limit of memory is set)
 import tifffile
+import vtk
+import xarray
 import zarr
+from PIL import Image
+from vtk.util.numpy_support import numpy_to_vtk  # pyright: ignore[reportMissingImports]
 
 import jaxvol as jv
 from jaxvol import bricks
@@ -109,6 +117,67 @@ def ome_zarr(folder):
     return folder / "a.zarr"
 
 
+def vtk_grid(data):
+    image = vtk.vtkImageData()
+    image.SetDimensions(*data.shape)
+    image.GetPointData().SetScalars(numpy_to_vtk(data.ravel(order="F").copy(), deep=True))
+    return image
+
+
+def vtk_image(ending, mode: Any = "Ascii", compress: Any = False):
+    def write(folder):
+        is_xml = ending == ".vti"
+        writer = vtk.vtkXMLImageDataWriter() if is_xml else vtk.vtkStructuredPointsWriter()
+        writer.SetFileName(str(folder / f"a{ending}"))
+        writer.SetInputData(vtk_grid(ramp("int16")))
+        if is_xml:
+            getattr(writer, f"SetDataModeTo{mode}")()
+            getattr(writer, f"SetCompressorTypeTo{'ZLib' if compress else 'None'}")()
+        else:
+            getattr(writer, f"SetFileTypeTo{'Binary' if mode != 'Ascii' else 'ASCII'}")()
+        writer.Write()
+        return folder / f"a{ending}"
+
+    return write
+
+
+def hdf5(folder):
+    with h5py.File(folder / "a.h5", "w") as file:
+        file.create_dataset("v", data=ramp("int16"), chunks=(2, 4, 3), compression="gzip")
+    return folder / "a.h5"
+
+
+def netcdf(engine):
+    def write(folder):
+        variable = xarray.DataArray(ramp("int16"), dims=("x", "y", "z"), coords={"x": np.arange(5.0)})
+        kind = "NETCDF3_64BIT" if engine == "scipy" else "NETCDF4"
+        xarray.Dataset({"v": variable}).to_netcdf(folder / "a.nc", engine=engine, format=kind)
+        return folder / "a.nc"
+
+    return write
+
+
+def mrc(folder):
+    with mrcfile.new(folder / "a.mrc") as file:
+        file.set_data(ramp("int16"))
+        file.voxel_size = 1.5
+    return folder / "a.mrc"
+
+
+def nibabel_image(kind, ending):
+    def write(folder):
+        nibabel.save(kind(ramp("float32"), np.diag([-1.0, 2, 3, 1])), folder / f"a{ending}")
+        return folder / f"a{ending}"
+
+    return write
+
+
+def pictures(folder):
+    for z in range(3):
+        Image.fromarray(ramp()[:, :, z]).save(folder / f"{z}.png")
+    return folder
+
+
 def loaded(path):
     return jv.load(path).data.size
 
@@ -128,6 +197,12 @@ FILES = [
     (tiff(), loaded),
     *((tiff(compression=how), loaded) for how in ("zlib", "lzw")),
     (tiff(imagej=True, metadata={"spacing": 2.0}), loaded),
+    (tiff(ome=True, metadata={"axes": "ZYX", "PhysicalSizeX": 2.0}), loaded),
+    *((vtk_image(".vti", *how), loaded) for how in (("Ascii",), ("Binary", True), ("Appended",))),
+    *((vtk_image(".vtk", mode), loaded) for mode in ("Ascii", "Binary")),
+    *((kind, loaded) for kind in (hdf5, netcdf("scipy"), netcdf("h5netcdf"), mrc, pictures)),
+    (nibabel_image(nibabel.AnalyzeImage, ".img"), loaded),
+    (nibabel_image(nibabel.MGHImage, ".mgz"), loaded),
     (ultrasound, lambda path: jv.load_ultrasound(path)[0].data.size),
     *((kind, in_bricks) for kind in (raw, npy, zarr_array(2), zarr_array(3), ome_zarr)),
 ]

@@ -159,7 +159,7 @@ BAD_FILES = {
     "npz with a flipped byte": ("a.npz", flipped(zipped(data=NPY), 170), r"a\.npz cannot be read.*CRC"),
     "npy empty": ("a.npy", b"", r"empty \(0 bytes\)"),
     "npy cut short": ("a.npy", NPY[:-1], "cut short: it holds 59 .*says 60"),
-    "unknown ending": ("a.vti", b"II*", r"unknown ending; .*\.npy.*\.raw\.gz"),
+    "unknown ending": ("a.xyz", b"II*", r"unknown ending; .*\.npy.*\.raw\.gz"),
     "empty": (RAW, b"", r"empty \(0 bytes\)"),
     "no header": ("a.raw", b"12", r"shape=.*name_XxYxZ_dtype\.raw.*a\.raw\.json"),
     "unknown dtype": ("a_5x4x3_rgb8.raw", b"1", "dtype must be uint8.*got 'rgb8'"),
@@ -205,7 +205,7 @@ def test_bad_paths_and_arguments_are_refused(tmp_path):
     for shape in ((5, 4), (5, 4, 3, 1), (5, 4, -3), (5.0, 4.0, 3.0), "543", 60, np.array(3)):
         with pytest.raises(ValueError, match="shape must be three positive integers"):
             load(path, shape=shape, dtype="uint8")
-    for dtype in ("uchar", "int32", "uint8xe", "le", "", 8, np.int64, np.dtype(">i2")):
+    for dtype in ("uchar", "int128", "uint8xe", "le", "", 8, np.complex64, np.dtype(">i2")):
         with pytest.raises(ValueError, match="dtype must be uint8"):
             load(path, shape=SHAPE, dtype=dtype)
     np.save(tmp_path / "a.npy", ramp())
@@ -249,7 +249,7 @@ def test_voxels_that_are_nan_or_infinite_are_refused_or_replaced_by_every_reader
 
 BAD_JSON = [
     ("{", "a.json is not JSON"),
-    ("[" * 100_000, "a.json is not JSON"),
+    ("[" * 5000, "a.json is not JSON"),
     ("\xff", "a.json is not JSON"),
     ("[5, 4, 3]", "must be a JSON object.*got list"),
     ('{"size": [5, 4], "type": "uint8"}', r"shape must be.*got \[5, 4\]"),
@@ -288,7 +288,8 @@ def test_neither_a_file_nor_a_header_takes_memory_that_the_other_does_not_back(t
 
 
 @pytest.mark.parametrize(
-    ("module", "ending"), [("SimpleITK", ".nrrd"), ("SimpleITK", ".dcm"), ("tifffile", ".tiff")]
+    ("module", "ending"),
+    [("nibabel", ".nii"), ("pydicom", ".dcm"), ("tifffile", ".tiff"), ("mrcfile", ".mrc"), ("xarray", ".h5")],
 )
 def test_a_missing_library_says_how_to_install_it(tmp_path, monkeypatch, module, ending):
     monkeypatch.setitem(sys.modules, module, None)

@@ -187,7 +187,7 @@ def test_directions_that_a_file_has_rounded_are_taken_as_meant(tmp_path, digits)
     path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text}")
     np.testing.assert_allclose(np.asarray(load(path).direction), meant, atol=1e-6)
     path = write_mhd(tmp_path / "a.mhd", bytes(24), f"TransformMatrix = {text.replace('0.7', '0.8')}")
-    with pytest.raises(ValueError, match="TransformMatrix must be three directions of length 1"):
+    with pytest.raises(ValueError, match="its place must be three directions of length 1"):
         load(path)
 
 

@@ -1,0 +1,66 @@
+"""Names of units of length and of axes, as files and libraries spell them."""
+
+import re
+import unicodedata
+from collections.abc import Callable, Sequence
+
+from .checks import shortened
+
+
+PREFIXES = {"kilo": 1e6, "": 1e3, "deci": 100.0, "centi": 10.0, "milli": 1.0, "micro": 1e-3, "nano": 1e-6}
+PREFIXES |= {"pico": 1e-9, "femto": 1e-12}
+LENGTHS = {f"{prefix}meter": length for prefix, length in PREFIXES.items()}
+LENGTHS |= dict(zip(("km", "m", "dm", "cm", "mm", "μm", "nm", "pm", "fm"), PREFIXES.values(), strict=True))
+LENGTHS |= {"um": 1e-3, "mum": 1e-3, "mcm": 1e-3, "mc": 1e-3, "micron": 1e-3, "μ": 1e-3, "μ meter": 1e-3}
+LENGTHS |= {"å": 1e-7, "ang": 1e-7, "angstrom": 1e-7, "ångström": 1e-7, "ångstrom": 1e-7, "a": 1e-7}
+LENGTHS |= dict.fromkeys(("in", "inch", "inche", '"'), 25.4) | dict.fromkeys(("ft", "foot", "feet"), 304.8)
+LENGTHS |= {"yd": 914.4, "yard": 914.4, "mi": 1609344.0, "mile": 1609344.0, "thou": 0.0254, "mil": 0.0254}
+LENGTHS |= {"li": 25.4 / 12, "pt": 25.4 / 72}
+"""Units of length in mm, in small letters, without a plural's s."""
+
+NAMES = {
+    "x": "x lon longitude i col column width w easting rlon right-left left-right",
+    "y": "y lat latitude j row length northing rlat anterior-posterior posterior-anterior",
+    "z": "z lev level k depth alt altitude slice plane page elevation plev layer inferior-superior",
+    "t": "t time frame timepoint date acquisition repetition",
+    "c": "c channel ch band component wavelength color colour e lambda",
+    "s": "s sample rgb rgba",
+}
+AXES = {name: letter for letter, names in NAMES.items() for name in names.split()}
+"""The letter of an axis by its name in small letters, without a plural's s."""
+
+
+def length_of(unit: str | None) -> float | None:
+    """The length of a unit in mm; None for an unknown one, such as "pixel", and for none."""
+    name = str(unit or "").replace("\\u00b5", "μ").replace("\\u00B5", "μ")
+    name = unicodedata.normalize("NFKC", name).strip().strip(".'").lower().replace("metre", "meter")
+    return next((LENGTHS[word] for word in (name, name.removesuffix("s")) if word in LENGTHS), None)
+
+
+def axis_letters(what: str, names: Sequence[str], note: Callable[[str], None]) -> str:
+    """The letter of each axis: x, y and z of space, t of time, c of channels, s of values in a voxel.
+
+    Where as many names are unknown as axes of space are missing, they are taken as these in order, and so
+    are three of which none is known. `note` is told so, but of names that only count. Raises `ValueError`,
+    which begins with `what`, for an axis that is not known otherwise, and for two of one kind.
+    """
+    words = [str(name).strip().lower() for name in names]
+    found: list[str | None] = [AXES.get(word) or AXES.get(word.removesuffix("s")) for word in words]
+    if "height" in words:  # of an image, or above the ground
+        found[words.index("height")] = "y" if "y" not in found else "z"
+    missing = [letter for letter in "xyz" if letter not in found]
+    if len(words) == len(missing) == 3:
+        found = [None] * 3
+    unknown = [at for at, letter in enumerate(found) if letter is None]
+    if unknown and len(unknown) == len(missing):
+        for at, letter in zip(unknown, missing, strict=True):
+            found[at] = letter
+        if not all(re.fullmatch(r"(dim|axis|phony_dim)_?\d+", words[at]) for at in unknown):
+            note(f"axes {', '.join(repr(str(names[at])) for at in unknown)}: taken as {', '.join(missing)}")
+    letters = "".join(letter or "?" for letter in found)
+    if "?" in letters or len({*letters}) < len(letters):
+        raise ValueError(
+            f"{what} must have axes named such as x, y, z, time and channel, each once; got "
+            f"{shortened(', '.join(map(str, names)))}. Rename or choose among them first."
+        )
+    return letters
