@@ -161,7 +161,16 @@ SEAMS = {
 }
 
 
-STATIC = "joins", "ends_at_exit", "tested_every", "valid", "block_side", "rules", "reads_labels"
+STATIC = (
+    "joins",
+    "ends_at_exit",
+    "tested_every",
+    "valid",
+    "block_side",
+    "rules",
+    "reads_labels",
+    "leaves_gaps",
+)
 
 
 @cache

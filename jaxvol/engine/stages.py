@@ -191,8 +191,8 @@ def _start(
     fault: Bool[Array, ""],
     tiling: Tiling,
 ) -> Started:
-    """Cuts the rays of a tile to the volume. `corners`: whether those at the corners of a beam bound it, as of
-    a camera's."""
+    """Cuts the rays of a tile to the volume. `corners`: whether those at the corners of a beam bound it, as
+    they do of a camera."""
     x, y, z = line.origin
     line = line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z))
     rays = entering(seams.locate(place), line, wanted, tiling.searched)

@@ -97,6 +97,12 @@ class Transform(eqx.Module):
         return rules if plain else None
 
     @property
+    def leaves_gaps(self) -> bool:
+        """Whether rays may leave the volume and come back, by its `locate` or `clip`."""
+        seams = "locate", "clip"
+        return any(getattr(type(self), seam) is not getattr(Transform, seam) for seam in seams)
+
+    @property
     def reads_labels(self) -> bool:
         """Whether `cut` reads the volume's labels."""
         return False
@@ -322,9 +328,8 @@ class March(eqx.Module):
             if answer is None:
                 return replace(plain, custom=self.transforms)
             found = answer
-        # rays have gaps only where a transform places or clips the volume
-        gaps = self.overriding("locate") or self.overriding("clip")
-        return found if gaps or self.reads_labels else replace(found, divide=None)
+        divided = self.reads_labels or any(transform.leaves_gaps for transform in self.transforms)
+        return found if divided else replace(found, divide=None)
 
     @property
     def reads_labels(self) -> bool:

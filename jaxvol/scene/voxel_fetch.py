@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
-from jaxtyping import Array, Bool, Float, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.vec3 import Scalar, Vec3
@@ -23,6 +23,9 @@ from ..xla.platform import on_gpu
 
 
 T = TypeVar("T")
+
+Voxels: TypeAlias = Any
+"""An array (nx, ny, nz) or (nx, ny, nz, channels); None where a `Packed` copy holds them."""
 
 Voxel: TypeAlias = Any
 """A number; of a volume of several channels, a tuple of numbers."""
@@ -58,7 +61,7 @@ class Fetch(eqx.Module):
     one node meet the voxels of another. It takes 1 to 4 % of a gradient."""
 
     @abstractmethod
-    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
         """The eight voxels from this one of the array on, along its axes."""
 
     @property
@@ -66,12 +69,12 @@ class Fetch(eqx.Module):
         """Those of `Window`."""
         return XYZ if self.window is None else self.window.axes
 
-    def cube(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> tuple[Cube, Vec3]:
+    def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
         node, fraction = self.split(data, coordinate)
         return transposed(self.cube_at(data, node, coordinate[0].dtype), self.axes), fraction
 
-    def interpolated(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> Voxel:
+    def interpolated(self, data: Voxels, coordinate: Vec3) -> Voxel:
         """Trilinear interpolation at a grid coordinate."""
         return trilinear(*self.cube(data, coordinate))
 
@@ -79,14 +82,14 @@ class Fetch(eqx.Module):
         """Numbers of voxels along the axes of the array."""
         return data.shape
 
-    def shape(self, data: Shaped[Array, "nx ny nz *c"]) -> tuple[int, int, int]:
+    def shape(self, data: Voxels) -> tuple[Any, Any, Any]:
         """Number of nodes of the grid."""
         if self.window is not None:
             return self.window.whole
         nx, ny, nz = data.shape[:3]
         return nx, ny, nz
 
-    def split(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> tuple[Node, Vec3]:
+    def split(self, data: Voxels, coordinate: Vec3) -> tuple[Node, Vec3]:
         """The node of the array below a grid coordinate, along its axes, and the fractions past it, along
         x, y, z."""
         if self.steady:
@@ -101,7 +104,7 @@ class Fetch(eqx.Module):
         i, j, k = (jnp.clip(index, 0, n - 2) for index, n in zip(past, data.shape[:3], strict=True))
         return (i, j, k), fraction
 
-    def nearest(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+    def nearest(self, data: Voxels, coordinate: Vec3) -> Int[Array, ""]:
         """The node nearest to a grid coordinate, as an index into the flattened array; -1 outside of the
         grid."""
         node, inside = [jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate], jnp.array(True)
@@ -112,7 +115,7 @@ class Fetch(eqx.Module):
             node = [jnp.clip(index, 0, n - 1) for index, n in zip(past, data.shape, strict=True)]
         return jnp.where(inside, flat_index((node[0], node[1], node[2]), data.shape), -1)
 
-    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+    def base(self, data: Voxels, coordinate: Vec3) -> Int[Array, ""]:
         """The node below a grid coordinate, as an index into the flattened array."""
         return flat_index(self.split(data, coordinate)[0], data.shape)
 
@@ -121,7 +124,7 @@ class Fetch(eqx.Module):
         on one thread, unless it is given in memory."""
         return self
 
-    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+    def slopes(self, data: Voxels, coordinate: Vec3) -> Vec3:
         """Slopes along x, y and z at a grid coordinate, in value units per node (`Volume.gradient`)."""
         node, fraction = self.split(data, coordinate)
         slopes = [self._slopes_of_nodes(data, node, axis, coordinate[0].dtype) for axis in range(3)]
@@ -132,7 +135,7 @@ class Fetch(eqx.Module):
         found = [trilinear(transposed(cube, self.axes), fraction) for cube in slopes]
         return permuted(found, inverse(self.axes))
 
-    def _slopes_of_nodes(self, data: Shaped[Array, "nx ny nz"], node: Node, axis: int, dtype: Any) -> Cube:
+    def _slopes_of_nodes(self, data: Voxels, node: Node, axis: int, dtype: Any) -> Cube:
         """Slopes along an axis of the array of the eight nodes from this one on."""
 
         def neighbours(offset: int) -> Cube:
@@ -206,14 +209,14 @@ class Nodes(Fetch):
 class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
-    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
         return voxels_from(data, node, dtype)
 
 
 class Zeros(Fetch):
     """Zeros in place of the voxels, to find out what reads these otherwise."""
 
-    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
         return cube_of(lambda *_: _zero_voxel(data, (), dtype))
 
 
@@ -232,11 +235,11 @@ class Packed(Fetch):
     kind: str | None = eqx.field(static=True, default=None)
     """Type of the voxels; None: theirs."""
 
-    def unshaped(self, data: Shaped[Array, "nx ny nz"]) -> "Packed":
+    def unshaped(self, data: Voxels) -> "Packed":
         """The same fetch without the voxels."""
         return replace(self, sizes=np.asarray(data.shape, np.int32), kind=str(data.dtype))
 
-    def shape(self, data: Shaped[Array, "nx ny nz *c"]) -> tuple[Any, Any, Any]:
+    def shape(self, data: Voxels) -> tuple[Any, Any, Any]:
         if self.sizes is None:
             return super().shape(data)
         return self.sizes[0], self.sizes[1], self.sizes[2]
@@ -244,13 +247,13 @@ class Packed(Fetch):
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
         return replace(self, begin=begin)
 
-    def base(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Int[Array, ""]:
+    def base(self, data: Voxels, coordinate: Vec3) -> Int[Array, ""]:
         return flat_index(self.split(data, coordinate)[0], self._stored(data))
 
     def _stored(self, data: Any) -> tuple[Any, ...]:
         return data.shape if self.sizes is None else self.shape(data)
 
-    def cube_at(self, data: Shaped[Array, "nx ny nz"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
         _, ny, nz = self._stored(data)
         base = flat_index(node, self._stored(data))
         kind = np.dtype(data.dtype if self.kind is None else self.kind)
@@ -270,7 +273,7 @@ class Packed(Fetch):
 
         return [row(base), row(base + ny * nz)]
 
-    def slopes(self, data: Shaped[Array, "nx ny nz"], coordinate: Vec3) -> Vec3:
+    def slopes(self, data: Voxels, coordinate: Vec3) -> Vec3:
         nodes = self.nodes
         if nodes is None:
             return super().slopes(data, coordinate)
@@ -319,11 +322,11 @@ class Recording(Fetch):
     state: Any = eqx.field(static=True, default_factory=lambda: _trace_state())
     """Of JAX, where recording began."""
 
-    def cube_at(self, data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
         cube = voxels_from(data, node, dtype)
         return self._perturbed(cube, Fetched(flat_index(node, data.shape)))
 
-    def interpolated(self, data: Shaped[Array, "nx ny nz *c"], coordinate: Vec3) -> Voxel:
+    def interpolated(self, data: Voxels, coordinate: Vec3) -> Voxel:
         node, fraction = self.split(data, coordinate)
         cube = voxels_from(data, node, coordinate[0].dtype)
         along = permuted(fraction, self.axes)
@@ -348,7 +351,7 @@ def _trace_state() -> Any:
     return home.get_opaque_trace_state()
 
 
-def perturbations_of(data: Shaped[Array, "nx ny nz *c"], fetched: list[Fetched], dtype: Any) -> list[Any]:
+def perturbations_of(data: Voxels, fetched: list[Fetched], dtype: Any) -> list[Any]:
     """Perturbations of 0 for what was fetched from an array."""
 
     def zeros(each: Fetched) -> Any:
@@ -358,7 +361,7 @@ def perturbations_of(data: Shaped[Array, "nx ny nz *c"], fetched: list[Fetched],
     return [zeros(each) for each in fetched]
 
 
-def _zero_voxel(data: Shaped[Array, "nx ny nz *c"], shape: tuple[int, ...], dtype: Any) -> Voxel:
+def _zero_voxel(data: Voxels, shape: tuple[int, ...], dtype: Any) -> Voxel:
     zero = jnp.zeros(shape, dtype)
     return (zero,) * data.shape[3] if data.ndim > 3 else zero
 
@@ -416,7 +419,7 @@ def _rows(parts: Sequence[Array]) -> Float[Array, "batch parts"]:
     return jnp.stack([part.reshape(-1) for part in parts], axis=-1)
 
 
-def voxels_from(data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> Cube:
+def voxels_from(data: Voxels, node: Node, dtype: Any) -> Cube:
     """The eight voxels from a node on, each number fetched by itself."""
     (_, ny, nz, *channels), base, flat = data.shape, flat_index(node, data.shape), data.reshape(-1)
 
@@ -430,14 +433,14 @@ def voxels_from(data: Shaped[Array, "nx ny nz *c"], node: Node, dtype: Any) -> C
     return cube_of(voxel)
 
 
-def flat_index(node: Node, shape: tuple[int, ...]) -> Int[Array, "..."]:
+def flat_index(node: Node, shape: tuple[Any, ...]) -> Int[Array, "..."]:
     """The index of a node into the flattened array."""
     i, j, k = node
     _, ny, nz, *_ = shape
     return (i * ny + j) * nz + k
 
 
-def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
+def corners(coordinate: Vec3, shape: tuple[Any, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
     """The eight nodes around a coordinate: the index of each into the flattened array, and its weight."""
     node, fraction = split(coordinate, shape)
     base, (_, ny, nz), found = flat_index(node, shape), shape, []
@@ -447,7 +450,7 @@ def corners(coordinate: Vec3, shape: tuple[int, ...]) -> list[tuple[Int[Array, "
     return found
 
 
-def split(coordinate: Vec3, shape: tuple[int, ...]) -> tuple[Node, Vec3]:
+def split(coordinate: Vec3, shape: tuple[Any, ...]) -> tuple[Node, Vec3]:
     """The node below a coordinate, and the fractions past it; the last node belongs to the cell below."""
     (i, fx), (j, fy), (k, fz) = (_below(c, n) for c, n in zip(coordinate, shape, strict=True))
     return (i, j, k), (fx, fy, fz)
@@ -475,7 +478,7 @@ def _below(coordinate: Scalar, n: Any) -> tuple[Int[Array, "..."], Scalar]:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _steady_split(coordinate: Vec3, live: Bool[Array, ""], shape: tuple[int, ...]) -> tuple[Node, Vec3]:
+def _steady_split(coordinate: Vec3, live: Bool[Array, ""], shape: tuple[Any, ...]) -> tuple[Node, Vec3]:
     """As `split`, for `Fetch.steady`. `live`: as for `in_memory`."""
     return split(coordinate, shape)
 

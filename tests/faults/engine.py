@@ -1,10 +1,10 @@
 """Faults of the march, its transforms, the fast engine and its gradients."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+
+from jaxvol.ray import NEVER
 
 from . import Fault
 
@@ -15,14 +15,14 @@ SEVERAL = (
 )
 
 
-def shifting_again(move):
-    """`move`, after which the next transparent cell shifts the ray, too."""
+def a_cell_later(shifted):
+    """`_shifted`, one cell too late."""
 
-    def moved(march, ray, at, transparent, steps):
-        found = move(march, ray, at, transparent, steps)
-        return found if at.shift is None else replace(found, shift=at.shift)
+    def found(*given):
+        cell = shifted(*given)
+        return jnp.where(cell < NEVER, cell + 1, cell)
 
-    return moved
+    return found
 
 
 def whole_at_the_exit(cut):
@@ -36,21 +36,21 @@ def whole_at_the_exit(cut):
     return pieces
 
 
-def later(visit):
-    """`visit`, by which the first visible cell is found four too late."""
+def later(widened):
+    """`widened`, by which the first visible cell is found four too late."""
 
-    def visited(self, ray, at, samples, given, carry, total):
-        found, *rest = visit(self, ray, at, samples, given, carry, total)
-        return found._replace(first=jnp.where(found.first < carry.first, found.first + 4, carry.first)), *rest
+    def found(self, at, samples):
+        wider = widened(self, at, samples)
+        return wider._replace(first=jnp.where(wider.first < self.first, wider.first + 4, self.first))
 
-    return visited
+    return found
 
 
 MARCH = "march/test_march.py::"
 FAULTS: list[Fault] = [
     Fault(
         "quadrature: midpoint samples at the front of cells",
-        "march.march:March.sample",
+        "march.march:CellRules.sample",
         lambda _: lambda self, cell: cell.front,
         (f"{MARCH}test_midpoint_samples_only_inside",),
     ),
@@ -61,15 +61,15 @@ FAULTS: list[Fault] = [
         (f"{MARCH}test_cells_reach_past_the_exit_unless_they_are_cut_there",),
     ),
     Fault(
-        "shift: at every transparent cell",
-        "ray:move",
-        shifting_again,
+        "shift: a cell too late",
+        "engine.shifts:_shifted",
+        a_cell_later,
         (f"{MARCH}test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty",),
     ),
     Fault(
-        "shift: segments are taken as a whole although rays may still shift",
-        "engine.wavefront:Job.shifts",
-        lambda _: lambda self, at: jnp.zeros_like(at.finished),
+        "shift: rays do not shift",
+        "engine.shifts:find_shifts",
+        lambda _: lambda scene, rays, at, tiling: at,
         (
             "test_agreement.py::"
             "test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_independent_marcher",
@@ -77,8 +77,8 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "stop: rays end while their transmittance is high",
-        "march.transforms.early_termination:EarlyTermination.stop",
-        lambda _: lambda self, stopped, transmittance: stopped | (transmittance >= self.opacity_left),
+        "march.march:CellRules.stop",
+        lambda _: lambda self, transmittance: transmittance >= self.opacity_left,
         (f"{MARCH}test_early_termination_stops_where_little_is_left",),
     ),
     Fault(
@@ -86,6 +86,12 @@ FAULTS: list[Fault] = [
         "march.transforms.alpha_correction:AlphaCorrection.cut",
         lambda _: lambda self, cell, ray, volume: (cell,),
         ("march/transforms/test_alpha_correction.py::test_a_cell_is_cut_at_the_exit",),
+    ),
+    Fault(
+        "cut: marched cells reach past the exit",
+        "march.march:CellRules.cut",
+        lambda _: lambda self, cell, ray, volume: (cell,),
+        ("test_invariants.py::test_a_constant_volume_is_exact_at_any_step_under_alpha_correction",),
     ),
     Fault(
         "cut: a cell that ends at the exit does not move with it",
@@ -143,7 +149,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "leap: the second march begins four cells too late",
-        "engine.wavefront:VisibleRangeRecorder.visit",
+        "engine.wavefront:CellRange.widened",
         later,
         ("engine/test_gradients.py::test_leaps_show_in_no_image_and_no_gradient",),
     ),

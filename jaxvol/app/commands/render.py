@@ -11,8 +11,8 @@ from ..._util.srgb import displayed
 from ...io.display import image_file, save_image
 from ...scene.labels import LabelTransferFunction
 from ...scene.rendering import Rendering
-from ...xla.persistent_cache import keep_programs_by_default
 from ...scene.volume import Volume
+from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import Scene, scene_of, with_march
 from ..progress import progress
 from ..recorded import text_of_options

@@ -74,6 +74,10 @@ class Clip(Transform):
         box = jnp.array([0.0, 1.0] * 3) if self.box is None else self.box
         return jnp.all(box[0::2] < box[1::2]) & jnp.all(jnp.any(self.normals != 0, axis=1))
 
+    @property
+    def leaves_gaps(self) -> bool:
+        return self.inside_out
+
     def clip(self, space: Space) -> Space:
         origins, normals = [*self.origins], [*self.normals]
         if self.box is not None:

@@ -1,0 +1,109 @@
+"""Is an image in stages that of one program? Does one march serve all images that differ by numbers alone?"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxvol as jv
+from jaxvol.engine import stages
+from jaxvol.scene.voxel_fetch import split
+from jaxvol.xla.packing import Layout
+
+from ..scenes import around
+
+
+ALL = (
+    jv.Jitter(3),
+    jv.EmptySpaceJitter(4),
+    jv.AlphaCorrection(),
+    jv.SpaceLeaping(),
+    jv.EarlyTermination(0.02),
+)
+
+
+def ball(shape=(20, 18, 16), dtype=np.uint8):
+    """A volume with empty space around a soft ball."""
+    place = np.stack(np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij"))
+    values = np.clip(1.2 - 1.5 * np.sqrt((place**2).sum(0)), 0, 1)
+    return jv.Volume((255 * values).astype(dtype), [2 / n for n in shape])
+
+
+def function(points):
+    """A transfer function with this number of points, transparent below a fifth."""
+    values = np.linspace(0, 255, points)
+    return jv.TransferFunction(
+        values, np.linspace([1, 0, 0], [0, 0.5, 1], points), np.maximum(values / 50 - 1, 0)
+    )
+
+
+def test_one_march_serves_all_images_whose_differences_are_numbers(monkeypatch):
+    marched, march_rays = [], stages.march_rays
+    monkeypatch.setattr(stages, "march_rays", lambda *a, **k: marched.append(1) or march_rays(*a, **k))
+
+    def image(volume, size=(24, 20), points=5, transforms=ALL, step=0.05, quadrature="left", **how):
+        camera = jv.Camera.looking_at(volume, (0.3, -1, 0.4), size=size)
+        rendering = jv.render(volume, function(points), camera, jv.March(step, transforms, quadrature), **how)
+        assert float(rendering.rgba[..., 3].max()) > 0.3
+        return rendering
+
+    image(ball())
+    marched.clear()
+    image(ball(), (31, 47), 8, ALL[2:], 0.08, "midpoint")
+    image(ball((22, 17, 19)), (25, 25), 2, (), 0.03)
+    image(ball(), transforms=ALL[:1] + ALL[3:])
+    image(ball(), antialias=2, until=np.full((20, 24), 99.0))
+    image(ball(), transforms=(*ALL[1:4], jv.Clip((-9, 9, -9, 1, -9, 9))))
+    jv.render(ball(), function(5), around(ball(), (24, 20)).crop(2, 3, 20, 9), jv.March(0.05, ALL))
+    assert not marched
+    image(ball(), quadrature="preintegrated")
+    assert len(marched) == 1
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16])
+def test_an_image_of_several_tiles_is_that_of_one_program(dtype):
+    volume, camera = ball(dtype=dtype), around(ball(), (160, 150))
+    march = jv.March(0.06, ALL, "midpoint")
+    staged = jv.render(volume, function(5), camera, march)
+    whole = jax.jit(lambda v, t, c: jv.render(v, t, c, march))(volume, function(5), camera)
+    assert stages.RayTiles.shared(camera, stages.Tiling()) == (256, 2)
+    assert float(whole.rgba[..., 3].max()) > 0.9
+    for name in ("rgba", "depth", "aligned", "exhausted"):
+        np.testing.assert_allclose(getattr(staged, name), getattr(whole, name), atol=1e-6)
+
+
+def test_a_node_read_from_the_bits_of_a_float_is_the_one_below():
+    at = np.array([-3, -0.0, 0.3, 1, 6.9999995, 7, 8.5, 9, 9.2, 1e9, np.inf, np.nan], np.float32)
+    (node, *_), (fraction, *_) = jax.jit(jax.vmap(lambda c: split((c, c, c), (10, 10, 10))))(at)
+    inside = np.clip(at, 0, 9)
+    known = np.minimum(np.floor(inside[:-1]), 8)
+    np.testing.assert_array_equal(node[:-1], known)
+    np.testing.assert_array_equal(fraction[:-1], inside[:-1] - known)
+    assert 0 <= node[-1] <= 8
+    assert np.isnan(fraction[-1])
+
+
+def test_what_is_packed_is_unpacked_taken_and_put():
+    rng = np.random.default_rng(0)
+    tree = {
+        "float": rng.normal(size=(6, 4)).astype(np.float32),
+        "vector": rng.normal(size=(6, 4, 3)).astype(np.float32),
+        "integer": rng.integers(-(2**31), 2**31 - 1, (6, 4)).astype(np.int32),
+        "truth": rng.random((6, 4)) < 0.5,
+        "none": None,
+    }
+
+    @jax.jit
+    def turned(tree):
+        packed = Layout.of(tree).pack(tree)
+        rows = jnp.array([4, 1, 6])  # the last one is none
+        taken = packed.take(jnp.minimum(rows, 5)).tree
+        return packed.tree, taken, packed.put(rows, jax.tree.map(lambda leaf: leaf[::-1], taken)).tree
+
+    same, taken, put = turned(tree)
+    jax.tree.map(np.testing.assert_array_equal, same, tree)
+    for name in ("float", "vector", "integer", "truth"):
+        whole, rows = tree[name].copy(), tree[name][[4, 1, 5]].reshape(12, *tree[name].shape[2:])
+        np.testing.assert_array_equal(taken[name], rows)
+        whole[[4, 1]] = rows[::-1].reshape(3, 4, *rows.shape[1:])[:2]
+        np.testing.assert_array_equal(put[name], whole)
