@@ -11,7 +11,7 @@ same functions, as a part of that.
 
 import weakref
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -44,7 +44,7 @@ from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
 from .wavefront import Marched, Recorded, blinded, march_rays
 
 
-program: Any = partial(eqx.filter_jit, compiler_options=OPTIONS)
+program: Any = partial(cast(Any, eqx.filter_jit), compiler_options=OPTIONS)
 
 
 class Started(NamedTuple):
@@ -69,15 +69,15 @@ class Kernel(NamedTuple):
     @property
     def scene(self) -> Scene:
         """The scene for the functions of `ray`."""
-        volume, transfer, rules, *rest = self
-        march: Any = rules
-        _, lighting, space = rest
-        if lighting is None or space is None:
-            classification = classification_of(transfer, volume, integrated=rules.integrates)
+        integrated = self.rules.integrates
+        if self.lighting is None or self.space is None:
+            classification = classification_of(self.transfer, self.volume, integrated=integrated)
         else:
-            given = volume, transfer, space, lighting
-            classification = lit_classification(*given, integrated=rules.integrates)
-        return Scene(*self[:2], None, march, *rest, classification)
+            given = self.volume, self.transfer, self.space, self.lighting
+            classification = lit_classification(*given, integrated=integrated)
+        march, space, mode = cast(Any, self.rules), cast(Any, self.space), self.compositing
+        parts = self.volume, self.transfer, None, march, mode, self.lighting, space, classification
+        return Scene(*parts)
 
 
 class Passed(NamedTuple):
@@ -251,7 +251,9 @@ def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex
 
 def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     scene, acceleration = given
-    (leap, *seams), blocks, transfer = scene.march.transforms, acceleration.blocks, scene.transfer
+    transforms: tuple[Any, ...] = scene.march.transforms
+    transfer: Any = scene.transfer
+    (leap, *seams), blocks = transforms, acceleration.blocks
     usual = type(scene.compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
     whole = isinstance(blocks, Blocks) and scene.volume.field is None and scene.volume.first is None
     known = whole and not blocks.low.committed and platform() == "cpu"
