@@ -4,7 +4,7 @@ Transfer functions are such functions of a volume's value. A table has one row f
 all that values from this point up to the next one need: see `TransferFunction.rows`.
 """
 
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -73,7 +73,8 @@ def points_below(
 def points_around(values: Any, low: Any, high: Any) -> Range:
     """The control points from `low` to `high`, and the next ones around; in NumPy, of NumPy arrays."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
-    xp, below = (np, _points_below) if isinstance(values, np.ndarray) else (jnp, points_below)
+    known = isinstance(values, np.ndarray)
+    xp, below = np if known else jnp, cast(Any, _points_below if known else points_below)
     first = xp.maximum(below(values, low) - 1, 0)
     # the first point at or above `high`; the second of two points at `high`
     last = xp.maximum(below(values, high, strictly=True), below(values, high) - 1)

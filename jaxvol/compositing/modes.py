@@ -30,6 +30,10 @@ MODES_ELSEWHERE |= {"xray": "integral", "x-ray": "integral", "drr": "integral", 
 """What other programs call them."""
 
 
+OVER = Over()
+"""The same for all images, since what is kept for a scene is kept for its parts."""
+
+
 def compositing_of(given: Mode | Any) -> Compositing[Any]:
     """The mode of this name, or the mode itself. **Raises** `ValueError` for anything else, and for a
     `Weighting` whose fields are not all static although its weights may depend on them."""
@@ -40,6 +44,8 @@ def compositing_of(given: Mode | Any) -> Compositing[Any]:
                 f"{described(given)} has others."
             )
         return given
+    if given == "over":
+        return OVER
     if isinstance(given, str) and given in MODES:
         return MODES[given]()
     names = ", ".join(f'"{name}"' for name in MODES)

@@ -275,7 +275,7 @@ class Replay(SampleVisitor):
             return found, fetched
 
         rays = jax.vmap(one, in_axes=(None, None, None, 0, None, 0, 0, 0, None))
-        cells = jax.vmap(rays, in_axes=(None, None, None, None, None, 0, None, None, 0))
+        cells: Any = jax.vmap(rays, in_axes=(None, None, None, None, None, 0, None, None, 0))
 
         def all_(moving: tuple[PyTree, ...], perturbations: list[Any]) -> PyTree:
             each = jnp.arange(number, dtype=at.index.dtype)

@@ -116,7 +116,7 @@ class Ahead(eqx.Module):
         )
 
 
-class Place(NamedTuple):
+class Place(eqx.Module):
     """Where the next cells of rays lie: what `pieces` reads of a `Progress`."""
 
     index: Int[Array, "*rays"]
@@ -147,7 +147,8 @@ def march_segment(
     cells = tuple(zip(samples.cells, values, colors, samples.opacity, strict=True))
     # Whether a ray is stopped follows from what it has passed, but of transforms of one's own. So it is not
     # carried from cell to cell, which XLA would then compute one after the other.
-    follows = isinstance(scene.compositing, Weighting) and not scene.march.custom
+    rules: Any = scene.march
+    follows = isinstance(scene.compositing, Weighting) and not rules.custom
 
     def composited(ray: Ray, at: Progress, cell: Any) -> Progress:
         if follows:

@@ -9,8 +9,9 @@ Larger images are several tiles of rays. Inside of a larger program, `image.marc
 same functions, as a part of that.
 """
 
+import weakref
 from functools import cache, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -43,7 +44,7 @@ from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
 from .wavefront import Marched, Recorded, blinded, march_rays
 
 
-program: Any = partial(eqx.filter_jit, compiler_options=OPTIONS)
+program: Any = partial(cast(Any, eqx.filter_jit), compiler_options=OPTIONS)
 
 
 class Started(NamedTuple):
@@ -68,15 +69,15 @@ class Kernel(NamedTuple):
     @property
     def scene(self) -> Scene:
         """The scene for the functions of `ray`."""
-        volume, transfer, rules, *rest = self
-        march: Any = rules
-        _, lighting, space = rest
-        if lighting is None or space is None:
-            classification = classification_of(transfer, volume, integrated=rules.integrates)
+        integrated = self.rules.integrates
+        if self.lighting is None or self.space is None:
+            classification = classification_of(self.transfer, self.volume, integrated=integrated)
         else:
-            given = volume, transfer, space, lighting
-            classification = lit_classification(*given, integrated=rules.integrates)
-        return Scene(*self[:2], None, march, *rest, classification)
+            given = self.volume, self.transfer, self.space, self.lighting
+            classification = lit_classification(*given, integrated=integrated)
+        march, space, mode = cast(Any, self.rules), cast(Any, self.space), self.compositing
+        parts = self.volume, self.transfer, None, march, mode, self.lighting, space, classification
+        return Scene(*parts)
 
 
 class Passed(NamedTuple):
@@ -102,11 +103,9 @@ def staged_image(
 ) -> tuple[Rendering, Recorded]:
     """The image; and, if `record` asks for it, what the second march needs of the first."""
     tiling, source = options.tiling, without_ends(scene.source)
-    kernel = _kernel_of(scene, acceleration)
+    kernel, seams, place = _staging_of(scene, acceleration)
     index = _index_of(scene, acceleration)
     fault = _has_fault(scene._replace(volume=without_voxels(scene.volume), source=source))
-    seams = _only(scene.march, "start", "shift", "locate", "clip")
-    place = _without_voxels(scene.volume, seams)
     size, number = RayTiles.shared(source, tiling)
     tiling = tiling._replace(least=0)
     most = np.asarray(scene.march.most_samples, np.int32)
@@ -128,6 +127,31 @@ def staged_image(
         found = _march(*told, track, first, skips, options.outputs, tiling, record and scene.march.leaps)
         passed.append(Passed(started.rays.t_in, started.rays.length, found, track.shifted))
     return _finish(passed, scene.compositing, source, tiling, size, record)
+
+
+class Staging(NamedTuple):
+    """What the stages of all images of a scene share: the kernel, the march with the seams of stage A alone,
+    and the place of the voxels."""
+
+    kernel: Kernel
+    seams: March
+    place: Volume
+
+
+_STAGINGS: dict[tuple[int, ...], Staging] = {}
+
+
+def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
+    """That of a scene, as long as its parts live: to take it apart takes as long as some thousand rays."""
+    parts = [scene.volume, scene.transfer, scene.march, scene.compositing]
+    parts += [] if scene.lighting is None else [scene.lighting]
+    key = tuple(map(id, parts))
+    if key not in _STAGINGS:
+        seams = _only(scene.march, "start", "shift", "locate", "clip")
+        _STAGINGS[key] = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
+        for part in parts:
+            weakref.finalize(part, _STAGINGS.pop, key, None)
+    return _STAGINGS[key]
 
 
 def _only(march: March, *seams: str) -> March:
@@ -227,7 +251,9 @@ def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex
 
 def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     scene, acceleration = given
-    (leap, *seams), blocks, transfer = scene.march.transforms, acceleration.blocks, scene.transfer
+    transforms: tuple[Any, ...] = scene.march.transforms
+    transfer: Any = scene.transfer
+    (leap, *seams), blocks = transforms, acceleration.blocks
     usual = type(scene.compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
     whole = isinstance(blocks, Blocks) and scene.volume.field is None and scene.volume.first is None
     known = whole and not blocks.low.committed and platform() == "cpu"

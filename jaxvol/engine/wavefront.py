@@ -91,7 +91,7 @@ class Marched(NamedTuple):
         return lanes.carry, lanes.sums, self.total
 
 
-class Lanes(NamedTuple):
+class Lanes(eqx.Module):
     """What of rays changes while they are marched."""
 
     index: Int[Array, "*rays"]
@@ -216,7 +216,7 @@ def _march_batch(
     beam = jnp.repeat(known // GROUPS_OF_BEAM, group)
     taken, lanes = job.rays.take(known), packed.take(known).tree
     none = jnp.repeat(rows >= job.groups, group)
-    lanes = lanes._replace(finished=lanes.finished | none)
+    lanes = with_fields(lanes, finished=lanes.finished | none)
 
     def living(lanes: Lanes) -> Bool[Array, " batch"]:
         _, track, _ = taken.tree

@@ -140,8 +140,8 @@ class Sums(eqx.Module):
 class Occupancy(eqx.Module):
     """A regular grid of cells. Everything visible lies in an occupied cell of it."""
 
-    occupied: Bool[Array, "cx cy cz"] | None
-    """None of what is `unshaped`."""
+    occupied: Any
+    """(cx, cy, cz), truth values; None of what is `unshaped`."""
     origin: Vec3
     """Corner of the grid, along the axes of `frame`, from `anchor` on."""
     size: Vec3

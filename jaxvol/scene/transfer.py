@@ -379,7 +379,7 @@ def with_shared_points(transfer: Any) -> Any:
     """The same function by one of a few numbers of points: beyond the last one it is constant."""
     if type(transfer) is not TransferFunction or transfer.values.shape[0] in SHARED_POINTS:
         return transfer
-    given = transfer.values, transfer.colors, transfer.extinction
+    given: tuple[Any, ...] = transfer.values, transfer.colors, transfer.extinction
     if not all(isinstance(leaf, jax.Array) and not is_traced(leaf) for leaf in given):
         return transfer
     values, colors, extinction = memoized_of(given, _padded)

@@ -30,7 +30,7 @@ class Row(NamedTuple):
     shape: tuple[int, ...]
 
     @property
-    def count(self) -> int:
+    def number(self) -> int:
         """Number of rows."""
         return math.prod(self.shape)
 
@@ -50,7 +50,7 @@ class Layout(NamedTuple):
             kind = "float32" if leaf.dtype in (bool, jnp.int32) else str(leaf.dtype)
             row = Row(kind, used.get(kind, 0), leaf.dtype, leaf.shape[2:])
             rows.append(row)
-            used[kind] = row.first + row.count
+            used[kind] = row.first + row.number
         return cls(structure, tuple(rows))
 
     def pack(self, tree: PyTree) -> "Packed":
@@ -81,7 +81,7 @@ class Packed(eqx.Module):
         for row in self.layout.rows:
             array = self.rows[row.kind]
             if row.shape:
-                part = jax.lax.slice_in_dim(array, row.first, row.first + row.count)
+                part = jax.lax.slice_in_dim(array, row.first, row.first + row.number)
                 part = jnp.moveaxis(part, 0, -1)
                 part = part.reshape(*part.shape[:-1], *row.shape)
             else:
