@@ -148,9 +148,18 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
     key = tuple(map(id, parts))
     if key not in _STAGINGS:
         seams = _only(scene.march, "start", "shift", "locate", "clip")
-        _STAGINGS[key] = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
-        for part in parts:
-            weakref.finalize(part, _STAGINGS.pop, key, None)
+        found = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
+        # copies, or what is kept would keep its own parts alive
+        kernel = (unchecked(part) if isinstance(part, eqx.Module) else part for part in found.kernel)
+        _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(found.place))
+        watched: list[Any] = []
+
+        def forget() -> None:  # once: parts that live on are watched no longer
+            _STAGINGS.pop(key, None)
+            for other in watched:
+                other.detach()
+
+        watched += [weakref.finalize(part, forget) for part in parts]
     return _STAGINGS[key]
 
 
