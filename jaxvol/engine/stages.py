@@ -93,9 +93,8 @@ def is_staged(scene: Scene, options: RenderOptions) -> bool:
     """Whether the image of a scene that is not traced is rendered here."""
     if options.tiling.devices is not None or options.adjoint == "direct":
         return False
-    # not where rays are to start where neighbouring ones do, which are found by a march of their own
-    leaps = scene.march.overriding("empty_space")
-    return all(type(leap) is SpaceLeaping and leap.method in ("hierarchy", "distance") for leap in leaps)
+    # an index of one's own may ask anything of the view
+    return all(type(leap) is SpaceLeaping for leap in scene.march.overriding("empty_space"))
 
 
 def staged_image(
@@ -248,9 +247,14 @@ def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, 
 
 
 def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex | None:
-    """Where the scene is empty: found once for each volume and transfer function."""
-    if not scene.march.leaps:
+    """Where the scene is empty: found once for each volume and transfer function, or, where rays start as
+    their neighbours do, for each view."""
+    leaps: list[Any] = scene.march.overriding("empty_space")
+    if not leaps:
         return None
+    if leaps[0].method in ("min_distance", "beam"):
+        view = scene._replace(source=without_ends(scene.source), lighting=None)
+        return _index_of_view(view, acceleration, Tiling.of_backend())
     march = unchecked(_only(scene.march, "empty_space", "locate", "clip"), step=None)
     given = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
     if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(given)):
@@ -287,6 +291,11 @@ def _index_by_jax(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | 
     nowhere = GivenRays(jnp.zeros((0, 3)), jnp.zeros((0, 3)))
     index = empty_space_of(scene._replace(source=nowhere), acceleration, Tiling())
     return None if index is None else index.unshaped
+
+
+@program
+def _index_of_view(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
+    return empty_space_of(acceleration.packed(scene), acceleration, tiling)
 
 
 # ---- stage B ----
