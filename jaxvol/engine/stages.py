@@ -231,7 +231,9 @@ def _start(
     track = vmap_rays(partial(track_of, seams))(rays)
     offset = track.offset if seams.overriding("start") else None
     box = box_of_corners if corners else box_of_rays
-    skips = None if index is None else index.skips(partial(box, tiling, rays), tiling.cells * seams.step)
+    skips = None
+    if index is not None:
+        skips = index.along(place).skips(partial(box, tiling, rays), tiling.cells * seams.step)
     track = unchecked(track, offset=offset, shifted=None, until=None)
     return Started(rays, track, skips, seams.locate(place))
 
@@ -276,12 +278,11 @@ def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     low, high = np.asarray(blocks.low), np.asarray(blocks.high)
     values, extinction = np.asarray(transfer.values), np.asarray(transfer.extinction)
     visible = positive_between(values, extinction, low, high) | ~(low <= high)
-    grid = jax.tree.map(np.asarray, _without_voxels(scene.volume, scene.march))
-    size = tuple(blocks.side * step for step in grid.spacing)
-    zero = np.zeros_like(size[0])
-    place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(grid.origin)}
+    spacing, origin = np.asarray(scene.volume.spacing), np.asarray(scene.volume.origin)
+    size, zero = tuple(blocks.side * step for step in spacing), np.zeros_like(spacing[0])
+    place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(origin), "frame": None}
     sizes = np.asarray(visible.shape, np.int32)
-    occupancy = unchecked(Occupancy, occupied=None, **place, frame=grid.frame, known=None, sizes=sizes)
+    occupancy = unchecked(Occupancy, occupied=None, **place, known=None, sizes=sizes)
     return leap.index_of(occupancy, Sums.of(visible))
 
 
