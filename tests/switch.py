@@ -118,11 +118,6 @@ class _Space(Space):
     def occupancy(self, visible, first=None, side=BLOCK):
         return either(self.on, *(s.occupancy(visible, first, side) for s in (self.clipped, self.inner)))
 
-    def visible_at_faces(self, visible):
-        faces = self.inner.visible_at_faces(visible)
-        cut = self.clipped.visible_at_faces(visible)
-        return *faces, *(seen & self.on for seen in cut[len(faces) :])
-
 
 def _clip(self, space):
     return _Space(self.inner.clip(space), space, self.on)

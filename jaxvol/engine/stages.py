@@ -93,9 +93,8 @@ def is_staged(scene: Scene, options: RenderOptions) -> bool:
     """Whether the image of a scene that is not traced is rendered here."""
     if options.tiling.devices is not None or options.adjoint == "direct":
         return False
-    # not where rays are to start where neighbouring ones do, which are found by a march of their own
-    leaps = scene.march.overriding("empty_space")
-    return all(type(leap) is SpaceLeaping and leap.method in ("hierarchy", "distance") for leap in leaps)
+    # an index of one's own may ask anything of the view
+    return all(type(leap) is SpaceLeaping for leap in scene.march.overriding("empty_space"))
 
 
 def staged_image(
@@ -148,9 +147,18 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
     key = tuple(map(id, parts))
     if key not in _STAGINGS:
         seams = _only(scene.march, "start", "shift", "locate", "clip")
-        _STAGINGS[key] = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
-        for part in parts:
-            weakref.finalize(part, _STAGINGS.pop, key, None)
+        found = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
+        # copies, or what is kept would keep its own parts alive
+        kernel = (unchecked(part) if isinstance(part, eqx.Module) else part for part in found.kernel)
+        _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(found.place))
+        watched: list[Any] = []
+
+        def forget() -> None:  # once: parts that live on are watched no longer
+            _STAGINGS.pop(key, None)
+            for other in watched:
+                other.detach()
+
+        watched += [weakref.finalize(part, forget) for part in parts]
     return _STAGINGS[key]
 
 
@@ -223,7 +231,9 @@ def _start(
     track = vmap_rays(partial(track_of, seams))(rays)
     offset = track.offset if seams.overriding("start") else None
     box = box_of_corners if corners else box_of_rays
-    skips = None if index is None else index.skips(partial(box, tiling, rays), tiling.cells * seams.step)
+    skips = None
+    if index is not None:
+        skips = index.along(place).skips(partial(box, tiling, rays), tiling.cells * seams.step)
     track = unchecked(track, offset=offset, shifted=None, until=None)
     return Started(rays, track, skips, seams.locate(place))
 
@@ -239,9 +249,14 @@ def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, 
 
 
 def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex | None:
-    """Where the scene is empty: found once for each volume and transfer function."""
-    if not scene.march.leaps:
+    """Where the scene is empty: found once for each volume and transfer function, or, where rays start as
+    their neighbours do, for each view."""
+    leaps: list[Any] = scene.march.overriding("empty_space")
+    if not leaps:
         return None
+    if leaps[0].method in ("min_distance", "beam"):
+        view = scene._replace(source=without_ends(scene.source), lighting=None)
+        return _index_of_view(view, acceleration, Tiling.of_backend())
     march = unchecked(_only(scene.march, "empty_space", "locate", "clip"), step=None)
     given = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
     if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(given)):
@@ -263,12 +278,11 @@ def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     low, high = np.asarray(blocks.low), np.asarray(blocks.high)
     values, extinction = np.asarray(transfer.values), np.asarray(transfer.extinction)
     visible = positive_between(values, extinction, low, high) | ~(low <= high)
-    grid = jax.tree.map(np.asarray, _without_voxels(scene.volume, scene.march))
-    size = tuple(blocks.side * step for step in grid.spacing)
-    zero = np.zeros_like(size[0])
-    place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(grid.origin)}
+    spacing, origin = np.asarray(scene.volume.spacing), np.asarray(scene.volume.origin)
+    size, zero = tuple(blocks.side * step for step in spacing), np.zeros_like(spacing[0])
+    place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(origin), "frame": None}
     sizes = np.asarray(visible.shape, np.int32)
-    occupancy = unchecked(Occupancy, occupied=None, **place, frame=grid.frame, known=None, sizes=sizes)
+    occupancy = unchecked(Occupancy, occupied=None, **place, known=None, sizes=sizes)
     return leap.index_of(occupancy, Sums.of(visible))
 
 
@@ -278,6 +292,11 @@ def _index_by_jax(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | 
     nowhere = GivenRays(jnp.zeros((0, 3)), jnp.zeros((0, 3)))
     index = empty_space_of(scene._replace(source=nowhere), acceleration, Tiling())
     return None if index is None else index.unshaped
+
+
+@program
+def _index_of_view(scene: Scene, acceleration: VolumeAcceleration, tiling: Tiling) -> EmptySpaceIndex | None:
+    return empty_space_of(acceleration.packed(scene), acceleration, tiling)
 
 
 # ---- stage B ----

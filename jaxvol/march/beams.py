@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Scalar, Vec3, along
 from ..scene.occupancy import Index, Occupancy, Sums
 from ..scene.space import Ray
+from ..scene.volume import Volume
 from ..xla.memory import gather
 from ..xla.platform import on_gpu
 from ..xla.sharding import varying
@@ -51,6 +52,10 @@ class EmptySpaceIndex(eqx.Module):
     @property
     def unshaped(self) -> "EmptySpaceIndex":
         """The same index, so that its kernel knows no numbers of cells, if that is possible."""
+        return self
+
+    def along(self, volume: Volume) -> "EmptySpaceIndex":
+        """The same index along the axes of a volume, if it does not know them."""
         return self
 
     def within_ranges(self) -> "EmptySpaceIndex":

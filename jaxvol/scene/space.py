@@ -112,11 +112,6 @@ class Space(eqx.Module):
         """Cells that may hold anything visible, placed from `anchor` on, from the visible blocks of `side`³
         cells of the grid, or of a part of it that begins at the node `first`."""
 
-    def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
-        """For each face at which rays may enter or leave, whether anything visible may lie there."""
-        faces = [jax.lax.index_in_dim(visible, end, axis) for axis in range(3) for end in (0, -1)]
-        return tuple(jnp.any(face) for face in faces)
-
     def path(self, entry: Vec3, direction: Vec3) -> Path:
         """The straight world ray from `entry`, in grid coordinates."""
         return Curved(self, entry, direction)

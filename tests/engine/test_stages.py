@@ -1,5 +1,8 @@
 """Is an image in stages that of one program? Does one march serve all images that differ by numbers alone?"""
 
+import gc
+import weakref
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -107,3 +110,15 @@ def test_what_is_packed_is_unpacked_taken_and_put():
         np.testing.assert_array_equal(taken[name], rows)
         whole[[4, 1]] = rows[::-1].reshape(3, 4, *rows.shape[1:])[:2]
         np.testing.assert_array_equal(put[name], whole)
+
+
+def test_what_is_kept_of_a_scene_goes_with_its_parts():
+    volume, march = ball(), jv.March(0.05, ALL)
+    for points in (5, 8):
+        transfer = function(points)
+        jv.render(volume, transfer, around(volume, (8, 8)), march)
+        kept, dead = len(stages._STAGINGS), weakref.ref(transfer)
+        del transfer
+        gc.collect()
+        assert dead() is None
+        assert len(stages._STAGINGS) == kept - 1

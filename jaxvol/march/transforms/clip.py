@@ -222,12 +222,6 @@ class _Clipped(Space):
             seen = reduce(jnp.logical_and, [height >= -reach for height, reach in over])
         return replace(grid, occupied=grid.occupied & seen)
 
-    def visible_at_faces(self, visible: Bool[Array, "bx by bz"]) -> tuple[Bool[Array, ""], ...]:
-        grid = self.occupancy(visible)
-        over = [side.over(grid) for side in self.local.sides]
-        own = [jnp.any(grid.occupied & (jnp.abs(height) <= reach)) for height, reach in over]
-        return *self.inner.visible_at_faces(visible), *own
-
 
 def _later(a: Scalar, b: Scalar) -> Scalar:
     """The greater distance; of equal ones, the derivatives of `b`."""

@@ -13,6 +13,7 @@ from ..._util.checks import integer
 from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import BLOCK, FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
+from ...scene.volume import Volume
 from ...xla.memory import gather
 from ...xla.trees import unchecked
 from ..beams import Box, EmptySpaceIndex, Skips, Stretches, View, stretches
@@ -136,6 +137,12 @@ class _Beams(EmptySpaceIndex):
     @property
     def unshaped(self) -> "_Beams":
         return _Beams(self.occupancy.unshaped, self.sums)
+
+    def along(self, volume: Volume) -> "_Beams":
+        frame: Any = self.occupancy.frame
+        if frame is not None:
+            return self
+        return _Beams(unchecked(self.occupancy, frame=volume.frame), self.sums)
 
     def skips(self, box: Callable[[Occupancy], Box], stretch: Scalar) -> Stretches:
         return stretches(self.occupancy, self.sums, box(self.occupancy), stretch)

@@ -401,3 +401,21 @@ def test_a_beam_holds_all_pixels_of_its_cell():
         np.testing.assert_allclose(found, expected, atol=1e-4, err_msg=f"seed {seed}")
         seen += np.sum(expected[..., 3] > 0)
     assert seen > 10
+
+
+@pytest.mark.parametrize("method", ["hierarchy", *slow("distance", "beam")])
+def test_leaps_show_in_no_image_of_a_turned_and_sheared_volume(method):
+    """In float32, as users render, by a function of many points."""
+    rng = np.random.default_rng(5)
+    data = sum(np.roll(rng.random((24, 24, 24)), k, k % 3) for k in range(9))
+    axes = np.array([[0.8, -0.36, 0], [0.6, 0.8, 0.28], [0, 0.48, 0.96]])
+    volume = jv.Volume(data.astype(np.float32) / 9, (1.3, 1.1, 0.9), direction=axes)
+    values, seen = np.linspace(0.2, 0.8, 40), np.arange(40) > 22
+    transfer = jv.TransferFunction(values, rng.random((40, 3)), rng.random(40) * seen)
+    camera = around(volume, (40, 32))
+    plain, leapt = (
+        np.asarray(jv.render(volume, transfer, camera, jv.March(0.5, leaps, "midpoint")).rgba)
+        for leaps in ((), (jv.SpaceLeaping(method),))
+    )
+    assert np.mean(plain[..., 3] > 0) > 0.1
+    np.testing.assert_allclose(leapt, plain, atol=1e-6, rtol=1e-6)
