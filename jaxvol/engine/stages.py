@@ -149,7 +149,7 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
         seams = _only(scene.march, "start", "shift", "locate", "clip")
         found = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
         # copies, or what is kept would keep its own parts alive
-        kernel = (unchecked(part) if isinstance(part, eqx.Module) else part for part in found.kernel)
+        kernel: Any = (unchecked(part) if isinstance(part, eqx.Module) else part for part in found.kernel)
         _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(found.place))
         watched: list[Any] = []
 

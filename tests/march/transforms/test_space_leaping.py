@@ -407,7 +407,7 @@ def test_a_beam_holds_all_pixels_of_its_cell():
 def test_leaps_show_in_no_image_of_a_turned_and_sheared_volume(method):
     """In float32, as users render, by a function of many points."""
     rng = np.random.default_rng(5)
-    data = sum(np.roll(rng.random((24, 24, 24)), k, k % 3) for k in range(9))
+    data = np.sum([np.roll(rng.random((24, 24, 24)), k, k % 3) for k in range(9)], axis=0)
     axes = np.array([[0.8, -0.36, 0], [0.6, 0.8, 0.28], [0, 0.48, 0.96]])
     volume = jv.Volume(data.astype(np.float32) / 9, (1.3, 1.1, 0.9), direction=axes)
     values, seen = np.linspace(0.2, 0.8, 40), np.arange(40) > 22
