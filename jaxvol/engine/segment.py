@@ -25,7 +25,6 @@ from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
 from ..xla.memory import in_memory
-from ..xla.packing import Packed
 from ..xla.trees import PyTree, unchecked, with_fields
 from .shading import inline_shader, light_terms, lit_colors, shaded_colors
 from .tiling import Tiling
@@ -80,37 +79,36 @@ class Ahead(eqx.Module):
     """The cells ahead of many rays, up to the one behind which they shift.
 
     Attributes:
-        taken: their `Ray`, `Track` and what a visitor is given, which branches take apart themselves, since
-            XLA would store each array that a branch is given.
+        rays: as they were given, with their own reach.
         index: of the next cell.
         offset: of these cells, as in `Track`.
         reach: `Ray.reach`, the end of the last cell that is taken.
         until: the first cell that is not.
     """
 
-    taken: Packed
+    rays: Ray
     index: Int[Array, " rays"]
     offset: Float[Array, " rays"]
     reach: Float[Array, " rays"]
     until: Int[Array, " rays"]
 
     @classmethod
-    def of(cls, taken: Packed, at: Progress, step: Scalar) -> "Ahead":
+    def of(cls, rays: Ray, at: Progress, step: Scalar) -> "Ahead":
         """The cells ahead of rays that are `at` these places."""
-        (ray, _, _), track = taken.tree, at.track
+        track = at.track
         offset, until = track.offset, track.until
         if track.shift is not None and track.shifted is not None:
             before = at.index < track.shifted
             offset = offset + jnp.where(before, 0, track.shift)
             until = jnp.where(before, jnp.minimum(until, track.shifted), until)
         back = (offset + until.astype(offset.dtype)) * step
-        reach = jnp.where(at.finished, 0, jnp.minimum(back, ray.length))
-        return cls(taken, at.index, offset, reach, until)
+        reach = jnp.where(at.finished, 0, jnp.minimum(back, rays.length))
+        return cls(rays, at.index, offset, reach, until)
 
     @property
     def place(self) -> "tuple[Ray, Place]":
         """The rays, which end where they take no other cell, and where their next cell lies."""
-        ray, _, _ = self.taken.tree
+        ray = self.rays
         return with_fields(ray, reach=self.reach), Place(
             self.index, unchecked(Track, offset=self.offset, shift=None, shifted=None, until=self.until)
         )
@@ -124,12 +122,12 @@ class Place(eqx.Module):
 
 
 def march_segment(
-    scene: Scene, tiling: Tiling, taken: Packed, at: Progress, *, shifts: bool = False
+    scene: Scene, tiling: Tiling, rays: Ray, at: Progress, *, shifts: bool = False
 ) -> tuple[Progress, Samples]:
     """Marches rays by a segment of cells; by fewer, where a ray has no more of them, and by none where it is
     finished. `shifts`: a segment is one cell, behind which rays may shift."""
     classification, number = scene.classification, tiling.cells
-    ahead = Ahead.of(taken, at, scene.march.step)
+    ahead = Ahead.of(rays, at, scene.march.step)
     samples = _sampled(scene, number, ahead)
     ray, _ = ahead.place
     colors: list[Vec3] | list[None]

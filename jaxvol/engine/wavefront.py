@@ -26,6 +26,7 @@ from ..march.march import CellRules
 from ..ray import NEVER, Progress, Scene, Track, front, move
 from ..scene.space import Ray
 from ..xla.compaction import in_front
+from ..xla.memory import gather
 from ..xla.packing import Layout, Packed
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, with_fields
@@ -108,18 +109,21 @@ class Job(NamedTuple):
     """What does not change while the rays of a tile are marched.
 
     Attributes:
-        rays: the constants of rays: `Ray`, `Track`, and the visitor's `given`.
-        groups: how many there are.
+        fixed: what does not change of rays: `Ray`, `Track`, and the visitor's `given`.
         skips, shifts: as for `march_rays`.
     """
 
     scene: Scene
     tiling: Tiling
-    rays: Packed
-    groups: int
+    fixed: tuple[Ray, Track, PyTree]
     visitor: SampleVisitor | None
     skips: Skips | None
     shifts: bool
+
+    @property
+    def groups(self) -> int:
+        """Number of groups."""
+        return self.fixed[0].length.shape[0]
 
     @property
     def rules(self) -> CellRules:
@@ -166,7 +170,7 @@ def march_rays(
     fixed = rays, track, given
     lanes = Lanes(start.index, start.composite, start.stats, start.finished, shifted, range_, carry, sums)
     lanes, total = varying((lanes, total), rays)
-    job = Job(scene, tiling, Layout.of(fixed).pack(fixed), rays.length.shape[0], visitor, skips, shifts)
+    job = Job(scene, tiling, fixed, visitor, skips, shifts)
     going = jnp.any(alive(start), axis=-1)
     packed, total = _march_all(job, Layout.of(lanes).pack(lanes), total, going)
     return Marched(packed, track, total)
@@ -214,21 +218,27 @@ def _march_batch(
     tiling, group = job.tiling, job.tiling.group
     known = jnp.minimum(rows, job.groups - 1)
     beam = jnp.repeat(known // GROUPS_OF_BEAM, group)
-    taken, lanes = job.rays.take(known), packed.take(known).tree
+    lanes = packed.take(known).tree
+
+    def take(leaf: Array) -> Array:
+        # from each array by itself: to join those of all rays would take longer
+        return gather(leaf, known).reshape(-1, *leaf.shape[2:])
+
+    taken = jax.tree.map(take, job.fixed)
     none = jnp.repeat(rows >= job.groups, group)
     lanes = with_fields(lanes, finished=lanes.finished | none)
 
     def living(lanes: Lanes) -> Bool[Array, " batch"]:
-        _, track, _ = taken.tree
+        _, track, _ = taken
         rays = ~lanes.finished & (lanes.index < track.until)
         # XLA finds the maximum of floats with SIMD, but looks at one truth value after the other
         return jnp.max(rays.astype(jnp.float32).reshape(-1, group), axis=-1) > 0
 
     def advance(state: tuple[Lanes, PyTree]) -> tuple[Lanes, PyTree]:
         lanes, total = state
-        rays, track, given = taken.tree
+        rays, track, given = taken
         here = _to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
-        after, samples = march_segment(job.scene, tiling, taken, here, shifts=job.shifts)
+        after, samples = march_segment(job.scene, tiling, rays, here, shifts=job.shifts)
         carry, sums = lanes.carry, lanes.sums
         if job.visitor is not None:
             carry, found, total = job.visitor.visit(samples.ray, here, samples, given, carry, total)
