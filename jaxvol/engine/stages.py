@@ -9,7 +9,6 @@ Larger images are several tiles of rays. Inside of a larger program, `image.marc
 same functions, as a part of that.
 """
 
-import weakref
 from functools import cache, partial
 from typing import Any, NamedTuple, cast
 
@@ -34,7 +33,7 @@ from ..scene.transfer import Transfer, TransferFunction, classification_of, with
 from ..scene.volume import Volume, grids, with_fetches, without_voxels
 from ..scene.voxel_fetch import Extent, Nodes, Packed
 from ..xla.compiling import OPTIONS
-from ..xla.memo import memoized_of
+from ..xla.memo import memoized_of, when_any_dies
 from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
 from .acceleration import VolumeAcceleration, empty_space_of
@@ -151,14 +150,7 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
         # copies, or what is kept would keep its own parts alive
         kernel: Any = (unchecked(part) if isinstance(part, eqx.Module) else part for part in found.kernel)
         _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(found.place))
-        watched: list[Any] = []
-
-        def forget() -> None:  # once: parts that live on are watched no longer
-            _STAGINGS.pop(key, None)
-            for other in watched:
-                other.detach()
-
-        watched += [weakref.finalize(part, forget) for part in parts]
+        when_any_dies(parts, lambda: _STAGINGS.pop(key, None))
     return _STAGINGS[key]
 
 

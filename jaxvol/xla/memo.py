@@ -5,7 +5,7 @@ requested again. So nothing stored here goes stale, and nothing outlives what it
 """
 
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from functools import cache
 from typing import Any, TypeVar
 
@@ -51,15 +51,20 @@ def memoized_of(tree: PyTree, compute: Callable[[Any], T]) -> T:
     key = tuple(map(id, leaves)), structure, compute
     if key not in _MEMORY:
         _MEMORY[key] = computed_now(compute, tree)
-        watched: list[Any] = []
-
-        def forget() -> None:  # once: arrays that live on are watched no longer
-            _MEMORY.pop(key, None)
-            for other in watched:
-                other.detach()
-
-        watched += [weakref.finalize(leaf, forget) for leaf in leaves]
+        when_any_dies(leaves, lambda: _MEMORY.pop(key, None))
     return _MEMORY[key]
+
+
+def when_any_dies(parts: Sequence[Any], forget: Callable[[], Any]) -> None:
+    """Calls `forget` once, when the first of these parts is freed; the others are watched no longer."""
+    watched: list[Any] = []
+
+    def first() -> None:
+        forget()
+        for other in watched:
+            other.detach()
+
+    watched += [weakref.finalize(part, first) for part in parts]
 
 
 @cache

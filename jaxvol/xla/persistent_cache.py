@@ -55,12 +55,6 @@ def keep_programs_by_default() -> None:
             keep_programs()
 
 
-def kept_folder() -> Path | None:
-    """Where JAX keeps compiled programs in this process; None where it keeps none."""
-    folder = _folder()
-    return Path(folder) if folder and getattr(jax.config, "jax_enable_compilation_cache", True) else None
-
-
 def _folder() -> str | None:
     return getattr(jax.config, "jax_compilation_cache_dir", None)
 
