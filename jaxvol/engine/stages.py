@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
+from .._util.checks import all_finite
 from .._util.piecewise_linear import positive_between
 from ..compositing.blending import Compositing, Outputs
 from ..lighting.shading import Lighting, lit_classification
@@ -101,9 +102,12 @@ def staged_image(
 ) -> tuple[Rendering, Recorded]:
     """The image; and, if `record` asks for it, what the second march needs of the first."""
     tiling, source = options.tiling, without_ends(scene.source)
-    kernel, seams, place = _staging_of(scene, acceleration)
-    index = _index_of(scene, acceleration)
-    fault = _has_fault(scene._replace(volume=without_voxels(scene.volume), source=source))
+    kernel, seams, place, index, fault = _staging_of(scene, acceleration)
+    if _by_view(scene):
+        view = scene._replace(source=source, lighting=None)
+        index = _index_of_view(view, acceleration, Tiling.of_backend())
+    if isinstance(source, Camera):
+        fault = fault | _is_invalid(source)
     size, number = RayTiles.shared(source, tiling)
     tiling = tiling._replace(least=0)
     most = np.asarray(scene.march.most_samples, np.int32)
@@ -129,11 +133,14 @@ def staged_image(
 
 class Staging(NamedTuple):
     """What the stages of all images of a scene share: the kernel, the march with the seams of stage A alone,
-    and the place of the voxels."""
+    the place of the voxels, where the scene is empty, unless that depends on the view, and whether it
+    `has_fault`."""
 
     kernel: Kernel
     seams: March
     place: Volume
+    index: EmptySpaceIndex | None
+    fault: Bool[Array, ""] | np.ndarray
 
 
 _STAGINGS: dict[tuple[int, ...], Staging] = {}
@@ -146,10 +153,16 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
     key = tuple(map(id, parts))
     if key not in _STAGINGS:
         seams = _only(scene.march, "start", "shift", "locate", "clip")
-        found = Staging(_kernel_of(scene, acceleration), seams, _without_voxels(scene.volume, seams))
+        place, index = _without_voxels(scene.volume, seams), None
+        if not _by_view(scene):
+            index = _index_of(scene, acceleration)
+        fault = _has_fault(scene._replace(volume=without_voxels(scene.volume), source=None))
         # copies, or what is kept would keep its own parts alive
-        kernel: Any = (unchecked(part) if isinstance(part, eqx.Module) else part for part in found.kernel)
-        _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(found.place))
+        kernel: Any = (
+            unchecked(part) if isinstance(part, eqx.Module) else part
+            for part in _kernel_of(scene, acceleration)
+        )
+        _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(place), index, fault)
         when_any_dies(parts, lambda: _STAGINGS.pop(key, None))
     return _STAGINGS[key]
 
@@ -170,6 +183,14 @@ def _has_fault(scene: Scene) -> Bool[Array, ""] | np.ndarray:
     return np.asarray(jax.tree.map(_known, scene).has_fault)
 
 
+def _is_invalid(camera: Camera) -> Bool[Array, ""] | np.ndarray:
+    """The same of a camera, which other images of a scene do not share."""
+    if platform() != "cpu":
+        return _is_invalid_by_jax(camera)
+    camera = jax.tree.map(_known, camera)
+    return ~np.asarray(all_finite(camera) & camera.valid)
+
+
 def _known(leaf: Any) -> Any:
     return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
@@ -177,6 +198,11 @@ def _known(leaf: Any) -> Any:
 @program
 def _has_fault_by_jax(scene: Scene) -> Bool[Array, ""]:
     return scene.has_fault
+
+
+@program
+def _is_invalid_by_jax(camera: Camera) -> Bool[Array, ""]:
+    return ~(all_finite(camera) & camera.valid)
 
 
 # ---- stage A ----
@@ -240,15 +266,16 @@ def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, 
     return jax.device_put((none, zero, never, stretches))
 
 
-def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex | None:
-    """Where the scene is empty: found once for each volume and transfer function, or, where rays start as
-    their neighbours do, for each view."""
+def _by_view(scene: Scene) -> bool:
+    """Whether where a scene is empty depends on the view: where rays start as their neighbours do."""
     leaps: list[Any] = scene.march.overriding("empty_space")
-    if not leaps:
+    return bool(leaps) and leaps[0].method in ("min_distance", "beam")
+
+
+def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex | None:
+    """Where the scene is empty, for all views: found once for each volume and transfer function."""
+    if not scene.march.leaps:
         return None
-    if leaps[0].method in ("min_distance", "beam"):
-        view = scene._replace(source=without_ends(scene.source), lighting=None)
-        return _index_of_view(view, acceleration, Tiling.of_backend())
     march = unchecked(_only(scene.march, "empty_space", "locate", "clip"), step=None)
     given = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
     if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(given)):

@@ -247,6 +247,22 @@ class Packed(Fetch):
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
         return replace(self, begin=begin)
 
+    def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
+        def place(coordinate: Vec3) -> tuple[Int[Array, ""], Vec3]:
+            node, fraction = self.split(data, coordinate)
+            return flat_index(node, self._stored(data)), fraction
+
+        # In memory, since LLVM computes one sample after the other where it fetches them, on processors whose
+        # gathers are slow: places take two fifths of a fetch there.
+        always = self.words[0].astype(jnp.float32) + 1 != 0
+        base, fraction = place(coordinate) if on_gpu() else in_memory(always, place, coordinate)
+        return transposed(self._cube_from(data, base, coordinate[0].dtype), self.axes), fraction
+
+    def split(self, data: Voxels, coordinate: Vec3) -> tuple[Node, Vec3]:
+        if self.steady or self.window is not None:
+            return super().split(data, coordinate)
+        return split(coordinate, self.shape(data), bounded=False)
+
     def base(self, data: Voxels, coordinate: Vec3) -> Int[Array, ""]:
         return flat_index(self.split(data, coordinate)[0], self._stored(data))
 
@@ -254,8 +270,11 @@ class Packed(Fetch):
         return data.shape if self.sizes is None else self.shape(data)
 
     def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
+        return self._cube_from(data, flat_index(node, self._stored(data)), dtype)
+
+    def _cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
+        """The eight voxels from the node of this flat index on."""
         _, ny, nz = self._stored(data)
-        base = flat_index(node, self._stored(data))
         kind = np.dtype(data.dtype if self.kind is None else self.kind)
         bits, signed = 8 * kind.itemsize, kind.kind == "i"
 
@@ -267,7 +286,7 @@ class Packed(Fetch):
         def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
             fetched = [flat] if bits == 8 else [flat, flat + nz]
             # converted, or XLA repeats the fetch for each use
-            words = [gather(self.words, index).astype(jnp.int32) for index in fetched]
+            words = [_word(self.words, index) for index in fetched]
             a, b, c, d = (voxel(word, number) for word in words for number in range(32 // bits))
             return [[a, b], [c, d]]
 
@@ -286,7 +305,7 @@ class Packed(Fetch):
         def word(x: int, y: int, z: int) -> Int[Array, ""]:
             offset = (x * ny + y) * nz + z
             if self.sizes is not None:
-                return gather(nodes, base + offset).astype(jnp.int32)
+                return _word(nodes, base + offset)
             # slices, which are not stored, so that all eight fetches share one index
             length = nodes.size - ((ny + 1) * nz + 1)
             return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
@@ -301,6 +320,13 @@ class Packed(Fetch):
         x, y, z = self._interpolated_slopes(slopes, fraction)
         factor = 2.0 ** -(shift + 1)
         return x * factor, y * factor, z * factor
+
+
+def _word(words: UInt32[Array, " words"], index: Int[Array, ""]) -> Int[Array, ""]:
+    """The word at an index, or any one if that is out of range."""
+    # by the bits of an index: XLA keeps each inside of the array by a comparison of 64 bits, which LLVM leaves
+    # out only where it sees that it is (where shapes are no data, or by these bits): a quarter of a fetch
+    return gather(words, index & ((1 << (words.size - 1).bit_length()) - 1)).astype(jnp.int32)
 
 
 class Fetched(NamedTuple):
@@ -450,9 +476,10 @@ def corners(coordinate: Vec3, shape: tuple[Any, ...]) -> list[tuple[Int[Array, "
     return found
 
 
-def split(coordinate: Vec3, shape: tuple[Any, ...]) -> tuple[Node, Vec3]:
-    """The node below a coordinate, and the fractions past it; the last node belongs to the cell below."""
-    (i, fx), (j, fy), (k, fz) = (_below(c, n) for c, n in zip(coordinate, shape, strict=True))
+def split(coordinate: Vec3, shape: tuple[Any, ...], *, bounded: bool = True) -> tuple[Node, Vec3]:
+    """The node below a coordinate, and the fractions past it; the last node belongs to the cell below. If not
+    `bounded`, the node of a NaN may lie anywhere."""
+    (i, fx), (j, fy), (k, fz) = (_below(c, n, bounded) for c, n in zip(coordinate, shape, strict=True))
     return (i, j, k), (fx, fy, fz)
 
 
@@ -460,7 +487,7 @@ SMALL = 2**22
 """Nodes along an axis up to which an index is read from a float's bits."""
 
 
-def _below(coordinate: Scalar, n: Any) -> tuple[Int[Array, "..."], Scalar]:
+def _below(coordinate: Scalar, n: Any, bounded: bool) -> tuple[Int[Array, "..."], Scalar]:
     """The node below a coordinate along an axis of `n` nodes, and the fraction past it."""
     dtype = coordinate.dtype
     last = jnp.asarray(n - 2, dtype)
@@ -473,8 +500,9 @@ def _below(coordinate: Scalar, n: Any) -> tuple[Int[Array, "..."], Scalar]:
         index = jax.lax.bitcast_convert_type(node + 2.0**23, jnp.int32) & (2**23 - 1)
     else:
         index = node.astype(jnp.int32)
-    # also keeps the index of a NaN inside the array
-    return jnp.clip(index, 0, jnp.asarray(n - 2, jnp.int32)), inside - node
+    if bounded:  # that of a NaN, too
+        index = jnp.clip(index, 0, jnp.asarray(n - 2, jnp.int32))
+    return index, inside - node
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
