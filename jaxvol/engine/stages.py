@@ -107,7 +107,7 @@ def staged_image(
         view = scene._replace(source=source, lighting=None)
         index = _index_of_view(view, acceleration, Tiling.of_backend())
     if isinstance(source, Camera):
-        fault = fault | _is_invalid(source)
+        fault = _is_invalid(source, fault)
     size, number = RayTiles.shared(source, tiling)
     tiling = tiling._replace(least=0)
     most = np.asarray(scene.march.most_samples, np.int32)
@@ -178,17 +178,19 @@ def _has_fault(scene: Scene) -> Bool[Array, ""] | np.ndarray:
     """`Scene.has_fault`; on a CPU in NumPy, which compiles nothing, of the kinds that know how."""
     kinds = (*map(type, scene.march.transforms), type(scene.transfer))
     others = [kind for kind in kinds if getattr(kind, "valid", None) not in (Transform.valid, Transfer.valid)]
-    if platform() != "cpu" or any(kind is not TransferFunction for kind in others):
+    if platform() != "cpu":
         return _has_fault_by_jax(scene)
+    if any(kind is not TransferFunction for kind in others):
+        return np.asarray(_has_fault_by_jax(scene))
     return np.asarray(jax.tree.map(_known, scene).has_fault)
 
 
-def _is_invalid(camera: Camera) -> Bool[Array, ""] | np.ndarray:
-    """The same of a camera, which other images of a scene do not share."""
+def _is_invalid(camera: Camera, fault: Bool[Array, ""] | np.ndarray) -> Bool[Array, ""] | np.ndarray:
+    """Whether this holds of a camera, which other images of the scene do not share, or else of a `fault`."""
     if platform() != "cpu":
-        return _is_invalid_by_jax(camera)
+        return _is_invalid_by_jax(camera, fault)
     camera = jax.tree.map(_known, camera)
-    return ~np.asarray(all_finite(camera) & camera.valid)
+    return np.asarray(fault | ~(all_finite(camera) & camera.valid))
 
 
 def _known(leaf: Any) -> Any:
@@ -201,8 +203,8 @@ def _has_fault_by_jax(scene: Scene) -> Bool[Array, ""]:
 
 
 @program
-def _is_invalid_by_jax(camera: Camera) -> Bool[Array, ""]:
-    return ~(all_finite(camera) & camera.valid)
+def _is_invalid_by_jax(camera: Camera, fault: Bool[Array, ""]) -> Bool[Array, ""]:
+    return fault | ~(all_finite(camera) & camera.valid)
 
 
 # ---- stage A ----
