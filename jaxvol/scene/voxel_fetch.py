@@ -324,8 +324,8 @@ class Packed(Fetch):
 
 def _word(words: UInt32[Array, " words"], index: Int[Array, ""]) -> Int[Array, ""]:
     """The word at an index, or any one if that is out of range."""
-    # by the bits of an index: XLA keeps each inside of the array by a comparison of 64 bits, which LLVM leaves
-    # out only where it sees that it is (where shapes are no data, or by these bits): a quarter of a fetch
+    # XLA keeps an index inside of the array by comparisons of 64 bits, a quarter of a fetch. LLVM leaves them
+    # out where it sees that it is: where shapes are no data, or by these bits.
     return gather(words, index & ((1 << (words.size - 1).bit_length()) - 1)).astype(jnp.int32)
 
 
