@@ -44,7 +44,7 @@ def light_terms(
 
     def begin(ray: Ray, cell: Cell) -> Int[Array, ""]:
         coordinate = around.space.local.coordinate(along(ray.entry, ray.direction, scene.march.sample(cell)))
-        return volume.fetch.base(volume.data, coordinate)
+        return volume.fetch.place(volume.data, coordinate)[0]
 
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
         sample = _inline_sample(scene, ray, cell)

@@ -61,8 +61,21 @@ class Fetch(eqx.Module):
     one node meet the voxels of another. It takes 1 to 4 % of a gradient."""
 
     @abstractmethod
+    def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
+        """The eight voxels from the one of this flat index on, along the array's axes."""
+
     def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
-        """The eight voxels from this one of the array on, along its axes."""
+        """The same from a node of the array on."""
+        return self.cube_from(data, flat_index(node, self._stored(data)), dtype)
+
+    def place(self, data: Voxels, coordinate: Vec3) -> tuple[Int[Array, ""], Vec3]:
+        """The node of the array below a grid coordinate, as a flat index, and the fractions past it."""
+        node, fraction = self.split(data, coordinate)
+        return flat_index(node, self._stored(data)), fraction
+
+    def _always(self, data: Voxels) -> Bool[Array, ""]:
+        """As `in_memory` asks for."""
+        return abs(data.reshape(-1)[0].astype(jnp.float32)) + 1 != 0
 
     @property
     def axes(self) -> Axes:
@@ -71,8 +84,14 @@ class Fetch(eqx.Module):
 
     def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
-        node, fraction = self.split(data, coordinate)
-        return transposed(self.cube_at(data, node, coordinate[0].dtype), self.axes), fraction
+        place = partial(self.place, data)
+        if on_gpu() or self.steady:
+            base, fraction = place(coordinate)
+        else:
+            # In memory, since LLVM computes one sample after the other where it fetches them, on processors
+            # whose gathers are slow: places take two fifths of a fetch there.
+            base, fraction = in_memory(self._always(data), place, coordinate)
+        return transposed(self.cube_from(data, base, coordinate[0].dtype), self.axes), fraction
 
     def interpolated(self, data: Voxels, coordinate: Vec3) -> Voxel:
         """Trilinear interpolation at a grid coordinate."""
@@ -93,8 +112,7 @@ class Fetch(eqx.Module):
         """The node of the array below a grid coordinate, along its axes, and the fractions past it, along
         x, y, z."""
         if self.steady:
-            always = abs(data.reshape(-1)[0].astype(jnp.float32)) + 1 != 0
-            node, fraction = _steady_split(coordinate, always, self.shape(data))
+            node, fraction = _steady_split(coordinate, self._always(data), self.shape(data))
         else:
             node, fraction = split(coordinate, self.shape(data))
         if self.window is None:
@@ -114,10 +132,6 @@ class Fetch(eqx.Module):
             past = [node[axis] - self.window.first[axis] for axis in self.axes]
             node = [jnp.clip(index, 0, n - 1) for index, n in zip(past, data.shape, strict=True)]
         return jnp.where(inside, flat_index((node[0], node[1], node[2]), data.shape), -1)
-
-    def base(self, data: Voxels, coordinate: Vec3) -> Int[Array, ""]:
-        """The node below a grid coordinate, as an index into the flattened array."""
-        return flat_index(self.split(data, coordinate)[0], data.shape)
 
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Fetch":
         """A fetch for one call of `slopes`, at the node whose flat index is `begin`: XLA computes the index
@@ -187,7 +201,7 @@ class Extent(Fetch):
 
     nodes: tuple[int, int, int] = eqx.field(static=True)
 
-    def cube_at(self, data: Any, node: Node, dtype: Any) -> Cube:
+    def cube_from(self, data: Any, base: Int[Array, ""], dtype: Any) -> Cube:
         raise ValueError("volume has no voxels of its own to be interpolated; read those of its field.")
 
     def shape(self, data: Any) -> tuple[int, int, int]:
@@ -199,7 +213,7 @@ class Nodes(Fetch):
 
     counts: Int[Array, "3"] | np.ndarray
 
-    def cube_at(self, data: Any, node: Node, dtype: Any) -> Cube:
+    def cube_from(self, data: Any, base: Int[Array, ""], dtype: Any) -> Cube:
         raise ValueError("volume has no voxels here.")
 
     def shape(self, data: Any) -> tuple[Any, Any, Any]:
@@ -209,14 +223,14 @@ class Nodes(Fetch):
 class OneByOne(Fetch):
     """Fetches each of the eight voxels separately."""
 
-    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
-        return voxels_from(data, node, dtype)
+    def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
+        return voxels_from(data, base, dtype)
 
 
 class Zeros(Fetch):
     """Zeros in place of the voxels, to find out what reads these otherwise."""
 
-    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
+    def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
         return cube_of(lambda *_: _zero_voxel(data, (), dtype))
 
 
@@ -247,33 +261,18 @@ class Packed(Fetch):
     def of_slopes_at(self, begin: Int[Array, ""]) -> "Packed":
         return replace(self, begin=begin)
 
-    def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
-        def place(coordinate: Vec3) -> tuple[Int[Array, ""], Vec3]:
-            node, fraction = self.split(data, coordinate)
-            return flat_index(node, self._stored(data)), fraction
-
-        # In memory, since LLVM computes one sample after the other where it fetches them, on processors whose
-        # gathers are slow: places take two fifths of a fetch there.
-        always = self.words[0].astype(jnp.float32) + 1 != 0
-        base, fraction = place(coordinate) if on_gpu() else in_memory(always, place, coordinate)
-        return transposed(self._cube_from(data, base, coordinate[0].dtype), self.axes), fraction
+    def _always(self, data: Voxels) -> Bool[Array, ""]:
+        return self.words[0].astype(jnp.float32) + 1 != 0
 
     def split(self, data: Voxels, coordinate: Vec3) -> tuple[Node, Vec3]:
         if self.steady or self.window is not None:
             return super().split(data, coordinate)
         return split(coordinate, self.shape(data), bounded=False)
 
-    def base(self, data: Voxels, coordinate: Vec3) -> Int[Array, ""]:
-        return flat_index(self.split(data, coordinate)[0], self._stored(data))
-
     def _stored(self, data: Any) -> tuple[Any, ...]:
         return data.shape if self.sizes is None else self.shape(data)
 
-    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
-        return self._cube_from(data, flat_index(node, self._stored(data)), dtype)
-
-    def _cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
-        """The eight voxels from the node of this flat index on."""
+    def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
         _, ny, nz = self._stored(data)
         kind = np.dtype(data.dtype if self.kind is None else self.kind)
         bits, signed = 8 * kind.itemsize, kind.kind == "i"
@@ -296,8 +295,8 @@ class Packed(Fetch):
         nodes = self.nodes
         if nodes is None:
             return super().slopes(data, coordinate)
-        node, fraction = self.split(data, coordinate)
-        base = flat_index(node, self._stored(data)) if self.begin is None else self.begin
+        base, fraction = self.place(data, coordinate)
+        base = base if self.begin is None else self.begin
         dtype = coordinate[0].dtype
         _, ny, nz = self._stored(data)
         shift = 32 - SLOPE_BITS
@@ -348,16 +347,19 @@ class Recording(Fetch):
     state: Any = eqx.field(static=True, default_factory=lambda: _trace_state())
     """Of JAX, where recording began."""
 
-    def cube_at(self, data: Voxels, node: Node, dtype: Any) -> Cube:
-        cube = voxels_from(data, node, dtype)
-        return self._perturbed(cube, Fetched(flat_index(node, data.shape)))
+    def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
+        base, fraction = self.place(data, coordinate)
+        return transposed(self.cube_from(data, base, coordinate[0].dtype), self.axes), fraction
+
+    def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
+        return self._perturbed(voxels_from(data, base, dtype), Fetched(base))
 
     def interpolated(self, data: Voxels, coordinate: Vec3) -> Voxel:
-        node, fraction = self.split(data, coordinate)
-        cube = voxels_from(data, node, coordinate[0].dtype)
+        base, fraction = self.place(data, coordinate)
+        cube = voxels_from(data, base, coordinate[0].dtype)
         along = permuted(fraction, self.axes)
         value = trilinear(transposed(cube, self.axes), fraction)
-        return self._perturbed(value, Fetched(flat_index(node, data.shape), along))
+        return self._perturbed(value, Fetched(base, along))
 
     def _perturbed(self, found: Any, fetched: Fetched) -> Any:
         if _trace_state() != self.state:
@@ -445,9 +447,9 @@ def _rows(parts: Sequence[Array]) -> Float[Array, "batch parts"]:
     return jnp.stack([part.reshape(-1) for part in parts], axis=-1)
 
 
-def voxels_from(data: Voxels, node: Node, dtype: Any) -> Cube:
-    """The eight voxels from a node on, each number fetched by itself."""
-    (_, ny, nz, *channels), base, flat = data.shape, flat_index(node, data.shape), data.reshape(-1)
+def voxels_from(data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
+    """The eight voxels from the node of this flat index on, each number fetched by itself."""
+    (_, ny, nz, *channels), flat = data.shape, data.reshape(-1)
 
     def voxel(x: int, y: int, z: int) -> Voxel:
         at = base + (x * ny + y) * nz + z
