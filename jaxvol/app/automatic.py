@@ -360,10 +360,6 @@ def labels_if_any(
     volume: Volume, around: Transfer | None = None
 ) -> tuple[Volume, LabelTransferFunction] | None:
     """As `labels_shown`; None where that raises."""
-    import matplotlib
-    from matplotlib.colors import ListedColormap, hsv_to_rgb
-    from scipy.ndimage import gaussian_filter, maximum_filter
-
     own, data = volume.labels is not None, np.asarray(volume.data)
     given = np.asarray(volume.labels) if own else data
     if not own and (given.dtype.kind not in "iu" or not is_flat(given)):
@@ -371,6 +367,11 @@ def labels_if_any(
     kinds = np.unique(np.append(given, 0) if own else given)
     if len(kinds) > MOST_LABELS or not (own or len(kinds) > 2):
         return None
+
+    import matplotlib
+    from matplotlib.colors import ListedColormap, hsv_to_rgb
+    from scipy.ndimage import gaussian_filter, maximum_filter
+
     labels = np.searchsorted(kinds, given).astype(np.uint8)
     # smoothed, so that the border of what has a label has a gradient
     inside = gaussian_filter(np.where(labels > 0, np.float32(1), np.float32(0)), 0.8)

@@ -139,7 +139,7 @@ class Staging(NamedTuple):
     kernel: Kernel
     seams: March
     place: Volume
-    index: EmptySpaceIndex | None
+    empty_space: EmptySpaceIndex | None
     fault: Bool[Array, ""] | np.ndarray
 
 

@@ -1,0 +1,32 @@
+"""Public names of `jaxvol.fitting`, each of which is imported when it is first used."""
+
+from .bijections import (
+    Bijection as Bijection,
+    Fixed as Fixed,
+    Pose as Pose,
+    Positive as Positive,
+    ProbeGeometry as ProbeGeometry,
+    Unconstrained as Unconstrained,
+    UnitInterval as UnitInterval,
+)
+from .candidates import (
+    Candidate as Candidate,
+    flat_grey as flat_grey,
+    nested_materials as nested_materials,
+    nested_points as nested_points,
+    refined as refined,
+)
+from .choice import Choice as Choice, Evidence as Evidence, choose as choose
+from .constraints import unconstrain as unconstrain
+from .driver import (
+    Fit as Fit,
+    Outcome as Outcome,
+    fit as fit,
+    fit_coarse_to_fine as fit_coarse_to_fine,
+    fit_in_stages as fit_in_stages,
+)
+from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
+from .path_traced import PathTracedResidual as PathTracedResidual
+from .registration import Registration as Registration, RigidMotion as RigidMotion, register as register
+from .residuals import ImageResidual as ImageResidual
+from .uncertainty import Uncertainty as Uncertainty
