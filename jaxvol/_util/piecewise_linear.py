@@ -17,8 +17,8 @@ from .vec3 import Scalar, Vec3
 
 
 FEW = 8
-"""Up to so many control points, a row is chosen by comparing with each point. Of more, it is searched for once
-and looked up: to choose among sixteen takes ten times as long as among eight, in colours."""
+"""Up to so many control points, a row is chosen by comparing with each. Of more, it is searched for once, and
+looked up: in colours, to choose among sixteen takes ten times as long as among eight."""
 
 COMPARED = 16
 """Up to so many control points, comparing a value with each costs less than a search."""

@@ -227,9 +227,10 @@ def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
     def all_(measured: list[Measured]) -> list[Vec3]:
         return [classify(each)[0] for each in measured]
 
-    # Means would be computed again for each use if they were fused into the compositing of each cell.
-    means = scene.march.integrates or isinstance(scene.transfer, Together)
-    return in_memory(always(at), all_, measured) if means else all_(measured)
+    # Means, and what is looked up, would be computed again for each use if they were fused into the compositing
+    # of each cell.
+    often = scene.classification.search is not None or isinstance(scene.transfer, Together)
+    return in_memory(always(at), all_, measured) if often or scene.march.integrates else all_(measured)
 
 
 def _measured_over(
