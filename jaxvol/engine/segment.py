@@ -227,8 +227,8 @@ def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
     def all_(measured: list[Measured]) -> list[Vec3]:
         return [classify(each)[0] for each in measured]
 
-    # Means, and what is looked up, would be computed again for each use if they were fused into the compositing
-    # of each cell.
+    # Means, and what is looked up, would be computed again for each use if they were fused into the
+    # compositing of each cell.
     often = scene.classification.search is not None or isinstance(scene.transfer, Together)
     return in_memory(always(at), all_, measured) if often or scene.march.integrates else all_(measured)
 
