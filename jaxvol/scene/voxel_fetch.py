@@ -301,15 +301,11 @@ class Packed(Fetch):
         _, ny, nz = self._stored(data)
         shift = 32 - SLOPE_BITS
 
-        def word(x: int, y: int, z: int) -> Int[Array, ""]:
-            offset = (x * ny + y) * nz + z
-            if self.sizes is not None:
-                return _word(nodes, base + offset)
-            # slices, which are not stored, so that all eight fetches share one index
-            length = nodes.size - ((ny + 1) * nz + 1)
-            return gather(jax.lax.slice(nodes, (offset,), (offset + length,)), base).astype(jnp.int32)
+        def words_from(base: Int[Array, ""]) -> Cube:
+            return cube_of(lambda x, y, z: _word(nodes, base + (x * ny + y) * nz + z))
 
-        words = cube_of(word)
+        # in memory, for the reason of `cube`
+        words = words_from(base) if on_gpu() else in_memory(self._always(data), words_from, base)
 
         def slope(bits: int, word: Int[Array, ""]) -> Scalar:
             """The slope from so many bits below the highest one on, times a power of two."""
