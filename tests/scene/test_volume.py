@@ -10,6 +10,8 @@ from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
+from jaxvol.engine.acceleration import words_of
+from jaxvol.scene.voxel_fetch import Packed
 
 from ..scenes import in_float64
 
@@ -63,6 +65,27 @@ def test_values_are_trilinear_and_voxels_keep_their_type(dtype):
     values, *_ = looked_up(jnp.asarray(data), NODES)
     np.testing.assert_array_equal(values, data.reshape(-1).astype(np.float32))
     assert np.isnan(looked_up(jnp.asarray(data), np.full_like(NODES, np.nan))[0]).all()
+
+
+@pytest.mark.parametrize("dtype", ["uint8", "int16"])
+def test_a_packed_copy_whose_shape_is_data_gives_the_values_between_voxels(dtype):
+    data = random_data(dtype)
+    packed = Packed(words_of(jv.Volume(data))).unshaped(data)
+    apart_from_nodes = random_coordinates()
+    coordinates = np.concatenate(
+        [apart_from_nodes, NODES, [[np.nan, 1, 1], [1, np.inf, 1]]], dtype=np.float32
+    )
+
+    @jax.jit
+    def values(packed, coordinates):
+        return jax.vmap(lambda c: packed.interpolated(None, (c[0], c[1], c[2])))(coordinates)
+
+    *found, nowhere, far = values(packed, coordinates)
+    inside = np.clip(coordinates[:-2].T, 0, np.array(SHAPE)[:, None] - 1)
+    true = map_coordinates(data.astype(np.float64), inside, order=1)
+    np.testing.assert_allclose(found, true, atol=1e-6 * np.ptp(true))
+    assert np.isnan(nowhere)
+    np.testing.assert_allclose(far, data[1, -1, 1], rtol=1e-6)
 
 
 def test_an_array_that_changes_afterwards_does_not_change_the_volume():
