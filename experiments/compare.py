@@ -26,7 +26,7 @@ from typing import Any
 
 from . import timing
 from .harness import data, experiment, geometric_mean, some_of
-from .scenes import PHANTOM, SCENES
+from .scenes import PHANTOM, SCENES, UNTUNED
 
 
 KINDS = "image", "gradient", "shaded"
@@ -97,7 +97,7 @@ def means(found: dict[str, dict[str, dict[str, Any]]], kinds: list[str]) -> dict
     size=512,
     repetitions=11,
     kinds=some_of(KINDS, "KIND"),
-    only=some_of(SCENES, "VOLUME"),
+    only=some_of([*SCENES, *UNTUNED], "VOLUME") | {"default": list(SCENES)},
     quick={"size": 32, "repetitions": 2},
 )
 def main(chosen: Namespace) -> dict[str, Any]:

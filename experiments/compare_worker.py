@@ -17,7 +17,8 @@ def programs(folder, names, kinds, size):
 
     import jaxvol as jv
 
-    scenes = runpy.run_path(str(Path(__file__).with_name("scenes.py")))["SCENES"]
+    found = runpy.run_path(str(Path(__file__).with_name("scenes.py")))
+    scenes = found["SCENES"] | found["UNTUNED"]
     made = {}
     for name in names:
         scene = scenes[name](folder and Path(folder), size)

@@ -93,6 +93,25 @@ SCENES: dict[str, Callable[..., Scene]] = {
 }
 
 
+def translucent(low: float, high: float) -> list[tuple[Any, ...]]:
+    """Points from transparent to opaque between two values."""
+    middle = (low + high) / 2
+    return [(low, (0.3, 0.1, 0.1), 0.0), (middle, (0.9, 0.6, 0.4), 0.05), (high, (1.0, 1.0, 1.0), 0.8)]
+
+
+UNTUNED: dict[str, Callable[..., Scene]] = {
+    "tooth": real("tooth_103x94x161_uint8.raw", translucent(90, 230), (0.5, 1, 0.3), (0, 0, 1), 1.3),
+    "studyforrest_t1": real(
+        "studyforrest_t1_137x192x192_int16le.raw.gz", translucent(10, 80), (1, 0.4, 0.3), (0, 0, 1), 1.2
+    ),
+    "cthead": real(CT_HEAD, translucent(500, 1600), (0.4, -1, 0.2), (0, 0, 1), 1.2),
+    "us_aplio_convex": real(
+        "us_aplio_convex_239x128x91_uint8.raw.gz", translucent(60, 200), (0.3, 0.5, 1), (0, 1, 0), 1.2
+    ),
+}
+"""Scenes to which nothing was ever fitted, for which nothing else is measured than whether commits differ."""
+
+
 def grid(side: int) -> tuple[np.ndarray, ...]:
     """x, y and z of the nodes of [-1, 1]³."""
     return tuple(np.meshgrid(*[np.linspace(-1, 1, side)] * 3, indexing="ij"))

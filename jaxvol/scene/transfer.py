@@ -285,7 +285,9 @@ class TransferFunction(Transfer):
         return search
 
     def classifier(self) -> Classify:
-        rows, values = self.rows(), jax.lax.stop_gradient(self.values)
+        rows, few = self.rows(), self.values.shape[0] <= linear.FEW
+        # taken apart once, not for each use: that takes longer to trace than all else
+        entries = [jnp.unstack(row) for row in jnp.unstack(rows)] if few else []
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
@@ -293,13 +295,13 @@ class TransferFunction(Transfer):
 
         def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
-            numbers = range(rows.shape[1])
-            row = tuple(rows[0, j] for j in numbers)
-            for k in range(1, values.shape[0]):  # numbers one by one, since XLA would store whole rows
-                row = tuple(jnp.where(value >= values[k], rows[k, j], row[j]) for j in numbers)
-            return linear.interpolate_row(row, linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
+            row, *others = entries
+            for other in others:  # numbers one by one, since XLA would store whole rows
+                reached = value >= other[0]
+                row = [jnp.where(reached, *each) for each in zip(other, row, strict=True)]
+            return linear.interpolate_row(tuple(row), linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
 
-        return chosen if values.shape[0] <= linear.FEW else looked_up
+        return chosen if few else looked_up
 
     def integrator(self) -> Classify:
         rows, few = self.span_rows(), self.values.shape[0] <= linear.FEW
