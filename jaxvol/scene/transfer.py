@@ -299,7 +299,9 @@ class TransferFunction(Transfer):
             for other in others:  # numbers one by one, since XLA would store whole rows
                 reached = value >= other[0]
                 row = [jnp.where(reached, *each) for each in zip(other, row, strict=True)]
-            return linear.interpolate_row(tuple(row), linear.clip_below(value - row[0], jnp.zeros_like(row[0])))
+            return linear.interpolate_row(
+                tuple(row), linear.clip_below(value - row[0], jnp.zeros_like(row[0]))
+            )
 
         return chosen if few else looked_up
 

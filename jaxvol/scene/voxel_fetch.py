@@ -73,9 +73,9 @@ class Fetch(eqx.Module):
         node, fraction = self.split(data, coordinate)
         return flat_index(node, self._stored(data)), fraction
 
-    def _always(self, data: Voxels) -> Bool[Array, ""]:
-        """As `in_memory` asks for."""
-        return abs(data.reshape(-1)[0].astype(jnp.float32)) + 1 != 0
+    def _always(self, data: Voxels) -> Bool[Array, ""] | None:
+        """As `in_memory` asks for; None where nothing is put in memory."""
+        return None
 
     @property
     def axes(self) -> Axes:
@@ -84,13 +84,13 @@ class Fetch(eqx.Module):
 
     def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
-        place = partial(self.place, data)
-        if on_gpu() or self.steady:
+        place, always = partial(self.place, data), self._always(data)
+        if always is None or on_gpu() or self.steady:
             base, fraction = place(coordinate)
         else:
             # In memory, since LLVM computes one sample after the other where it fetches them, on processors
             # whose gathers are slow: places take two fifths of a fetch there.
-            base, fraction = in_memory(self._always(data), place, coordinate)
+            base, fraction = in_memory(always, place, coordinate)
         return transposed(self.cube_from(data, base, coordinate[0].dtype), self.axes), fraction
 
     def interpolated(self, data: Voxels, coordinate: Vec3) -> Voxel:
@@ -111,8 +111,9 @@ class Fetch(eqx.Module):
     def split(self, data: Voxels, coordinate: Vec3) -> tuple[Node, Vec3]:
         """The node of the array below a grid coordinate, along its axes, and the fractions past it, along
         x, y, z."""
-        if self.steady:
-            node, fraction = _steady_split(coordinate, self._always(data), self.shape(data))
+        always = self._always(data)
+        if self.steady and always is not None:
+            node, fraction = _steady_split(coordinate, always, self.shape(data))
         else:
             node, fraction = split(coordinate, self.shape(data))
         if self.window is None:
@@ -225,6 +226,9 @@ class OneByOne(Fetch):
 
     def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
         return voxels_from(data, base, dtype)
+
+    def _always(self, data: Voxels) -> Bool[Array, ""]:
+        return abs(data.reshape(-1)[0].astype(jnp.float32)) + 1 != 0
 
 
 class Zeros(Fetch):
@@ -342,10 +346,6 @@ class Recording(Fetch):
     """Filled while tracing."""
     state: Any = eqx.field(static=True, default_factory=lambda: _trace_state())
     """Of JAX, where recording began."""
-
-    def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
-        base, fraction = self.place(data, coordinate)
-        return transposed(self.cube_from(data, base, coordinate[0].dtype), self.axes), fraction
 
     def cube_from(self, data: Voxels, base: Int[Array, ""], dtype: Any) -> Cube:
         return self._perturbed(voxels_from(data, base, dtype), Fetched(base))

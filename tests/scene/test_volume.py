@@ -70,7 +70,9 @@ def test_values_are_trilinear_and_voxels_keep_their_type(dtype):
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_a_packed_copy_whose_shape_is_data_gives_the_values_between_voxels(dtype):
     data = random_data(dtype)
-    packed = Packed(words_of(jv.Volume(data))).unshaped(data)
+    words = words_of(jv.Volume(data))
+    assert words is not None
+    packed = Packed(words).unshaped(data)
     apart_from_nodes = random_coordinates()
     coordinates = np.concatenate(
         [apart_from_nodes, NODES, [[np.nan, 1, 1], [1, np.inf, 1]]], dtype=np.float32
