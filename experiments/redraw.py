@@ -18,8 +18,9 @@ NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 IMAGES = {"path_traced", "tomography", "transport"}
 """Records whose charts show images that no record holds."""
 OTHERS = {
-    *("adaptive_error", "bricks", "compare", "compare_gpu", "gradient_agreement", "gradient_agreement_gpu"),
-    *("out_of_core", "probe_geometry", "shading", "viewer_latency", "visible_shading"),
+    *("adaptive_error", "bricks", "compare", "compare_gpu", "compare_small", "compare_untuned"),
+    *("gradient_agreement", "gradient_agreement_gpu", "out_of_core", "probe_geometry", "shading"),
+    *("viewer_latency", "visible_shading"),
 }
 """Records without a chart."""
 DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]
