@@ -162,7 +162,10 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
             unchecked(part) if isinstance(part, eqx.Module) else part
             for part in _kernel_of(scene, acceleration)
         )
-        _STAGINGS[key] = Staging(Kernel(*kernel), seams, unchecked(place), index, fault)
+        found = Staging(Kernel(*kernel), seams, unchecked(place), index, fault)
+        if any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(parts)):  # may change in place
+            return found
+        _STAGINGS[key] = found
         when_any_dies(parts, lambda: _STAGINGS.pop(key, None))
     return _STAGINGS[key]
 

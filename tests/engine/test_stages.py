@@ -3,6 +3,7 @@
 import gc
 import weakref
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,3 +122,17 @@ def test_what_is_kept_of_a_scene_goes_with_its_parts():
         gc.collect()
         assert dead() is None
         assert len(stages._STAGINGS) == kept - 1
+
+
+def test_numbers_that_change_in_place_are_seen():
+    extinction = np.ones(2, np.float32)
+    transfer = eqx.tree_at(
+        lambda t: t.extinction, jv.TransferFunction([0.0, 255.0], np.ones((2, 3)), [1.0, 1.0]), extinction
+    )
+    volume = jv.Volume(np.full((4, 4, 4), 100, np.uint8))
+    camera, march = jv.Camera.looking_at(volume, size=(8, 8)), jv.March(0.5, (jv.SpaceLeaping(),))
+    assert jv.render(volume, transfer, camera, march).rgba[4, 4, 3] > 0.5
+    extinction[:] = 0
+    assert np.all(jv.render(volume, transfer, camera, march).rgba == 0)
+    extinction[:] = np.nan
+    assert np.all(np.isnan(jv.render(volume, transfer, camera, march).rgba))
