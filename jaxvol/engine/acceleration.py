@@ -6,6 +6,7 @@ neighbour along z, and for 8-bit voxels the two next to these along y, which sav
 for each array of them. The slopes of 8-bit voxels take as much again.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -15,9 +16,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Shaped, UInt32
+from jaxtyping import Array, Bool, Int, Shaped, UInt32
 
 from .._util.checks import check_answer
+from .._util.piecewise_linear import positive_between
 from .._util.vec3 import plus
 from ..compositing.blending import Compositing
 from ..compositing.selection import FirstVisible
@@ -28,12 +30,13 @@ from ..ray import Scene, by_rules, end
 from ..scene.camera import GivenRays, without_ends
 from ..scene.occupancy import BLOCK, Blocks, Occupancy
 from ..scene.several import Several, SeveralBlocks
-from ..scene.transfer import Transfer
+from ..scene.transfer import Transfer, TransferFunction
 from ..scene.volume import Volume, grids, read_as
 from ..scene.voxel_fetch import SLOPE_BITS, Packed
 from ..xla.memo import memoized, memoized_of
-from ..xla.platform import is_traced
-from ..xla.trees import constant
+from ..xla.memory import zeros_in_reserve
+from ..xla.platform import is_traced, platform
+from ..xla.trees import constant, unchecked
 from .rays import RayTiles, lines, vmap_rays
 from .shifts import begin_rays
 from .tiling import Tiling
@@ -42,6 +45,9 @@ from .wavefront import blinded, march_rays
 
 LARGE = 2**24
 """Voxels from which on packed copies are not padded to a power of two."""
+
+RESERVES = LARGE, 2**28
+"""Lengths of packed copies in reserve (`zeros_in_reserve`)."""
 
 LIMIT = 2**30
 """Bytes that a copy of the voxels may take at most, and one of their slopes."""
@@ -153,6 +159,18 @@ def _occupancy(
     return march.locate(volume).occupancy(visible, volume.first, blocks.side)
 
 
+def visible_in_numpy(
+    compositing: Compositing[Any], transfer: Transfer, blocks: Any
+) -> Bool[np.ndarray, "bx by bz"] | None:
+    """Blocks in which anything may be visible, by NumPy, which compiles nothing; None where JAX has to."""
+    usual = type(compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
+    if not usual or not isinstance(blocks, Blocks) or blocks.low.ndim != 3 or platform() != "cpu":
+        return None
+    low, high = np.asarray(blocks.low), np.asarray(blocks.high)
+    values, extinction = np.asarray(transfer.values), np.asarray(transfer.extinction)
+    return positive_between(values, extinction, low, high) | ~(low <= high)
+
+
 NO_ACCELERATION = VolumeAcceleration([], [], None)
 
 
@@ -212,14 +230,32 @@ def words_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
         or 4 * data.size > LIMIT
     ):
         return None
+    return _words(data)[0]
+
+
+def _words(data: Array) -> tuple[Array, Array]:
     return memoized(data, _packed, _packed_in_numpy)
+
+
+def _slopes(data: Array) -> tuple[Array, Array]:
+    return memoized(data, _packed_slopes, _packed_slopes_in_numpy)
+
+
+def unshaped(volume: Volume) -> Volume:
+    """A volume of `Packed` voxels, so that kernels need not know its shape."""
+    fetch, data = cast(Packed, volume.fetch), volume.data
+    nodes = None if fetch.nodes is None else _slopes(data)[1]
+    sizes, kind = np.asarray(data.shape, np.int32), str(data.dtype)
+    return unchecked(
+        volume, fetch=replace(fetch, words=_words(data)[1], nodes=nodes, sizes=sizes, kind=kind), data=None
+    )
 
 
 def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
     """The slopes of a volume's nodes, exact, for the gradient; None where `words_of` is, and for voxels of
     more than 8 bits."""
     small = words_of(volume) is not None and volume.data.dtype.itemsize == 1
-    return memoized(volume.data, _packed_slopes) if small else None
+    return _slopes(volume.data)[0] if small else None
 
 
 def with_words(
@@ -240,7 +276,7 @@ def shared_length(voxels: int) -> int:
 
 
 @jax.jit
-def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " words"]:
+def _packed(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     bits = 8 * data.dtype.itemsize
 
     def plane(voxels: Shaped[Array, "ny nz"]) -> UInt32[Array, "ny nz"]:
@@ -250,41 +286,66 @@ def _packed(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " words"]:
         return words | jnp.roll(words, -1, 0) << 16 if bits == 8 else words
 
     # plane by plane: the neighbours of all voxels would take several times the memory of the words
-    return jnp.pad(jax.lax.map(plane, data).reshape(-1), (0, shared_length(data.size) - data.size))
+    return _in_one_length(jax.lax.map(plane, data))
 
 
-def _packed_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> UInt32[np.ndarray, " words"]:
-    bits, words = 8 * data.dtype.itemsize, np.zeros(shared_length(data.size), np.uint32)
-    planes = words[: data.size].reshape(data.shape)
+def _in_one_length(found: UInt32[Array, "nx ny nz"]) -> tuple[Array, Array]:
+    words = jnp.pad(found.reshape(-1), (0, shared_length(found.size) - found.size))
+    return words, words
+
+
+def _packed_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> tuple[np.ndarray, np.ndarray]:
+    bits, (words, reserve, planes) = 8 * data.dtype.itemsize, _reserved(data.shape)
     for plane, voxels in zip(planes, data.view(f"uint{bits}"), strict=True):
         plane[:] = voxels
         plane[:, :-1] |= plane[:, 1:] << bits
         if bits == 8:
             plane[:-1] |= plane[1:] << 16
-    return words
+    return words, reserve
+
+
+def _reserved(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same words in a length that goes with their number, in one that goes with any, and by voxels."""
+    count = math.prod(shape)
+    try:
+        reserve = zeros_in_reserve(next(each for each in RESERVES if each >= count), np.uint32)
+    except MemoryError:  # where addresses are limited
+        reserve = zeros_in_reserve(shared_length(count), np.uint32)
+    return reserve[: shared_length(count)], reserve, reserve[:count].reshape(shape)
 
 
 @jax.jit
-def _packed_slopes(data: Shaped[Array, "nx ny nz"]) -> UInt32[Array, " voxels"]:
+def _packed_slopes(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
     last = data.shape[0] - 1
-
-    def doubled(voxels: Int[Array, "..."], axis: int) -> Int[Array, "..."]:
-        n = voxels.shape[axis]
-        rise = jnp.diff(voxels, axis=axis)
-        before, after = (jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, n - 2), (1, n - 1)))
-        ends = (2 * jax.lax.slice_in_dim(rise, *part, axis=axis) for part in ((0, 1), (n - 2, n - 1)))
-        first, final = ends
-        return jnp.concatenate([first, before + after, final], axis)
 
     def plane(i: Int[Array, ""]) -> UInt32[Array, "ny nz"]:
         before, here, after = (data[jnp.clip(i + step, 0, last)].astype(jnp.int32) for step in (-1, 0, 1))
         across = (after - before) * jnp.where((i == 0) | (i == last), 2, 1)
-        x, y, z = (
-            (slope & (2**SLOPE_BITS - 1)).astype(jnp.uint32)
-            for slope in (across, doubled(here, 0), doubled(here, 1))
-        )
-        return x << (32 - SLOPE_BITS) | y << 12 | z
+        return _slopes_of_plane(across, here, jnp)
 
     # plane by plane, as `_packed`
-    found = jax.lax.map(plane, jnp.arange(last + 1)).reshape(-1)
-    return jnp.pad(found, (0, shared_length(data.size) - data.size))
+    return _in_one_length(jax.lax.map(plane, jnp.arange(last + 1)))
+
+
+def _packed_slopes_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> tuple[np.ndarray, np.ndarray]:
+    words, reserve, planes = _reserved(data.shape)
+    last = data.shape[0] - 1
+    for i, plane in enumerate(planes):
+        before, here, after = (data[min(max(i + step, 0), last)].astype(np.int32) for step in (-1, 0, 1))
+        across = (after - before) * (2 if i in (0, last) else 1)
+        plane[:] = _slopes_of_plane(across, here, np)
+    return words, reserve
+
+
+def _slopes_of_plane(across: Any, voxels: Any, xp: Any) -> Any:
+    """The words of a plane, whose slopes along x are `across`; in `xp`, which is NumPy or JAX's."""
+
+    def doubled(axis: int) -> Any:
+        n, rise = voxels.shape[axis], xp.diff(voxels, axis=axis)
+        before, after, first, last = (
+            rise[(slice(None),) * axis + (slice(*part),)] for part in ((0, n - 2), (1, n), (0, 1), (n - 2, n))
+        )
+        return xp.concatenate([2 * first, before + after, 2 * last], axis)
+
+    x, y, z = ((slope & (2**SLOPE_BITS - 1)).astype(np.uint32) for slope in (across, doubled(0), doubled(1)))
+    return x << (32 - SLOPE_BITS) | y << 12 | z

@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from .._util.checks import all_finite
-from .._util.piecewise_linear import positive_between
 from ..compositing.blending import Compositing, Outputs
 from ..lighting.shading import Lighting, lit_classification
 from ..march.beams import EmptySpaceIndex, Skips, Stretches
@@ -37,7 +36,7 @@ from ..xla.compiling import OPTIONS
 from ..xla.memo import memoized_of, when_any_dies
 from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
-from .acceleration import VolumeAcceleration, empty_space_of
+from .acceleration import VolumeAcceleration, empty_space_of, unshaped, visible_in_numpy
 from .rays import RayTiles, box_of_corners, box_of_rays, entering, vmap_rays
 from .shifts import behind_first_cells, find_shifts
 from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
@@ -293,15 +292,12 @@ def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     transforms: tuple[Any, ...] = scene.march.transforms
     transfer: Any = scene.transfer
     (leap, *seams), blocks = transforms, acceleration.blocks
-    usual = type(scene.compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
-    whole = isinstance(blocks, Blocks) and scene.volume.field is None and scene.volume.first is None
-    known = whole and not blocks.low.committed and platform() == "cpu"
-    if seams or not usual or not known or leap.method != "hierarchy":
+    whole = scene.volume.field is None and scene.volume.first is None
+    if seams or not whole or leap.method != "hierarchy" or not isinstance(blocks, Blocks):
         return _index_by_jax(given)
-    # in NumPy, which compiles nothing
-    low, high = np.asarray(blocks.low), np.asarray(blocks.high)
-    values, extinction = np.asarray(transfer.values), np.asarray(transfer.extinction)
-    visible = positive_between(values, extinction, low, high) | ~(low <= high)
+    visible = visible_in_numpy(scene.compositing, transfer, blocks)
+    if visible is None or blocks.low.committed:
+        return _index_by_jax(given)
     spacing, origin = np.asarray(scene.volume.spacing), np.asarray(scene.volume.origin)
     size, zero = tuple(blocks.side * step for step in spacing), np.zeros_like(spacing[0])
     place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(origin), "frame": None}
@@ -331,7 +327,7 @@ def _kernel_of(scene: Scene, acceleration: VolumeAcceleration) -> Kernel:
     volume, lighting = acceleration.packed(scene).volume, scene.lighting
     shared = lighting is None or (lighting.reads_gradient and lighting.farthest_read == 0)
     if shared and len(grids(volume)) == 1 and isinstance(volume.fetch, Packed):
-        volume = unchecked(volume, fetch=volume.fetch.unshaped(volume.data), data=None)
+        volume = unshaped(volume)
     transfer = with_shared_points(scene.transfer)
     return Kernel(volume, transfer, scene.march.rules, scene.compositing, lighting)
 

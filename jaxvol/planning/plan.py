@@ -15,6 +15,7 @@ from ..bricks import VoxelSource, render_bricks
 from ..bricks.opening import Openable
 from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
+from ..engine.acceleration import visible_in_numpy
 from ..engine.image import render_scene
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
@@ -317,7 +318,9 @@ def chosen_transforms(
 
 
 def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:
-    """Which blocks may change a pixel; in one row, of a length that many volumes share: a power of 8."""
+    """Which blocks may change a pixel; by JAX in a row, of a length that many volumes share: a power of 8."""
+    if (known := visible_in_numpy(mode, transfer, blocks)) is not None:
+        return known
     count = math.prod(blocks.shape)
     length = 8 ** max(4, -(-(count - 1).bit_length() // 3))
 

@@ -6,6 +6,7 @@ gradients.
 """
 
 import itertools
+import math
 import operator
 from collections.abc import Callable
 from functools import cache, partial, reduce
@@ -20,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped, UInt8, UInt32
 from .._util.axes import inverse
 from .._util.vec3 import Frame, Vec3
 from ..xla.memo import memoized
-from ..xla.memory import gather
+from ..xla.memory import gather, zeros_in_reserve
 from ..xla.platform import on_gpu
 from ..xla.sharding import varying
 from ..xla.trees import unchecked
@@ -32,6 +33,9 @@ BLOCK = 4
 
 LAYERS = 8
 """Layers of blocks whose extremes are found at a time, so that they stay in the cache."""
+
+LENGTHS = 2**19, 2**23, 2**27
+"""Of summed-volume tables, so that few programs read them: of blocks of up to 318³, 808³, 2044³ voxels."""
 
 FARTHEST = 255
 """Distance in a grid without occupied cells. Other distances, in cells, are at most one less."""
@@ -110,12 +114,15 @@ class Sums(eqx.Module):
         """Of a NumPy array, in NumPy."""
         sizes = np.asarray(occupied.shape, np.int32)
         if isinstance(occupied, np.ndarray):
-            entries = np.pad(occupied.astype(np.int32), ((1, 0),) * 3)
+            shape = tuple(n + 1 for n in occupied.shape)
+            count = math.prod(shape)
+            length = next(each for each in LENGTHS if each >= count) if count <= LENGTHS[-1] else count
+            table = zeros_in_reserve(length, np.int32)
+            entries = table[:count].reshape(shape)
+            entries[1:, 1:, 1:] = occupied
             for axis in range(3):
                 np.cumsum(entries, axis=axis, out=entries)
-            # of one of a few lengths, so that few programs read it
-            more = (1 << (entries.size - 1).bit_length()) - entries.size
-            return cls(jax.device_put(np.pad(entries.reshape(-1), (0, more))), sizes)
+            return cls(jax.device_put(table), sizes)
         table = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
         for axis in range(3):
             if on_gpu():  # a loop launches a kernel for each layer

@@ -241,7 +241,8 @@ class Zeros(Fetch):
 class Packed(Fetch):
     """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
 
-    It needs no other array than that, so that kernels need not know the shape of the volume: `unshaped`."""
+    It needs no other array than that, so that kernels need not know the shape of the volume
+    (`engine.acceleration.unshaped`)."""
 
     words: UInt32[Array, " words"]
     """At least as many as voxels."""
@@ -252,10 +253,6 @@ class Packed(Fetch):
     """Number of nodes along x, y, z; None: those of the voxels."""
     kind: str | None = eqx.field(static=True, default=None)
     """Type of the voxels; None: theirs."""
-
-    def unshaped(self, data: Voxels) -> "Packed":
-        """The same fetch without the voxels."""
-        return replace(self, sizes=np.asarray(data.shape, np.int32), kind=str(data.dtype))
 
     def shape(self, data: Voxels) -> tuple[Any, Any, Any]:
         if self.sizes is None:

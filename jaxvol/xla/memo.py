@@ -10,7 +10,6 @@ from functools import cache
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -38,9 +37,7 @@ def memoized(
             _MEMORY[key] = computed_now(compute, array)
         else:
             with jax.ensure_compile_time_eval():
-                _MEMORY[key] = jax.tree.map(
-                    lambda part: jnp.asarray(part, part.dtype), in_numpy(np.asarray(array))
-                )
+                _MEMORY[key] = jax.tree.map(jax.device_put, in_numpy(np.asarray(array)))
         weakref.finalize(array, _MEMORY.pop, key, None)
     return _MEMORY[key]
 

@@ -10,11 +10,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .platform import on_gpu
 from .sharding import varying
 
+
+ALIGNED = 64
+"""Bytes. JAX does not copy a NumPy array to the CPU that begins at a multiple of it."""
 
 COPIES, ROWS = 128, 2**15
 """On a GPU, the most copies of a table, and the most rows of all its copies."""
@@ -45,6 +49,15 @@ def without_zeros(
 def gather(array: Array, index: Array) -> Array:
     """`array[index]` along the first axis, for indices known to be in range: no check is compiled."""
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def zeros_in_reserve(length: int, dtype: Any) -> np.ndarray:
+    """NumPy zeros that `jax.device_put` does not copy to the CPU. So what is never written takes addresses,
+    but no memory: a few lengths can serve arrays of any, which then share programs."""
+    size = length * np.dtype(dtype).itemsize
+    reserved = np.zeros(size + ALIGNED, np.uint8)
+    first = -reserved.ctypes.data % ALIGNED
+    return reserved[first : first + size].view(dtype)
 
 
 def packed_pair(a: Array, b: Array, factor: Array) -> Array:
