@@ -33,6 +33,7 @@ from ..scene.transfer import Transfer, TransferFunction, classification_of, with
 from ..scene.volume import Volume, grids, with_fetches, without_voxels
 from ..scene.voxel_fetch import Extent, Nodes, Packed
 from ..xla.compiling import OPTIONS
+from ..xla.kept_programs import kept
 from ..xla.memo import memoized_of, when_any_dies
 from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
@@ -43,7 +44,7 @@ from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
 from .wavefront import Marched, Recorded, blinded, march_rays
 
 
-program: Any = partial(cast(Any, eqx.filter_jit), compiler_options=OPTIONS)
+program = partial(kept, compiler_options=OPTIONS)
 
 
 class Started(NamedTuple):
@@ -223,6 +224,17 @@ def _without_voxels(volume: Volume, seams: March) -> Volume:
         extents = [Nodes(np.asarray(volume.shape, np.int32))]
     place = with_fetches(without_voxels(volume), extents)
     return unchecked(place, labels=None, label_ids=None)
+
+
+def space_of(march: March, volume: Volume) -> Space:
+    """`March.locate`, by a program for volumes of all shapes."""
+    seams = _only(march, "locate", "clip")
+    return _located(seams, _without_voxels(volume, seams))
+
+
+@program
+def _located(seams: March, place: Volume) -> Space:
+    return seams.locate(place)
 
 
 @program

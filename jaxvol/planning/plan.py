@@ -17,6 +17,7 @@ from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..engine.acceleration import visible_in_numpy
 from ..engine.image import render_scene
+from ..engine.stages import space_of
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
 from ..march.transforms import AlphaCorrection, EarlyTermination, SpaceLeaping
@@ -214,7 +215,7 @@ def plan(
     transfer = sized(transfer, source or volume)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, scene)
-    space = March(1.0, given).locate(volume)
+    space = space_of(March(1.0, given), volume)
     shown, mode = transfer, scene.compositing
     if mode.resolves:
         shown, _ = mode.marched(transfer, March(1.0, given), volume)

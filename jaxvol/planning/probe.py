@@ -20,6 +20,7 @@ from ..scene.camera import Camera, GivenRays, axes_of
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
 from ..scene.space import Space
+from ..xla.kept_programs import kept
 
 
 SIDE = 8
@@ -283,7 +284,7 @@ def _rays(camera: Camera, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarr
     return origins.astype(dtype), directions.astype(dtype)
 
 
-@jax.jit
+@kept
 def _interval(space: Space, origins: Array, directions: Array) -> tuple[Array, Array]:
     return space.interval(*(tuple(each.T) for each in (origins, directions)))
 
@@ -309,7 +310,7 @@ def _passes(
     return np.concatenate(found)
 
 
-@jax.jit
+@kept
 def _along(space: Space, origins: Array, directions: Array, nears: Array, fars: Array) -> tuple[Array, Array]:
     """Grid coordinates of `POINTS` points along each ray, and whether it meets the volume."""
     parts = (jnp.arange(POINTS, dtype=nears.dtype) + 0.5) / POINTS

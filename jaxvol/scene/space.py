@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Frame, Scalar, Vec3, along, apart, minus, plus, times
+from ..xla.kept_programs import kept
 from .occupancy import BLOCK, Occupancy
 from .several import Several
 from .volume import Volume
@@ -325,7 +326,7 @@ def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
     return _median_distance(space, *middles)
 
 
-@jax.jit  # operations by themselves take seconds to compile
+@kept  # operations by themselves take seconds to compile
 def _median_distance(space: Space, *middles: Array) -> Scalar:
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .differentiation import transformations
+from .kept_programs import kept
 from .platform import is_traced
 from .trees import PyTree
 
@@ -42,8 +43,7 @@ def compiled(
     `in_turn`: False if operations are always to be batched, as for a batch of tangents, on which no branch
     and no loop depends.
     """
-    options: Any = {"compiler_options": OPTIONS}
-    nested, outermost = eqx.filter_jit(function), eqx.filter_jit(function, **options)
+    nested, outermost = eqx.filter_jit(function), kept(function, compiler_options=OPTIONS)
     looped = _in_turn(function, nested)
 
     def run(*args: Any) -> Any:

@@ -7,8 +7,12 @@ from pathlib import Path
 import jax
 
 
-SHORTEST = 0.1
+SHORTEST = 0.02
 """Seconds of compilation from which on a program is kept: what is faster to compile than to read is not."""
+
+
+_CHOSEN: set[str] = set()
+"""Folders that `keep_programs` was told of."""
 
 
 def default_programs() -> Path:
@@ -45,6 +49,7 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
         _forget_that_none_was_set()
+    _CHOSEN.add(str(path))
     return path
 
 
@@ -53,6 +58,13 @@ def keep_programs_by_default() -> None:
     if not _folder():
         with suppress(OSError):
             keep_programs()
+
+
+def kept_folder() -> Path | None:
+    """Where lowered programs are kept, too (`kept_programs`); None where they are not."""
+    folder = _folder()
+    on = folder in _CHOSEN and getattr(jax.config, "jax_enable_compilation_cache", True)
+    return Path(folder) if on and folder else None
 
 
 def _folder() -> str | None:
