@@ -163,8 +163,9 @@ def visible_in_numpy(
     compositing: Compositing[Any], transfer: Transfer, blocks: Any
 ) -> Bool[np.ndarray, "bx by bz"] | None:
     """Blocks in which anything may be visible, by NumPy, which compiles nothing; None where JAX has to."""
-    usual = type(compositing).occupied is Compositing.occupied and type(transfer) is TransferFunction
-    if not usual or not isinstance(blocks, Blocks) or blocks.low.ndim != 3 or platform() != "cpu":
+    if type(transfer) is not TransferFunction or type(compositing).occupied is not Compositing.occupied:
+        return None
+    if not isinstance(blocks, Blocks) or blocks.low.ndim != 3 or platform() != "cpu":
         return None
     low, high = np.asarray(blocks.low), np.asarray(blocks.high)
     values, extinction = np.asarray(transfer.values), np.asarray(transfer.extinction)

@@ -109,9 +109,9 @@ def staged_image(
     if isinstance(source, Camera):
         fault = _is_invalid(source, fault)
     size, number = RayTiles.shared(source, tiling)
-    tiling = tiling._replace(least=0)
+    corners = index is not None and (isinstance(source, Camera) or tiling.squares)
+    tiling = tiling._replace(least=0, squares=False)
     most = np.asarray(scene.march.most_samples, np.int32)
-    corners = isinstance(source, Camera) and index is not None
     passed = []
     for tile in range(number):
         lines = _lines(scene.source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
@@ -258,7 +258,7 @@ def _start(
     tiling: Tiling,
 ) -> Started:
     """Cuts the rays of a tile to the volume. `corners`: whether those at the corners of a beam bound it, as
-    they do of a camera."""
+    they do of squares of a camera's pixels."""
     x, y, z = line.origin
     line = line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z))
     rays = entering(seams.locate(place), line, wanted, tiling.searched)

@@ -42,6 +42,7 @@ class Tiling(NamedTuple):
             as many steps as the slowest ray among them.
         chunk: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
         least: beams of a tile at least, so that a few rays are marched by the program of an image.
+        squares: whether given rays are those of squares of a camera's pixels, beam by beam.
         devices: between which beams are sharded, a mesh of one axis; None where JAX decides.
     """
 
@@ -56,6 +57,7 @@ class Tiling(NamedTuple):
     searched: int = 16
     chunk: int = CHUNK
     least: int = 0
+    squares: bool = False
     devices: Mesh | None = None
 
     def batch_of(self, groups: int) -> int:

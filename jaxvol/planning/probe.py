@@ -86,8 +86,10 @@ class Candidates(NamedTuple):
         return PATCHES if self.hit.size >= SMALL else FEW
 
     def pixels(self, chosen: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n m"]]:
-        """Columns and rows of patches' pixels."""
-        y, x = np.divmod(np.arange(SIDE**2), SIDE)
+        """Columns and rows of patches' pixels, in the order of the engine's beams."""
+        half = SIDE // 2
+        down, across, y, x = np.unravel_index(np.arange(SIDE**2), (2, 2, half, half))
+        y, x = down * half + y, across * half + x
         row, column = np.divmod(chosen, _patches(self.camera)[0])
         return column[:, None] * SIDE + x, row[:, None] * SIDE + y
 
@@ -160,7 +162,7 @@ class Probe(NamedTuple):
 
     def render(self, scene: Scene, march: March) -> Rendering:
         """These pixels of the scene's image under another march."""
-        return rendered(self.source, scene, march)
+        return rendered(self.source, scene, march, squares=True)
 
     def mean_square(self, difference: Float[np.ndarray, "pixels 3"]) -> tuple[float, float]:
         """Over the whole image, and its standard error, since only some pixels are known: of one patch of
@@ -174,11 +176,11 @@ class Probe(NamedTuple):
         return self.mean(square), float(np.sqrt(error)) / self.pixels
 
 
-def rendered(rays: GivenRays, scene: Scene, march: March) -> Rendering:
-    """As many rays as a probe has, of the scene's image under another march."""
+def rendered(rays: GivenRays, scene: Scene, march: March, *, squares: bool = False) -> Rendering:
+    """As many rays as a probe has, of the scene's image under another march. `squares`: as in `Tiling`."""
     tiling = Tiling.of_backend()
     if isinstance(scene.source, Camera):  # by the program of its image
-        tiling = tiling._replace(least=RayTiles.shared(scene.source, tiling)[0])
+        tiling = tiling._replace(least=RayTiles.shared(scene.source, tiling)[0], squares=squares)
     return render_scene(scene._replace(source=rays, march=march), "all", "replay", tiling)
 
 

@@ -1,6 +1,9 @@
 """Are programs traced once, by the first process, and never taken from a file that is another one's?"""
 
+import json
 import pickle
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,14 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxvol as jv
 from jaxvol.compositing.blending import Over
-from jaxvol.march.march import March
-from jaxvol.xla import kept_programs
-from jaxvol.xla.kept_programs import NotKept, kept, text_of
+from jaxvol.engine.tiling import Tiling
+from jaxvol.scene.rendering import Rendering
+from jaxvol.xla import compiling, kept_programs
+from jaxvol.xla.kept_programs import ARRAY, NotKept, described, kept, rebuilt
+from jaxvol.xla.trees import unchecked
 
 
 OVER = Over()
 X = np.linspace(0, 1, 5).astype(np.float32)
+TRACES = []
+
+
+def squares(x, power, more):
+    """A function with what stages take and return: arrays, numbers, modules, and None."""
+    TRACES.append(power)
+    return {"sum": jnp.sum(x["x"] ** power), "all": (x["x"] ** power + 1, None, Tiling(), more, 0.1)}
+
+
+squares.__module__ = "jaxvol.squares"
 
 
 class Own(eqx.Module):
@@ -24,27 +40,33 @@ class Own(eqx.Module):
     power: int = eqx.field(static=True)
 
 
+class Pair(NamedTuple):
+    """Another."""
+
+    x: int
+
+
 @pytest.fixture
-def traces(tmp_path, monkeypatch):
-    """A new process, at each call: a kept function, and the list of its traces."""
+def run(tmp_path, monkeypatch):
+    """Calls a kept function, in a new process each time, as far as it knows."""
     monkeypatch.setattr(kept_programs, "kept_folder", lambda: tmp_path)
-    traces = []
+    TRACES.clear()
 
-    def squares(x, power, more):
-        traces.append(power)
-        return {"sum": jnp.sum(x["x"] ** power), "all": (x["x"] ** power + 1, None)}
-
-    def run(x=X, power=2, more=OVER, key=("squares",)):
+    def run(x=X, power=2, more=OVER, **options):
         jax.clear_caches()
-        return kept(squares, *key)({"x": jnp.asarray(x)}, power, more)
+        return kept(squares, **options)({"x": jnp.asarray(x)}, power, more)
 
-    return traces, run, lambda: sorted(tmp_path.glob("*.exported"))
+    return run
 
 
-def test_the_next_process_traces_nothing(traces, monkeypatch):
-    traced, run, files = traces
+@pytest.fixture
+def files(tmp_path):
+    return lambda: sorted(tmp_path.glob("*.exported"))
+
+
+def test_the_next_process_traces_nothing(run, files, monkeypatch):
     first = run()
-    assert traced == [2]
+    assert TRACES == [2]
 
     def refuse(*_):
         raise AssertionError("unpickled")
@@ -52,82 +74,99 @@ def test_the_next_process_traces_nothing(traces, monkeypatch):
     for name in ("load", "loads", "Unpickler"):
         monkeypatch.setattr(pickle, name, refuse)
     again = run()
-    assert traced == [2]
+    assert TRACES == [2]
     assert len(files()) == 1
     assert jax.tree.structure(first) == jax.tree.structure(again)
+    assert again["all"][1:] == (None, Tiling(), OVER, 0.1)
     assert all(map(np.array_equal, jax.tree.leaves(first), jax.tree.leaves(again)))
     np.testing.assert_allclose(again["all"][0], X**2 + 1, rtol=1e-6)
+    assert not again["sum"].committed  # so that it goes with arrays of any device
 
 
-def test_another_type_number_or_version_is_another_program(traces, monkeypatch):
-    traced, run, files = traces
+def test_another_type_number_option_or_version_is_another_program(run, files, monkeypatch):
     run()
     run(X[:3])
     run(power=3)
-    run(key=("cubes",))
     run(X.astype(np.float16))
+    run(compiler_options=compiling.OPTIONS)
     assert len(files()) == 5
     monkeypatch.setattr(kept_programs, "_versions", lambda: ("jax 0.0.1",))
     run()
-    assert len(files()) == len(traced) == 6
+    with jax.numpy_dtype_promotion("standard"):
+        run()
+    assert len(files()) == len(TRACES) == 7
 
 
-@pytest.mark.parametrize("change", [b"", b"jaxvol program 1\nshort", "bit", "magic"])
-def test_a_damaged_file_is_replaced(traces, change):
-    traced, run, files = traces
+@pytest.mark.parametrize("change", [b"", b"jaxvol program 2\nshort", "bit", "magic"])
+def test_a_damaged_file_is_replaced(run, files, change):
     run()
     (file,) = files()
     content = bytearray(file.read_bytes())
     content[0 if change == "magic" else 99] ^= 1
     file.write_bytes(content if isinstance(change, str) else change)
     np.testing.assert_allclose(run()["sum"], np.sum(X**2), rtol=1e-6)
-    assert traced == [2, 2]
+    assert TRACES == [2, 2]
     run()
-    assert traced == [2, 2]
+    assert TRACES == [2, 2]
 
 
-def test_programs_of_other_code_are_not_kept(traces):
-    traced, run, files = traces
-    for more in (Own(2), lambda x: x):
+def test_programs_of_other_code_are_not_kept(run, files):
+    for more in (Own(2), Pair(2), lambda x: x, partial(Own, 2)):
         for _ in range(2):
             run(more=more)
-    assert len(traced) == 4
+    assert len(TRACES) == 8
     assert not files()
 
 
-def test_keys_tell_what_differs_in_every_process():
-    assert text_of((1, Over, jnp.cos.__name__, {"b": 2.0, "a": None})) == text_of(
-        (1, Over, "cos", {"a": None, "b": 2.0})
-    )
-    texts = [text_of(each) for each in (1, 1.0, "1", True, (1,), [1], None, Over, Over(), np.dtype("f4"))]
+def test_a_folder_that_cannot_be_written_loses_nothing(run, monkeypatch, tmp_path):
+    monkeypatch.setattr(kept_programs, "kept_folder", lambda: tmp_path / "none")
+    np.testing.assert_allclose(run()["sum"], np.sum(X**2), rtol=1e-6)
+
+
+def test_arrays_on_a_device_of_ones_choice_stay_there(run, files):
+    (x,) = jax.device_put((X,), jax.devices()[0])
+    assert run(x)["sum"].committed
+    assert not files()
+
+
+def test_descriptions_tell_what_differs_and_are_the_same_in_every_process():
+    structure = jax.tree.structure({"a": 1, "b": (2, None)})
+    parts = [1, 1.0, "1", True, (1,), [1], None, Over, Over(), np.dtype("f4"), np.float32(1), {"1": 1}]
+    parts += [partial(jv.March, 0.1), Tiling(), structure, jnp.bfloat16.dtype, float("inf"), X]
+    texts = [json.dumps(described(each)) for each in parts]
     assert len(set(texts)) == len(texts)
-    assert "0x" not in "".join(texts)
-    for part in (object(), {1}, Own(1), Own, lambda: 0, March(0.1)):
+    assert "0x7" not in "".join(texts)
+    for part, text in zip(parts, texts, strict=True):
+        if not isinstance(part, partial):
+            again = rebuilt(json.loads(text))
+            assert again is ARRAY if part is X else (again == part and type(again) is type(part))
+    image = unchecked(Rendering, rgba=X, exhausted=X, details=None, background=(1.0, 0.5))
+    told = {"rgba": ARRAY, "exhausted": ARRAY, "details": None, "background": (1.0, 0.5)}
+    assert vars(rebuilt(described(image))) == told
+    for part in (object(), {1}, Own(1), Own, lambda: 0, np.linalg.norm, partial(lambda: 0)):
         with pytest.raises(NotKept):
-            text_of(part)
+            described(part)
 
 
-def test_rules_of_jax_go_around_a_program_from_a_file(traces):
-    """A derivative and a batching rule of one's own, as the engine has."""
-    traced, _, files = traces
+def test_images_and_gradients_are_those_that_are_traced(tmp_path, monkeypatch):
+    """Of a shape of its own, so that no other test has compiled their programs."""
+    volume = jv.phantom("head", 21)
+    transfer = jv.colormap("gray", (0, 255), unit_distance=0.2)
+    camera = jv.Camera.looking_at(volume, (0.6, -0.8, 0.3), size=(9, 7))
+    march = jv.March(0.1, (jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-4)), "midpoint")
 
-    def square(x):
-        traced.append(x)
-        return x * x
+    def found():
+        loss = lambda transfer: jv.render(volume, transfer, camera, march).rgba.sum()  # noqa: E731
+        image = jv.render(volume, transfer, camera, march)
+        return jax.tree.leaves((image, *jax.value_and_grad(loss)(transfer)))
 
-    def program(x):
-        jax.clear_caches()
-        return kept(square, "square", has_rules=True)(x)
-
-    @jax.custom_vjp
-    def f(x):
-        return program(x)
-
-    f.defvjp(lambda x: (program(x), x), lambda x, bar: (2 * x * bar,))
-    g = jax.custom_batching.custom_vmap(f)
-    g.def_vmap(lambda size, in_batched, x: (jax.lax.map(f, x), True))
-    x, both = jnp.asarray(X), jnp.asarray(np.stack([X, 2 * X]))
-    np.testing.assert_allclose(program(x), X**2)
-    np.testing.assert_allclose(jax.jit(jax.grad(lambda x: f(x).sum()))(x), 2 * X)
-    np.testing.assert_allclose(jax.jit(jax.vmap(g))(both), both**2, rtol=1e-6)
-    assert len(traced) == len(files()) == 1
+    usual = found()
+    monkeypatch.setattr(kept_programs, "kept_folder", lambda: tmp_path)
+    written = found()
+    count = len(list(tmp_path.glob("*.exported")))
+    jax.clear_caches()
+    read = found()
+    assert len(list(tmp_path.glob("*.exported"))) == count > 4
+    for each in (written, read):
+        for a, b in zip(usual, each, strict=True):
+            np.testing.assert_array_equal(a, b)
