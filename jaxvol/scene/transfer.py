@@ -286,8 +286,6 @@ class TransferFunction(Transfer):
 
     def classifier(self) -> Classify:
         rows, few = self.rows(), self.values.shape[0] <= linear.FEW
-        # taken apart once, not for each use: that takes longer to trace than all else
-        entries = [jnp.unstack(row) for row in jnp.unstack(rows)] if few else []
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
@@ -295,7 +293,9 @@ class TransferFunction(Transfer):
 
         def chosen(measured: Measured) -> tuple[Vec3, Scalar]:
             (value,) = measured
-            row, *others = entries
+            # taken apart here: XLA would compile a kernel for each number that enters a loop
+            entries, width = jnp.unstack(rows.reshape(-1)), rows.shape[1]
+            row, *others = (entries[i : i + width] for i in range(0, len(entries), width))
             for other in others:  # numbers one by one, since XLA would store whole rows
                 reached = value >= other[0]
                 row = [jnp.where(reached, *each) for each in zip(other, row, strict=True)]
