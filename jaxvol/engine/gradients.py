@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from ..lighting.shading import Shader, Surroundings
-from ..march.beams import EmptySpaceIndex
+from ..march.beams import EmptySpaceIndex, Skips
 from ..ray import Progress, Scene, by_rules
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
@@ -25,7 +25,7 @@ from .devices import on_devices
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
 from .shifts import begin_rays
-from .tiling import RenderOptions
+from .tiling import GROUPS_OF_BEAM, RenderOptions
 from .voxel_gradient import asked_of, cotangents_of
 from .wavefront import CellRange, Marched, Recorded, blinded, into_range, march_rays
 
@@ -67,6 +67,11 @@ def of_perturbed(found: Any, perturbed: Any, rendering: Rendering, whole: Render
     return jax.tree.map(lambda leaf: jnp.where(fault, jnp.nan, leaf), found)
 
 
+def moves_rays(perturbed: Any) -> bool:
+    """Whether any leaf on which rays depend is perturbed."""
+    return any(jax.tree.leaves((without_voxels(perturbed.volume), perturbed.source, perturbed.march)))
+
+
 class Sums(NamedTuple):
     """Gradients summed over the tiles so far: of the scene's parts, and of where its rays come from."""
 
@@ -91,15 +96,24 @@ class ImageVjp(NamedTuple):
     empty_space: EmptySpaceIndex | None
     shader: Shader | None
     pull_shader: Callable[[PyTree], Any] | None
-    fault: Bool[Array, ""]
     tiles: RayTiles
 
     @classmethod
     def of(
-        cls, scene: Scene, perturbed: Any, options: RenderOptions, acceleration: VolumeAcceleration
+        cls,
+        scene: Scene,
+        perturbed: Any,
+        options: RenderOptions,
+        acceleration: VolumeAcceleration,
+        recorded: Recorded | None = None,
     ) -> "ImageVjp":
-        """The pull-back of a scene's image."""
-        index = empty_space_of(scene, acceleration, options.tiling)
+        """The pull-back of a scene's image; of what was `recorded` of all rays, by the tiles of that."""
+        index, tiles = None, None
+        if recorded is None or recorded.skips is None:
+            index = empty_space_of(scene, acceleration, options.tiling)
+        if recorded is not None and (leaves := jax.tree.leaves(recorded[:2])):
+            number, groups = leaves[0].shape[:2]
+            tiles = number, groups // GROUPS_OF_BEAM
         lit = prepared = by_rules(acceleration.prepared(scene._replace(lighting=None)))
         shader, pull_shader = None, None
         if scene.lighting is not None:
@@ -108,13 +122,12 @@ class ImageVjp(NamedTuple):
             )
             if shader.inline:
                 lit = prepared._replace(classification=prepared.classification._replace(light=shader))
-        tiles = RayTiles.of(scene.source, options.tiling)
-        return cls(scene, prepared, lit, index, shader, pull_shader, scene.has_fault, tiles)
+        tiles = RayTiles.of(scene.source, options.tiling, tiles=tiles)
+        return cls(scene, prepared, lit, index, shader, pull_shader, tiles)
 
     def zeros(self, perturbed: Any) -> Sums:
         """Zeros, for what is perturbed."""
-        around = without_voxels(perturbed.volume), perturbed.source, perturbed.march
-        geometric = any(jax.tree.leaves(around))
+        geometric = moves_rays(perturbed)
         of_transfer = any(jax.tree.leaves(perturbed.transfer))
         total = Total.zeros(
             self.scene,
@@ -127,12 +140,13 @@ class ImageVjp(NamedTuple):
 
     def rays(self, number: Int[Array, ""]) -> tuple[Ray, Callable[[PyTree], Any]]:
         """The rays of a tile, and their pull-back to volume, source and march."""
+        fault = self.scene.has_fault
         volume, source, march = self.scene.volume, self.scene.source, self.scene.march
 
         def made(moving: PyTree) -> Ray:
             volume_, source_, march_ = eqx.combine(moving, (without_voxels(volume), source, march))
             space = march_.locate(with_voxels(volume_, voxels_of(volume)))
-            return self.tiles.rays(source_, space, number, self.fault)
+            return self.tiles.rays(source_, space, number, fault)
 
         return eqx.filter_vjp(made, floats((without_voxels(volume), source, march)))
 
@@ -144,11 +158,12 @@ class ImageVjp(NamedTuple):
         replay: Replay,
         start: Progress,
         *,
+        skips: Skips | None = None,
         shifts: bool = False,
     ) -> Marched:
         """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
         tiles, step = self.tiles, self.scene.march.step
-        skips = tiles.skips(self.empty_space, rays, step)
+        skips = tiles.skips(self.empty_space, rays, step) if skips is None else skips
         start = blinded(skips, start)
         if range_ is not None:
             start = into_range(self.prepared, rays, start, range_, shifts=shifts)
@@ -222,20 +237,23 @@ def _vjp_by_tiles(
     cotangent: Rendering,
 ) -> Any:
     """The cotangents of a scene's parts, tile by tile."""
-    image = ImageVjp.of(scene, perturbed, options, acceleration)
+    if moves_rays(perturbed):  # made again, to be pulled back
+        recorded = recorded._replace(rays=None, skips=None)
+    image = ImageVjp.of(scene, perturbed, options, acceleration, recorded)
+    own, skips = recorded.rays, recorded.skips
     if image.empty_space is not None and recorded.range is not None:
         image = image._replace(empty_space=image.empty_space.within_ranges())
 
     def tile(sums: Sums, each: Any) -> tuple[Sums, None]:
-        number, recorded, rendering, cotangent = each
-        rays, pull = image.rays(number)
+        number, (range_, shifted), rendering, cotangent = each
+        rays, pull = image.rays(number) if own is None else (own, lambda of_rays: ())
         replay = image.replay(rays, Cotangents.of(rays, rendering, cotangent), sums.total)
-        start = image.begin(rays, recorded.shifted)
-        _, of_rays, total = image.march(rays, number, recorded.range, replay, start).visited
+        start = image.begin(rays, shifted)
+        _, of_rays, total = image.march(rays, number, range_, replay, start, skips=skips).visited
         return image.of_rays(sums._replace(total=total), pull, of_rays, rendering, cotangent), None
 
     parts = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), recorded, *parts)
+    sums, _ = image.tiles.scan(tile, varying(image.zeros(perturbed), parts), recorded[:2], *parts)
     return image.cotangents(sums)
 
 

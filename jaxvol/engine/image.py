@@ -136,9 +136,14 @@ def march_image(
         known = record and skips is not None
         found = march_rays(prepared, rays, blinded(skips, start), tiling, skips, record=known)
         recorded = Recorded(found.range, start.track.shifted if record else None)
+        if record and only:
+            recorded = recorded.with_rays(rays, skips)
         return vmap_rays(partial(end, prepared))(rays, found.at), recorded
 
-    return _over_tiles(scene, prepared.space, tiles, marched)
+    only = tiles.number == 1 and tiling.devices is None
+    rendering, recorded = _over_tiles(scene, prepared.space, tiles, marched)
+    own = jax.tree.map(lambda leaf: leaf[0], (recorded.rays, recorded.skips))
+    return rendering, recorded._replace(rays=own[0], skips=own[1])
 
 
 @on_devices("replicated")

@@ -112,7 +112,7 @@ def staged_image(
     corners = index is not None and (isinstance(source, Camera) or tiling.squares)
     tiling = tiling._replace(least=0, squares=False)
     most = np.asarray(scene.march.most_samples, np.int32)
-    passed = []
+    passed, of_tile = [], None
     for tile in range(number):
         lines = _lines(scene.source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
         started = _start(*lines, corners, seams, place, index, fault, tiling)
@@ -127,8 +127,12 @@ def staged_image(
         told = _told(kernel, started._replace(skips=skips))
         # where rays do not leap, what has no extinction has a gradient, too
         found = _march(*told, track, first, skips, options.outputs, tiling, record and scene.march.leaps)
+        of_tile = started.rays, started.skips
         passed.append(Passed(started.rays.t_in, started.rays.length, found, track.shifted))
-    return _finish(passed, scene.compositing, source, tiling, size, record)
+    rendering, recorded = _finish(passed, scene.compositing, source, tiling, size, record)
+    if record and number == 1 and of_tile is not None:
+        recorded = recorded.with_rays(*of_tile)
+    return rendering, recorded
 
 
 class Staging(NamedTuple):
@@ -414,15 +418,5 @@ def _finish(
     rendering = jax.tree.map(lambda *leaves: tiles.assemble(jnp.stack(leaves)), *each)
     if not record:
         return rendering, Recorded(None, None)
-    usual = RayTiles.of(source, tiling)
     recorded = [Recorded(tile.marched.range, tile.shifted) for tile in passed]
-    return rendering, jax.tree.map(lambda *leaves: _as_usual(usual, jnp.stack(leaves)), *recorded)
-
-
-def _as_usual(usual: RayTiles, leaf: Array) -> Array:
-    """An array of all tiles, as that of the tiles of a single program."""
-    groups = usual.groups
-    flat = leaf.reshape(-1, *leaf.shape[2:])[: usual.number * groups]
-    missing = usual.number * groups - flat.shape[0]
-    flat = jnp.pad(flat, [(0, missing)] + [(0, 0)] * (flat.ndim - 1))
-    return flat.reshape(usual.number, groups, *flat.shape[1:])
+    return rendering, jax.tree.map(lambda *leaves: jnp.stack(leaves), *recorded)

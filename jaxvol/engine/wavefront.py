@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
-from ..march.beams import Skips
+from ..march.beams import Skips, Stretches
 from ..march.march import CellRules
 from ..ray import NEVER, Progress, Scene, Track, front, move
 from ..scene.space import Ray
@@ -60,11 +60,24 @@ class CellRange(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What the first march of rays leaves for the second: the range of their visible cells, where rays leap;
-    and where they shift, where they do."""
+    """What the first march of rays leaves for the second.
+
+    Attributes:
+        range: of their visible cells, where rays leap.
+        shifted: where they shift, where they do.
+        rays: of an image of a single tile, which need not be made again for what they do not depend on.
+        skips: where these see nothing.
+    """
 
     range: CellRange | None
     shifted: Int[Array, "*rays"] | None
+    rays: Ray | None = None
+    skips: Skips | None = None
+
+    def with_rays(self, rays: Ray, skips: Skips | None) -> "Recorded":
+        """The same of a single tile, with its rays."""
+        # other skips are for beams without ranges
+        return self._replace(rays=rays, skips=skips if isinstance(skips, Stretches) else None)
 
 
 class Marched(NamedTuple):

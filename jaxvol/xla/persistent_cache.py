@@ -26,12 +26,13 @@ def default_programs() -> Path:
 def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     """Keeps compiled programs in a folder, so that the first image of the next process takes less time.
 
-    XLA compiles a program for each kind of scene (sizes, transforms, light), which takes some 4 s. Call this
-    before the first image of a script: it turns on JAX's persistent compilation cache for this
-    process. The command `jaxvol` does so by itself, and so do notebooks, `show`, `view` and the page of
-    `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. The programs are those
-    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the
-    folder.
+    XLA compiles a few programs for each kind of scene (transforms, light, size of the image), which takes some
+    4 s. Call this before the first image of a script: it turns on JAX's persistent compilation cache for this
+    process, and keeps traced programs beside it (`kept_programs`), unless code of one's own is a part of them,
+    or of a `jax.jit` around. The command `jaxvol` does so by itself, and so do notebooks, `show`, `view` and
+    the page of `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. The programs are those
+    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the folder.
+    Keep it where nobody else can write: programs in it are executed.
 
     Args:
         folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
