@@ -10,8 +10,7 @@ from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
-from jaxvol.engine.acceleration import words_of
-from jaxvol.scene.voxel_fetch import Packed
+from jaxvol.engine.acceleration import unshaped, with_words, words_of
 
 from ..scenes import in_float64
 
@@ -70,9 +69,8 @@ def test_values_are_trilinear_and_voxels_keep_their_type(dtype):
 @pytest.mark.parametrize("dtype", ["uint8", "int16"])
 def test_a_packed_copy_whose_shape_is_data_gives_the_values_between_voxels(dtype):
     data = random_data(dtype)
-    words = words_of(jv.Volume(data))
-    assert words is not None
-    packed = Packed(words).unshaped(data)
+    volume = jv.Volume(data)
+    packed = unshaped(with_words(volume, [words_of(volume)])).fetch
     apart_from_nodes = random_coordinates()
     coordinates = np.concatenate(
         [apart_from_nodes, NODES, [[np.nan, 1, 1], [1, np.inf, 1]]], dtype=np.float32
