@@ -313,8 +313,12 @@ def box_of_corners(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
         groups = leaf.reshape(-1, GROUPS_OF_BEAM, leaf.shape[1])
         return jnp.stack([groups[:, group, lane] for group, lane in enumerate(lanes)], axis=-1)
 
-    chosen = unchecked(rays, path=None, pixel=None, gaps=(), spans=())
-    return Box.within(occupancy, jax.tree.map(corners, chosen))
+    def box(rays: Ray) -> Box:
+        return Box.within(occupancy, jax.tree.map(corners, rays))
+
+    chosen = unchecked(rays, path=None, pixel=None, gaps=(), spans=(), length=None)
+    # in a branch, whose operands lie in memory: XLA would make the rays again for each corner
+    return in_memory(occupancy.size[0] + 1 != 0, box, jax.lax.stop_gradient(chosen))
 
 
 def box_of_rays(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
@@ -324,13 +328,25 @@ def box_of_rays(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
 
 def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:
     """Maps a function of one ray over arrays (groups, rays in a group)."""
-    return jax.vmap(jax.vmap(f))
+
+    def run(*trees: PyTree) -> PyTree:
+        groups, group = jax.tree.leaves(trees)[0].shape[:2]
+        # of one axis: XLA unrolls a short last one, to ten times the code, which takes twice as long
+        flat = jax.tree.map(lambda leaf: leaf.reshape(groups * group, *leaf.shape[2:]), trees)
+        return jax.tree.map(lambda leaf: leaf.reshape(groups, group, *leaf.shape[1:]), jax.vmap(f)(*flat))
+
+    return run
 
 
 def entering(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], searched: int) -> Ray:
     """Rays, cut to the volume; those that are not wanted miss it. `searched`: groups at a time, where ends of
     rays are searched."""
-    group = jax.vmap(lambda line: enter(space, *line))
-    map_groups = partial(jax.lax.map, group, batch_size=searched) if space.searches else jax.vmap(group)
-    ray = map_groups(lines)
+
+    def one(line: Line) -> Ray:
+        return enter(space, *line)
+
+    if space.searches:
+        ray = jax.lax.map(jax.vmap(one), lines, batch_size=searched)
+    else:
+        ray = vmap_rays(one)(lines)
     return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))
