@@ -7,6 +7,7 @@ JAX's cache, the folder is trusted: who may write to it may run code.
 """
 
 import hashlib
+import itertools
 import json
 import os
 import tempfile
@@ -16,7 +17,7 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,6 +43,8 @@ CONFIG = (
 )
 """Settings of JAX that change what is traced."""
 
+ARRAYS = jax.Array, np.ndarray, np.generic
+
 PACKAGE = Path(__file__).parents[1]
 
 
@@ -50,80 +53,99 @@ class NotKept(Exception):
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`equinox.filter_jit(function, **options)`, whose lowered programs are kept where `keep_programs` keeps
-    compiled ones.
+    """`equinox.filter_jit(function, **options)`, which is called in a third of the time, and whose lowered
+    programs are kept where `keep_programs` keeps compiled ones.
 
     Args:
         function: of concrete arguments. It depends on nothing but these and the code of jaxvol. Where they
             hold anything else, such as a user's class, whose code may change, its programs are not kept.
     """
-    programs: dict[Any, Callable[..., Any] | None] = {}
-    traced: Any = eqx.filter_jit(function, **options)
+    programs: dict[Any, Callable[..., Any]] = {}
 
     def run(*args: Any) -> Any:
-        if kept_folder() is None or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
-            return traced(*args)
-        arrays, static = eqx.partition(args, _is_array)
-        leaves, structure = jax.tree.flatten(arrays)
-        # those on devices of a user's choice may be spread over several
-        if any(isinstance(leaf, jax.Array) and leaf.committed for leaf in leaves):
-            return traced(*args)
-        rest, other = jax.tree.flatten(static)
-        types, settings = tuple(map(jax.typeof, leaves)), (platform(), *_config())
-        key = structure, tuple(rest), other, types, settings
+        arrays, rest = _apart(args)
+        key = *rest, None
+        # arrays on devices of a user's choice may be spread over several
+        keeps = kept_folder() is not None and not any(getattr(leaf, "committed", False) for leaf in arrays)
+        if keeps:
+            types = tuple(getattr(leaf, "aval", None) or jax.typeof(leaf) for leaf in arrays)
+            key = *rest, (types, platform(), *(getattr(jax.config, name) for name in CONFIG))
         if key not in programs:
-            try:
-                programs[key] = _program(function, args, types, settings, options)
-            # what cannot be exported: a callback of the host
-            except (NotKept, OSError, ValueError, NotImplementedError):
-                programs[key] = None
-        program = programs[key]
-        return traced(*args) if program is None else program(leaves)
+            flat = _flat(function, rest)
+            found = _exported(function, args, flat, key[-1], options) if keeps else None
+            programs[key] = jax.jit(flat, **options) if found is None else found
+        return _together(*programs[key](*arrays))
 
     return run
 
 
-def _is_array(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray)
+class Rest(NamedTuple):
+    """A tree without its arrays."""
+
+    structure: Any
+    leaves: tuple[Any, ...]
 
 
-def _config() -> tuple[Any, ...]:
-    return tuple(getattr(jax.config, name) for name in CONFIG)
+# a node without children: `jax.jit` returns it as it is for arguments of these types
+jax.tree_util.register_pytree_node(Rest, lambda rest: ((), tuple(rest)), lambda rest, _: Rest(*rest))
 
 
-def _program(
-    function: Callable[..., Any], args: Any, types: Any, settings: Any, options: Any
-) -> Callable[[Sequence[Any]], Any]:
-    """The program of arguments like these: from its file, if that is there, else into it."""
-    called = described(function), described(args), list(map(repr, types)), list(map(repr, settings))
-    text = json.dumps([*_versions(), jax.devices()[0].device_kind, repr(options), *called])
-    folder = kept_folder()
-    assert folder is not None
-    file = folder / f"{hashlib.sha256(text.encode()).hexdigest()}.exported"
-    if (found := _read(file)) is None:
-        results = []
+def _apart(tree: Any) -> tuple[list[Any], Rest]:
+    leaves, structure = jax.tree.flatten(tree)
+    dynamic = [isinstance(leaf, ARRAYS) for leaf in leaves]
+    rest = (None if is_array else leaf for leaf, is_array in zip(leaves, dynamic, strict=True))
+    return list(itertools.compress(leaves, dynamic)), Rest(structure, tuple(rest))
 
-        def flat(*leaves: Any) -> Any:
-            arrays, static = eqx.partition(args, _is_array)
-            _, structure = jax.tree.flatten(arrays)
-            result = function(*eqx.combine(jax.tree.unflatten(structure, leaves), static))
-            results.append(described(result))
-            return jax.tree.leaves(eqx.filter(result, _is_array))
 
-        flat.__name__ = getattr(function, "__name__", "program")
-        exported = export.export(jax.jit(flat))(*types)
-        found = json.dumps(results[0]).encode(), exported
-        _write(file, found[0], bytes(exported.serialize()))
-    result, exported = found
-    arrays, static = eqx.partition(rebuilt(json.loads(result)), lambda leaf: leaf is ARRAY)
-    structure: Any = jax.tree.structure(arrays)
+def _together(arrays: Sequence[Any], rest: Rest) -> Any:
+    if len(arrays) < len(rest.leaves):
+        remaining = iter(arrays)
+        arrays = [next(remaining) if leaf is None else leaf for leaf in rest.leaves]
+    return jax.tree.unflatten(rest.structure, arrays)
+
+
+def _flat(function: Callable[..., Any], rest: Rest) -> Callable[..., Any]:
+    """The function of arrays, which returns arrays, and a `Rest`."""
+
+    def flat(*arrays: Any) -> tuple[list[Any], Rest]:
+        return _apart(function(*_together(arrays, rest)))
+
+    flat.__name__ = getattr(function, "__name__", "program")
+    return flat
+
+
+def _exported(
+    function: Callable[..., Any], args: Any, flat: Callable[..., Any], how: Any, options: Any
+) -> Callable[..., Any] | None:
+    """The program of arguments like these: from its file, if that is there, else into it; None where it
+    cannot be kept."""
+    types, *settings = how
+    try:
+        called = described(function), described(args), list(map(repr, types)), list(map(repr, settings))
+        text = json.dumps([*_versions(), jax.devices()[0].device_kind, repr(options), *called])
+        file = Path(kept_folder() or "") / f"{hashlib.sha256(text.encode()).hexdigest()}.exported"
+        if (found := _read(file)) is None:
+            rest = []
+
+            def arrays(*leaves: Any) -> list[Any]:
+                results, other = flat(*leaves)
+                rest.append(other)
+                return results
+
+            arrays.__name__ = flat.__name__
+            exported = export.export(jax.jit(arrays))(*types)
+            found = json.dumps(described(rest[0])).encode(), exported
+            _write(file, found[0], bytes(exported.serialize()))
+    # what cannot be exported: a callback of the host
+    except (NotKept, OSError, ValueError, NotImplementedError):
+        return None
+    rest, exported = rebuilt(json.loads(found[0])), found[1]
 
     def call(*leaves: Any) -> Any:
-        return _CALL.bind(*leaves, exported=exported)
+        return _CALL.bind(*leaves, exported=exported), rest
 
-    call.__name__ = exported.fun_name
-    program: Any = jax.jit(call, **options)
-    return lambda leaves: eqx.combine(jax.tree.unflatten(structure, program(*leaves)), static)
+    call.__name__ = flat.__name__
+    return jax.jit(call, **options)
 
 
 def _read(file: Path) -> tuple[bytes, export.Exported] | None:
@@ -160,6 +182,7 @@ def _versions() -> tuple[str, ...]:
 # by `Exported.call` itself, results would be committed to a device
 _CALL = Primitive("kept_program")
 _CALL.multiple_results = True
+_CALL.def_impl(lambda *args, exported: exported.call(*args))  # under `jax.disable_jit`
 _CALL.def_abstract_eval(lambda *_, exported: exported.out_avals)
 mlir.register_lowering(
     _CALL,
@@ -182,10 +205,8 @@ def described(part: Any) -> Any:
         return part
     if isinstance(part, float):
         return {"float": part.hex()}
-    if _is_array(part) or part is ARRAY:
+    if isinstance(part, ARRAYS) or part is ARRAY:
         return {"array": None}
-    if isinstance(part, np.generic):
-        return {"number": [part.dtype.name, part.item()]}
     if isinstance(part, np.dtype):
         return {"dtype": part.name}
     if isinstance(part, type | FunctionType):
@@ -223,8 +244,6 @@ def rebuilt(told: Any) -> Any:
             return float.fromhex(content)
         case "array":
             return ARRAY
-        case "number":
-            return np.dtype(content[0]).type(content[1])
         case "dtype":
             return np.dtype(content)
         case "name":

@@ -26,13 +26,13 @@ def default_programs() -> Path:
 def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     """Keeps compiled programs in a folder, so that the first image of the next process takes less time.
 
-    XLA compiles a few programs for each kind of scene (transforms, light, size of the image), which takes some
-    4 s. Call this before the first image of a script: it turns on JAX's persistent compilation cache for this
-    process, and keeps traced programs beside it (`kept_programs`), unless code of one's own is a part of them,
-    or of a `jax.jit` around. The command `jaxvol` does so by itself, and so do notebooks, `show`, `view` and
-    the page of `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. The programs are those
-    of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete the folder.
-    Keep it where nobody else can write: programs in it are executed.
+    XLA compiles a few programs for each kind of scene (transforms, light, size of the image), which takes
+    some 4 s. Call this before the first image of a script: it turns on JAX's persistent compilation cache for
+    this process, and keeps traced programs beside it (`kept_programs`), unless code of one's own is a part of
+    them, or a `jax.jit` is around them. The command `jaxvol` does so by itself, and so do notebooks, `show`,
+    `view` and the page of `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. Programs
+    are those of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete
+    the folder. Keep it where nobody else can write: programs in it are executed.
 
     Args:
         folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
@@ -61,11 +61,11 @@ def keep_programs_by_default() -> None:
             keep_programs()
 
 
-def kept_folder() -> Path | None:
+def kept_folder() -> str | None:
     """Where lowered programs are kept, too (`kept_programs`); None where they are not."""
     folder = _folder()
     on = folder in _CHOSEN and getattr(jax.config, "jax_enable_compilation_cache", True)
-    return Path(folder) if on and folder else None
+    return folder if on else None
 
 
 def _folder() -> str | None:
