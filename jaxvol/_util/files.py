@@ -28,6 +28,12 @@ Stream: TypeAlias = BufferedIOBase | IO[bytes]
 """Of a file, of gzip, of a member of a zip archive."""
 
 
+def ensure(holds: object, fault: str) -> None:
+    """Raise a `ValueError` of this text unless something holds, which NaN never does."""
+    if not holds:
+        raise ValueError(fault)
+
+
 def file_size(path: Path) -> int:
     """Size in bytes of a regular, non-empty file."""
     if not path.is_file():

@@ -44,7 +44,7 @@ def _info(options: argparse.Namespace) -> None:
     told = header_of(options)
     how = {name: told.pop(name) for name in ("nan", "channel")} | {"time": told["time"]}
     record = read_record(options.file, **told)
-    arguments = read(record, **how | ({"time": None} if record.format.endswith("at each place") else {}))
+    arguments = read(record, **how)
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)

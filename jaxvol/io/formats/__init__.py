@@ -6,34 +6,34 @@ unpickled, and the content of a file is checked against its header before memory
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..._util.checks import Arrayable, described
+from ..._util.files import ensure, file_size, refusing
 from ..._util.image_record import ImageRecord, numbered, volume_arguments
-from ..._util.npy import read_npy, read_npz
-from ..._util.voxels import WHOLE, is_flat, within
+from ..._util.voxels import WHOLE, within
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
-from . import hdf5, mrc, nifti, tiff
+from . import library_formats as known, tiff
+from .arrays import RAW, raw_json, read_npy, read_npz, read_raw
 from .dicom import dicom_files, folders_below, is_dicom, read_dicom, series_headers
 from .kretz import MAGIC, read_kretz
-from .raw import ENDINGS as RAW, raw_json, read_raw
 from .save import save as save
 from .text_headers import metaimage_header, nrrd_header, read_metaimage, read_nrrd
 from .vtk_files import read_vtk
 
 
-READERS: dict[str, Callable[[Path], ImageRecord]] = {".npy": read_npy, ".npz": read_npz}
+READERS: dict[str, Callable[..., ImageRecord]] = {".npy": read_npy, ".npz": read_npz}
 READERS |= dict.fromkeys((".nrrd", ".nhdr"), read_nrrd) | dict.fromkeys((".mha", ".mhd"), read_metaimage)
-READERS |= dict.fromkeys(nifti.ENDINGS, nifti.read_nifti) | dict.fromkeys(tiff.ENDINGS, tiff.read_tiff)
-READERS |= dict.fromkeys(mrc.ENDINGS, mrc.read_mrc) | dict.fromkeys((".vti", ".vtk"), read_vtk)
-VAGUE = (".img", ".hdf", *mrc.ENDINGS[1:])
+READERS |= dict.fromkeys(known.NIFTI, known.read_nifti) | dict.fromkeys(tiff.ENDINGS, tiff.read_tiff)
+READERS |= dict.fromkeys(known.MRC, known.read_mrc) | dict.fromkeys((".vti", ".vtk"), read_vtk)
+READERS |= dict.fromkeys(known.HDF5, known.read_hdf5)
+VAGUE = (".img", ".hdf", *known.MRC[1:])
 """Endings of voxels without a header, too, if the caller describes these."""
-NAMED: dict[str, Callable[[Path, str | None], ImageRecord]] = dict.fromkeys(hdf5.ENDINGS, hdf5.read_hdf5)
-"""Readers of files that hold several arrays, of which one is named: `file.h5::/name`."""
 
 FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
 """What knows a kind of folder, and its reader. `bricks.opening` adds that of Zarr."""
@@ -62,11 +62,10 @@ def load(
 
     Values are scaled as the file says (CT in HU), lengths become mm where their unit is known, and axes are
     exchanged and reversed so that x, y, z increase along the world's: of medical images, towards the
-    patient's left, back and head (LPS). An oblique image keeps its voxels, and the turn that is left is the
-    volume's `direction`, with the shear of a tilted gantry. What a file does not say, and what was taken in
-    its place, is told in a warning. Integers of 32 and 64 bits are converted to smaller types, float64 to
-    float32, as described in `Volume`. Of the levels of an OME-Zarr image, the finest is read that takes at
-    most a quarter of the memory; `render_bricks` takes finer ones.
+    patient's left, back and head (LPS). An oblique image keeps its voxels, and the turn that is left, with
+    the shear of a tilted gantry, is the volume's `direction`. What was taken in place of what a file does not
+    say is told in a warning. Of the levels of an OME-Zarr image, the finest is read that takes at most a
+    quarter of the memory.
 
     A raw file stores x fastest. A JSON file with its name and `.json` appended, or in place of `.raw` or
     `.raw.gz`, may hold `size`, `type`, `spacing` and `origin`. An argument overrides the JSON, and the JSON
@@ -94,7 +93,7 @@ def load(
         offset: bytes before the voxels; raw files only.
 
     Returns:
-        The `Volume`, with voxels in the file's type except as described above.
+        The `Volume`, with voxels in the file's type, or a smaller one as described in `Volume`.
 
     Raises:
         ValueError: for a file that is missing, empty, corrupt, of unknown kind, of another size than its
@@ -103,10 +102,8 @@ def load(
             not fit together; for labels that lie elsewhere; and for anything that `Volume` rejects.
         ImportError: for a format that needs a library that is missing: pip install "jaxvol[io]".
     """
-    index: dict[str, Any] = {"time": time, "channel": channel}
     record = read_record(path, shape, dtype, spacing=spacing, time=time, offset=offset)
-    index |= {"time": None} if record.format.endswith("at each place") else {}
-    arguments = read(record, nan=nan, **index)
+    arguments = read(record, nan=nan, time=time, channel=channel)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arguments |= {name: value for name, value in given.items() if value is not None}
     try:
@@ -116,19 +113,11 @@ def load(
         raise ValueError(f"{path}: {fault}") from fault
 
 
-def read(record: ImageRecord, **how: Any) -> dict[str, Any]:
-    """Arguments of `Volume` for what a file holds; those of which it says nothing are missing. Options: as
-    for `volume_arguments`."""
-    arguments = volume_arguments(record, **how)
-    data = arguments["data"]
-    if data.dtype.kind in "iu" and data.itemsize > 2 and not within(data, WHOLE["float32"]) and _is_ids(data):
-        arguments |= numbered(data)
-    return arguments
-
-
-def _is_ids(data: np.ndarray) -> bool:
-    """Whether voxels are ids of segments, which may be thin along an axis."""
-    return any(is_flat(np.moveaxis(data, axis, 0)) for axis in range(3))
+def read(record: ImageRecord, *, time: int | None = None, **options: Any) -> dict[str, Any]:
+    """Arguments of `Volume` for what a file holds, as by `volume_arguments`. The time of a DICOM image is
+    chosen as its slices are read."""
+    time = None if record.format.endswith("at each place") else time
+    return volume_arguments(record, time=time, **options)
 
 
 def read_record(
@@ -145,7 +134,7 @@ def read_record(
     path, name = _existing(path)
     lower, given = path.name.lower(), shape is not None or dtype is not None or offset
     folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
-    ending = next((ending for ending in (*READERS, *NAMED) if lower.endswith(ending)), None)
+    ending = next((ending for ending in READERS if lower.endswith(ending)), None)
     is_slices = (path.is_file() and is_dicom(path)) or lower.endswith(".dcm") or lower == "dicomdir"
     ending = None if ending in VAGUE and shape is not None and dtype is not None else ending
     if lower.endswith(RAW) or (given and not (folder or ending or path.is_dir() or is_slices)):
@@ -154,40 +143,42 @@ def read_record(
         raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
     elif folder:
         record = folder(path)
-    elif ending in NAMED:
-        record = NAMED[ending](path, name)
     elif ending:
-        record = READERS[ending](path)
+        file_size(path)
+        reader = partial(READERS[ending], name=name) if ending in known.HDF5 else READERS[ending]
+        with refusing(path):
+            record = reader(path)
     elif is_slices or (path.is_dir() and dicom_files(path)):
         record = read_dicom(path, spacing, time)  # on discs their names often have no ending
     elif path.is_dir() and tiff.slice_files(path):
         record = tiff.read_slices(path)
     else:
         raise ValueError(_unknown(path))
-    record.format = record.format or lower.rpartition(".")[2] or "folder"
+    record.what, record.format = f"path: {path}", record.format or lower.rpartition(".")[2] or "folder"
     return record
 
 
 def _unknown(path: Path) -> str:
     """Why a path is not read."""
+    endings = (*RAW, *READERS)
     if path.is_dir():
         inside = sorted(path.iterdir())
-        images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
-        files = [each for each in inside if each.name.lower().endswith((*RAW, *READERS, *NAMED, ".zarr"))]
-        if found := folders_below(path) or images or files:
-            kind = "" if found in (images, files) else "DICOM images in "
-            told = ", ".join(str(each.relative_to(path)) for each in found[:8])
-            return f"path: {path} is a directory that holds {kind}{told}: give its path."
-        return f"path: {path} is a directory without DICOM and TIFF files, other slices, and no Zarr."
+        found, kind = folders_below(path), "DICOM images in "
+        if not found:
+            images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
+            files = [each for each in inside if each.name.lower().endswith((*endings, ".zarr"))]
+            found, kind = images or files, ""
+        told = ", ".join(str(each.relative_to(path)) for each in found[:8])
+        holds = f"that holds {kind}{told}: give its path."
+        return f"path: {path} is a directory {holds if found else 'without DICOM and TIFF files, other slices, and no Zarr.'}"
     if path.name.lower().endswith(".vol"):
         with path.open("rb") as stream:
             if stream.read(16) == MAGIC:
                 use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
                 return f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}."
-    endings = ", ".join(sorted((*RAW, *READERS, *NAMED, ".dcm")))
     return (
-        f"path: {path} has an unknown ending; expected a folder of slices, or a file ending in {endings}. Of "
-        "voxels without a header, give shape=(nx, ny, nz) and dtype."
+        f"path: {path} has an unknown ending; expected a folder of slices, or a file ending in "
+        f"{', '.join(sorted((*endings, '.dcm')))}. Of voxels without a header, give shape=(nx, ny, nz) and dtype."
     )
 
 
@@ -198,18 +189,17 @@ def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     except ValueError as fault:
         raise ValueError(f"labels: {str(fault).removeprefix('path: ')}") from fault
     if (values := found["data"]).dtype.kind == "f":
-        if not np.array_equal(values, np.rint(values)):
-            raise ValueError(f"labels: {path} must hold integers; got {values.dtype} with fractions.")
+        are_whole = np.array_equal(values, np.rint(values))
+        ensure(are_whole, f"labels: {path} must hold integers; got {values.dtype} with fractions.")
         found["data"] = values.astype(np.int64)
     if "label_ids" not in found and not within(found["data"], WHOLE["uint8"]):
         found |= numbered(found["data"])
     labels = Volume(**found)
     here, there = map(_corners, (volume, labels))
-    if not np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min())):  # of a voxel
-        raise ValueError(
-            f"labels: {path} must lie where the volume does, with corners {here.tolist()}; it has "
-            f"{there.tolist()}. SimpleITK's Resample, with sitkNearestNeighbor, puts it there."
-        )
+    must, got = f"must lie where the volume does, with corners {here.tolist()}", f"it has {there.tolist()}"
+    hint = "SimpleITK's Resample, with sitkNearestNeighbor, puts it there."
+    same = np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min()))  # of a voxel
+    ensure(same, f"labels: {path} {must}; {got}. {hint}")
     place = volume.spacing, volume.origin
     numbers = np.asarray(labels.data)  # float32 of more than 65536 kinds
     numbers = numbers.astype(np.int32) if numbers.dtype.kind == "f" else numbers
@@ -274,8 +264,6 @@ def _existing(path: str | os.PathLike[str] | Any) -> tuple[Path, str | None]:
     if not file.exists() and "::" in str(path):
         before, _, name = str(path).rpartition("::")
         file = Path(before)
-    if not file.exists():
-        raise ValueError(
-            f"path: there is no file {file} (working directory {Path.cwd()}). Check the spelling."
-        )
+    here = f"(working directory {Path.cwd()}). Check the spelling."
+    ensure(file.exists(), f"path: there is no file {file} {here}")
     return file, name
