@@ -58,18 +58,14 @@ def load(
     Formats: raw voxels (`name_XxYxZ_dtype.raw`, `.raw.gz`, or of any name with `shape` and `dtype`), `.npy`,
     `.npz`, NIfTI, Analyze, MGH, MINC, NRRD, MetaImage, TIFF, MRC, VTK's images, HDF5 and NetCDF
     (`file.h5::/name`), DICOM, folders of slices (DICOM, TIFF, PNG, JPEG), Zarr and OME-Zarr. The page "Files"
-    of the documentation has a table of what is read of each.
+    of the documentation has a table of what is read of each, and of the JSON file beside raw voxels.
 
     Values are scaled as the file says (CT in HU), lengths become mm where their unit is known, and axes are
     exchanged and reversed so that x, y, z increase along the world's: of medical images, towards the
     patient's left, back and head (LPS). An oblique image keeps its voxels, and the turn that is left, with
-    the shear of a tilted gantry, is the volume's `direction`. What was taken in place of what a file does not
-    say is told in a warning. Of the levels of an OME-Zarr image, the finest is read that takes at most a
-    quarter of the memory.
-
-    A raw file stores x fastest. A JSON file with its name and `.json` appended, or in place of `.raw` or
-    `.raw.gz`, may hold `size`, `type`, `spacing` and `origin`. An argument overrides the JSON, and the JSON
-    the name.
+    the shear of a tilted gantry, is the volume's `direction`. A warning says what was taken in place of what
+    the file does not say. Of the levels of an OME-Zarr image, the finest is read that takes at most a quarter
+    of the memory.
 
     Ids of segments (labels) that are too large are replaced by 0, 1, 2, … in their order, and kept as
     `volume.label_ids`: those beyond 2**24 in a file whose voxels mostly equal their neighbours along an
@@ -77,29 +73,26 @@ def load(
 
     Args:
         path: the file, or the folder.
-        shape: number of voxels along x, y, z; raw files only.
-        dtype: an integer or float type of NumPy, little-endian unless it ends in `be` (`uint16be`); raw files
-            only.
+        shape: number of voxels along x, y, z; this, `dtype` and `offset` are for raw files, x fastest.
+        dtype: an integer or float type of NumPy, little-endian unless it ends in `be` (`uint16be`).
         spacing: see `Volume`; by default the file's, or (1, 1, 1) if it has none.
         origin: see `Volume`; by default the file's, or (0, 0, 0) if it has none.
         direction: see `Volume`; by default the file's, or none. These three are of the axes as loaded.
-        labels: a file or folder of any of these kinds that holds a segmentation, an integer for each voxel,
-            at the same place: it becomes the volume's labels.
+        labels: a file or folder of a segmentation at the same place, which becomes the volume's labels.
         nan: the value of voxels that are NaN or infinite in the file, which are refused by default, and of
             those that it calls missing, which take the least value by default.
         time: which one of several images, from 0 on, where a file holds an axis of time.
         channel: which channel, from 0 on. Without it, several values in a voxel, as of colours, become the
             channels of the volume; an axis of channels needs it.
-        offset: bytes before the voxels; raw files only.
+        offset: bytes before the voxels.
 
     Returns:
         The `Volume`, with voxels in the file's type, or a smaller one as described in `Volume`.
 
     Raises:
-        ValueError: for a file that is missing, empty, corrupt, of unknown kind, of another size than its
-            header says, or without a header; for an image that is not 3-D; where it holds several, and
-            `time` or `channel` does not say which; for several DICOM series in a folder, or slices that do
-            not fit together; for labels that lie elsewhere; and for anything that `Volume` rejects.
+        ValueError: for a file that is missing, damaged, of unknown kind or of another size than its header
+            says; for an image that is not 3-D; for several images or DICOM series, if nothing says which; for
+            slices that do not fit together; for labels that lie elsewhere; and for what `Volume` rejects.
         ImportError: for a format that needs a library that is missing: pip install "jaxvol[io]".
     """
     record = read_record(path, shape, dtype, spacing=spacing, time=time, offset=offset)
@@ -121,39 +114,39 @@ def read(record: ImageRecord, *, time: int | None = None, **options: Any) -> dic
 
 
 def read_record(
-    path: str | os.PathLike[str] | Any,
+    path: Any,
     shape: Any = None,
     dtype: Any = None,
     *,
     spacing: Any = None,
-    time: int | None = None,
-    offset: int | None = None,
+    time: Any = None,
+    offset: Any = None,
 ) -> ImageRecord:
-    """What a file or folder holds, and says of it. The spacing is that of the volume, if the caller gives
-    it."""
+    """What a file or folder holds, and says of it. Arguments: as for `load`."""
     path, name = _existing(path)
     lower, given = path.name.lower(), shape is not None or dtype is not None or offset
     folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
     ending = next((ending for ending in READERS if lower.endswith(ending)), None)
     is_slices = (path.is_file() and is_dicom(path)) or lower.endswith(".dcm") or lower == "dicomdir"
     ending = None if ending in VAGUE and shape is not None and dtype is not None else ending
+    reader: Callable[..., ImageRecord]
     if lower.endswith(RAW) or (given and not (folder or ending or path.is_dir() or is_slices)):
-        record = read_raw(path, shape, dtype, offset or 0)
+        reader = partial(read_raw, shape=shape, dtype=dtype, offset=offset or 0)
     elif given:
         raise ValueError(f"shape and dtype are for raw files; {path} has its own. Leave them out.")
     elif folder:
-        record = folder(path)
+        reader = folder
     elif ending:
         file_size(path)
         reader = partial(READERS[ending], name=name) if ending in known.HDF5 else READERS[ending]
-        with refusing(path):
-            record = reader(path)
     elif is_slices or (path.is_dir() and dicom_files(path)):
-        record = read_dicom(path, spacing, time)  # on discs their names often have no ending
+        reader = partial(read_dicom, spacing=spacing, time=time)  # on discs their names often have no ending
     elif path.is_dir() and tiff.slice_files(path):
-        record = tiff.read_slices(path)
+        reader = tiff.read_slices
     else:
-        raise ValueError(_unknown(path))
+        raise ValueError(f"path: {path} {_unknown(path)}")
+    with refusing(path):
+        record = reader(path)
     record.what, record.format = f"path: {path}", record.format or lower.rpartition(".")[2] or "folder"
     return record
 
@@ -162,23 +155,22 @@ def _unknown(path: Path) -> str:
     """Why a path is not read."""
     endings = (*RAW, *READERS)
     if path.is_dir():
-        inside = sorted(path.iterdir())
-        found, kind = folders_below(path), "DICOM images in "
-        if not found:
-            images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
-            files = [each for each in inside if each.name.lower().endswith((*endings, ".zarr"))]
-            found, kind = images or files, ""
-        told = ", ".join(str(each.relative_to(path)) for each in found[:8])
-        holds = f"that holds {kind}{told}: give its path."
-        return f"path: {path} is a directory {holds if found else 'without DICOM and TIFF files, other slices, and no Zarr.'}"
-    if path.name.lower().endswith(".vol"):
-        with path.open("rb") as stream:
-            if stream.read(16) == MAGIC:
-                use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
-                return f"path: {path} is ultrasound as acquired, whose voxels a probe places. {use}."
+        inside, series = sorted(path.iterdir()), folders_below(path)
+        images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
+        files = [each for each in inside if each.name.lower().endswith((*endings, ".zarr"))]
+        told = ", ".join(str(each.relative_to(path)) for each in (series or images or files)[:8])
+        holds = f"that holds {'DICOM images in ' if series else ''}{told}: give its path."
+        return (
+            f"is a directory {holds if told else 'without DICOM and TIFF files, other slices, and no Zarr.'}"
+        )
+    with path.open("rb") as stream:
+        if path.name.lower().endswith(".vol") and stream.read(16) == MAGIC:
+            use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
+            return f"is ultrasound as acquired, whose voxels a probe places. {use}."
     return (
-        f"path: {path} has an unknown ending; expected a folder of slices, or a file ending in "
-        f"{', '.join(sorted((*endings, '.dcm')))}. Of voxels without a header, give shape=(nx, ny, nz) and dtype."
+        "has an unknown ending; expected a folder of slices, or a file ending in "
+        f"{', '.join(sorted((*endings, '.dcm')))}. Of voxels without a header, give shape=(nx, ny, nz) and "
+        "dtype."
     )
 
 
@@ -196,10 +188,13 @@ def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
         found |= numbered(found["data"])
     labels = Volume(**found)
     here, there = map(_corners, (volume, labels))
-    must, got = f"must lie where the volume does, with corners {here.tolist()}", f"it has {there.tolist()}"
-    hint = "SimpleITK's Resample, with sitkNearestNeighbor, puts it there."
+    must, hint = (
+        "must lie where the volume does",
+        "SimpleITK's Resample, with sitkNearestNeighbor, puts it there.",
+    )
     same = np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min()))  # of a voxel
-    ensure(same, f"labels: {path} {must}; {got}. {hint}")
+    got = f"{must}, with corners {here.tolist()}; it has {there.tolist()}"
+    ensure(same, f"labels: {path} {got}. {hint}")
     place = volume.spacing, volume.origin
     numbers = np.asarray(labels.data)  # float32 of more than 65536 kinds
     numbers = numbers.astype(np.int32) if numbers.dtype.kind == "f" else numbers

@@ -10,7 +10,17 @@ import numpy as np
 
 from ..._util.affine import directions
 from ..._util.checks import finite_array, integer, shortened
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, ensure, file_size, library, refusing
+from ..._util.files import (
+    MOST_COMPRESSED,
+    MOST_VOXELS,
+    Refused,
+    check,
+    check_size,
+    ensure,
+    file_size,
+    library,
+    refusing,
+)
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import grid_of
 
@@ -89,25 +99,25 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
         folders = folders_below(path.parent)
         told = ", ".join(str(each.relative_to(path.parent)) for each in folders[:8]) or "no folder"
         hint = "beside it holds DICOM images. Give the path of one of them."
-        ensure(len(folders) == 1, f"path: {path}: {told} {hint}")
+        check(len(folders) == 1, f": {told} {hint}")
         path = folders[0]
     headers = series_headers(path)
     slices = [each for file, header in headers.items() for each in _slices(file, header, spacing)]
     must = "must hold at least 2 slices of a series, and fewer than 2**31 voxels"
     is_volume = 2 <= len(slices) <= MOST_VOXELS // math.prod(slices[0].shape[1:] if slices else (1,))
-    ensure(is_volume, f"path: {path} {must}; got {len(slices)}.")
+    check(is_volume, f"{must}; got {len(slices)}.")
     first, must = slices[0], "slices of one series must agree in size, spacing and directions"
     for each in slices:
         alike = each.shape[1:] == first.shape[1:] and np.allclose(each.grid, first.grid, rtol=1e-4, atol=1e-4)
         got = " and ".join(f"{one.shape[1:]} {one.grid.tolist()}" for one in (first, each))
         names = f"{first.name} and {each.name} do not: {got}. Is one an overview?"
-        ensure(alike, f"path: {path}: {must}; {names}")
+        check(alike, f": {must}; {names}")
     down, across, (rows, columns) = *first.grid[:2], first.grid[2:].reshape(2, 3)
     turn = np.column_stack([rows, columns, np.cross(rows, columns)])
     rows, columns, normal = directions(f"path: {path}: rows and columns of {first.name}", turn).T
     slices = sorted(slices, key=lambda each: float(each.place @ normal))
     slices, several = _at_one_time(path, slices, normal, time)
-    step = _even_step(path, slices, normal, min(across, down))
+    step = _even_step(slices, normal, min(across, down))
     grid = grid_of(np.column_stack([rows * across, columns * down, step, slices[0].place]))
     told = f"DICOM, {len(slices)} slices{several}"
     return ImageRecord(_values(slices), "zyx", units="mm", convention="LPS", format=told, **grid)
@@ -127,8 +137,8 @@ def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any)
     groups = [sorted(group, key=lambda each: _rank(each.element(key))) for group in groups]
     words = re.sub("(?<=[a-z])(?=[A-Z])", " ", key).lower()
     values = ", ".join(str(each.element(key)) for each in groups[0][:6])
-    told = f"path: {path} holds {count} images at each of {len(groups)} places ({words} {values})"
-    ensure(time is not None, f"{told}: time must be given, from 0 to {count - 1}.")
+    told = f"holds {count} images at each of {len(groups)} places ({words} {values})"
+    check(time is not None, f"{told}: time must be given, from 0 to {count - 1}.")
     at = integer("time", time, 0, count - 1)
     return [group[at] for group in groups], f", one of {count} at each place"
 
@@ -141,7 +151,7 @@ def _rank(value: Any) -> tuple[float, str]:
         return math.inf, str(value)
 
 
-def _even_step(path: Path, slices: list[Slice], normal: np.ndarray, pixel: float) -> np.ndarray:
+def _even_step(slices: list[Slice], normal: np.ndarray, pixel: float) -> np.ndarray:
     """The step from slice to slice. The gantry may be tilted."""
     at, names = np.array([each.place for each in slices]), [each.name for each in slices]
     mean = (at[-1] - at[0]) / (len(at) - 1)
@@ -163,7 +173,7 @@ def _even_step(path: Path, slices: list[Slice], normal: np.ndarray, pixel: float
         told = f"{missing} of {usual:.4g} mm {'is' if missing == 1 else 'are'} missing between {names[k]} and"
     else:
         told = f"{steps[k]:.4g} mm for {usual:.4g}: one is there twice, or shifted, between {names[k]} and"
-    raise ValueError(f"path: {path} must hold slices evenly spaced along a line; {told} {names[k + 1]}.")
+    raise Refused(f"must hold slices evenly spaced along a line; {told} {names[k + 1]}.")
 
 
 def series_headers(path: Path) -> dict[Path, Any]:
@@ -176,15 +186,14 @@ def series_headers(path: Path) -> dict[Path, Any]:
     examples = {uid: file for file, uid in series.items()}.values()
     told = ", ".join(f"{headers[file].get('SeriesDescription', '')} (as {file.name})" for file in examples)
     hint = "Give the path of one file of the series that you want, or put each into a folder of its own."
-    ensure(len(examples) < 2, f"path: {path} holds several series: {told}. {hint}")
+    check(len(examples) < 2, f"holds several series: {told}. {hint}")
     return headers
 
 
 def _header(path: Path, *, pixels: bool = False) -> Any:
     """The elements of a file, through a map of it: pydicom asks for as many bytes as lengths say."""
-    marked = f'it has no "DICM" at byte 128. Remove it from there.'
-    ensure(is_dicom(path), f"path: {path} is no DICOM file: {marked}")
     with refusing(path), path.open("rb") as stream:
+        check(is_dicom(path), 'is no DICOM file: it has no "DICM" at byte 128. Remove it from there.')
         content = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         return library("pydicom", path).dcmread(content, stop_before_pixels=not pixels)
 
@@ -200,21 +209,20 @@ def _meta(path: Path, element: bytes) -> str:
 
 def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
     """The images of a file."""
-    syntax, hint = _meta(path, SYNTAX), "Decompress the series first, for example with gdcmconv --raw."
-    is_read = f"path: {path} is stored in the transfer syntax {syntax}, which is not read. {hint}"
-    ensure(syntax in SYNTAXES, is_read)
     with refusing(path):
+        syntax, hint = _meta(path, SYNTAX), "Decompress the series first, for example with gdcmconv --raw."
+        check(syntax in SYNTAXES, f"is stored in the transfer syntax {syntax}, which is not read. {hint}")
         shape = int(header.get("NumberOfFrames") or 1), int(header.Rows), int(header.Columns)
         channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.get("BitsAllocated", 0))
-        got = f"{shape} of {channels} values of {bits} bits"
         is_grey = channels == 1 and min(shape) > 0 and bits in (1, 8, 16, 32, 64)
-        ensure(is_grey, f"path: {path} must hold slices of one value per pixel; got {got}.")
+        got = f"{shape} of {channels} values of {bits} bits"
+        check(is_grey, f"must hold slices of one value per pixel; got {got}.")
         held = file_size(path) * (1 if syntax in [*SYNTAXES][:3] else MOST_COMPRESSED)
-        check_size(path, held, math.prod(shape) * bits // 8, more=True)
+        check_size(held, math.prod(shape) * bits // 8, more=True)
         shared = list(header.get("SharedFunctionalGroupsSequence") or [])[:1]
         single = list(header.get("PerFrameFunctionalGroupsSequence") or [])
-        placed = f"each of {shape[0]} frames must say where it lies; {len(single)} do."
-        ensure(len(single) == shape[0] or (shape[0] == 1 and not single), f"path: {path}: {placed}")
+        is_placed = len(single) == shape[0] or (shape[0] == 1 and not single)
+        check(is_placed, f": each of {shape[0]} frames must say where it lies; {len(single)} do.")
         return [
             _slice(path, k, shape, [*single[k : k + 1], *shared], header, spacing) for k in range(shape[0])
         ]
@@ -224,17 +232,17 @@ def _slice(path: Path, k: int, shape: Any, groups: list[Any], header: Any, spaci
     """Frame k of a file. `groups`: sequences that hold its elements before the header does."""
     held = [element.value[:1] for group in groups for element in group if element.VR == "SQ"]
     parts = [*(item for items in held for item in items), header]
-    place = _numbers(path, parts, 3, "ImagePositionPatient")
-    turn = _numbers(path, parts, 6, "ImageOrientationPatient")
+    place = _numbers(parts, 3, "ImagePositionPatient")
+    turn = _numbers(parts, 6, "ImageOrientationPatient")
     if spacing is None:
-        pixel = _numbers(path, parts, 2, "PixelSpacing", "ImagerPixelSpacing")
+        pixel = _numbers(parts, 2, "PixelSpacing", "ImagerPixelSpacing")
     else:  # of the axes as loaded, to which rows and columns are nearest
         x_and_y = np.abs(turn.reshape(2, 3)).argmax(axis=1)
         pixel = np.asarray(finite_array("spacing", spacing, (3,)))[x_and_y[::-1]]
     return Slice(path, k, parts, shape, place, np.array([*pixel, *turn], float))
 
 
-def _numbers(path: Path, parts: list[Any], count: int, *names: str) -> np.ndarray:
+def _numbers(parts: list[Any], count: int, *names: str) -> np.ndarray:
     """The numbers of the first of these elements that has as many; two are positive distances."""
     texts = []
     for name in names:
@@ -251,7 +259,7 @@ def _numbers(path: Path, parts: list[Any], count: int, *names: str) -> np.ndarra
     told, kind = f"{' or '.join(names)} must be {count}", "positive numbers" if count == 2 else "numbers"
     fault = "does not say how far its pixels are apart" if count == 2 else "must say where it lies"
     hint = " Give spacing=(x, y, z), --spacing." if count == 2 else ""
-    raise ValueError(f"path: {path} {fault}: {told} {kind}; got {' and '.join(texts)}.{hint}")
+    raise Refused(f"{fault}: {told} {kind}; got {' and '.join(texts)}.{hint}")
 
 
 def _values(slices: list[Slice]) -> np.ndarray:

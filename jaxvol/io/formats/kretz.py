@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from ..._util.files import MOST_VOXELS, ensure, file_size
+from ..._util.files import MOST_VOXELS, check, file_size, refusing
 from ...march.transforms import ToroidalMap
 
 
@@ -40,39 +40,41 @@ MEANING = {
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:
     """The voxels and the map of a `.vol` file. Raises `ValueError` for a file that is none, is cut short
     or compressed, lacks an item or holds one twice, or whose items contradict each other."""
-    items = _items(path)
+    with refusing(path):
+        items = _items(path)
 
-    def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
-        expected, found = count * np.dtype(dtype).itemsize, len(items[tag])
-        hint = "Of a compressed file, the voxels have less: save it uncompressed."
-        must = f"path: {path}: item {_name(tag)} must have {expected} bytes; it has {found}. {hint}"
-        ensure(found == expected, must)
-        return np.frombuffer(items[tag], dtype)
+        def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
+            expected, found = count * np.dtype(dtype).itemsize, len(items[tag])
+            hint = "Of a compressed file, the voxels have less: save it uncompressed."
+            check(
+                found == expected, f": item {_name(tag)} must have {expected} bytes; it has {found}. {hint}"
+            )
+            return np.frombuffer(items[tag], dtype)
 
-    planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
-    must = "must have at least 2 planes, beams and samples, and fewer than 2**31 voxels"
-    is_volume = min(planes, beams, samples) > 1 and planes * beams * samples <= MOST_VOXELS
-    ensure(is_volume, f"path: {path} {must}; its header says {planes} x {beams} x {samples}.")
-    voxels = numbers("D000:1", "u1", planes * beams * samples).reshape(planes, beams, samples)
-    ends: list[tuple[float, float]] = []
-    for tag, count in (("C300:1", planes), ("C300:2", beams)):
-        angles = numbers(tag, "<f8", count)
-        with np.errstate(all="ignore"):  # NaN and infinity are refused below
-            even, step = np.linspace(angles[0], angles[-1], count, retstep=True)
-        must = f"must be evenly spaced angles that increase, up to {UNEVEN} of a step"
-        got = f"got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
-        is_even = step > 0 and np.abs(angles - even).max() <= UNEVEN * step
-        ensure(is_even, f"path: {path}: item {_name(tag)} {must}; {got}")
-        ends.append((float(angles[0]), float(angles[-1])))
-    resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
-    must = f"path: {path}: item {_name('C100:1')} must be a positive length in metres"
-    ensure(0 < resolution < math.inf, f"{must}; got {resolution}.")
+        planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
+        must = "must have at least 2 planes, beams and samples, and fewer than 2**31 voxels"
+        is_volume = min(planes, beams, samples) > 1 and planes * beams * samples <= MOST_VOXELS
+        check(is_volume, f"{must}; its header says {planes} x {beams} x {samples}.")
+        voxels = numbers("D000:1", "u1", planes * beams * samples).reshape(planes, beams, samples)
+        ends: list[tuple[float, float]] = []
+        for tag, count in (("C300:1", planes), ("C300:2", beams)):
+            angles = numbers(tag, "<f8", count)
+            with np.errstate(all="ignore"):  # NaN and infinity are refused below
+                even, step = np.linspace(angles[0], angles[-1], count, retstep=True)
+            must = f"must be evenly spaced angles that increase, up to {UNEVEN} of a step"
+            got = f"got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
+            is_even = step > 0 and np.abs(angles - even).max() <= UNEVEN * step
+            check(is_even, f": item {_name(tag)} {must}; {got}")
+            ends.append((float(angles[0]), float(angles[-1])))
+        resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
+        must = f": item {_name('C100:1')} must be a positive length in metres"
+        check(0 < resolution < math.inf, f"{must}; got {resolution}.")
     step = 1000 * resolution  # mm
     try:
-        probe = ToroidalMap(apex * step, first * step, *ends, (0.0, (samples - 1) * step))
+        probe = ToroidalMap(apex * step, first * step, ends[0], ends[1], (0.0, (samples - 1) * step))
         nearest = float(probe.nearest_to_axis)
         on_axis = nearest >= -1e-6 * abs(apex * step)  # 0 to within rounding
-        ensure(on_axis, f"its outermost beams begin {-nearest:.4g} mm behind the motor axis.")
+        check(on_axis, f"its outermost beams begin {-nearest:.4g} mm behind the motor axis.")
     except ValueError as fault:
         raise ValueError(f"path: {path} describes no probe: {fault}") from fault
     return voxels, probe
@@ -83,21 +85,23 @@ def _items(path: Path) -> dict[str, bytes]:
     n_bytes, found = file_size(path), {}
     with path.open("rb") as stream:
         magic = stream.read(len(MAGIC))
-        others = "Other programs write files of other kinds that end in .vol."
-        must = f"path: {path} is not a Kretz file: it must begin with {MAGIC!r}"
-        ensure(magic == MAGIC, f"{must}; got {magic!r}. {others}")
+        must, others = (
+            f"it must begin with {MAGIC!r}; got {magic!r}",
+            "Other programs write files of other kinds",
+        )
+        check(magic == MAGIC, f"is not a Kretz file: {must}. {others} that end in .vol.")
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
-            cut = f"item {_name(tag)} is to end at byte {end}, and it ends at {n_bytes}."
-            ensure(end <= n_bytes, f"path: {path} is cut short: {cut}")
-            ensure(tag not in found, f"path: {path} holds item {_name(tag)} twice.")
+            cut = f"is cut short: item {_name(tag)} is to end at byte {end}, and it ends at {n_bytes}."
+            check(end <= n_bytes, cut)
+            check(tag not in found, f"holds item {_name(tag)} twice.")
             if tag in MEANING:
                 found[tag] = stream.read(length)
             stream.seek(end)
     missing = ", no item ".join(_name(tag) for tag in MEANING if tag not in found)
     hint = "Compressed files, several frames and Cartesian volumes are not supported: save it as one"
-    ensure(not missing, f"path: {path} has no item {missing}. {hint} uncompressed volume as acquired.")
+    check(not missing, f"has no item {missing}. {hint} uncompressed volume as acquired.")
     return found
 
 

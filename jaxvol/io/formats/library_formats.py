@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..._util.checks import shortened
-from ..._util.files import MOST_COMPRESSED, check_size, ensure, file_size, library
+from ..._util.files import MOST_COMPRESSED, Refused, check, check_size, file_size, library
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import nibabel_record, record_of
 from .arrays import check_volume, read_voxels
@@ -46,17 +46,16 @@ def read_nifti(path: Path) -> ImageRecord:
         ("datatype", stored.kind in "iuf" or stored.names, "that of integers, floats, RGB or RGBA"),
     ):
         if not holds:  # also of NaN
-            raise ValueError(f"path: {path}: {name} must be {expected}; got {raw[name].tolist()!r}.")
+            raise Refused(f": {name} must be {expected}; got {raw[name].tolist()!r}.")
     while len(shape) > 5 and shape[-1] == 1:
         shape = shape[:-1]
-    check_volume(path, shape, len(stored.names or "1"))
+    check_volume(shape, len(stored.names or "1"))
     body = Path(files["image"].filename)
     if not hasattr(proxy, "offset"):  # MINC, in chunks
-        check_size(path, file_size(body) * MOST_COMPRESSED, math.prod(shape) * stored.itemsize, more=True)
+        check_size(file_size(body) * MOST_COMPRESSED, math.prod(shape) * stored.itemsize, more=True)
         return nibabel_record(image, np.asanyarray(proxy))
     packed = "gzip" if body.name.lower().endswith((".gz", ".mgz")) else ""
-    data = read_voxels(path, body, shape[::-1], stored, begin=proxy.offset, packed=packed)
-    return nibabel_record(image, data.T)
+    return nibabel_record(image, read_voxels(body, shape[::-1], stored, proxy.offset, packed).T)
 
 
 def read_mrc(path: Path) -> ImageRecord:
@@ -65,12 +64,13 @@ def read_mrc(path: Path) -> ImageRecord:
     with path.open("rb") as stream:
         size, extended = file_size(path), stream.read(96)[92:]
     longest = min(int.from_bytes(extended, order) for order in ("little", "big"))
-    cut = f"its extended header is longer than its {size} bytes."  # as many as mrcfile would take
-    ensure(longest <= size, f"path: {path} is cut short: {cut}")
-    file = library("mrcfile", path).mmap(path, permissive=True)
+    cut = f"is cut short: its extended header is longer than its {size} bytes."
+    check(longest <= size, cut)  # mrcfile would take as many
+    file: Any = library("mrcfile", path).mmap(path, permissive=True)
     header, data = file.header, file.data
     is_image = data is not None and data.ndim in (3, 4) and data.dtype.kind in "iuf"
-    ensure(is_image, "cut short, or no 3-D image of numbers")
+    if not is_image:
+        raise ValueError("cut short, or no 3-D image of numbers")
     order = [int(header[name]) for name in ("maps", "mapr", "mapc")]
     order = order if sorted(order) == [1, 2, 3] else [3, 2, 1]
     axes = "t" * (data.ndim - 3) + "".join("xyz"[number - 1] for number in order)
@@ -100,13 +100,12 @@ def read_hdf5(path: Path, name: str | None = None) -> ImageRecord:
     arrays = {f"{g.rstrip('/')}/{key}": each for g, group in groups.items() for key, each in group.items()}
     found = [key for key, each in arrays.items() if each.ndim > 2 and name in (None, key, key[1:])]
     told = shortened(", ".join(arrays)) if arrays else "none"
-    ensure(len(found) == 1, f"path: {path} holds the arrays {told}: name one, as in {path.name}::/name.")
+    check(len(found) == 1, f"holds the arrays {told}: name one, as in {path.name}::/name.")
     array = arrays[found[0]]
-    check_size(path, file_size(path) * MOST_COMPRESSED, array.nbytes, more=True)
+    check_size(file_size(path) * MOST_COMPRESSED, array.nbytes, more=True)
     chunk = math.prod(array.encoding.get("chunksizes") or (1,)) * array.dtype.itemsize
     is_read = chunk <= max(LARGE, BEYOND * array.nbytes) and array.dtype.kind in "biuf"
-    got = f"got {array.dtype}, {chunk} bytes."
-    ensure(is_read, f"path: {path}: {found[0]} must be numbers in chunks; {got}")
+    check(is_read, f": {found[0]} must be numbers in chunks; got {array.dtype}, {chunk} bytes.")
     labels = [str(label) for label in array.attrs.get("DIMENSION_LABELS", ())]
     if all(labels) and len({*labels}) == array.ndim:
         array = array.rename(dict(zip(array.dims, labels, strict=True)))

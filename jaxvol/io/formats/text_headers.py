@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..._util.checks import shortened
-from ..._util.files import ensure
+from ..._util.files import Refused, check
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import grid_of
 from .arrays import check_volume, read_voxels
@@ -24,32 +24,31 @@ META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": 
 META_TYPES |= {name.replace("_", "_U", 1): f"u{code[1]}" for name, code in META_TYPES.items()}
 META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
 NRRD_TYPES = {"char": "i1", "short": "i2", "int": "i4", "longlong": "i8"}
-NRRD_TYPES |= {f"int{8 * n}": f"i{n}" for n in (1, 2, 4, 8)}
+NRRD_TYPES |= {"int8": "i1", "int16": "i2", "int32": "i4", "int64": "i8"}
 NRRD_TYPES |= {f"u{name}": f"u{code[1]}" for name, code in NRRD_TYPES.items()}
 NRRD_TYPES |= {"float": "f4", "double": "f8"}
 """By names without "signed" and blanks, "int" and "_t" at their ends."""
+
 DOMAIN = "domain", "space", "???", "none"
 """Kinds of axes of space in NRRD."""
 
 
-def text_header(
-    path: Path, separator: str, last: str = "", longest: int = 2**20
-) -> tuple[dict[str, str], int]:
+def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> tuple[dict[str, str], int]:
     """The fields of a header in text, and where in the file it ends: at an empty line, or behind the field
-    `last`. Raises `ValueError` for more than `MOST_FIELDS`, and fields of more than `longest` letters."""
+    `last`. Refuses more than `MOST_FIELDS`, and fields of more than `longest` letters."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
         while last not in fields and (line := stream.readline(2**20).decode("utf-8", "replace").strip()):
             key, _, value = line.partition(separator)
-            long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
-            told = f"the field {shortened(line)}" if long else f"more than {MOST_FIELDS} fields"
-            is_short = not long and len(fields) < MOST_FIELDS
-            ensure(is_short, f"path: {path} cannot be read: its header has {told}.")
+            is_long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
+            check(not is_long, f"cannot be read: its header has the field {shortened(line)}.")
+            many = f"cannot be read: its header has more than {MOST_FIELDS} fields."
+            check(len(fields) < MOST_FIELDS, many)
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 
 
-def _numbers(path: Path, fields: dict[str, str], names: str, default: np.ndarray) -> np.ndarray:
+def _numbers(fields: dict[str, str], names: str, default: np.ndarray) -> np.ndarray:
     """The numbers of the first of these fields that is there, in the shape of `default`."""
     name = next((name for name in names.split() if name in fields), None)
     if name is None:
@@ -57,22 +56,21 @@ def _numbers(path: Path, fields: dict[str, str], names: str, default: np.ndarray
     try:
         return np.array(re.findall(r"[^\s,()]+", fields[name]), float).reshape(default.shape)
     except ValueError as fault:
-        got = fields[name][:80]
-        raise ValueError(f"path: {path}: {name} must be {default.size} numbers; got {got!r}.") from fault
+        raise Refused(f": {name} must be {default.size} numbers; got {fields[name][:80]!r}.") from fault
 
 
-def _sizes(path: Path, text: str) -> list[int]:
+def _sizes(text: str) -> list[int]:
     are_numbers = all(re.fullmatch("[0-9]{1,15}", word) for word in text.split())
-    ensure(are_numbers, f"path: {path}: sizes must be numbers of voxels; got {shortened(text)}.")
+    check(are_numbers, f": sizes must be numbers of voxels; got {shortened(text)}.")
     sizes = [*map(int, text.split())]
-    check_volume(path, sizes)
+    check_volume(sizes)
     return sizes
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
     """The fields of an NRRD file, in small letters without blanks, its magic the first; where its voxels
     begin, and in which file, which may be missing."""
-    found, end = text_header(path, ":", longest=LONGEST)
+    found, end = text_header(path, ":", "", LONGEST)
     fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
     named = fields.get("datafile")
     return (fields, end, path) if named is None else (fields, 0, path.parent / named)
@@ -85,101 +83,96 @@ def read_nrrd(path: Path) -> ImageRecord:
     must = "a NRRD file holds its voxels, or names one file of them, in the encoding raw or gzip"
     got = f"{shortened(magic)}, {shortened(encoding)}, {shortened(str(source))}"
     is_read = magic.startswith("nrrd00") and encoding in ("raw", "gzip", "gz") and source.is_file()
-    ensure(is_read, f"path: {path} cannot be read: {must}; got {got}.")
-    kind, shape = fields.get("type", "").lower(), _sizes(path, fields.get("sizes", ""))
+    check(is_read, f"cannot be read: {must}; got {got}.")
+    kind, shape = fields.get("type", "").lower(), _sizes(fields.get("sizes", ""))
     code, n = NRRD_TYPES.get(re.sub("nsigned | int$|_t$|^signed | ", "", kind), ""), len(shape)
-    ensure(code, f"path: {path}: type must be one of numbers; got {shortened(kind)}.")
+    check(code, f": type must be one of numbers; got {shortened(kind)}.")
     dtype = np.dtype(code).newbyteorder(">" if fields.get("endian", "").lower() == "big" else "<")
-    lines, skip = (int(_numbers(path, fields, name, np.zeros(1))[0]) for name in ("lineskip", "byteskip"))
+    lines, skip = (int(_numbers(fields, name, np.zeros(1))[0]) for name in ("lineskip", "byteskip"))
     with source.open("rb") as stream:
         stream.seek(begin)
         for _ in range(min(lines, 2**20)):
             stream.readline(2**20)
         begin = stream.tell() + skip if skip >= 0 else -1
     packed = "" if encoding == "raw" else "zlib"
-    data = read_voxels(path, source, shape[::-1], dtype, begin=begin, packed=packed)
+    data = read_voxels(source, shape[::-1], dtype, begin, packed, more=not packed or source == path)
     vectors = re.findall(r"none|\([^)]*\)", fields.get("spacedirections", "").lower())
     kinds = [*fields.get("kinds", "").lower().split(), *["domain"] * n][:n]
     placed = [each != "none" for each in vectors] if vectors else [each in DOMAIN for each in kinds]
     inside, others = [k for k, is_placed in enumerate(placed[:n]) if is_placed][:3], iter("tcs")
-    ensure(len(inside) == 3, f"path: {path} must be a 3-D image; got axes of kinds {shortened(str(kinds))}.")
+    check(len(inside) == 3, f"must be a 3-D image; got axes of kinds {shortened(str(kinds))}.")
     along = dict(zip(inside, "xyz", strict=True))
     axes = [along.get(k) or (next(others, "s") if kinds[k] in (*DOMAIN, "time") else "s") for k in range(n)]
-    labels, space_units, units = (
-        re.findall(r'"([^"]*)"', fields.get(name, "")) for name in ("labels", "spaceunits", "units")
-    )
-    if not vectors and sorted(name.lower() for name in labels) == sorted(axes):
-        axes = [name.lower() for name in labels]
-    units = space_units if vectors else [units[k] for k in inside if k < len(units)]
+    quoted = {
+        name: re.findall('"([^"]*)"', fields.get(name, "")) for name in ("labels", "spaceunits", "units")
+    }
+    labels = [name.lower() for name in quoted["labels"]]
+    axes = labels if not vectors and sorted(labels) == sorted(axes) else axes
+    units = [unit for k, unit in enumerate(quoted["units"]) if k in inside]
+    units = dict(zip("xyz", quoted["spaceunits"] if vectors else units, strict=False))
     space = fields.get("space", "").upper()
     space = "".join(word[0] for word in re.findall("[A-Z]+", space)) if "-" in space else space
-    record = ImageRecord(data, "".join(axes[::-1]), units=dict(zip("xyz", units, strict=False)))
+    record = ImageRecord(data, "".join(axes[::-1]), units=units)
     record.convention = space[:3] if re.fullmatch("[LR][AP][SI]T?", space) else ""
     if vectors:
-        text, d = {"spacedirections": " ".join(vectors[k] for k in inside)}, vectors[inside[0]].count(",") + 1
-        columns = _numbers(path, text, "spacedirections", np.zeros((3, d)))[:, :3]
-        origin, got = _numbers(path, fields, "spaceorigin", np.zeros(d))[:3], vectors[inside[0]][:80]
-        ensure(d >= 3, f"path: {path}: space directions must be of 3 numbers; got {got}.")
+        text = [vectors[k] for k in inside]
+        d = text[0].count(",") + 1
+        columns = _numbers({"spacedirections": " ".join(text)}, "spacedirections", np.zeros((3, d)))[:, :3]
+        origin = _numbers(fields, "spaceorigin", np.zeros(d))[:3]
+        check(d >= 3, f": space directions must be of 3 numbers; got {text[0][:80]}.")
         vars(record).update(grid_of(np.column_stack([columns.T, origin])))
     elif {"spacings", "axismins"} & fields.keys():
-        spacings = _numbers(path, fields, "spacings", np.ones(n))[inside]
-        must = f"path: {path}: spacings must be positive, for 3 axes"
-        ensure(np.all(spacings > 0), f"{must}; got {spacings.tolist()}.")
+        spacings = _numbers(fields, "spacings", np.ones(n))[inside]
+        check(np.all(spacings > 0), f": spacings must be positive, for 3 axes; got {spacings.tolist()}.")
         record.steps = dict(zip("xyz", spacings.tolist(), strict=True))
-        first = 0 if "node" in fields.get("centers", fields.get("centerings", "")).lower() else spacings / 2
-        mins = _numbers(path, fields, "axismins", np.full(n, np.nan))[inside] + first
+        is_node = "node" in fields.get("centers", fields.get("centerings", "")).lower()
+        mins = _numbers(fields, "axismins", np.full(n, np.nan))[inside] + (0 if is_node else spacings / 2)
         record.origin = np.where(np.isfinite(mins), mins, 0.0)
-    segments = {
-        key.removesuffix("_labelvalue"): value[1:]
-        for key, value in fields.items()
-        if re.fullmatch(r"segment\d+_labelvalue", key)
-    }
-    record.labels = {
-        int(value): fields.get(f"{key}_name", "=?")[1:].strip()
-        for key, value in segments.items()
-        if value.strip().isdigit()
-    }
+    for key, value in fields.items():
+        if re.fullmatch(r"segment\d+_labelvalue", key) and value[1:].strip().isdigit():
+            name = fields.get(key.replace("labelvalue", "name"), "=?")[1:].strip()
+            record.labels = {**record.labels, int(value[1:]): name}
     return record
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
     """The fields of the header; where it ends, and the file of the voxels, which may be missing."""
     fields, end = text_header(path, "=", "ElementDataFile")
-    named = fields.get("ElementDataFile", "")
-    ends = "ElementDataFile" in fields
-    ensure(ends, f"path: {path} cannot be read: no header of a MetaImage, which ends in ElementDataFile.")
+    no_header = "cannot be read: no header of a MetaImage, which ends in ElementDataFile."
+    check("ElementDataFile" in fields, no_header)
+    named = fields["ElementDataFile"]
     return fields, end, path if named.upper() == "LOCAL" else path.parent / named
 
 
 def read_metaimage(path: Path) -> ImageRecord:
     """Reader for `.mha` and `.mhd` of binary voxels, in LPS."""
     fields, begin, source = metaimage_header(path)
-    shape, channels = _sizes(path, fields.get("DimSize", "")), fields.get("ElementNumberOfChannels", "1")
+    shape, channels = _sizes(fields.get("DimSize", "")), fields.get("ElementNumberOfChannels", "1")
     n, channels = len(shape), int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
-    check_volume(path, shape, channels)
+    check_volume(shape, channels)
 
-    def flag(key: str, default: str = "F") -> bool:
-        return fields.get(key, default).lower().startswith(("t", "1"))
+    def flag(key: str) -> bool:
+        return fields.get(key, "").lower().startswith(("t", "1"))
 
-    kind, text = fields.get("ElementType", ""), fields.get("BinaryData", "True")
+    kind, text = fields.get("ElementType", ""), fields.setdefault("BinaryData", "True")
     must = f"ElementType must be one of {', '.join(META_TYPES)}, and BinaryData true"
-    is_read = kind in META_TYPES and flag("BinaryData", "T")
-    ensure(is_read, f"path: {path}: {must}; got {kind[:40]!r} and {text[:20]!r}.")
-    named = f"there is no file of its voxels, {shortened(str(source))}."
-    ensure(source.is_file(), f"path: {path} cannot be read: {named}")
+    is_read = kind in META_TYPES and flag("BinaryData")
+    check(is_read, f": {must}; got {kind[:40]!r} and {text[:20]!r}.")
+    missing = f"cannot be read: there is no file of its voxels, {shortened(str(source))}."
+    check(source.is_file(), missing)
     if source != path:
         size = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file
         is_size = re.fullmatch("-1|[0-9]{1,15}", size)
-        ensure(is_size, f"path: {path}: HeaderSize must be a number of bytes; got {size[:40]!r}.")
+        check(is_size, f": HeaderSize must be a number of bytes; got {size[:40]!r}.")
         begin = int(size)
-    big = any(flag(f"{prefix}ByteOrderMSB") for prefix in ("", "BinaryData", "Element"))
-    dtype, several = np.dtype(META_TYPES[kind]).newbyteorder(">" if big else "<"), channels > 1
-    packed = "zlib" if flag("CompressedData") else ""
-    data = read_voxels(path, source, [*shape[::-1], *[channels] * several], dtype, begin=begin, packed=packed)
-    steps = _numbers(path, fields, "ElementSpacing ElementSize", np.ones(n))[:3].tolist()
-    origin = _numbers(path, fields, "Offset Position Origin", np.zeros(n))[:3]
+    is_big = any(flag(f"{prefix}ByteOrderMSB") for prefix in ("", "BinaryData", "Element"))
+    dtype, several = np.dtype(META_TYPES[kind]).newbyteorder(">" if is_big else "<"), channels > 1
+    packed, sizes = "zlib" if flag("CompressedData") else "", [*shape[::-1], *[channels] * several]
+    data = read_voxels(source, sizes, dtype, begin, packed, more=not packed or source == path)
+    steps = _numbers(fields, "ElementSpacing ElementSize", np.ones(n))[:3].tolist()
+    origin = _numbers(fields, "Offset Position Origin", np.zeros(n))[:3]
     # the axes of the data follow each other; here they are columns
-    turn = _numbers(path, fields, "TransformMatrix Rotation Orientation", np.eye(n)).T[:3, :3]
+    turn = _numbers(fields, "TransformMatrix Rotation Orientation", np.eye(n)).T[:3, :3]
     axes, steps = "xyztc"[:n][::-1] + "s" * several, dict(zip("xyz", steps, strict=True))
     unit = fields.get("DistanceUnits", "mm").strip("?") or "mm"
     return ImageRecord(data, axes, steps, unit, origin, turn, "LPS")

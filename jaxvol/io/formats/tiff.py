@@ -11,7 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, ensure, file_size, library, refusing
+from ..._util.files import (
+    MOST_COMPRESSED,
+    MOST_VOXELS,
+    check,
+    check_size,
+    ensure,
+    file_size,
+    library,
+    refusing,
+)
 from ..._util.image_record import ImageRecord
 from ..._util.units import AXES
 
@@ -38,7 +47,7 @@ def read_tiff(path: Path) -> ImageRecord:
 def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     pixels: dict[str, Any] = _ome_pixels(path, file, tifffile) if file.is_ome else {}
     if not pixels:  # pages of OME may lie in other files
-        _check_last(path, file)
+        _check_last(file)
     several, first = list(file.series), file.pages[0].aspage()
     axes, kinds = several[0].axes, {(each.shape, each.dtype) for each in several}
     one_by_one = len(several) > 1 and len(kinds) == 1 and {*axes} <= {*"YXS"}
@@ -46,7 +55,7 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     told = "; ".join(f"{each.shape} ({each.axes})" for each in several[:4])
     must, got = "must hold one stack of images of one size and type", f"got {len(several)} stacks"
     hint = "Choose one, as by tifffile.imread(path, series=0)."
-    ensure(is_stack, f"path: {path} {must}; {got}, and pages of {len(kinds)} kinds: {told}. {hint}")
+    check(is_stack, f"{must}; {got}, and pages of {len(kinds)} kinds: {told}. {hint}")
     record, shape = ImageRecord(None, ""), several[0].shape
     if not {*axes} - {*"YXS"}:
         axes, shape = "I" + axes, (len(several), *shape)
@@ -61,13 +70,13 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     held = [page for page in pages if page is not None or not pixels]
     if missing := len(pages) - len(held):
         record.note(f"{missing} of {len(pages)} planes are not in the file: filled with 0")
-    ensure(0 < math.prod(shape) < 2**62, f"path: {path} must hold images; its header says {shape}.")
+    check(0 < math.prod(shape) < 2**62, f"must hold images; its header says {shape}.")
     packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
     files = {page.parent.filehandle.path for page in held} if pixels else {path}
     size = sum(Path(each).stat().st_size for each in files) * (MOST_COMPRESSED if packed else 1)
-    check_size(path, size, math.prod(shape) * first.dtype.itemsize * len(held) // len(pages), more=True)
+    check_size(size, math.prod(shape) * first.dtype.itemsize * len(held) // len(pages), more=True)
     strips = [n for page in held if page is not None for n in page.databytecounts]
-    check_size(path, size, max(strips, default=0), more=True)  # of which tifffile reads as many
+    check_size(size, max(strips, default=0), more=True)  # of which tifffile reads as many
     arrays = [each.asarray() for each in several]
     record.data = (np.stack(arrays) if one_by_one else arrays[0]).reshape(shape)
     _calibrate(record, file, first, pixels)
@@ -91,9 +100,8 @@ def _calibrate(record: ImageRecord, file: Any, first: Any, pixels: dict[str, Any
     units = {axis: told.get(f"{axis}unit", told.get("unit")) for axis in "xyz"}
     steps = {"z": float(told.get("spacing", 1.0))} if {"spacing", "unit"} & told.keys() else {}
     for axis in "xy" if steps else "":
-        numerator, denominator = (
-            first.tags[name].value if (name := f"{axis.upper()}Resolution") in first.tags else (0, 1)
-        )
+        tag = first.tags.get(f"{axis.upper()}Resolution")
+        numerator, denominator = tag.value if tag else (0, 1)
         steps |= {axis: denominator / numerator} if numerator > 0 else {}
     if pixels:
         steps = {a.lower(): float(pixels[f"PhysicalSize{a}"]) for a in "XYZ" if f"PhysicalSize{a}" in pixels}
@@ -107,30 +115,29 @@ def _ome_pixels(path: Path, file: Any, tifffile: Any) -> dict[str, Any]:
     own = re.search(r'<OME [^>]*UUID="([^"]*)"', file.ome_metadata)
     for name, uuid in {*re.findall(r'<UUID FileName="([^"]*)">\s*([^<\s]*)', file.ome_metadata)}:
         is_here = (own and uuid == own[1]) or (Path(name).name == name and (path.parent / name).is_file())
-        ensure(is_here, f"path: {path} is one of several files of an image: {name} is not beside it.")
+        check(is_here, f"is one of several files of an image: {name} is not beside it.")
     image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
     return (image[0] if isinstance(image, list) else image)["Pixels"]
 
 
-def _check_last(path: Path, file: Any) -> None:
-    """Raises `ValueError` if more pages follow: tifffile leaves out what lies beyond the file's end."""
+def _check_last(file: Any) -> None:
+    """Refuse a file if more pages follow: tifffile leaves out what lies beyond the file's end."""
     format, handle = file.tiff, file.filehandle
     handle.seek(file.pages[-1].aspage().offset)
     (tags,) = struct.unpack(format.tagnoformat, handle.read(format.tagnosize))
     handle.seek(tags * format.tagsize, 1)
     following = handle.read(format.offsetsize)
     is_last = len(following) == format.offsetsize and not any(following)
-    ensure(is_last, f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
+    check(is_last, f"is cut short: after {len(file.pages)} images, the next is not there.")
 
 
 def slice_files(folder: Path) -> list[Path]:
     """The images in a folder, of the ending that most have, with numbers in their names in numeric order."""
     files = [file for file in folder.iterdir() if file.is_file()]
-    kinds = [
-        [file for file in files if file.suffix.lower() in kind]
-        for kind in (ENDINGS, *((ending,) for ending in PICTURES))
-    ]
-    return sorted(max(kinds, key=len), key=_words)
+    kinds = (ENDINGS, *((ending,) for ending in PICTURES))
+    return sorted(
+        max(([f for f in files if f.suffix.lower() in kind] for kind in kinds), key=len), key=_words
+    )
 
 
 def _words(file: Path) -> list[Any]:
@@ -142,27 +149,21 @@ def _words(file: Path) -> list[Any]:
 
 def read_slices(folder: Path) -> ImageRecord:
     """Reader for a folder of files of one image each, in the order of the numbers in their names; where two
-    of these count, one is that of channels or times. Raises `ValueError` naming the files for images of
-    different sizes or types, for a number that is missing, and for names that count in another way."""
+    of these count, one is that of channels or times. Refuses images of different sizes or types, a number
+    that is missing, and names that count in another way."""
     axes, counts, files = _counted(folder, slice_files(folder))
-    planes: list[np.ndarray] = []
-    record = ImageRecord(None, "")
+    record, planes = ImageRecord(None, axes), list[np.ndarray]()
     for file in files:
         image = read_tiff(file) if file.suffix.lower() in ENDINGS else _picture(file)
         plane = image.decode(np.asarray(image.data))[0]
         record.steps, record.units = (record.steps, record.units) if planes else (image.steps, image.units)
         planes.append(plane)
         first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (planes[0], plane))
-        if (
-            image.axes not in ("ZYX", "ZYXS")
-            or first != last
-            or len(files) * plane.size > MOST_VOXELS
-            or len(plane) > 1
-        ):
-            raise ValueError(
-                f"path: each file in {folder} must hold one image of the same size and type, fewer than "
-                f"2**31 voxels in all; {files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
-            )
+        must = f"path: each file in {folder} must hold one image of the same size and type, fewer than 2**31 voxels"
+        got = f"{files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
+        is_image = image.axes in ("ZYX", "ZYXS") and len(plane) == 1
+        is_alike = is_image and first == last and len(files) * plane.size <= MOST_VOXELS
+        ensure(is_alike, f"{must} in all; {got}")
     record.data = np.concatenate(planes).reshape(*counts, *planes[0].shape[1:])
     record.axes = axes + "yxs"[: record.data.ndim - len(axes)]
     return record
@@ -186,7 +187,7 @@ def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Seque
     patterns = Counter("#".join(each[::2]) for each in words.values())
     told = ", ".join(f"{count} named {pattern}" for pattern, count in patterns.most_common(4))
     is_one = len(patterns) == 1 or min(patterns.values()) == 1
-    ensure(is_one, f"path: {folder} holds {len(patterns)} series of images: {told}. {elsewhere}")
+    check(is_one, f"holds {len(patterns)} series of images: {told}. {elsewhere}")
     numbers = [] if len(patterns) > 1 else [*zip(*(each[1::2] for each in words.values()), strict=True)]
     sizes = {k: len({*column}) for k, column in enumerate(numbers) if len({*column}) > 1}
     unique = [k for k, size in sizes.items() if size == len(files)]
@@ -197,12 +198,11 @@ def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Seque
         n = max(sizes.values())
         names = f"names such as {files[0].name} and {files[-1].name} count by {len(sizes)} numbers"
         is_grid = len({*axes}) == len(axes) and math.prod(sizes.values()) == len(files)
-        ensure(is_grid, f"path: {folder} holds {len(files) // n} series of {n} images: {names}. {elsewhere}")
+        check(is_grid, f"holds {len(files) // n} series of {n} images: {names}. {elsewhere}")
         files = sorted(files, key=lambda file: [words[file][2 * k + 1] for k in sizes])
         return "".join(axes), [*sizes.values()], files
-    steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else []
-    if len({*steps}) > 1 and min(steps) > 0:
-        at = int(np.argmax(steps))
-        gap = f"{files[at].name} is followed by {files[at + 1].name}"
-        raise ValueError(f"path: slices are missing in {folder}: {gap}.")
+    steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else [1]
+    before, after = (files[min(steps.index(max(steps)) + k, len(files) - 1)].name for k in (0, 1))
+    is_whole = len({*steps}) <= 1 or min(steps) <= 0
+    ensure(is_whole, f"path: slices are missing in {folder}: {before} is followed by {after}.")
     return "z", [len(files)], files

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..._util.checks import shortened
-from ..._util.files import check_size, ensure
+from ..._util.files import check, check_size
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import vtk_record, vtk_sizes
 
@@ -26,82 +26,81 @@ LEGACY |= {"vtktypeuint64": "u8", "float": "f4", "double": "f8"}
 def read_vtk(path: Path) -> ImageRecord:
     """Reader for both: the scalars at points, else the first array; of cells, at their centres."""
     content = path.read_bytes()
-    return (_xml if content.lstrip()[:1] == b"<" else _legacy)(path, content)
-
-
-def _record(path: Path, held: Any, dtype: np.dtype, count: int, *grid: Any) -> ImageRecord:
-    """The record of bytes, or of words of text. `grid`: extent, whether of cells, place (`vtk_record`)."""
-    is_text = isinstance(held, list)
-    values = math.prod(vtk_sizes(*grid[:2])) * count
-    check_size(path, len(held), values * (1 if is_text else dtype.itemsize))
+    held, dtype, count, *grid = (_xml if content.lstrip()[:1] == b"<" else _legacy)(content)
+    is_text, values = isinstance(held, list), math.prod(vtk_sizes(*grid[:2])) * count
+    check_size(len(held), values * (1 if is_text else dtype.itemsize))
     data = np.array(held, float).astype(dtype.newbyteorder("=")) if is_text else np.frombuffer(held, dtype)
     return vtk_record(data.reshape(-1, count), *grid)
 
 
-def _legacy(path: Path, content: bytes) -> ImageRecord:
-    """The record of a legacy file, whose binary numbers are big-endian."""
+def _legacy(content: bytes) -> tuple[Any, ...]:
+    """Values as bytes or words, their type, components of each; extent, whether of cells, and place."""
     last = rb"\n(LOOKUP_TABLE[^\n]*|COLOR_SCALARS[^\n]*|(?:\w+ \d+ \d+ [a-zA-Z]\w+))[ \t]*\r?\n"
-    end = re.search(last, content)
-    head = content[: end.end() if end else 2**12].decode("latin-1")
+    found: Any = re.search(last, content)
+    end = found.end() if found else 2**12
+    head = content[:end].decode("latin-1")
     words = {line.split()[0].upper(): line.split()[1:] for line in head.splitlines()[2:] if line.split()}
     dataset = words.get("DATASET", ["none"])
-    if not head.startswith("# vtk DataFile") or dataset != ["STRUCTURED_POINTS"] or end is None:
-        got = shortened(" ".join(dataset))
-        raise ValueError(f"path: {path} must hold a DATASET of STRUCTURED_POINTS with scalars; got {got}.")
+    is_image = head.startswith("# vtk DataFile") and dataset == ["STRUCTURED_POINTS"] and found
+    got = shortened(" ".join(dataset))
+    check(is_image, f"must hold a DATASET of STRUCTURED_POINTS with scalars; got {got}.")
     if "SCALARS" in words:
         kind, count = [*words["SCALARS"], "1"][1:3]
     elif "COLOR_SCALARS" in words:
         kind, count = "unsigned_char", words["COLOR_SCALARS"][-1]
     else:  # a field's first array
-        _, count, _, kind = end[1].decode().split()
-    dtype, counts = np.dtype(LEGACY[kind.lower()]).newbyteorder(">"), [int(n) for n in words["DIMENSIONS"]]
-    extent = [end for n in counts for end in (0, n - 1)]
+        _, count, _, kind = found[1].decode().split()
+    dtype = np.dtype(LEGACY[kind.lower()]).newbyteorder(">")
+    extent = [end for n in words["DIMENSIONS"] for end in (0, int(n) - 1)]
     of_cells = "CELL_DATA" in words and "POINT_DATA" not in words
     total = math.prod(vtk_sizes(extent, of_cells)) * int(count)
     if "BINARY" in words:
-        held: Any = content[end.end() : end.end() + total * dtype.itemsize]
+        held: Any = content[end : end + total * dtype.itemsize]
     else:
-        held = content[end.end() :].split(None, total)[:total]
+        held = content[end:].split(None, total)[:total]
         if "COLOR_SCALARS" in words:  # from 0 to 1
             held = [round(255 * float(word)) for word in held]
     spacing = words.get("SPACING") or words.get("ASPECT_RATIO") or np.ones(3)
-    place = spacing, words.get("ORIGIN", np.zeros(3)), np.eye(3)
-    return _record(path, held, dtype, int(count), extent, of_cells, place)
+    return held, dtype, int(count), extent, of_cells, (spacing, words.get("ORIGIN", np.zeros(3)), np.eye(3))
 
 
-def _xml(path: Path, content: bytes) -> ImageRecord:
-    """The record of an XML file of arrays in ASCII, base64 or appended, also compressed by zlib."""
+def _xml(content: bytes) -> tuple[Any, ...]:
+    """The same of arrays in ASCII, base64 or appended, also compressed by zlib."""
     raw = re.search(rb"<AppendedData[^>]*>\s*_", content)
-    text = content[: raw.end() - 1] + b"</AppendedData></VTKFile>" if raw else content
+    text, appended = (content, b"")
+    if raw:
+        text, appended = content[: raw.end() - 1] + b"</AppendedData></VTKFile>", content[raw.end() :]
     is_plain = b"<!DOCTYPE" not in text and b"<!ENTITY" not in text  # which may expand without end
-    ensure(is_plain, f"path: {path} must be XML without a DOCTYPE.")
+    check(is_plain, "must be XML without a DOCTYPE.")
     root: Any = ElementTree.fromstring(text)
     pieces, compressor = root.findall("ImageData/Piece"), root.get("compressor")
-    must = f"path: {path} must hold one Piece of ImageData, plain or compressed by zlib"
-    told = f"{root.get('type')} of {len(pieces)} pieces, {compressor}"
-    ensure(len(pieces) == 1 and compressor in (None, "vtkZLibDataCompressor"), f"{must}; got {told}.")
+    is_read = len(pieces) == 1 and compressor in (None, "vtkZLibDataCompressor")
+    got = f"{root.get('type')} of {len(pieces)} pieces, {compressor}"
+    check(is_read, f"must hold one Piece of ImageData, plain or compressed by zlib; got {got}.")
     image, parts = (
         root.find("ImageData"),
-        [part for part in pieces[0] if part.tag in ("PointData", "CellData")],
+        [each for each in pieces[0] if each.tag in ("PointData", "CellData")],
     )
-    part = next(part for part in parts if part.find("DataArray") is not None)
-    named = (a for a in part.findall("DataArray") if a.get("Name") == part.get("Scalars"))
+    part = next(each for each in parts if each.find("DataArray") is not None)
+    named = (each for each in part.findall("DataArray") if each.get("Name") == part.get("Scalars"))
     array = next(named, part.find("DataArray"))
     order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
-    dtype, count = np.dtype(array.get("type").lower()), int(array.get("NumberOfComponents", "1"))
-    ensure(dtype.kind in "iuf", f"path: {path} must hold an array of numbers; got {dtype}.")
-    if array.get("format") == "ascii":
-        held: Any = (array.text or "").split()
-    else:
-        inside = array.get("format") == "appended" and raw is not None
-        store = content[raw.end() + int(array.get("offset", "0")) :] if inside else (array.text or "").strip()
+    dtype = np.dtype(array.get("type").lower()).newbyteorder(order)
+    check(dtype.kind in "iuf", f"must hold an array of numbers; got {dtype}.")
+    held: Any = (array.text or "").split()
+    if array.get("format") != "ascii":
+        inside = array.get("format") == "appended"
+        store = appended[int(array.get("offset", "0")) :] if inside else (array.text or "").strip().encode()
         is_raw = inside and root.find("AppendedData").get("encoding") == "raw"
         word = np.dtype("u8" if root.get("header_type") == "UInt64" else "u4").newbyteorder(order)
-        held = _bytes(store if inside else store.encode(), word, is_raw=is_raw, packed=compressor is not None)
-    extent = pieces[0].get("Extent", image.get("WholeExtent", "")).split()
-    defaults = {"Spacing": "1 1 1", "Origin": "0 0 0", "Direction": "1 0 0 0 1 0 0 0 1"}
-    place = [image.get(name, default).split() for name, default in defaults.items()]
-    return _record(path, held, dtype.newbyteorder(order), count, extent, part.tag == "CellData", place)
+        held = _bytes(store, word, is_raw=is_raw, packed=compressor is not None)
+    count, extent = (
+        array.get("NumberOfComponents", "1"),
+        pieces[0].get("Extent", image.get("WholeExtent", "")),
+    )
+    places = ("Spacing", "1 1 1"), ("Origin", "0 0 0"), ("Direction", "1 0 0 0 1 0 0 0 1")
+    place = [image.get(*each).split() for each in places]
+    return held, dtype, int(count), extent.split(), part.tag == "CellData", place
 
 
 def _bytes(store: bytes, word: np.dtype, *, is_raw: bool, packed: bool) -> bytes:
