@@ -92,8 +92,8 @@ ARGUMENTS = ("path:", "shape must", "dtype must", "spacing must", "time must", "
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Turn whatever is raised within the context into a `ValueError` that says what is wrong with a file. What
-    libraries warn of and log, which may be a line for each of a file's faults, is left out."""
+    """Turn whatever is raised within the context into a `ValueError` that says what is wrong with a file.
+    What libraries warn of and log, which may be a line for each of a file's faults, is left out."""
     loggers = [logging.getLogger(name) for name in ("tifffile", "nibabel.global", "pydicom")]
     before = [logger.disabled for logger in loggers]
     try:
@@ -104,11 +104,11 @@ def refusing(path: Path) -> Iterator[None]:
             yield
     except (MemoryError, ImportError):
         raise
-    except Refused as fault:
-        raise ValueError(f"path: {path}{'' if str(fault).startswith(':') else ' '}{fault}") from fault
     except Exception as fault:
         if isinstance(fault, ValueError) and str(fault).startswith(ARGUMENTS):
             raise
+        if isinstance(fault, Refused):
+            raise ValueError(f"path: {path}{'' if str(fault).startswith(':') else ' '}{fault}") from fault
         told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
         raise ValueError(f"path: {path} cannot be read: {told}") from fault
     finally:

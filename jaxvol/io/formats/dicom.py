@@ -10,26 +10,15 @@ import numpy as np
 
 from ..._util.affine import directions
 from ..._util.checks import finite_array, integer, shortened
-from ..._util.files import (
-    MOST_COMPRESSED,
-    MOST_VOXELS,
-    Refused,
-    check,
-    check_size,
-    ensure,
-    file_size,
-    library,
-    refusing,
-)
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, Refused, check, check_size, library, refusing
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import grid_of
 
 
 UID = "1.2.840.10008."
 SYNTAXES = {UID + end: "" for end in ("1.2", "1.2.1", "1.2.2", "1.2.1.99", "1.2.5")}
-SYNTAXES |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (50, 51, 57, 70)), "jpeg_decode")
-SYNTAXES |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (80, 81)), "jpegls_decode")
-SYNTAXES |= dict.fromkeys((f"{UID}1.2.4.{number}" for number in (90, 91)), "jpeg2k_decode")
+DECODERS = {"jpeg_decode": (50, 51, 57, 70), "jpegls_decode": (80, 81), "jpeg2k_decode": (90, 91)}
+SYNTAXES |= {f"{UID}1.2.4.{number}": name for name, numbers in DECODERS.items() for number in numbers}
 """Transfer syntaxes, and what decodes them in imagecodecs; "": pydicom does. The first 3 do not compress."""
 
 STORAGE = UID + "5.1.4.1.1."
@@ -40,9 +29,9 @@ KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
 """Elements of the meta information with which a file begins."""
 
 TIMES = (
-    *("TemporalPositionIndex", "TemporalPositionIdentifier", "AcquisitionNumber", "TriggerTime"),
-    *("DiffusionBValue", "EchoTime", "AcquisitionTime", "ContentTime", "InstanceNumber"),
+    "TemporalPositionIndex TemporalPositionIdentifier AcquisitionNumber TriggerTime DiffusionBValue EchoTime"
 )
+TIMES = (*TIMES.split(), "AcquisitionTime", "ContentTime", "InstanceNumber")
 """Elements that tell images at one place apart."""
 
 AWAY = 0.1
@@ -54,7 +43,7 @@ class Slice(NamedTuple):
 
     file: Path
     frame: int
-    parts: list[Any]  # what holds its elements; the first that has one counts
+    elements: Any  # those of its frame in place of those of the file
     shape: tuple[int, int, int]  # of all frames of the file
     place: np.ndarray
     grid: np.ndarray  # distances between rows and between columns, and the directions of both
@@ -62,9 +51,6 @@ class Slice(NamedTuple):
     @property
     def name(self) -> str:
         return self.file.name if self.shape[0] == 1 else f"frame {self.frame + 1}"
-
-    def element(self, name: str) -> Any:
-        return next((part[name].value for part in self.parts if name in part), None)
 
 
 def is_dicom(path: Path) -> bool:
@@ -100,7 +86,8 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
         told = ", ".join(str(each.relative_to(path.parent)) for each in folders[:8]) or "no folder"
         hint = "beside it holds DICOM images. Give the path of one of them."
         check(len(folders) == 1, f": {told} {hint}")
-        path = folders[0]
+        with refusing(folders[0]):
+            return read_dicom(folders[0], spacing, time)
     headers = series_headers(path)
     slices = [each for file, header in headers.items() for each in _slices(file, header, spacing)]
     must = "must hold at least 2 slices of a series, and fewer than 2**31 voxels"
@@ -130,13 +117,13 @@ def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any)
     groups = [slices[a:b] for a, b in zip([0, *cuts], [*cuts, len(slices)], strict=True)]
     count = len(groups[0])
     if count == 1 or len(groups) == 1 or {len(group) for group in groups} != {count}:
-        ensure(time is None, f"time: {path} has no such axis; it holds one image at each place.")
+        check(time is None, f"time: {path} has no such axis; it holds one image at each place.")
         return slices, ""
-    differs = (name for name in TIMES if len({str(each.element(name)) for each in groups[0]}) == count)
+    differs = (name for name in TIMES if len({str(each.elements.get(name)) for each in groups[0]}) == count)
     key = next(differs, TIMES[-1])
-    groups = [sorted(group, key=lambda each: _rank(each.element(key))) for group in groups]
+    groups = [sorted(group, key=lambda each: _rank(each.elements.get(key))) for group in groups]
     words = re.sub("(?<=[a-z])(?=[A-Z])", " ", key).lower()
-    values = ", ".join(str(each.element(key)) for each in groups[0][:6])
+    values = ", ".join(str(each.elements.get(key)) for each in groups[0][:6])
     told = f"holds {count} images at each of {len(groups)} places ({words} {values})"
     check(time is not None, f"{told}: time must be given, from 0 to {count - 1}.")
     at = integer("time", time, 0, count - 1)
@@ -217,38 +204,39 @@ def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
         is_grey = channels == 1 and min(shape) > 0 and bits in (1, 8, 16, 32, 64)
         got = f"{shape} of {channels} values of {bits} bits"
         check(is_grey, f"must hold slices of one value per pixel; got {got}.")
-        held = file_size(path) * (1 if syntax in [*SYNTAXES][:3] else MOST_COMPRESSED)
+        held = path.stat().st_size * (1 if syntax in [*SYNTAXES][:3] else MOST_COMPRESSED)
         check_size(held, math.prod(shape) * bits // 8, more=True)
         shared = list(header.get("SharedFunctionalGroupsSequence") or [])[:1]
         single = list(header.get("PerFrameFunctionalGroupsSequence") or [])
         is_placed = len(single) == shape[0] or (shape[0] == 1 and not single)
         check(is_placed, f": each of {shape[0]} frames must say where it lies; {len(single)} do.")
-        return [
-            _slice(path, k, shape, [*single[k : k + 1], *shared], header, spacing) for k in range(shape[0])
-        ]
+        groups = [[*shared, *single[k : k + 1]] for k in range(shape[0])]
+        return [_slice(path, k, shape, header, parts, spacing) for k, parts in enumerate(groups)]
 
 
-def _slice(path: Path, k: int, shape: Any, groups: list[Any], header: Any, spacing: Any) -> Slice:
-    """Frame k of a file. `groups`: sequences that hold its elements before the header does."""
-    held = [element.value[:1] for group in groups for element in group if element.VR == "SQ"]
-    parts = [*(item for items in held for item in items), header]
-    place = _numbers(parts, 3, "ImagePositionPatient")
-    turn = _numbers(parts, 6, "ImageOrientationPatient")
+def _slice(path: Path, k: int, shape: Any, header: Any, groups: list[Any], spacing: Any) -> Slice:
+    """Frame k of a file. `groups`: sequences of elements that count more than those of the header."""
+    elements = library("pydicom", path).Dataset()
+    elements.set_original_encoding(*header.original_encoding)
+    elements.update(header)
+    for item in (item for group in groups for each in group if each.VR == "SQ" for item in each.value[:1]):
+        elements.update(item)
+    place = _numbers(elements, 3, "ImagePositionPatient")
+    turn = _numbers(elements, 6, "ImageOrientationPatient")
     if spacing is None:
-        pixel = _numbers(parts, 2, "PixelSpacing", "ImagerPixelSpacing")
+        pixel = _numbers(elements, 2, "PixelSpacing", "ImagerPixelSpacing")
     else:  # of the axes as loaded, to which rows and columns are nearest
         x_and_y = np.abs(turn.reshape(2, 3)).argmax(axis=1)
         pixel = np.asarray(finite_array("spacing", spacing, (3,)))[x_and_y[::-1]]
-    return Slice(path, k, parts, shape, place, np.array([*pixel, *turn], float))
+    return Slice(path, k, elements, shape, place, np.array([*pixel, *turn], float))
 
 
-def _numbers(parts: list[Any], count: int, *names: str) -> np.ndarray:
+def _numbers(elements: Any, count: int, *names: str) -> np.ndarray:
     """The numbers of the first of these elements that has as many; two are positive distances."""
     texts = []
     for name in names:
-        raw: Any = next((part.get_item(name) for part in parts if name in part), None)
-        value = b"" if raw is None else raw.value
-        text = value.decode("latin-1") if isinstance(value, bytes) else "\\".join(map(str, value or ()))
+        value = getattr(elements.get_item(name), "value", None) or b""
+        text = value.decode("latin-1") if isinstance(value, bytes) else "\\".join(map(str, value))
         texts.append(shortened(text.strip()))
         try:
             numbers = np.array(text.strip("\0 ").split("\\"), float)
@@ -256,10 +244,13 @@ def _numbers(parts: list[Any], count: int, *names: str) -> np.ndarray:
             continue
         if numbers.shape == (count,) and np.isfinite(numbers).all() and (count > 2 or np.all(numbers > 0)):
             return numbers
-    told, kind = f"{' or '.join(names)} must be {count}", "positive numbers" if count == 2 else "numbers"
-    fault = "does not say how far its pixels are apart" if count == 2 else "must say where it lies"
-    hint = " Give spacing=(x, y, z), --spacing." if count == 2 else ""
-    raise Refused(f"{fault}: {told} {kind}; got {' and '.join(texts)}.{hint}")
+    told, got = f"{' or '.join(names)} must be {count}", " and ".join(texts)
+    if count == 2:
+        hint = "Give spacing=(x, y, z), --spacing."
+        raise Refused(
+            f"does not say how far its pixels are apart: {told} positive numbers; got {got}. {hint}"
+        )
+    raise Refused(f"must say where it lies: {told} numbers; got {got}.")
 
 
 def _values(slices: list[Slice]) -> np.ndarray:
@@ -270,11 +261,10 @@ def _values(slices: list[Slice]) -> np.ndarray:
         with refusing(each.file):
             if each.file != last:
                 pixels, last = _pixels(each), each.file
-            plane = pixels[each.frame]
-            if each.element("ModalityLUTSequence"):
-                header = next(part for part in each.parts if "ModalityLUTSequence" in part)
-                plane = library("pydicom.pixels", each.file).apply_modality_lut(plane, header)
-            slope, intercept = (each.element(name) for name in ("RescaleSlope", "RescaleIntercept"))
+            plane, elements = pixels[each.frame], each.elements
+            if elements.get("ModalityLUTSequence"):
+                plane = library("pydicom.pixels", each.file).apply_modality_lut(plane, elements)
+            slope, intercept = elements.get("RescaleSlope"), elements.get("RescaleIntercept")
             record = ImageRecord(plane, "yx", slope=float(slope or 1), intercept=float(intercept or 0))
             planes.append(record.decode(plane)[0])
     return np.stack(planes)

@@ -11,16 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import (
-    MOST_COMPRESSED,
-    MOST_VOXELS,
-    check,
-    check_size,
-    ensure,
-    file_size,
-    library,
-    refusing,
-)
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check, check_size, file_size, library, refusing
 from ..._util.image_record import ImageRecord
 from ..._util.units import AXES
 
@@ -163,7 +154,7 @@ def read_slices(folder: Path) -> ImageRecord:
         got = f"{files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
         is_image = image.axes in ("ZYX", "ZYXS") and len(plane) == 1
         is_alike = is_image and first == last and len(files) * plane.size <= MOST_VOXELS
-        ensure(is_alike, f"{must} in all; {got}")
+        check(is_alike, f"{must} in all; {got}")
     record.data = np.concatenate(planes).reshape(*counts, *planes[0].shape[1:])
     record.axes = axes + "yxs"[: record.data.ndim - len(axes)]
     return record
@@ -175,8 +166,8 @@ def _picture(path: Path) -> ImageRecord:
 
     size = file_size(path)
     with refusing(path), Image.open(io.BytesIO(path.read_bytes())) as image:  # lengths within it may be any
-        claim = f"its header says {image.size}, more than its bytes can hold"
-        ensure(image.width * image.height <= size * MOST_COMPRESSED, claim)
+        if image.width * image.height > size * MOST_COMPRESSED:
+            raise ValueError(f"its header says {image.size}, more than its bytes can hold")
         data = np.asarray(image)
     return ImageRecord(data[None], "ZYXS"[: data.ndim + 1])
 
@@ -204,5 +195,5 @@ def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Seque
     steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else [1]
     before, after = (files[min(steps.index(max(steps)) + k, len(files) - 1)].name for k in (0, 1))
     is_whole = len({*steps}) <= 1 or min(steps) <= 0
-    ensure(is_whole, f"path: slices are missing in {folder}: {before} is followed by {after}.")
+    check(is_whole, f"path: slices are missing in {folder}: {before} is followed by {after}.")
     return "z", [len(files)], files
