@@ -46,6 +46,7 @@ class ImageRecord:
     also: dict[str, Any] = field(default_factory=dict)  # further arguments of `Volume`
     what: str = "data"  # how errors begin
     format: str = ""
+    is_chosen: bool = False  # one of several times was chosen as the file was read
 
     @property
     def letters(self) -> str:
@@ -80,7 +81,7 @@ class ImageRecord:
         """The values of stored numbers, and where there are none, if anywhere. Whole numbers stay so under a
         scale of whole numbers; others are scaled in float64, and rounded once to float32."""
         kind = stored.dtype
-        absent = [kind.type(number) for number in self.missing if kind.kind == "f" or holds(kind, number)]
+        absent = [kind.type(number) for number in self.missing if holds(kind, number)]
         mask = np.isin(stored, absent) if absent else None
         mask = mask if mask is not None and mask.any() else None
         if self.unsigned and kind.kind == "i":
@@ -99,9 +100,7 @@ class ImageRecord:
                 into[...] = plane * np.float64(slope) + intercept
         return values, mask
 
-    def oriented(
-        self, sizes: Sequence[int], *, turned: bool = True
-    ) -> tuple[list[int], list[int], dict[str, Any]]:
+    def oriented(self, sizes: list[int], turned: bool = True) -> tuple[list[int], list[int], dict[str, Any]]:
         """How axes of `sizes` voxels are brought along the world's: which of x, y, z becomes each, its sign,
         and spacing (mm), origin and direction of `Volume`, missing where the file says nothing. Not `turned`:
         axes stay in order, and only those along which steps are negative are reversed. No voxel is
@@ -112,9 +111,9 @@ class ImageRecord:
         world = np.array([1.0 if axis in "LPS" else -1.0 for axis in self.convention or "LPS"])
         turn = np.eye(3) if self.direction is None else np.asarray(self.direction, float)
         what, origin = f"{self.what}: its place", np.asarray(self.origin, float)
+        must, got = "must be finite, with steps longer than 0", f"{given.tolist()} from {origin.tolist()}"
         is_place = given.all() and np.isfinite([*given, *origin, *turn.flat]).all()
-        got = f"{given.tolist()} from {origin.tolist()}"
-        ensure(is_place, f"{what} must be finite, with steps longer than 0; got {got}.")
+        ensure(is_place, f"{what} {must}; got {got}.")
         turn = directions(what, turn) * world[:, None] * np.sign(given)
         order, signs = [0, 1, 2], np.sign(given).astype(int)
         if turned:  # the axis of the data that is nearest to each axis of the world, all three at once
@@ -149,10 +148,9 @@ class ImageRecord:
 
 
 def holds(dtype: np.dtype, number: float) -> bool:
-    """Whether a type of integers holds a number."""
-    if dtype.kind not in "iu" or not float(number).is_integer():
-        return False
-    return bool(np.iinfo(dtype).min <= number <= np.iinfo(dtype).max)
+    """Whether a type of integers or floats holds a number; floats may round it."""
+    is_whole = dtype.kind in "iu" and float(number).is_integer()
+    return dtype.kind == "f" or (is_whole and np.iinfo(dtype).min <= number <= np.iinfo(dtype).max)
 
 
 def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[tuple[Any, ...], str]:
@@ -161,7 +159,10 @@ def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[
     letters, shape, where = record.letters, record.data.shape, record.what.removeprefix("path: ")
     axes = sorted(zip(letters, shape, strict=True), key=lambda axis: "xyztcs".index(axis[0]))
     sizes = ", ".join(f"{axis} {n}" for axis, n in axes)
-    given = {"t": ("time", time), "c" if "c" in letters else "s": ("channel", channel)}
+    given = {
+        "t": ("time", None if record.is_chosen else time),
+        "c" if "c" in letters else "s": ("channel", channel),
+    }
     for letter, (name, number) in given.items():
         ensure(number is None or letter in letters, f"{name}: {where} has no such axis; it holds {sizes}.")
     index: list[Any] = [slice(None)] * len(letters)
@@ -177,22 +178,14 @@ def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[
 
 
 def volume_arguments(
-    record: ImageRecord,
-    *,
-    time: int | None = None,
-    channel: int | None = None,
-    nan: float | None = None,
-    turned: bool = True,
+    record: ImageRecord, *, time: Any = None, channel: Any = None, nan: Any = None, turned: bool = True
 ) -> dict[str, Any]:
     """Arguments of `Volume` for an image: axes along the world's (if `turned`), lengths in mm, values scaled,
     and those that are missing replaced by `nan`, by default by the least one that is there. Ids of segments,
     and whole numbers under a scale, are numbered where float32 would round them.
 
-    Raises:
-        ValueError: for axes that are not known, a choice of `time` or `channel` that is missing or wrong, a
-            place that is none, and 2**31 voxels or more.
-
-    Warns of what was taken in place of what the file does not say (`ImageRecord.assumed`).
+    Raises `ValueError` for unknown axes, a choice of `time` or `channel` that is missing or wrong, a place
+    that is none, and 2**31 voxels or more. Warns of what was assumed.
     """
     index, letters = choose(record, time, channel)
     shape = [n for n, part in zip(record.data.shape, index, strict=True) if isinstance(part, slice)]
@@ -202,8 +195,7 @@ def volume_arguments(
         check_shape(tuple(shape[:2]))
     order, signs, place = record.oriented([shape[letters.index(a)] for a in "xyz"], turned=turned)
     stored = np.asarray(record.data[index])
-    stored = stored if stored.dtype.isnative else stored.astype(stored.dtype.newbyteorder("="))
-    data, mask = record.decode(stored)
+    data, mask = record.decode(stored.astype(stored.dtype.newbyteorder("="), copy=False))
     if mask is not None:
         data = _filled(record, data, mask, nan)
     if nan is not None and data.dtype.kind == "f":
@@ -211,9 +203,8 @@ def volume_arguments(
     axes = [letters.index("xyz"[axis]) for axis in order] + [k for k, a in enumerate(letters) if a == "s"]
     data = np.transpose(data, axes)[tuple(slice(None, None, sign) for sign in signs)]
     arguments = {"data": np.ascontiguousarray(data), **place, **record.also}
-    is_wide = (
-        data.dtype.kind in "iu" and data.itemsize > 2 and data.size and not within(data, WHOLE["float32"])
-    )
+    is_wide = data.dtype.kind in "iu" and data.itemsize > 2 and data.size > 0
+    is_wide = is_wide and not within(data, WHOLE["float32"])
     if is_wide and record.is_scaled:
         record.note("whole numbers beyond 2**24, which float32 would round: numbered, see label_ids")
     if is_wide and (record.is_scaled or any(is_flat(np.moveaxis(data, axis, 0)) for axis in range(3))):
@@ -234,12 +225,11 @@ def warn_caller(text: str) -> None:
 def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float | None) -> np.ndarray:
     """Values with those that are missing replaced."""
     if nan is None:
-        some = f"{record.what} must hold values; all {mask.size} are missing. Give nan=VALUE."
-        ensure(not mask.all(), some)
+        count, n = np.count_nonzero(mask), mask.size
+        ensure(count < n, f"{record.what} must hold values; all {n} are missing. Give nan=VALUE.")
         nan = float(data[~mask].min().item())
-        count = f"{np.count_nonzero(mask)} of {mask.size}"
-        record.note(f"{count} values are missing: shown as {nan:g}; see nan")
-    data = np.array(data, data.dtype if data.dtype.kind == "f" or holds(data.dtype, nan) else np.float32)
+        record.note(f"{count} of {n} values are missing: shown as {nan:g}; see nan")
+    data = np.array(data, data.dtype if holds(data.dtype, nan) else np.float32)
     data[mask] = nan
     return data
 
@@ -251,8 +241,7 @@ def numbered(ids: np.ndarray) -> dict[str, Any]:
 
 
 class DecodedArray:
-    """The array of a record, of which boxes are read as values, with some of its axes reversed: for
-    bricks."""
+    """The array of a record, for bricks: boxes of it are read as values, with some of its axes reversed."""
 
     def __init__(self, record: ImageRecord, reverse: Sequence[int], nan: float | None):
         self.record, self.reverse, self.nan, self.shape = record, reverse, nan, record.data.shape

@@ -41,11 +41,12 @@ def object_arguments(value: Any) -> dict[str, Any] | None:
 
 def grid_of(affine: Any) -> dict[str, Any]:
     """`steps`, `origin` and `direction` of a record whose voxel (i, j, k) lies at `affine @ (i, j, k, 1)`."""
-    columns, origin = np.asarray(affine, float)[:3, :3], np.asarray(affine, float)[:3, 3]
+    columns, origin = np.split(np.asarray(affine, float)[:3], [3], axis=1)
     steps = np.linalg.norm(columns, axis=0)
     with np.errstate(invalid="ignore"):
-        direction = columns / np.where(steps > 0, steps, 1)
-    return {"steps": dict(zip("xyz", steps.tolist(), strict=True)), "origin": origin, "direction": direction}
+        turn = columns / np.where(steps > 0, steps, 1)
+    steps = dict(zip("xyz", steps.tolist(), strict=True))
+    return {"steps": steps, "origin": origin[:, 0], "direction": turn}
 
 
 def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
@@ -116,10 +117,8 @@ def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
     slope, intercept = float(attributes.get("scale_factor", 1)), float(attributes.get("add_offset", 0))
     fills = [attributes.get(name) for name in ("_FillValue", "missing_value")]
     numbers = [float(n) for fill in fills if not isinstance(fill, str | None) for n in np.ravel(fill)]
-    unsigned, missing = (
-        str(attributes.get("_Unsigned")).lower() == "true",
-        tuple(n for n in numbers if n == n),
-    )
+    unsigned = str(attributes.get("_Unsigned")).lower() == "true"
+    missing = tuple(n for n in numbers if n == n)
     return {"slope": slope, "intercept": intercept, "missing": missing, "unsigned": unsigned}
 
 

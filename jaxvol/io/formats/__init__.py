@@ -96,7 +96,7 @@ def load(
         ImportError: for a format that needs a library that is missing: pip install "jaxvol[io]".
     """
     record = read_record(path, shape, dtype, spacing=spacing, time=time, offset=offset)
-    arguments = read(record, nan=nan, time=time, channel=channel)
+    arguments = volume_arguments(record, nan=nan, time=time, channel=channel)
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arguments |= {name: value for name, value in given.items() if value is not None}
     try:
@@ -104,13 +104,6 @@ def load(
         return volume if labels is None else labelled(volume, labels)
     except ValueError as fault:
         raise ValueError(f"{path}: {fault}") from fault
-
-
-def read(record: ImageRecord, *, time: int | None = None, **options: Any) -> dict[str, Any]:
-    """Arguments of `Volume` for what a file holds, as by `volume_arguments`. The time of a DICOM image is
-    chosen as its slices are read."""
-    time = None if record.format.endswith("at each place") else time
-    return volume_arguments(record, time=time, **options)
 
 
 def read_record(
@@ -167,17 +160,15 @@ def _unknown(path: Path) -> str:
         if path.name.lower().endswith(".vol") and stream.read(16) == MAGIC:
             use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
             return f"is ultrasound as acquired, whose voxels a probe places. {use}."
-    return (
-        "has an unknown ending; expected a folder of slices, or a file ending in "
-        f"{', '.join(sorted((*endings, '.dcm')))}. Of voxels without a header, give shape=(nx, ny, nz) and "
-        "dtype."
-    )
+    hint = "Of voxels without a header, give shape=(nx, ny, nz) and dtype."
+    expected = f"expected a folder of slices, or a file ending in {', '.join(sorted((*endings, '.dcm')))}"
+    return f"has an unknown ending; {expected}. {hint}"
 
 
 def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
     """The volume with the voxels of another file as labels."""
     try:
-        found = read(read_record(path))
+        found = volume_arguments(read_record(path))
     except ValueError as fault:
         raise ValueError(f"labels: {str(fault).removeprefix('path: ')}") from fault
     if (values := found["data"]).dtype.kind == "f":
@@ -188,13 +179,10 @@ def labelled(volume: Volume, path: str | os.PathLike[str]) -> Volume:
         found |= numbered(found["data"])
     labels = Volume(**found)
     here, there = map(_corners, (volume, labels))
-    must, hint = (
-        "must lie where the volume does",
-        "SimpleITK's Resample, with sitkNearestNeighbor, puts it there.",
-    )
+    must = f"labels: {path} must lie where the volume does, with corners {here.tolist()}; it has"
+    hint = "SimpleITK's Resample, with sitkNearestNeighbor, puts it there."
     same = np.allclose(here, there, rtol=0, atol=0.05 * float(volume.spacing.min()))  # of a voxel
-    got = f"{must}, with corners {here.tolist()}; it has {there.tolist()}"
-    ensure(same, f"labels: {path} {got}. {hint}")
+    ensure(same, f"{must} {there.tolist()}. {hint}")
     place = volume.spacing, volume.origin
     numbers = np.asarray(labels.data)  # float32 of more than 65536 kinds
     numbers = numbers.astype(np.int32) if numbers.dtype.kind == "f" else numbers
@@ -228,24 +216,22 @@ def files_of(path: Path) -> list[Path]:
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:
-    """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world, from a
-    Kretz file (`.vol`) of GE Voluson scanners: `KRETZFILE 1.0`, uncompressed, of 8-bit voxels.
+    """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world.
 
     Angles are taken as they stand in the file, with the middle beam at π/2. The first sample of a beam has
     depth γ = 0. The format is not published: the reader is written after those of SlicerHeart and
     plooney/kretz, and tested on files of its tests alone, not on a scanner's own.
 
     Args:
-        path: the file.
+        path: the Kretz file (`.vol`) of a GE Voluson: `KRETZFILE 1.0`, uncompressed, of 8-bit voxels.
 
     Returns:
         The volume, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe, in mm. Render them with
         `March(step, (probe, ...))`, or make a Cartesian volume with `scan_convert`.
 
     Raises:
-        ValueError: for a file that is missing, empty, corrupt, cut short, compressed, of another kind, or
-            lacks an item; for angles that are not evenly spaced to 0.01 of a step; and for what
-            `ToroidalMap` and `Volume` reject.
+        ValueError: for a file that is missing, damaged, compressed or of another kind; for angles that are
+            not evenly spaced to 0.01 of a step; and for what `ToroidalMap` and `Volume` reject.
     """
     data, probe = read_kretz(_existing(path)[0])
     return Volume(data), probe

@@ -28,10 +28,8 @@ NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "48
 KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
 """Elements of the meta information with which a file begins."""
 
-TIMES = (
-    "TemporalPositionIndex TemporalPositionIdentifier AcquisitionNumber TriggerTime DiffusionBValue EchoTime"
-)
-TIMES = (*TIMES.split(), "AcquisitionTime", "ContentTime", "InstanceNumber")
+TIMES = "TemporalPositionIndex TemporalPositionIdentifier AcquisitionNumber TriggerTime DiffusionBValue"
+TIMES = f"{TIMES} EchoTime AcquisitionTime ContentTime InstanceNumber".split()
 """Elements that tell images at one place apart."""
 
 AWAY = 0.1
@@ -103,22 +101,24 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
     turn = np.column_stack([rows, columns, np.cross(rows, columns)])
     rows, columns, normal = directions(f"path: {path}: rows and columns of {first.name}", turn).T
     slices = sorted(slices, key=lambda each: float(each.place @ normal))
-    slices, several = _at_one_time(path, slices, normal, time)
+    slices, count = _at_one_time(path, slices, normal, time)
     step = _even_step(slices, normal, min(across, down))
     grid = grid_of(np.column_stack([rows * across, columns * down, step, slices[0].place]))
-    told = f"DICOM, {len(slices)} slices{several}"
-    return ImageRecord(_values(slices), "zyx", units="mm", convention="LPS", format=told, **grid)
+    record = ImageRecord(_values(slices), "zyx", units="mm", convention="LPS", **grid)
+    record.format = f"DICOM, {len(slices)} slices" + (f", one of {count} at each place" if count > 1 else "")
+    record.is_chosen = count > 1
+    return record
 
 
-def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any) -> tuple[list[Slice], str]:
-    """One image at each place, by `time` where there are as many at each; and words on how many there are."""
+def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any) -> tuple[list[Slice], int]:
+    """One image at each place, by `time` where there are as many at each; and how many there are."""
     along = np.array([each.place @ normal for each in slices])
     cuts = np.flatnonzero(np.diff(along) > 1e-3 * np.ptp(along) / len(along)) + 1
     groups = [slices[a:b] for a, b in zip([0, *cuts], [*cuts, len(slices)], strict=True)]
     count = len(groups[0])
     if count == 1 or len(groups) == 1 or {len(group) for group in groups} != {count}:
         check(time is None, f"time: {path} has no such axis; it holds one image at each place.")
-        return slices, ""
+        return slices, 1
     differs = (name for name in TIMES if len({str(each.elements.get(name)) for each in groups[0]}) == count)
     key = next(differs, TIMES[-1])
     groups = [sorted(group, key=lambda each: _rank(each.elements.get(key))) for group in groups]
@@ -127,7 +127,7 @@ def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any)
     told = f"holds {count} images at each of {len(groups)} places ({words} {values})"
     check(time is not None, f"{told}: time must be given, from 0 to {count - 1}.")
     at = integer("time", time, 0, count - 1)
-    return [group[at] for group in groups], f", one of {count} at each place"
+    return [group[at] for group in groups], count
 
 
 def _rank(value: Any) -> tuple[float, str]:
@@ -216,11 +216,12 @@ def _slices(path: Path, header: Any, spacing: Any) -> list[Slice]:
 
 def _slice(path: Path, k: int, shape: Any, header: Any, groups: list[Any], spacing: Any) -> Slice:
     """Frame k of a file. `groups`: sequences of elements that count more than those of the header."""
-    elements = library("pydicom", path).Dataset()
-    elements.set_original_encoding(*header.original_encoding)
-    elements.update(header)
-    for item in (item for group in groups for each in group if each.VR == "SQ" for item in each.value[:1]):
-        elements.update(item)
+    items = [item for group in groups for each in group if each.VR == "SQ" for item in each.value[:1]]
+    elements = library("pydicom", path).Dataset() if items else header
+    if items:
+        elements.set_original_encoding(*header.original_encoding)
+        for each in (header, *items):
+            elements.update(each)
     place = _numbers(elements, 3, "ImagePositionPatient")
     turn = _numbers(elements, 6, "ImageOrientationPatient")
     if spacing is None:
@@ -244,13 +245,12 @@ def _numbers(elements: Any, count: int, *names: str) -> np.ndarray:
             continue
         if numbers.shape == (count,) and np.isfinite(numbers).all() and (count > 2 or np.all(numbers > 0)):
             return numbers
-    told, got = f"{' or '.join(names)} must be {count}", " and ".join(texts)
+    fault, kind, hint = "must say where it lies", "numbers", ""
     if count == 2:
-        hint = "Give spacing=(x, y, z), --spacing."
-        raise Refused(
-            f"does not say how far its pixels are apart: {told} positive numbers; got {got}. {hint}"
-        )
-    raise Refused(f"must say where it lies: {told} numbers; got {got}.")
+        fault, kind = "does not say how far its pixels are apart", "positive numbers"
+        hint = " Give spacing=(x, y, z), --spacing."
+    told = f"{' or '.join(names)} must be {count} {kind}; got {' and '.join(texts)}."
+    raise Refused(f"{fault}: {told}{hint}")
 
 
 def _values(slices: list[Slice]) -> np.ndarray:

@@ -46,9 +46,8 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
         def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
             expected, found = count * np.dtype(dtype).itemsize, len(items[tag])
             hint = "Of a compressed file, the voxels have less: save it uncompressed."
-            check(
-                found == expected, f": item {_name(tag)} must have {expected} bytes; it has {found}. {hint}"
-            )
+            must = f": item {_name(tag)} must have {expected} bytes"
+            check(found == expected, f"{must}; it has {found}. {hint}")
             return np.frombuffer(items[tag], dtype)
 
         planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
@@ -85,11 +84,9 @@ def _items(path: Path) -> dict[str, bytes]:
     n_bytes, found = file_size(path), {}
     with path.open("rb") as stream:
         magic = stream.read(len(MAGIC))
-        must, others = (
-            f"it must begin with {MAGIC!r}; got {magic!r}",
-            "Other programs write files of other kinds",
-        )
-        check(magic == MAGIC, f"is not a Kretz file: {must}. {others} that end in .vol.")
+        others = "Other programs write files of other kinds that end in .vol."
+        must = f"is not a Kretz file: it must begin with {MAGIC!r}"
+        check(magic == MAGIC, f"{must}; got {magic!r}. {others}")
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length

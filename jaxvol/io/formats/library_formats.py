@@ -67,8 +67,8 @@ def read_mrc(path: Path) -> ImageRecord:
     cut = f"is cut short: its extended header is longer than its {size} bytes."
     check(longest <= size, cut)  # mrcfile would take as many
     file: Any = library("mrcfile", path).mmap(path, permissive=True)
-    header, data = file.header, file.data
-    is_image = data is not None and data.ndim in (3, 4) and data.dtype.kind in "iuf"
+    header, data = file.header, np.asanyarray(file.data)
+    is_image = data.ndim in (3, 4) and data.dtype.kind in "iuf"
     if not is_image:
         raise ValueError("cut short, or no 3-D image of numbers")
     order = [int(header[name]) for name in ("maps", "mapr", "mapc")]

@@ -43,9 +43,8 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
             format cannot hold, and a file that cannot be written.
         ImportError: if the format needs a library that is missing.
     """
-    if not isinstance(volume, Volume):
-        told = f"volume must be a Volume; got {described(volume)}"
-        raise ValueError(f"{told}. The volume comes first, as in save(volume, path).")
+    hint = "The volume comes first, as in save(volume, path)."
+    ensure(isinstance(volume, Volume), f"volume must be a Volume; got {described(volume)}. {hint}")
     ensure(isinstance(path, str | os.PathLike), f"path must be a str or a path; got {described(path)}.")
     field = "volume must have voxels; got one with a field. Save an array of its values."
     ensure(volume.field is None, field)
@@ -57,11 +56,11 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     ensure(name.endswith(ENDINGS), f"path must end in {', '.join(ENDINGS)}; got {path}.")
     is_held = kind not in (("bfloat16",) if in_npz else ("bfloat16", "float16"))
     ensure(is_held, f"volume has voxels of {kind}, which {path.name} cannot hold. Convert to float32.")
+    has_labels, told = volume.labels is not None or volume.label_ids, f"for which {path.name} has no place"
     hint = (
-        "Save it as .npz, or save labels and voxels as two volumes, and read them by load(path, labels=...)."
+        "Save it as .npz, or save labels and voxels as two volumes, and read them by load(path, labels=...)"
     )
-    has_labels = volume.labels is not None or volume.label_ids
-    ensure(in_npz or not has_labels, f"volume has labels, for which {path.name} has no place. {hint}")
+    ensure(in_npz or not has_labels, f"volume has labels, {told}. {hint}.")
     parts = {part: getattr(volume, part) for part in VOLUME}
     arrays = {part: np.asarray(array) for part, array in parts.items() if array is not None}
     if ids := volume.label_ids:

@@ -103,9 +103,7 @@ def read_nrrd(path: Path) -> ImageRecord:
     check(len(inside) == 3, f"must be a 3-D image; got axes of kinds {shortened(str(kinds))}.")
     along = dict(zip(inside, "xyz", strict=True))
     axes = [along.get(k) or (next(others, "s") if kinds[k] in (*DOMAIN, "time") else "s") for k in range(n)]
-    quoted = {
-        name: re.findall('"([^"]*)"', fields.get(name, "")) for name in ("labels", "spaceunits", "units")
-    }
+    quoted = {key: re.findall('"([^"]*)"', fields.get(key, "")) for key in ("labels", "spaceunits", "units")}
     labels = [name.lower() for name in quoted["labels"]]
     axes = labels if not vectors and sorted(labels) == sorted(axes) else axes
     units = [unit for k, unit in enumerate(quoted["units"]) if k in inside]

@@ -63,7 +63,7 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
         record.note(f"{missing} of {len(pages)} planes are not in the file: filled with 0")
     check(0 < math.prod(shape) < 2**62, f"must hold images; its header says {shape}.")
     packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
-    files = {page.parent.filehandle.path for page in held} if pixels else {path}
+    files = {page.parent.filehandle.path for page in held if page is not None} if pixels else {path}
     size = sum(Path(each).stat().st_size for each in files) * (MOST_COMPRESSED if packed else 1)
     check_size(size, math.prod(shape) * first.dtype.itemsize * len(held) // len(pages), more=True)
     strips = [n for page in held if page is not None for n in page.databytecounts]
@@ -126,9 +126,8 @@ def slice_files(folder: Path) -> list[Path]:
     """The images in a folder, of the ending that most have, with numbers in their names in numeric order."""
     files = [file for file in folder.iterdir() if file.is_file()]
     kinds = (ENDINGS, *((ending,) for ending in PICTURES))
-    return sorted(
-        max(([f for f in files if f.suffix.lower() in kind] for kind in kinds), key=len), key=_words
-    )
+    groups = [[file for file in files if file.suffix.lower() in kind] for kind in kinds]
+    return sorted(max(groups, key=len), key=_words)
 
 
 def _words(file: Path) -> list[Any]:
@@ -150,11 +149,11 @@ def read_slices(folder: Path) -> ImageRecord:
         record.steps, record.units = (record.steps, record.units) if planes else (image.steps, image.units)
         planes.append(plane)
         first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (planes[0], plane))
-        must = f"path: each file in {folder} must hold one image of the same size and type, fewer than 2**31 voxels"
+        must = f"path: each file in {folder} must hold one image of the same size and type, fewer than 2**31"
         got = f"{files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
         is_image = image.axes in ("ZYX", "ZYXS") and len(plane) == 1
         is_alike = is_image and first == last and len(files) * plane.size <= MOST_VOXELS
-        check(is_alike, f"{must} in all; {got}")
+        check(is_alike, f"{must} voxels in all; {got}")
     record.data = np.concatenate(planes).reshape(*counts, *planes[0].shape[1:])
     record.axes = axes + "yxs"[: record.data.ndim - len(axes)]
     return record

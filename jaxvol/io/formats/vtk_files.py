@@ -67,9 +67,8 @@ def _legacy(content: bytes) -> tuple[Any, ...]:
 def _xml(content: bytes) -> tuple[Any, ...]:
     """The same of arrays in ASCII, base64 or appended, also compressed by zlib."""
     raw = re.search(rb"<AppendedData[^>]*>\s*_", content)
-    text, appended = (content, b"")
-    if raw:
-        text, appended = content[: raw.end() - 1] + b"</AppendedData></VTKFile>", content[raw.end() :]
+    appended = content[raw.end() :] if raw else b""
+    text = content[: raw.end() - 1] + b"</AppendedData></VTKFile>" if raw else content
     is_plain = b"<!DOCTYPE" not in text and b"<!ENTITY" not in text  # which may expand without end
     check(is_plain, "must be XML without a DOCTYPE.")
     root: Any = ElementTree.fromstring(text)
@@ -77,11 +76,8 @@ def _xml(content: bytes) -> tuple[Any, ...]:
     is_read = len(pieces) == 1 and compressor in (None, "vtkZLibDataCompressor")
     got = f"{root.get('type')} of {len(pieces)} pieces, {compressor}"
     check(is_read, f"must hold one Piece of ImageData, plain or compressed by zlib; got {got}.")
-    image, parts = (
-        root.find("ImageData"),
-        [each for each in pieces[0] if each.tag in ("PointData", "CellData")],
-    )
-    part = next(each for each in parts if each.find("DataArray") is not None)
+    image, kinds = root.find("ImageData"), ("PointData", "CellData")
+    part = next(each for each in pieces[0] if each.tag in kinds and each.find("DataArray") is not None)
     named = (each for each in part.findall("DataArray") if each.get("Name") == part.get("Scalars"))
     array = next(named, part.find("DataArray"))
     order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
@@ -94,13 +90,11 @@ def _xml(content: bytes) -> tuple[Any, ...]:
         is_raw = inside and root.find("AppendedData").get("encoding") == "raw"
         word = np.dtype("u8" if root.get("header_type") == "UInt64" else "u4").newbyteorder(order)
         held = _bytes(store, word, is_raw=is_raw, packed=compressor is not None)
-    count, extent = (
-        array.get("NumberOfComponents", "1"),
-        pieces[0].get("Extent", image.get("WholeExtent", "")),
-    )
+    extent = pieces[0].get("Extent") or image.get("WholeExtent", "")
     places = ("Spacing", "1 1 1"), ("Origin", "0 0 0"), ("Direction", "1 0 0 0 1 0 0 0 1")
     place = [image.get(*each).split() for each in places]
-    return held, dtype, int(count), extent.split(), part.tag == "CellData", place
+    count, of_cells = int(array.get("NumberOfComponents", "1")), part.tag == "CellData"
+    return held, dtype, count, extent.split(), of_cells, place
 
 
 def _bytes(store: bytes, word: np.dtype, *, is_raw: bool, packed: bool) -> bytes:
