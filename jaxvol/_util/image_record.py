@@ -22,8 +22,7 @@ ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
 
-INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"
-"""Modules between a caller and the reader of a file."""
+INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a caller and the reader of a file
 
 
 @dataclass
@@ -157,12 +156,10 @@ def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[
     """An index of the array that chooses an image of several, and the letters of the axes that are left: x, y
     and z, and s of several values in a voxel. Raises `ValueError` where the choice is missing or wrong."""
     letters, shape, where = record.letters, record.data.shape, record.what.removeprefix("path: ")
+    time = None if record.is_chosen else time
     axes = sorted(zip(letters, shape, strict=True), key=lambda axis: "xyztcs".index(axis[0]))
     sizes = ", ".join(f"{axis} {n}" for axis, n in axes)
-    given = {
-        "t": ("time", None if record.is_chosen else time),
-        "c" if "c" in letters else "s": ("channel", channel),
-    }
+    given = {"t": ("time", time), "c" if "c" in letters else "s": ("channel", channel)}
     for letter, (name, number) in given.items():
         ensure(number is None or letter in letters, f"{name}: {where} has no such axis; it holds {sizes}.")
     index: list[Any] = [slice(None)] * len(letters)

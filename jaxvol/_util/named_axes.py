@@ -11,8 +11,7 @@ from .files import ensure
 from .image_record import ImageRecord, volume_arguments
 
 
-EVEN = 1e-3
-"""Part of a step by which a coordinate may be away from evenly spaced ones."""
+EVEN = 1e-3  # part of a step by which a coordinate may be away from evenly spaced ones
 
 
 def record_of(value: Any) -> ImageRecord | None:
@@ -86,13 +85,13 @@ def _itk(image: Any) -> ImageRecord:
 
 
 def _vtk(image: Any) -> ImageRecord:
-    scalars, matrix = image.GetPointData().GetScalars(), image.GetDirectionMatrix()
+    scalars = image.GetPointData().GetScalars()
     of_cells = scalars is None
     scalars = image.GetCellData().GetScalars() if of_cells else scalars
     ensure(scalars is not None, "data must be an image with scalars at its points or cells; got one without.")
     data = np.ravel(memoryview(scalars)).reshape(-1, scalars.GetNumberOfComponents())
-    turn = [matrix.GetElement(i, j) for i in range(3) for j in range(3)]
-    return vtk_record(data, image.GetExtent(), of_cells, (image.GetSpacing(), image.GetOrigin(), turn))
+    place = image.GetSpacing(), image.GetOrigin(), image.GetDirectionMatrix().GetData()
+    return vtk_record(data, image.GetExtent(), of_cells, place)
 
 
 def vtk_sizes(extent: Any, of_cells: bool) -> list[int]:

@@ -32,8 +32,7 @@ READERS |= dict.fromkeys((".nrrd", ".nhdr"), read_nrrd) | dict.fromkeys((".mha",
 READERS |= dict.fromkeys(known.NIFTI, known.read_nifti) | dict.fromkeys(tiff.ENDINGS, tiff.read_tiff)
 READERS |= dict.fromkeys(known.MRC, known.read_mrc) | dict.fromkeys((".vti", ".vtk"), read_vtk)
 READERS |= dict.fromkeys(known.HDF5, known.read_hdf5)
-VAGUE = (".img", ".hdf", *known.MRC[1:])
-"""Endings of voxels without a header, too, if the caller describes these."""
+VAGUE = (".img", ".hdf", *known.MRC[1:])  # of voxels without a header, too, if the caller describes these
 
 FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
 """What knows a kind of folder, and its reader. `bricks.opening` adds that of Zarr."""

@@ -25,15 +25,13 @@ STORAGE = UID + "5.1.4.1.1."
 NO_IMAGES = tuple(STORAGE + kind for kind in ("11.", "88.", "104.", "481.3", "481.5"))
 """Presentation states, reports, documents, contours and plans, which often lie in a series' folder."""
 
-KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"
-"""Elements of the meta information with which a file begins."""
+KIND, SYNTAX = b"\x02\x00\x02\x00UI", b"\x02\x00\x10\x00UI"  # elements with which a file begins
 
-TIMES = "TemporalPositionIndex TemporalPositionIdentifier AcquisitionNumber TriggerTime DiffusionBValue"
-TIMES = f"{TIMES} EchoTime AcquisitionTime ContentTime InstanceNumber".split()
+TIMES = ["TemporalPositionIndex", "TemporalPositionIdentifier", "AcquisitionNumber", "TriggerTime"]
+TIMES += ["DiffusionBValue", "EchoTime", "AcquisitionTime", "ContentTime", "InstanceNumber"]
 """Elements that tell images at one place apart."""
 
-AWAY = 0.1
-"""The part of a voxel by which a slice may be away from its place: lengths in DICOM files are rounded."""
+AWAY = 0.1  # the part of a voxel by which a slice may be away from its place: lengths are rounded
 
 
 class Slice(NamedTuple):
@@ -104,10 +102,9 @@ def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> Imag
     slices, count = _at_one_time(path, slices, normal, time)
     step = _even_step(slices, normal, min(across, down))
     grid = grid_of(np.column_stack([rows * across, columns * down, step, slices[0].place]))
-    record = ImageRecord(_values(slices), "zyx", units="mm", convention="LPS", **grid)
-    record.format = f"DICOM, {len(slices)} slices" + (f", one of {count} at each place" if count > 1 else "")
-    record.is_chosen = count > 1
-    return record
+    told = f"DICOM, {len(slices)} slices" + (f", one of {count} at each place" if count > 1 else "")
+    place: dict[str, Any] = {"units": "mm", "convention": "LPS", **grid}
+    return ImageRecord(_values(slices), "zyx", format=told, is_chosen=count > 1, **place)
 
 
 def _at_one_time(path: Path, slices: list[Slice], normal: np.ndarray, time: Any) -> tuple[list[Slice], int]:

@@ -20,10 +20,9 @@ from ...march.transforms import ToroidalMap
 
 MAGIC = b"KRETZFILE 1.0   "
 
-UNEVEN = 0.01
-"""How far an angle may be from evenly spaced ones, in steps: a part of a voxel by which it is misplaced."""
+UNEVEN = 0.01  # steps by which an angle may be away from evenly spaced ones: it misplaces a part of a voxel
 
-MEANING = {
+MEANING = {  # by group and element
     "C000:1": "the number of samples along a beam",  # u16
     "C000:2": "the number of beams",  # u16
     "C000:3": "the number of planes",  # u16
@@ -34,7 +33,6 @@ MEANING = {
     "C300:2": "the angles of the beams",  # likewise
     "D000:1": "the voxels",  # u8, γ fastest, then σ, then β
 }
-"""By group and element."""
 
 
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:

@@ -19,8 +19,7 @@ NIFTI = (".nii", ".nii.gz", ".hdr", ".img", ".mgh", ".mgz", ".mnc")
 MRC = (".mrc", ".map", ".ccp4", ".rec")
 HDF5 = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4", ".cdf")
 
-LARGE, BEYOND = 2**26, 8
-"""Bytes that a chunk may always have, and how many times those of its array."""
+LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
 
 
 def read_nifti(path: Path) -> ImageRecord:
@@ -68,15 +67,13 @@ def read_mrc(path: Path) -> ImageRecord:
     check(longest <= size, cut)  # mrcfile would take as many
     file: Any = library("mrcfile", path).mmap(path, permissive=True)
     header, data = file.header, np.asanyarray(file.data)
-    is_image = data.ndim in (3, 4) and data.dtype.kind in "iuf"
-    if not is_image:
+    if data.ndim not in (3, 4) or data.dtype.kind not in "iuf":
         raise ValueError("cut short, or no 3-D image of numbers")
     order = [int(header[name]) for name in ("maps", "mapr", "mapc")]
     order = order if sorted(order) == [1, 2, 3] else [3, 2, 1]
     axes = "t" * (data.ndim - 3) + "".join("xyz"[number - 1] for number in order)
-    lengths = {a: float(header.cella[a]) for a in "xyz"}
-    counts = {a: int(header[f"m{a}"]) for a in "xyz"}
-    steps = {a: lengths[a] / counts[a] for a in "xyz" if lengths[a] > 0 and counts[a] > 0}
+    sizes = {a: (float(header.cella[a]), int(header[f"m{a}"])) for a in "xyz"}
+    steps = {a: length / n for a, (length, n) in sizes.items() if length > 0 and n > 0}
     origin = np.array([float(header.origin[a]) for a in "xyz"])
     if not np.any(origin):
         starts = dict(zip(axes[-3:], (int(header[f"n{a}start"]) for a in "zyx"), strict=True))

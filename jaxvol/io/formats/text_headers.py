@@ -17,20 +17,16 @@ from .arrays import check_volume, read_voxels
 
 
 LONGEST, MOST_FIELDS = 900, 1024
-"""Letters of a field in an NRRD header, at most (comments and pairs may be longer); and fields in a
-header."""
+"""Letters of a field in an NRRD header (comments and pairs may be longer), and fields in any, at most."""
 
 META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8"}
 META_TYPES |= {name.replace("_", "_U", 1): f"u{code[1]}" for name, code in META_TYPES.items()}
 META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
-NRRD_TYPES = {"char": "i1", "short": "i2", "int": "i4", "longlong": "i8"}
-NRRD_TYPES |= {"int8": "i1", "int16": "i2", "int32": "i4", "int64": "i8"}
-NRRD_TYPES |= {f"u{name}": f"u{code[1]}" for name, code in NRRD_TYPES.items()}
-NRRD_TYPES |= {"float": "f4", "double": "f8"}
+NRRD_TYPES = {name[4:].replace("_", "").lower(): code for name, code in META_TYPES.items()}
+NRRD_TYPES |= {np.dtype(code).name: code for code in META_TYPES.values()}
 """By names without "signed" and blanks, "int" and "_t" at their ends."""
 
-DOMAIN = "domain", "space", "???", "none"
-"""Kinds of axes of space in NRRD."""
+DOMAIN = "domain", "space", "???", "none"  # kinds of axes of space in NRRD
 
 
 def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> tuple[dict[str, str], int]:
@@ -42,8 +38,8 @@ def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> 
             key, _, value = line.partition(separator)
             is_long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
             check(not is_long, f"cannot be read: its header has the field {shortened(line)}.")
-            many = f"cannot be read: its header has more than {MOST_FIELDS} fields."
-            check(len(fields) < MOST_FIELDS, many)
+            is_short = len(fields) < MOST_FIELDS
+            check(is_short, f"cannot be read: its header has more than {MOST_FIELDS} fields.")
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 
