@@ -151,12 +151,13 @@ def _unknown(path: Path) -> str:
         images = [each for each in inside if each.is_dir() and tiff.slice_files(each)]
         files = [each for each in inside if each.name.lower().endswith((*endings, ".zarr"))]
         told = ", ".join(str(each.relative_to(path)) for each in (series or images or files)[:8])
-        holds = f"that holds {'DICOM images in ' if series else ''}{told}: give its path."
-        return (
-            f"is a directory {holds if told else 'without DICOM and TIFF files, other slices, and no Zarr.'}"
-        )
-    with path.open("rb") as stream:
-        if path.name.lower().endswith(".vol") and stream.read(16) == MAGIC:
+        if not told:
+            return "is a directory without DICOM and TIFF files, other slices, and no Zarr."
+        return f"is a directory that holds {'DICOM images in ' if series else ''}{told}: give its path."
+    if path.is_file() and path.name.lower().endswith(".vol"):
+        with path.open("rb") as stream:
+            magic = stream.read(len(MAGIC))
+        if magic == MAGIC:
             use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
             return f"is ultrasound as acquired, whose voxels a probe places. {use}."
     hint = "Of voxels without a header, give shape=(nx, ny, nz) and dtype."
@@ -208,10 +209,11 @@ def files_of(path: Path) -> list[Path]:
         return [path, *raw_json(path)]
     if name.endswith((".hdr", ".img")):
         return sorted(file for ending in (".hdr", ".img") if (file := path.with_suffix(ending)).is_file())
-    if name.endswith((".mhd", ".nrrd", ".nhdr")):
-        data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
-        return [path, data] if data != path and data.is_file() else [path]
-    return list(series_headers(path)) if is_dicom(path) else [path]
+    with refusing(path):
+        if name.endswith((".mhd", ".nrrd", ".nhdr")):
+            data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
+            return [path, data] if data != path and data.is_file() else [path]
+        return list(series_headers(path)) if is_dicom(path) else [path]
 
 
 def load_ultrasound(path: str | os.PathLike[str] | Any) -> tuple[Volume, ToroidalMap]:

@@ -23,7 +23,7 @@ META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": 
 META_TYPES |= {name.replace("_", "_U", 1): f"u{code[1]}" for name, code in META_TYPES.items()}
 META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
 NRRD_TYPES = {name[4:].replace("_", "").lower(): code for name, code in META_TYPES.items()}
-NRRD_TYPES |= {np.dtype(code).name: code for code in META_TYPES.values()}
+NRRD_TYPES |= {np.dtype(code).name: code for code in META_TYPES.values()} | {"long": "", "ulong": ""}
 """By names without "signed" and blanks, "int" and "_t" at their ends."""
 
 DOMAIN = "domain", "space", "???", "none"  # kinds of axes of space in NRRD
