@@ -106,13 +106,7 @@ def load(
 
 
 def read_record(
-    path: Any,
-    shape: Any = None,
-    dtype: Any = None,
-    *,
-    spacing: Any = None,
-    time: Any = None,
-    offset: Any = None,
+    path: Any, shape: Any = None, dtype: Any = None, spacing: Any = None, time: Any = None, offset: Any = None
 ) -> ImageRecord:
     """What a file or folder holds, and says of it. Arguments: as for `load`."""
     path, name = _existing(path)

@@ -33,6 +33,7 @@ MEANING = {  # by group and element
     "C300:2": "the angles of the beams",  # likewise
     "D000:1": "the voxels",  # u8, γ fastest, then σ, then β
 }
+TOLD = {tag: f"{tag} ({meaning})" for tag, meaning in MEANING.items()}
 
 
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:
@@ -44,7 +45,7 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
         def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
             expected, found = count * np.dtype(dtype).itemsize, len(items[tag])
             hint = "Of a compressed file, the voxels have less: save it uncompressed."
-            must = f": item {_name(tag)} must have {expected} bytes"
+            must = f": item {TOLD[tag]} must have {expected} bytes"
             check(found == expected, f"{must}; it has {found}. {hint}")
             return np.frombuffer(items[tag], dtype)
 
@@ -61,10 +62,10 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
             must = f"must be evenly spaced angles that increase, up to {UNEVEN} of a step"
             got = f"got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
             is_even = step > 0 and np.abs(angles - even).max() <= UNEVEN * step
-            check(is_even, f": item {_name(tag)} {must}; {got}")
+            check(is_even, f": item {TOLD[tag]} {must}; {got}")
             ends.append((float(angles[0]), float(angles[-1])))
         resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
-        must = f": item {_name('C100:1')} must be a positive length in metres"
+        must = f": item {TOLD['C100:1']} must be a positive length in metres"
         check(0 < resolution < math.inf, f"{must}; got {resolution}.")
     step = 1000 * resolution  # mm
     try:
@@ -88,17 +89,15 @@ def _items(path: Path) -> dict[str, bytes]:
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
-            cut = f"is cut short: item {_name(tag)} is to end at byte {end}, and it ends at {n_bytes}."
+            cut = (
+                f"is cut short: item {TOLD.get(tag, tag)} is to end at byte {end}, and it ends at {n_bytes}."
+            )
             check(end <= n_bytes, cut)
-            check(tag not in found, f"holds item {_name(tag)} twice.")
+            check(tag not in found, f"holds item {TOLD.get(tag, tag)} twice.")
             if tag in MEANING:
                 found[tag] = stream.read(length)
             stream.seek(end)
-    missing = ", no item ".join(_name(tag) for tag in MEANING if tag not in found)
+    missing = ", no item ".join(told for tag, told in TOLD.items() if tag not in found)
     hint = "Compressed files, several frames and Cartesian volumes are not supported: save it as one"
     check(not missing, f"has no item {missing}. {hint} uncompressed volume as acquired.")
     return found
-
-
-def _name(tag: str) -> str:
-    return f"{tag} ({MEANING[tag]})" if tag in MEANING else tag

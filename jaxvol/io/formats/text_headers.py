@@ -55,11 +55,11 @@ def _numbers(fields: dict[str, str], names: str, default: np.ndarray) -> np.ndar
         raise Refused(f": {name} must be {default.size} numbers; got {fields[name][:80]!r}.") from fault
 
 
-def _sizes(text: str) -> list[int]:
+def _sizes(text: str, channels: int = 1) -> list[int]:
     are_numbers = all(re.fullmatch("[0-9]{1,15}", word) for word in text.split())
     check(are_numbers, f": sizes must be numbers of voxels; got {shortened(text)}.")
     sizes = [*map(int, text.split())]
-    check_volume(sizes)
+    check_volume(sizes, channels)
     return sizes
 
 
@@ -141,9 +141,10 @@ def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
 def read_metaimage(path: Path) -> ImageRecord:
     """Reader for `.mha` and `.mhd` of binary voxels, in LPS."""
     fields, begin, source = metaimage_header(path)
-    shape, channels = _sizes(fields.get("DimSize", "")), fields.get("ElementNumberOfChannels", "1")
-    n, channels = len(shape), int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
-    check_volume(shape, channels)
+    channels = fields.get("ElementNumberOfChannels", "1")
+    channels = int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
+    shape = _sizes(fields.get("DimSize", ""), channels)
+    n = len(shape)
 
     def flag(key: str) -> bool:
         return fields.get(key, "").lower().startswith(("t", "1"))

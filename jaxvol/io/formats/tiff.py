@@ -132,9 +132,8 @@ def slice_files(folder: Path) -> list[Path]:
 
 def _words(file: Path) -> list[Any]:
     """The name of a file without ending, cut into words and the numbers between them."""
-    words: list[Any] = re.split(r"([0-9]+)", file.stem.lower())
-    words[1::2] = map(int, words[1::2])
-    return words
+    words = re.split(r"([0-9]+)", file.stem.lower())
+    return [int(word) if k % 2 else word for k, word in enumerate(words)]
 
 
 def read_slices(folder: Path) -> ImageRecord:
