@@ -6,6 +6,7 @@ unpickled, and the content of a file is checked against its header before memory
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -131,9 +132,10 @@ def read_record(
         reader = tiff.read_slices
     else:
         raise ValueError(f"path: {path} {_unknown(path)}")
-    with refusing(path):
+    with nullcontext() if folder else refusing(path):  # what others know tells its own faults
         record = reader(path)
-    record.what, record.format = f"path: {path}", record.format or lower.rpartition(".")[2] or "folder"
+    record.what = f"path: {path}" if record.what == "data" else record.what
+    record.format = record.format or lower.rpartition(".")[2] or "folder"
     return record
 
 
