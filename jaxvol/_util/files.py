@@ -28,6 +28,22 @@ Stream: TypeAlias = BufferedIOBase | IO[bytes]
 """Of a file, of gzip, of a member of a zip archive."""
 
 
+class Refused(ValueError):
+    """What is wrong with a file, without its path, which `refusing` puts in front."""
+
+
+def check(holds: object, fault: str) -> None:
+    """Raise `Refused` with this text unless what a file must be is so, which it never is of NaN."""
+    if not holds:
+        raise Refused(fault)
+
+
+def ensure(holds: object, fault: str) -> None:
+    """Raise `ValueError` with this text unless something holds."""
+    if not holds:
+        raise ValueError(fault)
+
+
 def file_size(path: Path) -> int:
     """Size in bytes of a regular, non-empty file."""
     if not path.is_file():
@@ -39,43 +55,45 @@ def file_size(path: Path) -> int:
     return size
 
 
-def read_all(path: Path, stream: Stream, expected: int, *, more: bool = False) -> bytearray:
+def read_all(stream: Stream, expected: int, *, more: bool = False) -> bytearray:
     """All bytes of a stream, which must be `expected`; at most one further is read. `more`: others follow."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing
     while chunk := stream.read(min(expected + 1 - len(content), CHUNK)):
         content += chunk
-    check_size(path, len(content), expected, more=more)
+    check_size(len(content), expected, more=more)
     del content[expected:]
     return content
 
 
-def check_size(path: Path, size: int, expected: int, *, more: bool = False) -> None:
+def check_size(size: int, expected: int, *, more: bool = False) -> None:
     """Check that a file holds as many bytes of voxels as its header says; or `more`, where others follow."""
-    if size < expected or (size > expected and not more):
-        fault = f"cut short: it holds {size}" if size < expected else f"oversized: it holds {size} or more"
-        raise ValueError(
-            f"path: {path} is {fault} bytes of voxels where its header (shape and dtype) says {expected}. "
-            "Check the header, or fetch the file again."
-        )
+    fault = f"cut short: it holds {size}" if size < expected else f"oversized: it holds {size} or more"
+    check(
+        size == expected or (more and size > expected),
+        f"is {fault} bytes of voxels where its header (shape and dtype) says {expected}. "
+        "Check the header, or fetch the file again.",
+    )
 
 
 @contextmanager
-def decoding(path: Path) -> Iterator[None]:
-    """Turn any error of a decoder within the context into a `ValueError` that says what is wrong."""
+def decoding() -> Iterator[None]:
+    """Turn any error of a decoder within the context into one that says what is wrong."""
     try:
         yield
-    except RuntimeError as fault:  # also of whole files
-        told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
-        raise ValueError(f"path: {path} cannot be read: {told}") from fault
+    except RuntimeError:  # also of whole files
+        raise
     except CORRUPT as fault:
-        told = f"corrupt, cut short or incomplete ({reason(fault)})"
-        raise ValueError(f"path: {path} cannot be read: {told}.") from fault
+        raise Refused(f"cannot be read: corrupt, cut short or incomplete ({reason(fault)}).") from fault
+
+
+ARGUMENTS = ("path:", "shape must", "dtype must", "spacing must", "time must", "time:")
+"""Beginnings of errors that name an argument."""
 
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Turn whatever a library raises within the context into a `ValueError` that says what is wrong. What it
-    warns of and logs, which may be a line for each of a file's faults, is left out."""
+    """Turn whatever is raised within the context into a `ValueError` that says what is wrong with a file.
+    What libraries warn of and log, which may be a line for each of a file's faults, is left out."""
     loggers = [logging.getLogger(name) for name in ("tifffile", "nibabel.global", "pydicom")]
     before = [logger.disabled for logger in loggers]
     try:
@@ -87,8 +105,10 @@ def refusing(path: Path) -> Iterator[None]:
     except (MemoryError, ImportError):
         raise
     except Exception as fault:
-        if isinstance(fault, ValueError) and str(fault).startswith("path:"):
+        if isinstance(fault, ValueError) and str(fault).startswith(ARGUMENTS):
             raise
+        if isinstance(fault, Refused):
+            raise ValueError(f"path: {path}{'' if str(fault).startswith(':') else ' '}{fault}") from fault
         told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
         raise ValueError(f"path: {path} cannot be read: {told}") from fault
     finally:

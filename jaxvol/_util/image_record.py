@@ -13,58 +13,39 @@ import numpy as np
 
 from .affine import directions
 from .checks import finite_array, integer, shortened
-from .files import MOST_VOXELS
+from .files import MOST_VOXELS, ensure
 from .units import axis_letters, length_of
-from .voxels import WHOLE, check_shape, within
+from .voxels import WHOLE, check_shape, is_flat, within
 
 
 ALONG_AXES = 1e-5
 """Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
 voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
 
-
-INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"
-"""Modules between a caller and the reader of a file."""
+INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a caller and the reader of a file
 
 
 @dataclass
 class ImageRecord:
-    """What is known of an array of voxels, as its writer meant it.
+    """What is known of an array of voxels, as its writer meant it."""
 
-    Attributes:
-        data: the array as it is stored, of NumPy or one that is read box by box.
-        axes: the name of each of its axes, in order.
-        steps: signed distances between voxels by x, y and z; those that are not known are missing.
-        units: the unit of each of these, or one of all; None where there is none.
-        origin: where the first voxel lies, along x, y and z, in the same units.
-        direction: the directions of the axes x, y and z in the world, as columns.
-        convention: where the world's axes point: "LPS" (left, back, head), "RAS" or such, or "" for nowhere.
-        slope, intercept: a value is slope times the stored number plus intercept.
-        missing: stored numbers that mean that there is no value.
-        unsigned: whether stored integers have no sign, whatever their type (`_Unsigned` of NetCDF).
-        labels: the name of each value of a segmentation, where the file has them.
-        assumed: what the file does not say, and what was taken in its place.
-        also: further arguments of `Volume`.
-        what: how errors begin.
-        format: the name of the format.
-    """
-
-    data: Any
-    axes: Sequence[str]
-    steps: Mapping[str, float] = field(default_factory=dict)
-    units: Mapping[str, str | None] | str | None = None
-    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
-    direction: np.ndarray | None = None
-    convention: str = ""
-    slope: float = 1.0
+    data: Any  # the array as it is stored, of NumPy or one that is read box by box
+    axes: Sequence[str]  # the name of each of its axes, in order
+    steps: Mapping[str, float] = field(default_factory=dict)  # signed distances along x, y, z, where known
+    units: Mapping[str, str | None] | str | None = None  # of each of these, or one of all
+    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)  # of the first voxel, along x, y, z
+    direction: np.ndarray | None = None  # of the axes x, y, z in the world, as columns
+    convention: str = ""  # where the world's axes point: "LPS" (left, back, head), "RAS" or such; "": nowhere
+    slope: float = 1.0  # a value is slope times the stored number plus intercept
     intercept: float = 0.0
-    missing: tuple[float, ...] = ()
-    unsigned: bool = False
-    labels: Mapping[int, str] = field(default_factory=dict)
-    assumed: list[str] = field(default_factory=list)
-    also: dict[str, Any] = field(default_factory=dict)
-    what: str = "data"
+    missing: tuple[float, ...] = ()  # stored numbers that mean that there is no value
+    unsigned: bool = False  # stored integers have no sign, whatever their type (`_Unsigned` of NetCDF)
+    labels: Mapping[int, str] = field(default_factory=dict)  # names of the values of a segmentation
+    assumed: list[str] = field(default_factory=list)  # what was taken in place of what the file does not say
+    also: dict[str, Any] = field(default_factory=dict)  # further arguments of `Volume`
+    what: str = "data"  # how errors begin
     format: str = ""
+    is_chosen: bool = False  # one of several times was chosen as the file was read
 
     @property
     def letters(self) -> str:
@@ -86,44 +67,40 @@ class ImageRecord:
     def millimetres(self) -> np.ndarray:
         """Lengths of the units along x, y, z in mm. An unknown one is taken as those of the others are, or as
         1, and `assumed` says so."""
-        told = {letter: self.unit(letter) for letter in "xyz"}
-        known = {letter: length_of(unit) for letter, unit in told.items()}
-        usual = next((length for length in known.values() if length), None)
-        for unit in dict.fromkeys(unit for letter, unit in told.items() if unit and not known[letter]):
-            taken = "taken as 1" if usual is None else f"taken as {usual:g} mm, as along other axes"
-            self.note(f"unit {shortened(unit)}: {taken}")
-        return np.array([length or usual or 1.0 for length in known.values()])
+        told = [self.unit(letter) for letter in "xyz"]
+        known = [length_of(unit) for unit in told]
+        usual = next(filter(None, known), None)
+        taken = "taken as 1" if usual is None else f"taken as {usual:g} mm, as along other axes"
+        for unit, length in zip(told, known, strict=True):
+            if unit and not length:
+                self.note(f"unit {shortened(unit)}: {taken}")
+        return np.array([length or usual or 1.0 for length in known])
 
     def decode(self, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
         """The values of stored numbers, and where there are none, if anywhere. Whole numbers stay so under a
         scale of whole numbers; others are scaled in float64, and rounded once to float32."""
-        mask = None
-        for number in self.missing:
-            if stored.dtype.kind == "f" or holds(stored.dtype, number):
-                at = stored == stored.dtype.type(number)
-                mask = (at if mask is None else mask | at) if at.any() else mask
-        if self.unsigned and stored.dtype.kind == "i":
-            stored = stored.view(stored.dtype.str.replace("i", "u"))
+        kind = stored.dtype
+        absent = [kind.type(number) for number in self.missing if holds(kind, number)]
+        mask = np.isin(stored, absent) if absent else None
+        mask = mask if mask is not None and mask.any() else None
+        if self.unsigned and kind.kind == "i":
+            stored = stored.view(kind.str.replace("i", "u"))
         slope, intercept = float(self.slope), float(self.intercept)
         if not self.is_scaled:
             return stored, mask
         if stored.dtype.kind in "iu" and slope.is_integer() and intercept.is_integer() and stored.size:
             most = max(abs(int(end) * int(slope) + int(intercept)) for end in (stored.min(), stored.max()))
-            if most < 2**62:
-                kind = (
-                    np.int32 if most < 2**31 and abs(slope) < 2**31 and abs(intercept) < 2**31 else np.int64
-                )
-                return (stored.astype(np.int64) * int(slope) + int(intercept)).astype(kind), mask
+            if most < 2**62 and max(abs(slope), abs(intercept)) < 2**63:
+                values = stored.astype(np.int64) * int(slope) + int(intercept)
+                return values.astype(np.int32 if most < 2**31 else np.int64), mask
         values = np.empty(stored.shape, np.float64 if stored.dtype == np.float64 else np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # what is infinite is refused, or replaced, later
             for plane, into in zip(stored, values, strict=True):  # which saves memory
                 into[...] = plane * np.float64(slope) + intercept
         return values, mask
 
-    def oriented(
-        self, sizes: Sequence[int], *, turned: bool = True
-    ) -> tuple[list[int], list[int], dict[str, Any]]:
-        """How axes of so many voxels are brought along the world's: which of x, y, z becomes each, its sign,
+    def oriented(self, sizes: list[int], turned: bool = True) -> tuple[list[int], list[int], dict[str, Any]]:
+        """How axes of `sizes` voxels are brought along the world's: which of x, y, z becomes each, its sign,
         and spacing (mm), origin and direction of `Volume`, missing where the file says nothing. Not `turned`:
         axes stay in order, and only those along which steps are negative are reversed. No voxel is
         interpolated."""
@@ -133,9 +110,9 @@ class ImageRecord:
         world = np.array([1.0 if axis in "LPS" else -1.0 for axis in self.convention or "LPS"])
         turn = np.eye(3) if self.direction is None else np.asarray(self.direction, float)
         what, origin = f"{self.what}: its place", np.asarray(self.origin, float)
-        if not (given.all() and np.isfinite([*given, *origin, *turn.flat]).all()):
-            got = f"{given.tolist()} from {origin.tolist()}"
-            raise ValueError(f"{what} must be finite, with steps longer than 0; got {got}.")
+        must, got = "must be finite, with steps longer than 0", f"{given.tolist()} from {origin.tolist()}"
+        is_place = given.all() and np.isfinite([*given, *origin, *turn.flat]).all()
+        ensure(is_place, f"{what} {must}; got {got}.")
         turn = directions(what, turn) * world[:, None] * np.sign(given)
         order, signs = [0, 1, 2], np.sign(given).astype(int)
         if turned:  # the axis of the data that is nearest to each axis of the world, all three at once
@@ -156,89 +133,82 @@ class ImageRecord:
         axes = zip(self.axes, self.data.shape, self.letters, strict=True)
         told = ", ".join(f"{name} {n}{lengths.get(letter, '')}" for name, n, letter in axes)
         stored = getattr(self.data.dtype, "numpy_dtype", self.data.dtype)  # of tensorstore
-        rows = {"format": self.format, "stored": f"{stored}, {told}"}
-        rows |= (
-            {"scale": f"value = {self.slope:.9g} x stored + {self.intercept:.9g}"} if self.is_scaled else {}
-        )
-        rows |= {"missing": f"stored {', '.join(f'{n:g}' for n in self.missing)}"} if self.missing else {}
-        rows |= {"world": f"{self.convention}, shown as LPS (left, back, head)"} if self.convention else {}
-        named = ", ".join(f"{value} {name}" for value, name in self.labels.items())
-        rows |= {"names": shortened(named)} if named else {}
-        return rows | ({"assumed": "; ".join(self.assumed)} if self.assumed else {})
+        scale = f"value = {self.slope:.9g} x stored + {self.intercept:.9g}"
+        rows = {
+            "format": self.format,
+            "stored": f"{stored}, {told}",
+            "scale": self.is_scaled and scale,
+            "missing": self.missing and f"stored {', '.join(f'{n:g}' for n in self.missing)}",
+            "world": self.convention and f"{self.convention}, shown as LPS (left, back, head)",
+            "names": self.labels and shortened(", ".join(f"{k} {name}" for k, name in self.labels.items())),
+            "assumed": "; ".join(self.assumed),
+        }
+        return {name: str(text) for name, text in rows.items() if text}
 
 
 def holds(dtype: np.dtype, number: float) -> bool:
-    """Whether a type of integers holds a number."""
-    if dtype.kind not in "iu" or not float(number).is_integer():
-        return False
-    return bool(np.iinfo(dtype).min <= number <= np.iinfo(dtype).max)
+    """Whether a type of integers or floats holds a number; floats may round it."""
+    is_whole = dtype.kind in "iu" and float(number).is_integer()
+    return dtype.kind == "f" or (is_whole and np.iinfo(dtype).min <= number <= np.iinfo(dtype).max)
 
 
 def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[tuple[Any, ...], str]:
     """An index of the array that chooses an image of several, and the letters of the axes that are left: x, y
     and z, and s of several values in a voxel. Raises `ValueError` where the choice is missing or wrong."""
     letters, shape, where = record.letters, record.data.shape, record.what.removeprefix("path: ")
-    given = {"time": time, "channel": channel}
-    own = {"time": "t", "channel": "c" if "c" in letters else "s"}
+    time = None if record.is_chosen else time
     axes = sorted(zip(letters, shape, strict=True), key=lambda axis: "xyztcs".index(axis[0]))
     sizes = ", ".join(f"{axis} {n}" for axis, n in axes)
-    for name, letter in own.items():
-        if given[name] is not None and letter not in letters:
-            raise ValueError(f"{name}: {where} has no such axis; it holds {sizes}.")
+    given = {"t": ("time", time), "c" if "c" in letters else "s": ("channel", channel)}
+    for letter, (name, number) in given.items():
+        ensure(number is None or letter in letters, f"{name}: {where} has no such axis; it holds {sizes}.")
     index: list[Any] = [slice(None)] * len(letters)
     for letter in sorted({*letters} - {*"xyz"}):
-        name, at = "time" if letter == "t" else "channel", letters.index(letter)
-        number = given[name] if own[name] == letter else None
-        if number is None and shape[at] > 1:
-            if letter == "s":
-                continue  # the volume's channels
-            raise ValueError(f"{name} must be given, from 0 to {shape[at] - 1}: {where} holds {sizes}.")
+        at = letters.index(letter)
+        name, number = given.get(letter, ("channel", None))
+        if number is None and letter == "s" and shape[at] > 1:
+            continue  # the volume's channels
+        wanted = f"{name} must be given, from 0 to {shape[at] - 1}: {where} holds {sizes}."
+        ensure(number is not None or shape[at] == 1, wanted)
         index[at] = integer(name, number or 0, 0, shape[at] - 1)
     return tuple(index), "".join(a for a, i in zip(letters, index, strict=True) if isinstance(i, slice))
 
 
 def volume_arguments(
-    record: ImageRecord,
-    *,
-    time: int | None = None,
-    channel: int | None = None,
-    nan: float | None = None,
-    turned: bool = True,
+    record: ImageRecord, *, time: Any = None, channel: Any = None, nan: Any = None, turned: bool = True
 ) -> dict[str, Any]:
     """Arguments of `Volume` for an image: axes along the world's (if `turned`), lengths in mm, values scaled,
-    and those that are missing replaced by `nan`, by default by the least one that is there.
+    and those that are missing replaced by `nan`, by default by the least one that is there. Ids of segments,
+    and whole numbers under a scale, are numbered where float32 would round them.
 
-    Raises:
-        ValueError: for axes that are not known, a choice of `time` or `channel` that is missing or wrong, a
-            place that is none, and 2**31 voxels or more.
-
-    Warns of what was taken in place of what the file does not say (`ImageRecord.assumed`).
+    Raises `ValueError` for unknown axes, a choice of `time` or `channel` that is missing or wrong, a place
+    that is none, and 2**31 voxels or more. Warns of what was assumed.
     """
     index, letters = choose(record, time, channel)
     shape = [n for n, part in zip(record.data.shape, index, strict=True) if isinstance(part, slice)]
-    if math.prod(shape) > MOST_VOXELS:
-        raise ValueError(f"{record.what} must hold 1 to 2**31 - 1 voxels; got shape {tuple(shape)}.")
+    most = f"{record.what} must hold 1 to 2**31 - 1 voxels; got shape {tuple(shape)}."
+    ensure(math.prod(shape) <= MOST_VOXELS, most)
     if not {*"xyz"} <= {*letters}:
         check_shape(tuple(shape[:2]))
     order, signs, place = record.oriented([shape[letters.index(a)] for a in "xyz"], turned=turned)
     stored = np.asarray(record.data[index])
-    data, mask = record.decode(
-        stored if stored.dtype.isnative else stored.astype(stored.dtype.newbyteorder("="))
-    )
-    also = dict(record.also)
+    data, mask = record.decode(stored.astype(stored.dtype.newbyteorder("="), copy=False))
     if mask is not None:
         data = _filled(record, data, mask, nan)
     if nan is not None and data.dtype.kind == "f":
         data = np.where(np.isfinite(data), data, data.dtype.type(np.asarray(finite_array("nan", nan, ()))))
-    if record.is_scaled and data.dtype.kind in "iu" and not within(data, WHOLE["float32"]):
-        record.note("whole numbers beyond 2**24, which float32 would round: numbered, see label_ids")
-        also |= numbered(data)
-        data = also.pop("data")
     axes = [letters.index("xyz"[axis]) for axis in order] + [k for k, a in enumerate(letters) if a == "s"]
     data = np.transpose(data, axes)[tuple(slice(None, None, sign) for sign in signs)]
+    arguments = {"data": np.ascontiguousarray(data), **place, **record.also}
+    is_wide = data.dtype.kind in "iu" and data.itemsize > 2 and data.size > 0
+    is_wide = is_wide and not within(data, WHOLE["float32"])
+    if is_wide and record.is_scaled:
+        record.note("whole numbers beyond 2**24, which float32 would round: numbered, see label_ids")
+    if is_wide and (record.is_scaled or any(is_flat(np.moveaxis(data, axis, 0)) for axis in range(3))):
+        arguments |= numbered(arguments["data"])
     for text in record.assumed:
         warn_caller(f"{record.what.removeprefix('path: ')}: {text}")
-    return {"data": np.ascontiguousarray(data), **place, **also}
+    return arguments
 
 
 def warn_caller(text: str) -> None:
@@ -252,14 +222,11 @@ def warn_caller(text: str) -> None:
 def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float | None) -> np.ndarray:
     """Values with those that are missing replaced."""
     if nan is None:
-        if mask.all():
-            raise ValueError(f"{record.what} must hold values; all {mask.size} are missing. Give nan=VALUE.")
-        least = data[~mask].min().item()
-        record.note(
-            f"{np.count_nonzero(mask)} of {mask.size} values are missing: shown as {least:g}; see nan"
-        )
-        nan = float(least)
-    data = np.array(data, data.dtype if data.dtype.kind == "f" or holds(data.dtype, nan) else np.float32)
+        count, n = np.count_nonzero(mask), mask.size
+        ensure(count < n, f"{record.what} must hold values; all {n} are missing. Give nan=VALUE.")
+        nan = float(data[~mask].min().item())
+        record.note(f"{count} of {n} values are missing: shown as {nan:g}; see nan")
+    data = np.array(data, data.dtype if holds(data.dtype, nan) else np.float32)
     data[mask] = nan
     return data
 
@@ -271,8 +238,7 @@ def numbered(ids: np.ndarray) -> dict[str, Any]:
 
 
 class DecodedArray:
-    """The array of a record, of which boxes are read as values, with some of its axes reversed: for
-    bricks."""
+    """The array of a record, for bricks: boxes of it are read as values, with some of its axes reversed."""
 
     def __init__(self, record: ImageRecord, reverse: Sequence[int], nan: float | None):
         self.record, self.reverse, self.nan, self.shape = record, reverse, nan, record.data.shape

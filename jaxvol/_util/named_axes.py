@@ -7,25 +7,25 @@ from typing import Any
 
 import numpy as np
 
+from .files import ensure
 from .image_record import ImageRecord, volume_arguments
 
 
-EVEN = 1e-3
-"""Part of a step by which a coordinate may be away from evenly spaced ones."""
+EVEN = 1e-3  # part of a step by which a coordinate may be away from evenly spaced ones
 
 
 def record_of(value: Any) -> ImageRecord | None:
     """The record of an image of one of these libraries; None for anything else."""
-    kind, placed = type(value), ("GetSpacing", "GetOrigin")
+    placed = ("GetSpacing", "GetOrigin")
     marks: dict[Callable[[Any], ImageRecord | None], tuple[str, ...]] = {
         _xarray: ("dims", "coords", "transpose", "to_numpy"),
         nibabel_record: ("dataobj", "affine", "header"),
         _itk: (*placed, "GetDirection", "GetNumberOfComponentsPerPixel"),
         _vtk: (*placed, "GetDirectionMatrix", "GetPointData"),
-        zarr_record: ("metadata", "attrs", "store", "chunks"),
+        _zarr: ("metadata", "attrs", "store", "chunks"),
     }
-    read = next((read for read, names in marks.items() if all(hasattr(kind, name) for name in names)), None)
-    return None if read is None else read(value)
+    found = (read for read, names in marks.items() if all(hasattr(type(value), name) for name in names))
+    return next(found, lambda _: None)(value)
 
 
 def object_arguments(value: Any) -> dict[str, Any] | None:
@@ -40,17 +40,18 @@ def object_arguments(value: Any) -> dict[str, Any] | None:
 
 def grid_of(affine: Any) -> dict[str, Any]:
     """`steps`, `origin` and `direction` of a record whose voxel (i, j, k) lies at `affine @ (i, j, k, 1)`."""
-    columns, origin = np.asarray(affine, float)[:3, :3], np.asarray(affine, float)[:3, 3]
+    columns, origin = np.split(np.asarray(affine, float)[:3], [3], axis=1)
     steps = np.linalg.norm(columns, axis=0)
     with np.errstate(invalid="ignore"):
-        direction = columns / np.where(steps > 0, steps, 1)
-    return {"steps": dict(zip("xyz", steps.tolist(), strict=True)), "origin": origin, "direction": direction}
+        turn = columns / np.where(steps > 0, steps, 1)
+    steps = dict(zip("xyz", steps.tolist(), strict=True))
+    return {"steps": steps, "origin": origin[:, 0], "direction": turn}
 
 
-def nibabel_record(image: Any, stored: Any = None, what: str = "data") -> ImageRecord:
-    """Its world is right, front, head. Where a NIfTI has neither an sform nor a qform, axes are left as they
-    are in the file, from 0 on, as by SimpleITK; nibabel itself reverses one of them and centres all.
-    `stored`: its numbers, if they were read before."""
+def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
+    """The record of an image whose world is right, front, head; of a NIfTI without sform and qform, axes as
+    they are in the file, from 0 on, as by SimpleITK: nibabel itself reverses one of them and centres all.
+    `stored`: its numbers, if they were read before. Without, a fourth axis is the volume's channels."""
     header, proxy = image.header, image.dataobj
     data = proxy.get_unscaled() if stored is None and hasattr(proxy, "get_unscaled") else stored
     data = np.asanyarray(proxy if data is None else data)
@@ -59,71 +60,77 @@ def nibabel_record(image: Any, stored: Any = None, what: str = "data") -> ImageR
     if codes and not any(codes):
         place = {"steps": dict(zip("xyz", map(float, header["pixdim"][1:4]), strict=True))}
     unit = header.get_xyzt_units()[0] if hasattr(header, "get_xyzt_units") else "mm"
+    axes = "xyzsc" if stored is None else "xyztc"
+    while data.ndim > 5 and data.shape[-1] == 1:
+        data = data[..., 0]
     if names := data.dtype.names:  # of colours
-        data = np.stack([data[name] for name in names], axis=-1)
+        axes, data = "xyztc"[: data.ndim] + "s", np.stack([data[name] for name in names], axis=-1)
     else:
         place |= {"slope": getattr(proxy, "slope", 1.0), "intercept": getattr(proxy, "inter", 0.0)}
-    n = data.ndim - bool(names)
-    while n > 5 and data.shape[n - 1] == 1:
-        data, n = np.squeeze(data, n - 1), n - 1
-    # of objects in memory, a fourth axis is the volume's channels
-    axes = "xyztc"[:n] + "s" if names else "xyztc"[:n].replace("t", "t" if stored is not None else "s")
-    return ImageRecord(data, axes, units=None if unit == "unknown" else unit, what=what, **place)
+    return ImageRecord(data, axes[: data.ndim], units=None if unit == "unknown" else unit, **place)
 
 
 def _itk(image: Any) -> ImageRecord:
-    """An image of SimpleITK, or of the package `itk`."""
+    """The record of an image of SimpleITK, or of the package `itk`."""
     simple = hasattr(image, "GetDimension")
     n = image.GetDimension() if simple else image.GetImageDimension()
-    if n != 3:
-        raise ValueError(f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
+    ensure(n == 3, f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
     library = sys.modules.get("SimpleITK" if simple else "itk")
     if library is None:  # a class that only looks like theirs
         raise ValueError(f"data must be an image of SimpleITK or itk; got {type(image).__name__}.")
     data = (library.GetArrayFromImage if simple else library.array_from_image)(image)
     turn = np.asarray(image.GetDirection() if simple else library.array_from_matrix(image.GetDirection()))
-    spacing, origin = (list(map(float, each)) for each in (image.GetSpacing(), image.GetOrigin()))
-    steps, axes = dict(zip("xyz", spacing, strict=True)), "zyx" + "s" * (data.ndim > 3)
-    return ImageRecord(data, axes, steps, "mm", origin, np.reshape(turn, (3, 3)), "LPS")
+    steps, axes = dict(zip("xyz", map(float, image.GetSpacing()), strict=True)), "zyxs"[: data.ndim]
+    return ImageRecord(data, axes, steps, "mm", list(image.GetOrigin()), np.reshape(turn, (3, 3)), "LPS")
 
 
 def _vtk(image: Any) -> ImageRecord:
-    scalars, matrix = image.GetPointData().GetScalars(), image.GetDirectionMatrix()
-    cells = scalars is None and image.GetCellData().GetScalars()
-    scalars = cells or scalars
-    if scalars is None:
-        raise ValueError("data must be an image with scalars at its points or cells; got one without.")
-    sizes = np.array(image.GetDimensions()) - (1 if cells else 0)
-    data = np.ravel(memoryview(scalars)).reshape(*sizes[::-1], scalars.GetNumberOfComponents())
-    turn = np.reshape([matrix.GetElement(i, j) for i in range(3) for j in range(3)], (3, 3))
-    first = np.array(image.GetExtent()[::2]) + (0.5 if cells else 0)
-    affine = np.column_stack(
-        [turn * image.GetSpacing(), image.GetOrigin() + turn * image.GetSpacing() @ first]
-    )
+    scalars = image.GetPointData().GetScalars()
+    of_cells = scalars is None
+    scalars = image.GetCellData().GetScalars() if of_cells else scalars
+    ensure(scalars is not None, "data must be an image with scalars at its points or cells; got one without.")
+    data = np.ravel(memoryview(scalars)).reshape(-1, scalars.GetNumberOfComponents())
+    place = image.GetSpacing(), image.GetOrigin(), image.GetDirectionMatrix().GetData()
+    return vtk_record(data, image.GetExtent(), of_cells, place)
+
+
+def vtk_sizes(extent: Any, of_cells: bool) -> list[int]:
+    """Numbers of points of an extent of VTK along x, y, z, or of cells between them."""
+    first, last = np.array(extent, int).reshape(3, 2).T
+    return np.maximum(last - first + (not of_cells), 1).tolist()
+
+
+def vtk_record(data: np.ndarray, extent: Any, of_cells: bool, place: Any) -> ImageRecord:
+    """The record of values [voxel, component], x fastest, at points of an extent, or at the centres of cells.
+    `place`: spacing, origin, direction."""
+    spacing, origin, turn = (np.array(numbers, float) for numbers in place)
+    columns, first = turn.reshape(3, 3) * spacing, np.array(extent, int)[::2] + 0.5 * of_cells
+    grid = grid_of(np.column_stack([columns, origin + columns @ first]))
+    data = data.reshape(*vtk_sizes(extent, of_cells)[::-1], data.shape[1])
     several = data.shape[3] > 1
-    return ImageRecord(data if several else data[..., 0], "zyx" + "s" * several, **grid_of(affine))
+    return ImageRecord(data if several else data[..., 0], "zyx" + "s" * several, **grid)
 
 
 def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """`slope`, `intercept` and `missing` of a record by attributes of the CF convention."""
+    """`slope`, `intercept`, `missing` and `unsigned` of a record by attributes of the CF convention."""
     slope, intercept = float(attributes.get("scale_factor", 1)), float(attributes.get("add_offset", 0))
-    fills = [attributes[name] for name in ("_FillValue", "missing_value") if attributes.get(name) is not None]
-    numbers = [float(n) for fill in fills if not isinstance(fill, str) for n in np.ravel(fill)]
+    fills = [attributes.get(name) for name in ("_FillValue", "missing_value")]
+    numbers = [float(n) for fill in fills if not isinstance(fill, str | None) for n in np.ravel(fill)]
     unsigned = str(attributes.get("_Unsigned")).lower() == "true"
     missing = tuple(n for n in numbers if n == n)
     return {"slope": slope, "intercept": intercept, "missing": missing, "unsigned": unsigned}
 
 
-def zarr_record(value: Any) -> ImageRecord | None:
-    """Of an array with names of axes, its own or xarray's; without, it is like any other array."""
+def _zarr(value: Any) -> ImageRecord | None:
+    """The record of an array with names of axes, its own or xarray's; without, it is like any other array."""
     attributes = dict(value.attrs)
     names = getattr(value.metadata, "dimension_names", None) or attributes.get("_ARRAY_DIMENSIONS") or []
     return ImageRecord(value, list(names), **cf_scale(attributes)) if len(names) > 2 and all(names) else None
 
 
 def _xarray(value: Any) -> ImageRecord:
-    """Axes by name, or by `axis` of the CF convention; places by their coordinates, which must be evenly
-    spaced, also by those of several axes; `direction` as `itk.xarray_from_image` keeps it."""
+    """The record of a `DataArray`: axes by name, or by `axis` of the CF convention; places by their
+    coordinates, evenly spaced, also of several axes; `direction` as `itk.xarray_from_image` keeps it."""
     own = {name: value.coords[name] for name in value.dims if name in value.coords}
     names = [str(getattr(own.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
     record = ImageRecord(value.variable, names, **cf_scale(value.attrs))  # read later, maybe from a file
@@ -136,16 +143,14 @@ def _xarray(value: Any) -> ImageRecord:
         record.units = {letter: each.attrs.get("units") for letter, each in named.items()}
         vars(record).update(grid_of(_affine(np.stack(world))))
         return record
-    places = {
-        a: named[a] if a in named and named[a].dims == (dim,) else own.get(dim) for a, dim in dims.items()
-    }
-    found = {letter: each for letter, each in places.items() if each is not None}
-    ends = {letter: even_step(each.to_numpy(), each.name) for letter, each in found.items()}
-    record.steps = {letter: ends.get(letter, (1.0, 0.0))[0] for letter in "xyz"} if found else {}
+    along = {a: each for a, each in named.items() if each.dims == (dims.get(a),)}
+    along = {a: own[dim] for a, dim in dims.items() if dim in own} | along
+    ends = {letter: even_step(each.to_numpy(), each.name) for letter, each in along.items()}
+    record.steps = {letter: ends.get(letter, (1.0, 0.0))[0] for letter in "xyz"} if along else {}
     record.origin = [ends.get(letter, (1.0, 0.0))[1] for letter in "xyz"]
-    record.units = {letter: each.attrs.get("units") for letter, each in found.items()}
+    record.units = {letter: each.attrs.get("units") for letter, each in along.items()}
     if (turn := value.attrs.get("direction")) is not None and len(dims) == 3:
-        rank = [[dim for dim in value.dims if dim in dims.values()].index(dims[letter]) for letter in "xyz"]
+        rank = [list(dims).index(letter) for letter in "xyz"]
         record.direction = np.reshape(np.asarray(turn, float), (3, 3))[np.ix_(rank, rank)]
         record.convention = "LPS"
     return record
@@ -155,8 +160,8 @@ def even_step(at: np.ndarray, name: Any) -> tuple[float, float]:
     """The distance between evenly spaced numbers, and the first. Raises `ValueError` for others."""
     even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" and at.size else np.zeros(2)
     step = float(even[1] - even[0]) if at.size > 1 else 0.0
-    if not (step and np.abs(at - even).max() <= EVEN * abs(step)):  # NaN, too
-        raise ValueError(f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
+    is_even = step and np.abs(at - even).max() <= EVEN * abs(step)  # not of NaN
+    ensure(is_even, f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
     return step, float(at[0])
 
 
@@ -166,6 +171,6 @@ def _affine(world: np.ndarray) -> np.ndarray:
     ends = world[:, -1, 0, 0], world[:, 0, -1, 0], world[:, 0, 0, -1]
     columns = (np.stack(ends, axis=1) - first[:, None]) / last
     exact = first[:, None, None, None] + np.tensordot(columns, np.indices(world.shape[1:]), 1)
-    if not np.abs(world - exact).max() <= EVEN * np.linalg.norm(columns, axis=0).min():  # NaN, too
-        raise ValueError("data must have evenly spaced numbers as coordinates; got those of a curved grid.")
+    is_affine = np.abs(world - exact).max() <= EVEN * np.linalg.norm(columns, axis=0).min()  # not of NaN
+    ensure(is_affine, "data must have evenly spaced numbers as coordinates; got those of a curved grid.")
     return np.column_stack([columns, first])

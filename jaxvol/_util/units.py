@@ -11,9 +11,9 @@ PREFIXES = {"kilo": 1e6, "": 1e3, "deci": 100.0, "centi": 10.0, "milli": 1.0, "m
 PREFIXES |= {"pico": 1e-9, "femto": 1e-12}
 LENGTHS = {f"{prefix}meter": length for prefix, length in PREFIXES.items()}
 LENGTHS |= dict(zip(("km", "m", "dm", "cm", "mm", "μm", "nm", "pm", "fm"), PREFIXES.values(), strict=True))
-LENGTHS |= {"um": 1e-3, "mum": 1e-3, "mcm": 1e-3, "mc": 1e-3, "micron": 1e-3, "μ": 1e-3, "μ meter": 1e-3}
-LENGTHS |= {"å": 1e-7, "ang": 1e-7, "angstrom": 1e-7, "ångström": 1e-7, "ångstrom": 1e-7, "a": 1e-7}
-LENGTHS |= dict.fromkeys(("in", "inch", "inche", '"'), 25.4) | dict.fromkeys(("ft", "foot", "feet"), 304.8)
+LENGTHS |= dict.fromkeys(("um", "mum", "mcm", "mc", "micron", "μ", "μ meter"), 1e-3)
+LENGTHS |= dict.fromkeys(("å", "a", "ang", "angstrom", "ångström", "ångstrom"), 1e-7)
+LENGTHS |= {"in": 25.4, "inch": 25.4, "inche": 25.4, '"': 25.4, "ft": 304.8, "foot": 304.8, "feet": 304.8}
 LENGTHS |= {"yd": 914.4, "yard": 914.4, "mi": 1609344.0, "mile": 1609344.0, "thou": 0.0254, "mil": 0.0254}
 LENGTHS |= {"li": 25.4 / 12, "pt": 25.4 / 72}
 """Units of length in mm, in small letters, without a plural's s."""
@@ -45,22 +45,20 @@ def axis_letters(what: str, names: Sequence[str], note: Callable[[str], None]) -
     which begins with `what`, for an axis that is not known otherwise, and for two of one kind.
     """
     words = [str(name).strip().lower() for name in names]
-    found: list[str | None] = [AXES.get(word) or AXES.get(word.removesuffix("s")) for word in words]
+    found = [AXES.get(word) or AXES.get(word.removesuffix("s")) or "?" for word in words]
     if "height" in words:  # of an image, or above the ground
         found[words.index("height")] = "y" if "y" not in found else "z"
     missing = [letter for letter in "xyz" if letter not in found]
-    if len(words) == len(missing) == 3:
-        found = [None] * 3
-    unknown = [at for at, letter in enumerate(found) if letter is None]
+    found = ["?"] * 3 if len(words) == len(missing) == 3 else found
+    unknown = [str(name) for name, letter in zip(names, found, strict=True) if letter == "?"]
     if unknown and len(unknown) == len(missing):
-        for at, letter in zip(unknown, missing, strict=True):
-            found[at] = letter
-        if not all(re.fullmatch(r"(dim|axis|phony_dim)_?\d+", words[at]) for at in unknown):
-            note(f"axes {', '.join(repr(str(names[at])) for at in unknown)}: taken as {', '.join(missing)}")
-    letters = "".join(letter or "?" for letter in found)
-    if "?" in letters or len({*letters}) < len(letters):
+        free = iter(missing)
+        found = [next(free) if letter == "?" else letter for letter in found]
+        if not all(re.fullmatch(r"(dim|axis|phony_dim)_?\d+", name.strip().lower()) for name in unknown):
+            note(f"axes {', '.join(map(repr, unknown))}: taken as {', '.join(missing)}")
+    if "?" in found or len({*found}) < len(found):
         raise ValueError(
             f"{what} must have axes named such as x, y, z, time and channel, each once; got "
             f"{shortened(', '.join(map(str, names)))}. Rename or choose among them first."
         )
-    return letters
+    return "".join(found)

@@ -22,7 +22,8 @@ from .._util.memory import memory_of_device, require_room
 from .._util.named_axes import cf_scale, even_step, record_of
 from .._util.units import axis_letters
 from .._util.voxels import check_shape
-from ..io.formats import FOLDERS, hdf5, mrc, read_record
+from ..io.formats import FOLDERS, read_record
+from ..io.formats.library_formats import HDF5, MRC
 from ..scene.camera import Camera, axes_of
 from ..scene.volume import Volume, check_one_channel
 from .sources import SPACE, VoxelSource, voxel_type
@@ -32,7 +33,7 @@ Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
 
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")  # a Zarr array or group has at least one of them
 LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
-READ_IN_BOXES = (".raw", ".npy", *mrc.ENDINGS, *hdf5.ENDINGS)
+READ_IN_BOXES = (".raw", ".npy", *MRC, *HDF5)
 CACHE = 2**24  # bytes of decoded chunks and indices of shards that are kept, for boxes that share them
 
 

@@ -73,7 +73,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "files: ids are numbered, and lost",
-        "io.formats:numbered",
+        "_util.image_record:numbered",
         lambda numbered: lambda ids: {"data": numbered(ids)["data"]},
         ("io/formats/test_save.py::test_ids_of_labels_are_numbered_and_kept",),
     ),

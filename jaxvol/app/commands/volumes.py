@@ -38,13 +38,14 @@ def add_datasets(parser: Parser) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from ...io.formats import labelled, read, read_record
+    from ..._util.image_record import volume_arguments
+    from ...io.formats import labelled, read_record
     from ...scene.volume import Volume
 
     told = header_of(options)
     how = {name: told.pop(name) for name in ("nan", "channel")} | {"time": told["time"]}
     record = read_record(options.file, **told)
-    arguments = read(record, **how | ({"time": None} if record.format.endswith("at each place") else {}))
+    arguments = volume_arguments(record, **how)
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)

@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from ..._util.checks import described
-from ..._util.files import MOST_VOXELS, check_size
+from ..._util.files import MOST_VOXELS, check_size, refusing
 from ..._util.texts import near
 from ...scene.volume import Volume
 from ..formats import load as load_file
@@ -157,7 +157,8 @@ def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, prog
 def _of_right_size(path: Path, dataset: Dataset) -> Path:
     """A dataset's file, after checking its size; of a packed one, `load` checks it."""
     if path.suffix != ".gz":
-        check_size(path, path.stat().st_size, dataset.nbytes)
+        with refusing(path):
+            check_size(path.stat().st_size, dataset.nbytes)
     return path
 
 

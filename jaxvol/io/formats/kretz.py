@@ -2,10 +2,9 @@
 
 A file is 16 bytes of magic and then items: group (u16), element (u16), length (u32), and `length` bytes, all
 little-endian. The format is not published; the items that are read (`MEANING`) are those of
-`vtkSlicerKretzFileReaderLogic` (SlicerHeart) and plooney/kretz, who found them out from files.
-
-`ToroidalMap` has the readers' place for every voxel but for a shift along z by a and, against SlicerHeart's
-RAS axes, the sign of y.
+`vtkSlicerKretzFileReaderLogic` (SlicerHeart) and plooney/kretz, who found them out from files. `ToroidalMap`
+has the readers' place for every voxel but for a shift along z by a and, against SlicerHeart's RAS axes, the
+sign of y.
 """
 
 import math
@@ -15,16 +14,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from ..._util.files import MOST_VOXELS, file_size
+from ..._util.files import MOST_VOXELS, check, file_size, refusing
 from ...march.transforms import ToroidalMap
 
 
 MAGIC = b"KRETZFILE 1.0   "
 
-UNEVEN = 0.01
-"""How far an angle may be from evenly spaced ones, in steps: a part of a voxel by which it is misplaced."""
+UNEVEN = 0.01  # steps by which an angle may be away from evenly spaced ones: it misplaces a part of a voxel
 
-MEANING = {
+MEANING = {  # by group and element
     "C000:1": "the number of samples along a beam",  # u16
     "C000:2": "the number of beams",  # u16
     "C000:3": "the number of planes",  # u16
@@ -35,53 +33,46 @@ MEANING = {
     "C300:2": "the angles of the beams",  # likewise
     "D000:1": "the voxels",  # u8, γ fastest, then σ, then β
 }
-"""By group and element."""
+TOLD = {tag: f"{tag} ({meaning})" for tag, meaning in MEANING.items()}
 
 
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:
     """The voxels and the map of a `.vol` file. Raises `ValueError` for a file that is none, is cut short
     or compressed, lacks an item or holds one twice, or whose items contradict each other."""
-    items = _items(path)
+    with refusing(path):
+        items = _items(path)
 
-    def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
-        expected = count * np.dtype(dtype).itemsize
-        if len(items[tag]) != expected:
-            raise ValueError(
-                f"path: {path}: item {_name(tag)} must have {expected} bytes; it has {len(items[tag])}. Of a "
-                "compressed file, the voxels have less: save it uncompressed."
-            )
-        return np.frombuffer(items[tag], dtype)
+        def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
+            expected, found = count * np.dtype(dtype).itemsize, len(items[tag])
+            hint = "Of a compressed file, the voxels have less: save it uncompressed."
+            must = f": item {TOLD[tag]} must have {expected} bytes"
+            check(found == expected, f"{must}; it has {found}. {hint}")
+            return np.frombuffer(items[tag], dtype)
 
-    planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
-    if min(planes, beams, samples) < 2 or planes * beams * samples > MOST_VOXELS:
-        raise ValueError(
-            f"path: {path} must have at least 2 planes, beams and samples, and fewer than 2**31 voxels; its "
-            f"header says {planes} x {beams} x {samples}."
-        )
-    voxels = numbers("D000:1", "u1", planes * beams * samples).reshape(planes, beams, samples)
-    ends: list[tuple[float, float]] = []
-    for tag, count in (("C300:1", planes), ("C300:2", beams)):
-        angles = numbers(tag, "<f8", count)
-        with np.errstate(all="ignore"):  # NaN and infinity are refused below
-            even, step = np.linspace(angles[0], angles[-1], count, retstep=True)
-        if not (step > 0 and np.abs(angles - even).max() <= UNEVEN * step):
-            raise ValueError(
-                f"path: {path}: item {_name(tag)} must be evenly spaced angles that increase, up to {UNEVEN} "
-                f"of a step; got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
-            )
-        ends.append((float(angles[0]), float(angles[-1])))
-    resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
-    if not 0 < resolution < math.inf:
-        raise ValueError(
-            f"path: {path}: item {_name('C100:1')} must be a positive length in metres; got {resolution}."
-        )
+        planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
+        must = "must have at least 2 planes, beams and samples, and fewer than 2**31 voxels"
+        is_volume = min(planes, beams, samples) > 1 and planes * beams * samples <= MOST_VOXELS
+        check(is_volume, f"{must}; its header says {planes} x {beams} x {samples}.")
+        voxels = numbers("D000:1", "u1", planes * beams * samples).reshape(planes, beams, samples)
+        ends: list[tuple[float, float]] = []
+        for tag, count in (("C300:1", planes), ("C300:2", beams)):
+            angles = numbers(tag, "<f8", count)
+            with np.errstate(all="ignore"):  # NaN and infinity are refused below
+                even, step = np.linspace(angles[0], angles[-1], count, retstep=True)
+            must = f"must be evenly spaced angles that increase, up to {UNEVEN} of a step"
+            got = f"got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
+            is_even = step > 0 and np.abs(angles - even).max() <= UNEVEN * step
+            check(is_even, f": item {TOLD[tag]} {must}; {got}")
+            ends.append((float(angles[0]), float(angles[-1])))
+        resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
+        must = f": item {TOLD['C100:1']} must be a positive length in metres"
+        check(0 < resolution < math.inf, f"{must}; got {resolution}.")
     step = 1000 * resolution  # mm
     try:
-        beta, sigma = ends
-        probe = ToroidalMap(apex * step, first * step, beta, sigma, (0.0, (samples - 1) * step))
+        probe = ToroidalMap(apex * step, first * step, ends[0], ends[1], (0.0, (samples - 1) * step))
         nearest = float(probe.nearest_to_axis)
-        if nearest < -1e-6 * abs(apex * step):  # 0 to within rounding is on the axis
-            raise ValueError(f"its outermost beams begin {-nearest:.4g} mm behind the motor axis.")
+        on_axis = nearest >= -1e-6 * abs(apex * step)  # 0 to within rounding
+        check(on_axis, f"its outermost beams begin {-nearest:.4g} mm behind the motor axis.")
     except ValueError as fault:
         raise ValueError(f"path: {path} describes no probe: {fault}") from fault
     return voxels, probe
@@ -92,31 +83,21 @@ def _items(path: Path) -> dict[str, bytes]:
     n_bytes, found = file_size(path), {}
     with path.open("rb") as stream:
         magic = stream.read(len(MAGIC))
-        if magic != MAGIC:
-            raise ValueError(
-                f"path: {path} is not a Kretz file: it must begin with {MAGIC!r}; got {magic!r}. "
-                "Other programs write files of other kinds that end in .vol."
-            )
+        others = "Other programs write files of other kinds that end in .vol."
+        must = f"is not a Kretz file: it must begin with {MAGIC!r}"
+        check(magic == MAGIC, f"{must}; got {magic!r}. {others}")
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
-            if end > n_bytes:
-                raise ValueError(
-                    f"path: {path} is cut short: item {_name(tag)} is to end at byte {end}, and it ends at "
-                    f"{n_bytes}."
-                )
-            if tag in found:
-                raise ValueError(f"path: {path} holds item {_name(tag)} twice.")
+            cut = (
+                f"is cut short: item {TOLD.get(tag, tag)} is to end at byte {end}, and it ends at {n_bytes}."
+            )
+            check(end <= n_bytes, cut)
+            check(tag not in found, f"holds item {TOLD.get(tag, tag)} twice.")
             if tag in MEANING:
                 found[tag] = stream.read(length)
             stream.seek(end)
-    if missing := [_name(tag) for tag in MEANING if tag not in found]:
-        raise ValueError(
-            f"path: {path} has no item {', no item '.join(missing)}. Compressed files, several frames and "
-            "Cartesian volumes are not supported: save it as one uncompressed volume as acquired."
-        )
+    missing = ", no item ".join(told for tag, told in TOLD.items() if tag not in found)
+    hint = "Compressed files, several frames and Cartesian volumes are not supported: save it as one"
+    check(not missing, f"has no item {missing}. {hint} uncompressed volume as acquired.")
     return found
-
-
-def _name(tag: str) -> str:
-    return f"{tag} ({MEANING[tag]})" if tag in MEANING else tag

@@ -1,17 +1,18 @@
 """Writes volumes to files that `load` reads again as they were."""
 
+import gzip
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..._util.affine import SHEARED
 from ..._util.checks import described, output_file
-from ..._util.files import library, reason
-from ..._util.npy import VOLUME
+from ..._util.files import ensure, library, reason
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume, check_one_channel
-from .nifti import write_nifti
+from .arrays import VOLUME
 
 
 ENDINGS = (".mha", ".nii", ".nii.gz", ".npz", ".nrrd")
@@ -26,9 +27,9 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     | `.nrrd`, `.mha` | voxels, spacing, origin, direction; by SimpleITK (`pip install "jaxvol[io]"`) |
     | `.nii`, `.nii.gz` | the same, rounded to about 1e-7, as sform and, unless sheared, as qform |
 
-    Voxels are written in their own type, and read so. Medical formats are read along the patient's axes: a
-    volume whose axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every
-    voxel where it was in the world. A file that is there is replaced, at once when the new one is whole.
+    Voxels are written in their own type. Medical formats are read along the patient's axes: a volume whose
+    axes are turned by more than 45 degrees comes back with axes exchanged or reversed, and every voxel where
+    it was in the world. A file that is there is replaced, at once when the new one is whole.
 
     Args:
         volume: with voxels, not with a `field`. It comes first; `save_png`, of images, has the path first.
@@ -40,46 +41,54 @@ def save(volume: Volume | Any, path: str | os.PathLike[str] | Any) -> Path:
     Raises:
         ValueError: for an unknown ending, a volume that has a field, labels or a type of voxels that the
             format cannot hold, and a file that cannot be written.
-        ImportError: if the format needs SimpleITK, and it is missing.
+        ImportError: if the format needs a library that is missing.
     """
-    if not isinstance(volume, Volume):
-        told = f"volume must be a Volume; got {described(volume)}"
-        raise ValueError(f"{told}. The volume comes first, as in save(volume, path).")
-    if not isinstance(path, str | os.PathLike):
-        raise ValueError(f"path must be a str or a path; got {described(path)}.")
-    if volume.field is not None:
-        raise ValueError("volume must have voxels; got one with a field. Save an array of its values.")
+    hint = "The volume comes first, as in save(volume, path)."
+    ensure(isinstance(volume, Volume), f"volume must be a Volume; got {described(volume)}. {hint}")
+    ensure(isinstance(path, str | os.PathLike), f"path must be a str or a path; got {described(path)}.")
+    field = "volume must have voxels; got one with a field. Save an array of its values."
+    ensure(volume.field is None, field)
     path = output_file("path", path)
-    if not path.name.lower().endswith(".npz"):
+    name, kind = path.name.lower(), volume.data.dtype.name
+    in_npz = name.endswith(".npz")
+    if not in_npz:
         check_one_channel(volume, f"{path.suffix} (.npz holds several)")
-    name = path.name.lower()
-    if not name.endswith(ENDINGS):
-        raise ValueError(f"path must end in {', '.join(ENDINGS)}; got {path}.")
-    unknown = ("bfloat16",) if name.endswith(".npz") else ("bfloat16", "float16")
-    if volume.data.dtype.name in unknown:
-        raise ValueError(
-            f"volume has voxels of {volume.data.dtype}, which {path.name} cannot hold. Convert to float32."
-        )
-    if (volume.labels is not None or volume.label_ids) and not name.endswith(".npz"):
-        raise ValueError(
-            f"volume has labels, for which {path.name} has no place. Save it as .npz, or save labels "
-            "and voxels as two volumes, and read them by load(path, labels=...)."
-        )
+    ensure(name.endswith(ENDINGS), f"path must end in {', '.join(ENDINGS)}; got {path}.")
+    is_held = kind not in (("bfloat16",) if in_npz else ("bfloat16", "float16"))
+    ensure(is_held, f"volume has voxels of {kind}, which {path.name} cannot hold. Convert to float32.")
+    has_labels, told = volume.labels is not None or volume.label_ids, f"for which {path.name} has no place"
+    hint = (
+        "Save it as .npz, or save labels and voxels as two volumes, and read them by load(path, labels=...)"
+    )
+    ensure(in_npz or not has_labels, f"volume has labels, {told}. {hint}.")
     parts = {part: getattr(volume, part) for part in VOLUME}
     arrays = {part: np.asarray(array) for part, array in parts.items() if array is not None}
-    if volume.label_ids:
-        arrays["label_ids"] = np.array(
-            volume.label_ids, np.uint64 if min(volume.label_ids) >= 0 else np.int64
-        )
+    if ids := volume.label_ids:
+        arrays["label_ids"] = np.array(ids, np.uint64 if min(ids) >= 0 else np.int64)
     with whole_file(path) as file:
-        if name.endswith(".npz"):
+        if in_npz:
             with file.open("wb") as stream:  # by a path, NumPy would append .npz to .NPZ
                 np.savez_compressed(stream, **arrays)  # pyright: ignore[reportArgumentType]
         elif name.endswith((".nii", ".nii.gz")):
-            write_nifti(file, arrays, packed=name.endswith(".gz"))
+            content = _nifti(arrays, file)
+            file.write_bytes(gzip.compress(content, 6) if name.endswith(".gz") else content)
         else:
             _write_medical(arrays, file)
     return path
+
+
+def _nifti(arrays: dict[str, np.ndarray], path: Path) -> bytes:
+    """The bytes of a NIfTI-1 with an sform, which keeps shears, and the same qform unless it is sheared."""
+    data, turn, affine = arrays["data"], arrays.get("direction", np.eye(3)).astype(float), np.eye(4)
+    fits = max(data.shape) < 2**15
+    ensure(fits, f"path: NIfTI-1 holds fewer than 32768 voxels along an axis; got {data.shape}.")
+    affine[:3] = np.diag([-1.0, -1, 1]) @ np.column_stack([turn * arrays["spacing"], arrays["origin"]])  # RAS
+    image = library("nibabel", path).Nifti1Image(data, affine)
+    image.set_sform(affine, 1)
+    if np.abs(turn.T @ turn - np.eye(3)).max() <= SHEARED:
+        image.set_qform(affine, 1)
+    image.header.set_xyzt_units("mm")
+    return image.to_bytes()
 
 
 def _write_medical(arrays: dict[str, np.ndarray], path: Path) -> None:
@@ -87,8 +96,7 @@ def _write_medical(arrays: dict[str, np.ndarray], path: Path) -> None:
     image = sitk.GetImageFromArray(np.ascontiguousarray(arrays["data"].T))
     image.SetSpacing(arrays["spacing"].astype(float).tolist())
     image.SetOrigin(arrays["origin"].astype(float).tolist())
-    if "direction" in arrays:
-        image.SetDirection(arrays["direction"].astype(float).ravel().tolist())
+    image.SetDirection(arrays.get("direction", np.eye(3)).astype(float).ravel().tolist())
     try:
         sitk.WriteImage(image, str(path), True)
     except RuntimeError as fault:

@@ -4,76 +4,47 @@ ITK, which also reads them, hangs on some headers, ends the process on others, a
 header understates the number of compressed bytes.
 """
 
-import math
 import re
-import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..._util.checks import shortened
-from ..._util.files import as_array, check_size, decoding, file_size
+from ..._util.files import Refused, check
 from ..._util.image_record import ImageRecord
 from ..._util.named_axes import grid_of
+from .arrays import check_volume, read_voxels
 
 
 LONGEST, MOST_FIELDS = 900, 1024
-"""Letters of a field in an NRRD header, at most (comments and pairs may be longer); and fields in a
-header."""
+"""Letters of a field in an NRRD header (comments and pairs may be longer), and fields in any, at most."""
 
 META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8"}
 META_TYPES |= {name.replace("_", "_U", 1): f"u{code[1]}" for name, code in META_TYPES.items()}
 META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
-NRRD_TYPE = re.compile(r"(un?)?(?:signed )?(char|short|longlong|long long|int)(8|16|32|64)?(?: int|_t)?")
-BYTES = {"char": 1, "short": 2, "int": 4, "longlong": 8, "long long": 8}
-DOMAIN = "domain", "space", "???", "none"
-"""Kinds of axes of space in NRRD."""
+NRRD_TYPES = {name[4:].replace("_", "").lower(): code for name, code in META_TYPES.items()}
+NRRD_TYPES |= {np.dtype(code).name: code for code in META_TYPES.values()} | {"long": "", "ulong": ""}
+"""By names without "signed" and blanks, "int" and "_t" at their ends."""
+
+DOMAIN = "domain", "space", "???", "none"  # kinds of axes of space in NRRD
 
 
-def text_header(
-    path: Path, separator: str, last: str = "", longest: int = 2**20
-) -> tuple[dict[str, str], int]:
+def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> tuple[dict[str, str], int]:
     """The fields of a header in text, and where in the file it ends: at an empty line, or behind the field
-    `last`. Raises `ValueError` for more than `MOST_FIELDS`, and fields of more than `longest` letters."""
+    `last`. Refuses more than `MOST_FIELDS`, and fields of more than `longest` letters."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
         while last not in fields and (line := stream.readline(2**20).decode("utf-8", "replace").strip()):
             key, _, value = line.partition(separator)
-            long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
-            if long or len(fields) == MOST_FIELDS:
-                told = f"the field {shortened(line)}" if long else f"more than {MOST_FIELDS} fields"
-                raise ValueError(f"path: {path} cannot be read: its header has {told}.")
+            is_long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
+            check(not is_long, f"cannot be read: its header has the field {shortened(line)}.")
+            is_short = len(fields) < MOST_FIELDS
+            check(is_short, f"cannot be read: its header has more than {MOST_FIELDS} fields.")
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 
 
-def check_volume(path: Path, size: Any, channels: Any = 1) -> None:
-    """Raises `ValueError` for an image that is no volume, or several of them along further axes."""
-    if not 3 <= len(size) <= 5 or channels < 1 or min(size) < 1 or math.prod(size) * channels >= 2**62:
-        raise ValueError(
-            f"path: {path} must be a 3-D image, or several along further axes, of fewer than 2**31 voxels; "
-            f"got size {tuple(size)} and {channels} values per voxel."
-        )
-
-
-def _voxels(
-    path: Path, source: Path, begin: int, shape: list[int], dtype: Any, *, packed: bool
-) -> np.ndarray:
-    """Voxels from a byte of a file on (-1: at its end), by zlib or gzip if `packed`."""
-    expected, size = math.prod(shape) * dtype.itemsize, file_size(source)
-    with source.open("rb") as stream, decoding(path):
-        stream.seek(begin if begin >= 0 else max(size - expected, 0))
-        if packed:
-            content = zlib.decompressobj(wbits=47).decompress(stream.read(), expected + 1)
-            check_size(path, len(content), expected, more=source == path)
-        else:
-            check_size(path, max(size - stream.tell(), 0), expected, more=True)
-            content = stream.read(expected)
-    return as_array(content[:expected], shape, dtype, "C")
-
-
-def _numbers(path: Path, fields: dict[str, str], names: str, default: np.ndarray) -> np.ndarray:
+def _numbers(fields: dict[str, str], names: str, default: np.ndarray) -> np.ndarray:
     """The numbers of the first of these fields that is there, in the shape of `default`."""
     name = next((name for name in names.split() if name in fields), None)
     if name is None:
@@ -81,22 +52,21 @@ def _numbers(path: Path, fields: dict[str, str], names: str, default: np.ndarray
     try:
         return np.array(re.findall(r"[^\s,()]+", fields[name]), float).reshape(default.shape)
     except ValueError as fault:
-        got = fields[name][:80]
-        raise ValueError(f"path: {path}: {name} must be {default.size} numbers; got {got!r}.") from fault
+        raise Refused(f": {name} must be {default.size} numbers; got {fields[name][:80]!r}.") from fault
 
 
-def _sizes(path: Path, text: str) -> list[int]:
-    words = text.split()
-    if not all(word.isascii() and word.isdigit() and len(word) < 16 for word in words):
-        raise ValueError(f"path: {path}: sizes must be numbers of voxels; got {shortened(text)}.")
-    check_volume(path, [*map(int, words)])
-    return [*map(int, words)]
+def _sizes(text: str, channels: int = 1) -> list[int]:
+    are_numbers = all(re.fullmatch("[0-9]{1,15}", word) for word in text.split())
+    check(are_numbers, f": sizes must be numbers of voxels; got {shortened(text)}.")
+    sizes = [*map(int, text.split())]
+    check_volume(sizes, channels)
+    return sizes
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
     """The fields of an NRRD file, in small letters without blanks, its magic the first; where its voxels
     begin, and in which file, which may be missing."""
-    found, end = text_header(path, ":", longest=LONGEST)
+    found, end = text_header(path, ":", "", LONGEST)
     fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
     named = fields.get("datafile")
     return (fields, end, path) if named is None else (fields, 0, path.parent / named)
@@ -104,118 +74,100 @@ def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
 
 def read_nrrd(path: Path) -> ImageRecord:
     """Reader for `.nrrd` and `.nhdr`, whose space may be that of a patient; its lengths in `space units`."""
-    file_size(path)
     fields, begin, source = nrrd_header(path)
     encoding, magic = fields.get("encoding", "").lower(), next(iter(fields), "")
-    if not magic.startswith("nrrd00") or encoding not in ("raw", "gzip", "gz") or not source.is_file():
-        raise ValueError(
-            f"path: {path} cannot be read: a NRRD file holds its voxels, or names one file of them, in the "
-            f"encoding raw or gzip; got {shortened(magic)}, {shortened(encoding)}, {shortened(str(source))}."
-        )
-    kind, shape = fields.get("type", "").lower(), _sizes(path, fields.get("sizes", ""))
-    code, found = {"float": "f4", "double": "f8"}.get(kind, ""), NRRD_TYPE.fullmatch(kind)
-    if found:
-        code = f"{'u' if found[1] else 'i'}{int(found[3]) // 8 if found[3] else BYTES[found[2]]}"
-    if not code:
-        raise ValueError(f"path: {path}: type must be one of numbers; got {shortened(kind)}.")
+    must = "a NRRD file holds its voxels, or names one file of them, in the encoding raw or gzip"
+    got = f"{shortened(magic)}, {shortened(encoding)}, {shortened(str(source))}"
+    is_read = magic.startswith("nrrd00") and encoding in ("raw", "gzip", "gz") and source.is_file()
+    check(is_read, f"cannot be read: {must}; got {got}.")
+    kind, shape = fields.get("type", "").lower(), _sizes(fields.get("sizes", ""))
+    code, n = NRRD_TYPES.get(re.sub("nsigned | int$|_t$|^signed | ", "", kind), ""), len(shape)
+    check(code, f": type must be one of numbers; got {shortened(kind)}.")
     dtype = np.dtype(code).newbyteorder(">" if fields.get("endian", "").lower() == "big" else "<")
-    lines, skip = (int(_numbers(path, fields, name, np.zeros(1))[0]) for name in ("lineskip", "byteskip"))
+    lines, skip = (int(_numbers(fields, name, np.zeros(1))[0]) for name in ("lineskip", "byteskip"))
     with source.open("rb") as stream:
         stream.seek(begin)
         for _ in range(min(lines, 2**20)):
             stream.readline(2**20)
         begin = stream.tell() + skip if skip >= 0 else -1
-    data, n = _voxels(path, source, begin, shape[::-1], dtype, packed=encoding != "raw"), len(shape)
-    axes, inside, others = "", [], iter("tcs")
+    packed = "" if encoding == "raw" else "zlib"
+    data = read_voxels(source, shape[::-1], dtype, begin, packed, more=not packed or source == path)
     vectors = re.findall(r"none|\([^)]*\)", fields.get("spacedirections", "").lower())
-    kinds = [*fields.get("kinds", "").lower().split(), *["domain"] * n]
-    for k in range(n):
-        placed = [*vectors, *["none"] * n][k] != "none" if vectors else kinds[k] in DOMAIN
-        if placed and len(inside) < 3:
-            axes, inside = axes + "xyz"[len(inside)], [*inside, k]
-        else:
-            axes += next(others, "s") if kinds[k] in (*DOMAIN, "time") else "s"
-    if len(inside) < 3:
-        raise ValueError(f"path: {path} must be a 3-D image; got axes of kinds {shortened(str(kinds[:n]))}.")
-    quoted = {
-        name: re.findall(r'"([^"]*)"', fields.get(name, "")) for name in ("labels", "spaceunits", "units")
-    }
-    if not vectors and sorted(name.lower() for name in quoted["labels"]) == sorted(axes):
-        axes = "".join(quoted["labels"]).lower()
-    units = (
-        quoted["spaceunits"] if vectors else [quoted["units"][k] for k in inside if k < len(quoted["units"])]
-    )
-    record = ImageRecord(data, axes[::-1], units=dict(zip("xyz", units, strict=False)), what=f"path: {path}")
+    kinds = [*fields.get("kinds", "").lower().split(), *["domain"] * n][:n]
+    placed = [each != "none" for each in vectors] if vectors else [each in DOMAIN for each in kinds]
+    inside, others = [k for k, is_placed in enumerate(placed[:n]) if is_placed][:3], iter("tcs")
+    check(len(inside) == 3, f"must be a 3-D image; got axes of kinds {shortened(str(kinds))}.")
+    along = dict(zip(inside, "xyz", strict=True))
+    axes = [along.get(k) or (next(others, "s") if kinds[k] in (*DOMAIN, "time") else "s") for k in range(n)]
+    quoted = {key: re.findall('"([^"]*)"', fields.get(key, "")) for key in ("labels", "spaceunits", "units")}
+    labels = [name.lower() for name in quoted["labels"]]
+    axes = labels if not vectors and sorted(labels) == sorted(axes) else axes
+    units = [unit for k, unit in enumerate(quoted["units"]) if k in inside]
+    units = dict(zip("xyz", quoted["spaceunits"] if vectors else units, strict=False))
     space = fields.get("space", "").upper()
     space = "".join(word[0] for word in re.findall("[A-Z]+", space)) if "-" in space else space
+    record = ImageRecord(data, "".join(axes[::-1]), units=units)
     record.convention = space[:3] if re.fullmatch("[LR][AP][SI]T?", space) else ""
     if vectors:
-        text, d = {"spacedirections": " ".join(vectors[k] for k in inside)}, vectors[inside[0]].count(",") + 1
-        columns = _numbers(path, text, "spacedirections", np.zeros((3, d)))[:, :3]
-        origin = _numbers(path, fields, "spaceorigin", np.zeros(d))[:3]
-        if d < 3:
-            raise ValueError(
-                f"path: {path}: space directions must be of 3 numbers; got {vectors[inside[0]][:80]}."
-            )
+        text = [vectors[k] for k in inside]
+        d = text[0].count(",") + 1
+        columns = _numbers({"spacedirections": " ".join(text)}, "spacedirections", np.zeros((3, d)))[:, :3]
+        origin = _numbers(fields, "spaceorigin", np.zeros(d))[:3]
+        check(d >= 3, f": space directions must be of 3 numbers; got {text[0][:80]}.")
         vars(record).update(grid_of(np.column_stack([columns.T, origin])))
     elif {"spacings", "axismins"} & fields.keys():
-        spacings = _numbers(path, fields, "spacings", np.ones(n))[inside]
-        if not np.all(spacings > 0):
-            raise ValueError(f"path: {path}: spacings must be positive, for 3 axes; got {spacings.tolist()}.")
+        spacings = _numbers(fields, "spacings", np.ones(n))[inside]
+        check(np.all(spacings > 0), f": spacings must be positive, for 3 axes; got {spacings.tolist()}.")
         record.steps = dict(zip("xyz", spacings.tolist(), strict=True))
-        first = 0 if "node" in fields.get("centers", fields.get("centerings", "")).lower() else spacings / 2
-        mins = _numbers(path, fields, "axismins", np.full(n, np.nan))[inside] + first
+        is_node = "node" in fields.get("centers", fields.get("centerings", "")).lower()
+        mins = _numbers(fields, "axismins", np.full(n, np.nan))[inside] + (0 if is_node else spacings / 2)
         record.origin = np.where(np.isfinite(mins), mins, 0.0)
     for key, value in fields.items():
-        if (found := re.fullmatch(r"segment(\d+)_labelvalue", key)) and value[1:].strip().isdigit():
-            record.labels = {
-                **record.labels,
-                int(value[1:]): fields.get(f"segment{found[1]}_name", "=?")[1:].strip(),
-            }
+        if re.fullmatch(r"segment\d+_labelvalue", key) and value[1:].strip().isdigit():
+            name = fields.get(key.replace("labelvalue", "name"), "=?")[1:].strip()
+            record.labels = {**record.labels, int(value[1:]): name}
     return record
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
     """The fields of the header; where it ends, and the file of the voxels, which may be missing."""
     fields, end = text_header(path, "=", "ElementDataFile")
-    named = fields.get("ElementDataFile")
-    if named is None:
-        raise ValueError(
-            f"path: {path} cannot be read: no header of a MetaImage, which ends in ElementDataFile."
-        )
+    no_header = "cannot be read: no header of a MetaImage, which ends in ElementDataFile."
+    check("ElementDataFile" in fields, no_header)
+    named = fields["ElementDataFile"]
     return fields, end, path if named.upper() == "LOCAL" else path.parent / named
 
 
 def read_metaimage(path: Path) -> ImageRecord:
     """Reader for `.mha` and `.mhd` of binary voxels, in LPS."""
-    file_size(path)
     fields, begin, source = metaimage_header(path)
-    shape, channels = _sizes(path, fields.get("DimSize", "")), fields.get("ElementNumberOfChannels", "1")
-    n, channels = len(shape), int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
-    check_volume(path, shape, channels)
+    channels = fields.get("ElementNumberOfChannels", "1")
+    channels = int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
+    shape = _sizes(fields.get("DimSize", ""), channels)
+    n = len(shape)
 
-    def flag(key: str, default: str = "F") -> bool:
-        return fields.get(key, default).lower().startswith(("t", "1"))
+    def flag(key: str) -> bool:
+        return fields.get(key, "").lower().startswith(("t", "1"))
 
-    kind, text = fields.get("ElementType", ""), fields.get("BinaryData", "True")
-    if kind not in META_TYPES or not flag("BinaryData", "T"):
-        expected = f"ElementType must be one of {', '.join(META_TYPES)}, and BinaryData true"
-        raise ValueError(f"path: {path}: {expected}; got {kind[:40]!r} and {text[:20]!r}.")
-    if not source.is_file():
-        named = shortened(str(source))
-        raise ValueError(f"path: {path} cannot be read: there is no file of its voxels, {named}.")
+    kind, text = fields.get("ElementType", ""), fields.setdefault("BinaryData", "True")
+    must = f"ElementType must be one of {', '.join(META_TYPES)}, and BinaryData true"
+    is_read = kind in META_TYPES and flag("BinaryData")
+    check(is_read, f": {must}; got {kind[:40]!r} and {text[:20]!r}.")
+    missing = f"cannot be read: there is no file of its voxels, {shortened(str(source))}."
+    check(source.is_file(), missing)
     if source != path:
-        begin = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file
-        if not re.fullmatch("-1|[0-9]{1,15}", begin):
-            raise ValueError(f"path: {path}: HeaderSize must be a number of bytes; got {begin[:40]!r}.")
-    big = any(flag(f"{prefix}ByteOrderMSB") for prefix in ("", "BinaryData", "Element"))
-    dtype, sizes = np.dtype(META_TYPES[kind]).newbyteorder(">" if big else "<"), shape[::-1]
-    sizes = [*sizes, channels] if channels > 1 else sizes
-    data = _voxels(path, source, int(begin), sizes, dtype, packed=flag("CompressedData"))
-    steps = _numbers(path, fields, "ElementSpacing ElementSize", np.ones(n))[:3].tolist()
-    origin = _numbers(path, fields, "Offset Position Origin", np.zeros(n))[:3]
+        size = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file
+        is_size = re.fullmatch("-1|[0-9]{1,15}", size)
+        check(is_size, f": HeaderSize must be a number of bytes; got {size[:40]!r}.")
+        begin = int(size)
+    is_big = any(flag(f"{prefix}ByteOrderMSB") for prefix in ("", "BinaryData", "Element"))
+    dtype, several = np.dtype(META_TYPES[kind]).newbyteorder(">" if is_big else "<"), channels > 1
+    packed, sizes = "zlib" if flag("CompressedData") else "", [*shape[::-1], *[channels] * several]
+    data = read_voxels(source, sizes, dtype, begin, packed, more=not packed or source == path)
+    steps = _numbers(fields, "ElementSpacing ElementSize", np.ones(n))[:3].tolist()
+    origin = _numbers(fields, "Offset Position Origin", np.zeros(n))[:3]
     # the axes of the data follow each other; here they are columns
-    turn = _numbers(path, fields, "TransformMatrix Rotation Orientation", np.eye(n)).T[:3, :3]
-    axes, steps = "xyztc"[:n][::-1] + "s" * (channels > 1), dict(zip("xyz", steps, strict=True))
+    turn = _numbers(fields, "TransformMatrix Rotation Orientation", np.eye(n)).T[:3, :3]
+    axes, steps = "xyztc"[:n][::-1] + "s" * several, dict(zip("xyz", steps, strict=True))
     unit = fields.get("DistanceUnits", "mm").strip("?") or "mm"
-    return ImageRecord(data, axes, steps, unit, origin, turn, "LPS", what=f"path: {path}")
+    return ImageRecord(data, axes, steps, unit, origin, turn, "LPS")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check_size, file_size, library, refusing
+from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check, check_size, file_size, library, refusing
 from ..._util.image_record import ImageRecord
 from ..._util.units import AXES
 
@@ -24,147 +24,136 @@ def read_tiff(path: Path) -> ImageRecord:
     """Reader for the first series of a file: axes are those of OME's XML, of ImageJ, or of tifffile's own
     metadata, and of plain pages z; lengths and scale are what OME or ImageJ wrote."""
     tifffile = library("tifffile", path)
-    file_size(path)
     with refusing(path):
         try:
             with tifffile.TiffFile(path) as file:
                 return _series(path, file, tifffile)
         except Exception as fault:
-            if "imagecodecs" in str(fault):
-                told = f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
-                raise ImportError(told) from fault
-            raise
+            if "imagecodecs" not in str(fault):
+                raise
+            told = f"reading {path} needs imagecodecs ({fault}): pip install 'jaxvol[io]'"
+            raise ImportError(told) from fault
 
 
 def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
     pixels: dict[str, Any] = _ome_pixels(path, file, tifffile) if file.is_ome else {}
     if not pixels:  # pages of OME may lie in other files
-        _check_last(path, file)
+        _check_last(file)
     several, first = list(file.series), file.pages[0].aspage()
-    series, kinds = several[0], {(each.shape, each.dtype) for each in several}
-    one_by_one = len(several) > 1 and len(kinds) == 1 and {*series.axes} <= {*"YXS"}
-    if (len(several) > 1 and not one_by_one) or not {*series.axes} <= {*"XYZTCSQIAPRHEV"} or not first.dtype:
-        told = "; ".join(f"{each.shape} ({each.axes})" for each in several[:4])
-        raise ValueError(
-            f"path: {path} must hold one stack of images of one size and type; got {len(several)} stacks, "
-            f"and pages of {len(kinds)} kinds: {told}. Choose one, as by tifffile.imread(path, series=0)."
-        )
-    axes, shape = series.axes, series.shape
-    if one_by_one or not {*axes} - {*"YXS"}:
+    axes, kinds = several[0].axes, {(each.shape, each.dtype) for each in several}
+    one_by_one = len(several) > 1 and len(kinds) == 1 and {*axes} <= {*"YXS"}
+    is_stack = (len(several) == 1 or one_by_one) and {*axes} <= {*"XYZTCSQIAPRHEV"} and first.dtype
+    told = "; ".join(f"{each.shape} ({each.axes})" for each in several[:4])
+    must, got = "must hold one stack of images of one size and type", f"got {len(several)} stacks"
+    hint = "Choose one, as by tifffile.imread(path, series=0)."
+    check(is_stack, f"{must}; {got}, and pages of {len(kinds)} kinds: {told}. {hint}")
+    record, shape = ImageRecord(None, ""), several[0].shape
+    if not {*axes} - {*"YXS"}:
         axes, shape = "I" + axes, (len(several), *shape)
-    record, further = ImageRecord(None, "", what=f"path: {path}"), [a for a in axes if a not in "YXS"]
+    further = [a for a in axes if a not in "YXS"]
     if len(further) == 1 and not pixels:  # ImageJ's stacks may be of times
-        _ = record.note(f"axis {further[0]}: taken as z") if further[0] in "TC" and file.is_shaped else None
+        if further[0] in "TC" and file.is_shaped:
+            record.note(f"axis {further[0]}: taken as z")
         axes = axes.replace(further[0], "Z")
     free = iter(letter for letter in "ZTC" if letter not in axes)
-    axes = "".join(a if a in "ZTCYXS" else next(free, a) for a in axes[::-1])[::-1]  # the fastest is z
-    pages = len(series.pages) * len(several)
-    missing = sum(page is None for page in series.pages) if pixels else 0
-    if missing:
-        record.note(f"{missing} of {pages} planes are not in the file: filled with 0")
-    if not 0 < math.prod(shape) < 2**62:
-        raise ValueError(f"path: {path} must hold images; its header says {shape}.")
+    record.axes = "".join(a if a in "ZTCYXS" else next(free, a) for a in axes[::-1])[::-1]  # the fastest is z
+    pages = [page for each in several for page in each.pages]
+    held = [page for page in pages if page is not None or not pixels]
+    if missing := len(pages) - len(held):
+        record.note(f"{missing} of {len(pages)} planes are not in the file: filled with 0")
+    check(0 < math.prod(shape) < 2**62, f"must hold images; its header says {shape}.")
     packed = first.compression != 1 or first.bitspersample < 8 * first.dtype.itemsize
-    files = {page.parent.filehandle.path for page in series.pages if page is not None} if pixels else {path}
-    held = sum(Path(each).stat().st_size for each in files) * (MOST_COMPRESSED if packed else 1)
-    check_size(path, held, math.prod(shape) * first.dtype.itemsize * (pages - missing) // pages, more=True)
-    strips = [n for each in several for page in each.pages if page is not None for n in page.databytecounts]
-    check_size(path, held, max(strips, default=0), more=True)  # of which tifffile reads as many
-    data = np.stack([each.asarray() for each in several]) if one_by_one else series.asarray()
-    record.data, record.axes = data.reshape(shape), axes
-    record.missing = (float(first.nodata),) if "GDAL_NODATA" in first.tags else ()
-    for role, name in (("scale", "slope"), ("offset", "intercept")) if "GDAL_METADATA" in first.tags else ():
-        if found := re.search(rf'role="{role}"[^>]*>([^<]+)<', str(first.tags["GDAL_METADATA"].value)):
+    files = {page.parent.filehandle.path for page in held if page is not None} if pixels else {path}
+    size = sum(Path(each).stat().st_size for each in files) * (MOST_COMPRESSED if packed else 1)
+    check_size(size, math.prod(shape) * first.dtype.itemsize * len(held) // len(pages), more=True)
+    strips = [n for page in held if page is not None for n in page.databytecounts]
+    check_size(size, max(strips, default=0), more=True)  # of which tifffile reads as many
+    arrays = [each.asarray() for each in several]
+    record.data = (np.stack(arrays) if one_by_one else arrays[0]).reshape(shape)
+    _calibrate(record, file, first, pixels)
+    return record
+
+
+def _calibrate(record: ImageRecord, file: Any, first: Any, pixels: dict[str, Any]) -> None:
+    """Set the scale of a record as GDAL or ImageJ wrote it, and steps as ImageJ or OME did: ImageJ leaves out
+    a step of 1 along z."""
+    if "GDAL_NODATA" in first.tags:
+        record.missing = (float(first.nodata),)
+    gdal = str(first.tags["GDAL_METADATA"].value) if "GDAL_METADATA" in first.tags else ""
+    for role, name in (("scale", "slope"), ("offset", "intercept")):
+        if found := re.search(rf'role="{role}"[^>]*>([^<]+)<', gdal):
             setattr(record, name, float(found[1]))
     told = (file.imagej_metadata or {}) if file.is_imagej else {}
     if told.get("cf") == 0:  # a line; 20 and 22 are none
         record.slope, record.intercept = float(told.get("c1", 1)), float(told.get("c0", 0))
     elif told.get("cf", 20) not in (20, 22):
         record.note(f"ImageJ's calibration function {told['cf']} is not read: stored numbers are shown")
-    steps, units = _imagej_steps(told, first.tags)
+    units = {axis: told.get(f"{axis}unit", told.get("unit")) for axis in "xyz"}
+    steps = {"z": float(told.get("spacing", 1.0))} if {"spacing", "unit"} & told.keys() else {}
+    for axis in "xy" if steps else "":
+        tag = first.tags.get(f"{axis.upper()}Resolution")
+        numerator, denominator = tag.value if tag else (0, 1)
+        steps |= {axis: denominator / numerator} if numerator > 0 else {}
     if pixels:
         steps = {a.lower(): float(pixels[f"PhysicalSize{a}"]) for a in "XYZ" if f"PhysicalSize{a}" in pixels}
         units = {a.lower(): pixels.get(f"PhysicalSize{a}Unit", "µm") for a in "XYZ"}
     if all(0 < abs(step) < math.inf for step in steps.values()):
         record.steps, record.units = {axis: abs(step) for axis, step in steps.items()}, units
-    return record
 
 
 def _ome_pixels(path: Path, file: Any, tifffile: Any) -> dict[str, Any]:
     """The pixels of the first image of OME's XML. Raises `ValueError` for a file of it that is not there."""
     own = re.search(r'<OME [^>]*UUID="([^"]*)"', file.ome_metadata)
     for name, uuid in {*re.findall(r'<UUID FileName="([^"]*)">\s*([^<\s]*)', file.ome_metadata)}:
-        is_other = own is None or uuid != own[1]
-        if is_other and (Path(name).name != name or not (path.parent / name).is_file()):
-            raise ValueError(f"path: {path} is one of several files of an image: {name} is not beside it.")
+        is_here = (own and uuid == own[1]) or (Path(name).name == name and (path.parent / name).is_file())
+        check(is_here, f"is one of several files of an image: {name} is not beside it.")
     image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
     return (image[0] if isinstance(image, list) else image)["Pixels"]
 
 
-def _imagej_steps(told: dict[str, Any], tags: Any) -> tuple[dict[str, float], dict[str, str | None]]:
-    """Steps and units of ImageJ, which leaves out a step of 1 along z; none where it tells neither."""
-    units = {axis: told.get(f"{axis}unit", told.get("unit")) for axis in "xyz"}
-    steps = {"z": float(told.get("spacing", 1.0))} if {"spacing", "unit"} & told.keys() else {}
-    for axis in "xy" if steps else "":
-        numerator, denominator = tags[name].value if (name := f"{axis.upper()}Resolution") in tags else (0, 1)
-        steps |= {axis: denominator / numerator} if numerator > 0 else {}
-    return steps, units
-
-
-def _check_last(path: Path, file: Any) -> None:
-    """Raises `ValueError` if more pages follow: tifffile leaves out what lies beyond the file's end."""
+def _check_last(file: Any) -> None:
+    """Refuse a file if more pages follow: tifffile leaves out what lies beyond the file's end."""
     format, handle = file.tiff, file.filehandle
     handle.seek(file.pages[-1].aspage().offset)
     (tags,) = struct.unpack(format.tagnoformat, handle.read(format.tagnosize))
     handle.seek(tags * format.tagsize, 1)
     following = handle.read(format.offsetsize)
-    if len(following) < format.offsetsize or any(following):
-        raise ValueError(f"path: {path} is cut short: after {len(file.pages)} images, the next is not there.")
+    is_last = len(following) == format.offsetsize and not any(following)
+    check(is_last, f"is cut short: after {len(file.pages)} images, the next is not there.")
 
 
 def slice_files(folder: Path) -> list[Path]:
     """The images in a folder, of the ending that most have, with numbers in their names in numeric order."""
-    images = [
-        file for file in folder.iterdir() if file.suffix.lower() in ENDINGS + PICTURES and file.is_file()
-    ]
-    kinds = [
-        [file for file in images if file.suffix.lower() in kind]
-        for kind in (ENDINGS, *((e,) for e in PICTURES))
-    ]
-    return sorted(max(kinds, key=len), key=_words)
+    files = [file for file in folder.iterdir() if file.is_file()]
+    kinds = (ENDINGS, *((ending,) for ending in PICTURES))
+    groups = [[file for file in files if file.suffix.lower() in kind] for kind in kinds]
+    return sorted(max(groups, key=len), key=_words)
 
 
 def _words(file: Path) -> list[Any]:
-    words: list[Any] = re.split(r"([0-9]+)", file.stem.lower())
-    words[1::2] = map(int, words[1::2])
-    return words
+    """The name of a file without ending, cut into words and the numbers between them."""
+    words = re.split(r"([0-9]+)", file.stem.lower())
+    return [int(word) if k % 2 else word for k, word in enumerate(words)]
 
 
 def read_slices(folder: Path) -> ImageRecord:
     """Reader for a folder of files of one image each, in the order of the numbers in their names; where two
-    of these count, one is that of channels or times. Raises `ValueError` naming the files for images of
-    different sizes or types, for a number that is missing, and for names that count in another way."""
-    files = slice_files(folder)
-    axes, counts, files = _counted(folder, files)
-    slices: list[np.ndarray] = []
-    record = ImageRecord(None, "", what=f"path: {folder}")
+    of these count, one is that of channels or times. Refuses images of different sizes or types, a number
+    that is missing, and names that count in another way."""
+    axes, counts, files = _counted(folder, slice_files(folder))
+    record, planes = ImageRecord(None, axes), list[np.ndarray]()
     for file in files:
         image = read_tiff(file) if file.suffix.lower() in ENDINGS else _picture(file)
         plane = image.decode(np.asarray(image.data))[0]
-        record.steps, record.units = (record.steps, record.units) if slices else (image.steps, image.units)
-        slices.append(plane)
-        first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (slices[0], plane))
-        if (
-            image.axes not in ("ZYX", "ZYXS")
-            or first != last
-            or len(files) * plane.size > MOST_VOXELS
-            or len(plane) > 1
-        ):
-            raise ValueError(
-                f"path: each file in {folder} must hold one image of the same size and type, fewer than "
-                f"2**31 voxels in all; {files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
-            )
-    record.data = np.concatenate(slices).reshape(*counts, *slices[0].shape[1:])
+        record.steps, record.units = (record.steps, record.units) if planes else (image.steps, image.units)
+        planes.append(plane)
+        first, last = (f"{each.shape[1:]} of {each.dtype}" for each in (planes[0], plane))
+        must = f"path: each file in {folder} must hold one image of the same size and type, fewer than 2**31"
+        got = f"{files[0].name} has {first}, and {file.name} {len(plane)} of {last}."
+        is_image = image.axes in ("ZYX", "ZYXS") and len(plane) == 1
+        is_alike = is_image and first == last and len(files) * plane.size <= MOST_VOXELS
+        check(is_alike, f"{must} voxels in all; {got}")
+    record.data = np.concatenate(planes).reshape(*counts, *planes[0].shape[1:])
     record.axes = axes + "yxs"[: record.data.ndim - len(axes)]
     return record
 
@@ -173,44 +162,36 @@ def _picture(path: Path) -> ImageRecord:
     """One PNG or JPEG, by Pillow."""
     from PIL import Image
 
-    file_size(path)
+    size = file_size(path)
     with refusing(path), Image.open(io.BytesIO(path.read_bytes())) as image:  # lengths within it may be any
-        if image.width * image.height > path.stat().st_size * MOST_COMPRESSED:
+        if image.width * image.height > size * MOST_COMPRESSED:
             raise ValueError(f"its header says {image.size}, more than its bytes can hold")
         data = np.asarray(image)
-    return ImageRecord(data[None], "ZYX" + "S" * (data.ndim > 2))
+    return ImageRecord(data[None], "ZYXS"[: data.ndim + 1])
 
 
 def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Sequence[Path]]:
     """Axes that the names of files count, sizes along them, and the files in their order."""
-    words = {file: _words(file) for file in files}
+    words, elsewhere = {file: _words(file) for file in files}, "Put each series into a folder of its own."
     patterns = Counter("#".join(each[::2]) for each in words.values())
-    elsewhere = "Put each series into a folder of its own."
-    if len(patterns) > 1 and min(patterns.values()) > 1:
-        told = ", ".join(f"{count} named {pattern}" for pattern, count in patterns.most_common(4))
-        raise ValueError(f"path: {folder} holds {len(patterns)} series of images: {told}. {elsewhere}")
+    told = ", ".join(f"{count} named {pattern}" for pattern, count in patterns.most_common(4))
+    is_one = len(patterns) == 1 or min(patterns.values()) == 1
+    check(is_one, f"holds {len(patterns)} series of images: {told}. {elsewhere}")
     numbers = [] if len(patterns) > 1 else [*zip(*(each[1::2] for each in words.values()), strict=True)]
     sizes = {k: len({*column}) for k, column in enumerate(numbers) if len({*column}) > 1}
     unique = [k for k, size in sizes.items() if size == len(files)]
     if len(sizes) > 1 and not unique:
-        names = ([*re.findall("[a-z]+", words[files[0]][2 * k]), ""][-2:][0] for k in sizes)
-        letters = [
-            "c" if name == "w" or AXES.get(name) == "c" else "t" if AXES.get(name) == "t" else "z"
-            for name in names
-        ]
-        if len({*letters}) < len(letters) or math.prod(sizes.values()) != len(files):
-            n = max(sizes.values())
-            raise ValueError(
-                f"path: {folder} holds {len(files) // n} series of {n} images: names such as {files[0].name} "
-                f"and {files[-1].name} count by {len(sizes)} numbers. {elsewhere}"
-            )
-        return (
-            "".join(letters),
-            [*sizes.values()],
-            sorted(files, key=lambda file: [words[file][2 * k + 1] for k in sizes]),
-        )
-    steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else []
-    if len({*steps}) > 1 and min(steps) > 0:
-        before, after = files[int(np.argmax(steps))], files[int(np.argmax(steps)) + 1]
-        raise ValueError(f"path: slices are missing in {folder}: {before.name} is followed by {after.name}.")
+        before = [([*re.findall("[a-z]+", words[files[0]][2 * k]), ""][-2:])[0] for k in sizes]
+        axes = ["c" if name == "w" else AXES.get(name, "z") for name in before]
+        axes = [axis if axis in "ct" else "z" for axis in axes]
+        n = max(sizes.values())
+        names = f"names such as {files[0].name} and {files[-1].name} count by {len(sizes)} numbers"
+        is_grid = len({*axes}) == len(axes) and math.prod(sizes.values()) == len(files)
+        check(is_grid, f"holds {len(files) // n} series of {n} images: {names}. {elsewhere}")
+        files = sorted(files, key=lambda file: [words[file][2 * k + 1] for k in sizes])
+        return "".join(axes), [*sizes.values()], files
+    steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else [1]
+    before, after = (files[min(steps.index(max(steps)) + k, len(files) - 1)].name for k in (0, 1))
+    is_whole = len({*steps}) <= 1 or min(steps) <= 0
+    check(is_whole, f"path: slices are missing in {folder}: {before} is followed by {after}.")
     return "z", [len(files)], files
