@@ -345,8 +345,6 @@ def entering(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], sear
     def one(line: Line) -> Ray:
         return enter(space, *line)
 
-    if space.searches:
-        ray = jax.lax.map(jax.vmap(one), lines, batch_size=searched)
-    else:
-        ray = vmap_rays(one)(lines)
+    mapped = partial(jax.lax.map, jax.vmap(one), batch_size=searched) if space.searches else vmap_rays(one)
+    ray = mapped(lines)
     return eqx.tree_at(lambda ray: ray.length, ray, jnp.where(wanted, ray.length, 0))

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import subprocess
 import sys
 from typing import Any
 
@@ -253,6 +254,13 @@ def test_load_reads_the_finest_level_that_fits(tmp_path, monkeypatch):
     np.testing.assert_array_equal(load(tmp_path / "a", channel=1).data, data[1])
     with pytest.raises(ValueError, match="channel must be given, from 0 to 1"):
         load(tmp_path / "a")
+
+
+def test_load_knows_zarr_before_anything_else_of_jaxvol_is_used(tmp_path):
+    zarr.create_array(tmp_path / "a.zarr", data=np.ones((3, 4, 5), np.uint8))
+    code = "import sys, jaxvol as jv; print(jv.load(sys.argv[1]).shape)"
+    ran = subprocess.run([sys.executable, "-c", code, tmp_path / "a.zarr"], capture_output=True, text=True)
+    assert ran.stdout.strip() == "(3, 4, 5)", ran.stderr[-500:]
 
 
 def test_levels_must_become_coarser(tmp_path):

@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ READERS |= dict.fromkeys(known.HDF5, known.read_hdf5)
 VAGUE = (".img", ".hdf", *known.MRC[1:])  # of voxels without a header, too, if the caller describes these
 
 FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
-"""What knows a kind of folder, and its reader. `bricks.opening` adds that of Zarr."""
+"""What knows a kind of folder, and its reader. `bricks.opening`, imported where a folder is read, adds Zarr's."""
 
 
 def load(
@@ -112,6 +113,8 @@ def read_record(
     """What a file or folder holds, and says of it. Arguments: as for `load`."""
     path, name = _existing(path)
     lower, given = path.name.lower(), shape is not None or dtype is not None or offset
+    if path.is_dir():
+        import_module("jaxvol.bricks.opening")  # if nothing else has
     folder = next((read for knows, read in FOLDERS if path.is_dir() and knows(path)), None)
     ending = next((ending for ending in READERS if lower.endswith(ending)), None)
     is_slices = (path.is_file() and is_dicom(path)) or lower.endswith(".dcm") or lower == "dicomdir"
