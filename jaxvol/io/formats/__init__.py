@@ -37,7 +37,7 @@ READERS |= dict.fromkeys(known.HDF5, known.read_hdf5)
 VAGUE = (".img", ".hdf", *known.MRC[1:])  # of voxels without a header, too, if the caller describes these
 
 FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
-"""What knows a kind of folder, and its reader. `bricks.opening`, imported where a folder is read, adds Zarr's."""
+"""What knows a kind of folder, and its reader. `bricks.opening`, imported where one is read, adds Zarr."""
 
 
 def load(
