@@ -166,8 +166,12 @@ def _read(file: Path) -> tuple[bytes, export.Exported] | None:
 def _write(file: Path, result: bytes, program: bytes) -> None:
     rest = result + b"\n" + program
     with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
-        part.write(MAGIC + hashlib.sha256(rest).digest() + rest)
-    os.replace(part.name, file)  # appears whole, also for processes that write it at the same time
+        try:
+            part.write(MAGIC + hashlib.sha256(rest).digest() + rest)
+            part.close()
+            os.replace(part.name, file)  # appears whole, also for processes that write it at the same time
+        finally:
+            Path(part.name).unlink(missing_ok=True)
 
 
 @cache
