@@ -59,7 +59,7 @@ from .march.transforms import (
     ToroidalMap as ToroidalMap,
 )
 from .path_tracing import PathTraced as PathTraced, path_trace as path_trace
-from .planning import Plan as Plan, fastest_leaping as fastest_leaping, plan as plan
+from .planning import Plan as Plan, plan as plan
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .scene.camera import Camera as Camera

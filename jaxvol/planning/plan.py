@@ -160,8 +160,7 @@ def plan(
       not within the tolerance at an eighth of a voxel, or seems not to get there; it is kept where it is
       faster, by what a sample costs on CPU.
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
-      0 have no gradient from what is leapt over. `fastest_leaping` measures which of its methods is the
-      fastest.
+      0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: always kept.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
