@@ -55,6 +55,19 @@ def planned():
     return plan_of()
 
 
+def test_a_plan_without_parts_is_printed_and_rendered():
+    march = jv.March(0.1, max_samples=4)
+    found = jv.Plan(march, SPHERE, None, TOLERANCE, 0.01, 9.0, (), 0.0)
+    assert "step 0.1" in str(found)
+    given = soft_transfer(), CAMERA
+    image = jv.render(SPHERE, *given, march)
+    np.testing.assert_array_equal(found.render(*given).rgba, image.rgba)
+    with pytest.raises(ValueError, match=r"transfer must be .* That is the camera"):
+        found.render(*given[::-1])
+    with pytest.raises(ValueError, match="options must be outputs and devices; got output"):
+        found.render(*given, output="rgba")
+
+
 def test_something_that_lies_beside_all_patches_is_found():
     """A single voxel, in an image of which two thirds of the patches are known: with another seed, too."""
     data = np.zeros(SPHERE.shape, np.float32)
