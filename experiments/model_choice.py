@@ -115,11 +115,16 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
         camera = jv.Camera(position, (0, 0, 0), (0, 0, 1), 32, size=(size, size))
         image = jv.render(*problem.scene(parameters, camera)).image()
         views.append((camera, np.asarray(image) + noise * generator.normal(size=image.shape)))
-    residual = jv.ImageResidual(problem.scene, views[:SEEN])
-    choice = jv.choose(residual, problem.candidates, views[SEEN:], block=1, max_steps=40)
+
+    def residual(some: list[Any]) -> jv.ImageResidual:
+        return jv.ImageResidual(problem.scene, some)
+
+    how: dict[str, Any] = {"views": views[:SEEN], "block": 1, "max_steps": 40}
+    choice = jv.choose(residual, problem.candidates, views[SEEN:], **how)
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
     # of independent Gaussian residuals of one unknown variance; losses below -80 dB count as equal
-    count, least = residual.references.count, (1e-4 * residual.references.scale()) ** 2
+    references = residual(views[:SEEN]).references
+    count, least = references.count, (1e-4 * references.scale()) ** 2
     rows = [
         {
             "name": row.name,

@@ -31,7 +31,6 @@ from .fitting import (
     choose as choose,
     fit as fit,
     fit_coarse_to_fine as fit_coarse_to_fine,
-    fit_in_stages as fit_in_stages,
     flat_grey as flat_grey,
     nested_materials as nested_materials,
     nested_points as nested_points,

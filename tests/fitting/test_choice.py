@@ -225,9 +225,9 @@ def scene(transfer, camera):
     return VOLUME, transfer, camera, MARCH
 
 
-def blank(direction, value=0.0):
+def blank(direction):
     """A view that nothing was rendered for."""
-    return jv.Camera.looking_at(VOLUME, direction, size=(7, 6)), np.full((6, 7, 3), value, np.float32)
+    return jv.Camera.looking_at(VOLUME, direction, size=(7, 6)), np.zeros((6, 7, 3), np.float32)
 
 
 SEEN = [blank(direction) for direction in DIRECTIONS]
@@ -244,9 +244,13 @@ def test_control_points_are_counted_from_images():
         noisy = [(view, image + 0.02 * rng.normal(size=image.shape)) for view, image in clear]
         for views in (noisy, clear):
             rows, columns = np.indices((6, 7))
+            masks = dict(zip(map(id, views), [None, None, columns > 0, rows > 1], strict=True))
+
+            def residual(some, masks=masks):
+                return jv.ImageResidual(scene, some, weights=[masks[id(view)] for view in some])
+
             masked = [columns > 0, rows > 1]
-            training = jv.ImageResidual(scene, views[:2])
-            choice = jv.choose(training, models, views[2:], weights=masked, max_steps=20)
+            choice = jv.choose(residual, models, views[2:], views=views[:2], max_steps=20)
             assert choice.name == f"{len(points)} points"
             assert [row.numbers for row in choice.candidates] == [2, 3]
             # the loss of an image is half its mean square error, and that of several is their mean
@@ -280,10 +284,6 @@ def given(*candidates, **changes):
     return lambda: jv.choose(arguments.pop("residual", polynomial), **arguments)
 
 
-def of_images(held_out, **how):
-    return lambda: jv.choose(jv.ImageResidual(scene, SEEN[:2]), jv.nested_points(PLAIN), held_out, **how)
-
-
 def merged(parts, partitions):
     return lambda: jv.nested_materials(parts, partitions)
 
@@ -298,16 +298,15 @@ BAD = [
     (given(candidates=[]), "candidates must be a list of at least one"),
     (given(candidates=POLYNOMIALS[0]), "candidates must be a list"),
     (given(3), r"candidates\[0\] must be a Candidate; got 3"),
-    (given(one("b", 2), one("a", 1)), "candidates must be in order, .*'a' has 1, and 'b' 2"),
-    (given(one("b", 2), one("a", 2)), "'a' has 2, and 'b' 2"),
-    (given(*POLYNOMIALS[1:]), r"candidates\[0\], '2', must have a start, or, after the first, grow"),
-    (given(one("1", 1), jv.Candidate("b", zeros(2), one_more)), r"\[1\], 'b', must have a start, or"),
-    (given(held_out=NOISY[3:]), r"held_out\[0\] must not be among .*; it is the same as number 3"),
-    (given(held_out=[tuple(map(np.array, NOISY[1]))]), r"held_out\[0\] must not be among .* number 1"),
-    (of_images([SEEN[2], blank(DIRECTIONS[1], 0.1)]), r"held_out\[1\] must not be among .* number 1"),
-    (of_images(SEEN[2:], views=SEEN[:2]), "views must not be given with an ImageResidual"),
+    (given(one("b", 2), one("a", 1)), "candidates must be in order, .*'a', has 1 after 2"),
+    (given(one("b", 2), one("a", 2)), "'a', has 2 after 2"),
+    (given(*POLYNOMIALS[1:]), r"candidates\[0\] must have a start, or, after the first, grow"),
+    (given(one("1", 1), jv.Candidate("b", zeros(2), one_more)), r"\[1\] must have a start, or"),
+    (given(held_out=NOISY[3:]), "held_out must not be among the views that are fitted"),
+    (given(held_out=[tuple(map(np.array, NOISY[1]))]), "held_out must not be among the views"),
+    (given(residual=jv.ImageResidual(scene, SEEN)), "residual must be a function of a list of views; got"),
     (given(views=None), "views must be a list of at least one; got None"),
-    (given(residual=3), "residual must be an ImageResidual"),
+    (given(residual=3), "residual must be a function of a list of views; got 3"),
     (given(errors=-1), "errors must not be negative; got -1"),
     (given(block=0), "block must be an integer of at least 1; got 0"),
     (given(where=np.sum, constraints=None), "constraints and where must be given with each Candidate"),
