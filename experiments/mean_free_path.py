@@ -160,7 +160,7 @@ class Scene:
         return self.volume, self.medium(given), camera, self.march, lit
 
     def transport(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
-        how: dict[str, Any] = {"form": "transport", "baked": self.nodes, "levels": self.levels}
+        how: dict[str, Any] = {"form": "transport", "nodes": self.nodes, "levels": self.levels}
         lit = ScattererTemplates(given["materials"], lights(given["brightness"]), seed=self.seed, **how)
         return self.volume, self.medium(given), camera, self.fine, lit
 

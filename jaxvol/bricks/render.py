@@ -85,7 +85,7 @@ def render_bricks(
             `memory` goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
             (`bricks.traversal.Schedule`).
         compositing: as for `render`.
-        lighting: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
+        lighting: `Phong`, `ScattererTemplates` as published, or another one that says how far it reads
             (`Lighting.farthest_read`).
         outputs: as for `render`.
         level: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
@@ -108,7 +108,7 @@ def render_bricks(
     Raises:
         ValueError: naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
             whose file changed; for less memory than the smallest bricks take; for what needs the whole volume
-            at once (labels, baked or deferred light); and for what cannot be had with `own="bricks"`.
+            at once (labels, light by transport); and for what cannot be had with `own="bricks"`.
 
     It has no gradients, since it reads its source while it runs; nor can it be called inside `jax.jit` or
     `jax.vmap`. Fit with `render` to a copy that fits (`VoxelSource.subsampled`).

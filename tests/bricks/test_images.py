@@ -151,7 +151,11 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
     ({"march": jv.March(1.0, (jv.SpaceLeaping("distance", block=1),))}, "block=1. needs the whole volume"),
     (
-        {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), DirectionalLight((1, 0, 0)), baked=True)},
+        {
+            "lighting": ScattererTemplates(
+                jv.Material(0.5, 1.0, 1.4), DirectionalLight((1, 0, 0)), form="transport"
+            )
+        },
         "farthest_read",
     ),
     ({"compositing": "over!"}, "compositing must be one of"),

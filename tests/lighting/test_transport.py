@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ import pytest
 import jaxvol as jv
 from jaxvol.lighting import (
     ConstantLight,
-    Deferred,
     DirectionalLight,
     Material,
     PointLight,
@@ -27,6 +27,7 @@ from jaxvol.lighting import (
 from jaxvol.lighting.materials import shares
 from jaxvol.lighting.medium import FADE, scattering_at
 from jaxvol.lighting.shading import Surroundings
+from jaxvol.lighting.template_lighting import with_baked_light
 
 from ..scenes import in_float64
 
@@ -70,7 +71,7 @@ def materials(outer: float, inner: float, opacity: float = 0.1) -> tuple[Materia
 
 
 def light_of(of_materials: Any, lights: Any, **how: Any) -> ScattererTemplates:
-    how = {"baked": NODES, "levels": LEVELS} | how
+    how = {"nodes": NODES, "levels": LEVELS} | how
     return ScattererTemplates(of_materials, lights, form="transport", **how)
 
 
@@ -338,8 +339,8 @@ def test_light_is_computed_once_for_all_images_of_a_scene(monkeypatch):
     from jaxvol.lighting import template_lighting
 
     calls = []
-    solved = template_lighting._baked
-    monkeypatch.setattr(template_lighting, "_baked", lambda *given: calls.append(1) or solved(*given))
+    solved = template_lighting._solved
+    monkeypatch.setattr(template_lighting, "_solved", lambda *given: calls.append(1) or solved(*given))
     scene = nested(), transfer(0.8, (1.0, 1.0, 1.0)), light_of(materials(1.2, 0.8, 0.0), lit(SKY))
     first, again = (np.asarray(image(*scene)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
@@ -348,13 +349,15 @@ def test_light_is_computed_once_for_all_images_of_a_scene(monkeypatch):
     assert len(calls) == 2
 
 
-@pytest.mark.slow
-def test_a_ray_that_sees_one_surface_is_lit_alike_where_it_is_shaded_once():
-    volume, function = nested(), transfer(60.0)
-    lighting = light_of(materials(1 / 60, 1 / 60), lit(SUN))
-    whole, once = (np.asarray(image(volume, function, one)) for one in (lighting, Deferred(lighting)))
-    middle = whole[3:5, 3:5]
-    np.testing.assert_allclose(once[3:5, 3:5].mean(), middle.mean(), rtol=0.25)
+def test_light_that_was_computed_inside_a_program_serves_outside():
+    scene = nested(), transfer(0.8), MARCH
+
+    def prepared():
+        lighting = light_of(materials(1.2, 0.8), lit(SUN), nodes=2, levels=1, templates=1, packets=1)
+        return jax.tree.leaves(with_baked_light(lighting, *scene))
+
+    jax.eval_shape(lambda x: (prepared(), x)[1], 0.0)
+    assert not any(isinstance(leaf, jax.core.Tracer) for leaf in prepared())
 
 
 @pytest.mark.parametrize(
