@@ -14,7 +14,6 @@ from .._util.checks import flag, integer, number
 from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..engine.acceleration import visible_in_numpy
-from ..engine.image import render_scene
 from ..engine.stages import space_of
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
@@ -52,52 +51,25 @@ class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
     Attributes:
-        march: what to pass to `render`, with `volume`, `lighting` and `compositing`.
-        volume: as given.
-        lighting: as given.
+        march: what to pass to `render`, with the same scene.
         tolerance: as given.
         error: predicted, on the safe side; above the tolerance where nothing could be proven.
         samples: predicted for each pixel.
         parts: what was kept or left out, and why.
         probed: seconds that planning took, compilation included.
-        compositing: as given.
     """
 
     march: March
-    volume: Volume
-    lighting: Lighting | None
     tolerance: float
     error: float
     samples: float
     parts: tuple[Part, ...]
     probed: float
-    compositing: Compositing[Any] = Over()
 
     @property
     def within(self) -> bool:
         """Whether the predicted error is within the tolerance."""
         return self.error <= self.tolerance
-
-    def render(self, transfer: Transfer | Any, camera: Camera | Any, **options: Any) -> Rendering:
-        """The image as planned.
-
-        Args:
-            transfer: as for the plan.
-            camera: as for the plan.
-            options: `outputs` and `devices`, as for `render`.
-
-        Returns:
-            As `render`.
-
-        Raises:
-            ValueError: as `render` does, and for other options.
-        """
-        if unknown := sorted(options.keys() - {"outputs", "devices"}):
-            raise ValueError(f"options must be outputs and devices; got {', '.join(unknown)}.")
-        transfer = sized(transfer, self.volume)
-        check_arguments("render(transfer, camera)", transfer=transfer, camera=camera)
-        scene = Scene(self.volume, transfer, camera, self.march, self.compositing, self.lighting)
-        return render_scene(scene, options.get("outputs", "all"), "replay", devices=options.get("devices"))
 
     def __str__(self) -> str:
         transforms = ", ".join(type(each).__name__ for each in self.march.transforms) or "no transform"
@@ -231,14 +203,11 @@ def plan(
         parts.append(Part("EarlyTermination", bool(share), f"{opaque:.1%} of the pixels become opaque"))
     return Plan(
         march=march,
-        volume=volume,
-        lighting=lighting,
         tolerance=tolerance,
         error=max(chosen.error + share, unseen),
         samples=chosen.samples,
         parts=tuple(parts),
         probed=time.perf_counter() - begun,
-        compositing=scene.compositing,
     )
 
 

@@ -218,7 +218,7 @@ def plans(monkeypatch):
         longer = not how["once"] and len(made) % 2
         step = (0.9, how["transforms"], "preintegrated") if longer else (0.7, how["transforms"])
         march, parts = jv.March(*step), (Part("leaps", False, "nothing is empty"),)
-        found = Plan(march, volume, how["lighting"], tolerance, 0.02 - tolerance, 9.0, parts, 1.0)
+        found = Plan(march, tolerance, 0.02 - tolerance, 9.0, parts, 1.0)
         made.append((volume, transfer, camera, tolerance, how))
         return found
 
