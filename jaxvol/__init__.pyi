@@ -32,7 +32,6 @@ from .fitting import (
     fit as fit,
     fit_coarse_to_fine as fit_coarse_to_fine,
     flat_grey as flat_grey,
-    nested_materials as nested_materials,
     nested_points as nested_points,
     read_transfer as read_transfer,
     read_views as read_views,

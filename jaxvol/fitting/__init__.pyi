@@ -13,7 +13,6 @@ from .bijections import (
 from .candidates import (
     Candidate as Candidate,
     flat_grey as flat_grey,
-    nested_materials as nested_materials,
     nested_points as nested_points,
     refined as refined,
 )

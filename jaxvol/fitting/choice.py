@@ -125,7 +125,7 @@ def choose(
     Args:
         residual: `residual(views)`, from a list of views, of any kind, to what `fit` takes.
         candidates: nested models, each with more free parameters than the one before, such as
-            `nested_points` and `nested_materials` make.
+            `nested_points` makes.
         held_out: views that none is fitted to.
         views: the training views.
         errors: standard errors of the difference up to which a candidate is not significantly worse, ≥ 0. If

@@ -102,12 +102,6 @@ FAULTS: list[Fault] = [
         ("fitting/test_choice.py::test_the_truth_is_chosen_in_nine_of_ten_noisy_trials",),
     ),
     Fault(
-        "choice: larger models start from the beginning",
-        "fitting.candidates:_grow",
-        lambda grow: lambda expand, classes, found: grow(lambda _: expand.args[0], classes, found),
-        ("fitting/test_choice.py::test_materials_share_what_they_have_in_common",),
-    ),
-    Fault(
         "plan: an error that is known from a part of the image is taken as it is",
         "planning.probe:CONFIDENT",
         lambda errors: 0.0,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments.model_choice import nested_materials
 from jaxvol.fitting.choice import standard_error
 
 
@@ -181,36 +182,22 @@ def test_a_refined_transfer_function_is_the_same_function():
     np.testing.assert_allclose(even.values, np.linspace(0, 1, 9), atol=1e-7)
 
 
-def grown_from(candidate, found):
-    assert candidate.start is None
-    assert candidate.grow is not None
-    return candidate.grow(found)
-
-
 def test_materials_share_what_they_have_in_common():
     parts = [jv.Material(0.5, path, values=(at, at + 1)) for at, path in enumerate((0.1, 0.2, 0.3))]
-    one, two, three = jv.nested_materials(parts, [(0, 0, 0), (0, 1, 1), (0, 1, 2)])
-    assert (one.name, two.name) == ("1 class: 0+1+2", "2 classes: 0, 1+2")
+    one, two = nested_materials(parts, [(0, 0, 0), (0, 1, 1)])
 
     def paths(materials):
         return [round(float(material.mean_free_path), 4) for material in materials]
 
     assert paths(one.expand(one.start)) == [0.1, 0.1, 0.1]
     moved = (eqx.tree_at(lambda m: m.mean_free_path, one.start[0], jnp.asarray(0.7)),)
-    grown = grown_from(two, moved)
+    assert two.grow is not None
+    grown = two.grow(moved)
     assert paths(grown) == [0.7, 0.7]
-    assert paths(two.expand(grown)) == [0.7, 0.7, 0.7]
     split = (grown[0], eqx.tree_at(lambda m: m.mean_free_path, grown[1], jnp.asarray(0.9)))
-    assert paths(two.expand(split)) == paths(three.expand(grown_from(three, split))) == [0.7, 0.9, 0.9]
+    assert paths(two.expand(split)) == [0.7, 0.9, 0.9]
     # where a material is, is its own
     assert [material.values.tolist() for material in two.expand(split)] == [[0, 1], [1, 2], [2, 3]]
-
-
-def test_transfer_functions_of_labels_are_merged_as_a_whole():
-    parts = [PLAIN, jv.refined(PLAIN, 2)]
-    one, two = jv.nested_materials(parts, [(0, 0), (0, 1)])
-    assert one.expand(one.start) == (PLAIN, PLAIN)
-    assert two.expand(grown_from(two, one.start)) == (PLAIN, PLAIN)
 
 
 # -- images -----------------------------------------------------------------------------------------------
@@ -267,7 +254,6 @@ def test_control_points_are_counted_from_images():
 
 
 NOISY = views_of(2, 0.1, 0)
-CLASSES = [(0, 0), (0, 1)]
 
 
 def one(name, n):
@@ -282,10 +268,6 @@ def given(*candidates, **changes):
         **changes,
     }
     return lambda: jv.choose(arguments.pop("residual", polynomial), **arguments)
-
-
-def merged(parts, partitions):
-    return lambda: jv.nested_materials(parts, partitions)
 
 
 def points(*numbers, start: Any = PLAIN):
@@ -313,12 +295,6 @@ BAD = [
     (lambda: jv.refined(PLAIN, 1), "points must be an integer of at least 2; got 1"),
     (points(4, 4), r"points must be increasing .*\(4, 4\)"),
     (points(2, start=zeros(3)), "start must be a TransferFunction; got a JAX array"),
-    (merged([], CLASSES), "parts must be a list"),
-    (merged([PLAIN, 1.0], CLASSES), "parts must be .* of one kind"),
-    (merged([1.0, 2.0], [(0, 2)]), r"without gaps.* got \(0, 2\)"),
-    (merged([1.0, 2.0], [(0,)]), r"a class for each of 2 parts.*\(0,\)"),
-    (merged([1.0, 2.0, 3.0], [(0, 0, 1), (0, 1, 1)]), r"got \(0, 1, 1\) after \(0, 0, 1\)"),
-    (merged([1.0, 2.0], CLASSES[::-1]), r"each divide classes of the one before; got \(0, 0\) after"),
 ]
 
 
