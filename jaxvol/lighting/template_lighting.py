@@ -6,7 +6,7 @@ volume rendering (2016), sections 3.3 and 3.4.
 """
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -26,11 +26,13 @@ from .packet_tree import PacketTree, ThresholdOn
 from .photons import Interpolation, Occlusion, PhotonShading
 from .random_walks import scatterings
 from .shading import Lighting, Shading, Surroundings
-from .simulation import Form, check_form, check_isotropic, isotropic, scatterer_templates
+from .simulation import scatterer_templates
 from .template import ScattererTemplate
 from .transport import Transport
 from .voxel_photons import VoxelPhotons
 
+
+Form = Literal["published", "transport"]
 
 NODES = 48
 """Nodes of the grid of `form="transport"`, along the volume's longest side."""
@@ -178,7 +180,11 @@ class ScattererTemplates(Lighting):
         form: Form | Any = "published",
         anisotropy: Arrayable | None = 0.0,
     ):
-        check_form(form)
+        if form not in get_args(Form):
+            raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
+        isotropic = anisotropy is None or (
+            isinstance(anisotropy, int | float | np.number) and anisotropy == 0
+        )
         if form == "transport":
             published = {
                 "threshold_on": threshold_on,
@@ -189,14 +195,15 @@ class ScattererTemplates(Lighting):
             }
             _check_unused({**published, "cutoff": cutoff, "interpolation": interpolation, "given": given})
         else:
-            check_isotropic(anisotropy)
-            if nodes is not None:
-                raise ValueError(f'nodes is of form="transport"; got {nodes!r} for form="published".')
+            for name, value, unused in (
+                ("nodes", nodes, nodes is None),
+                ("anisotropy", anisotropy, isotropic),
+            ):
+                if not unused:
+                    raise ValueError(f'{name} is of form="transport"; got {value!r} for form="published".')
         templates = (256 if form == "transport" else 8) if templates is None else templates
         self.form = form
-        self.anisotropy = None
-        if anisotropy is not None and not isotropic(anisotropy):
-            self.anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
+        self.anisotropy = None if isotropic else number("anisotropy", anisotropy, above=-1, below=1)
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         if occlusion not in get_args(Occlusion):
