@@ -1,4 +1,4 @@
-"""Which way of leaping over empty space is the fastest in a scene whose image it leaves right?
+"""Find the fastest way of leaping over empty space that leaves the image of a scene right.
 
 A function for scripts and notebooks, not an experiment: the answer depends on the view. `interleaved` times
 the images in turn, and an image is right if no colour or opacity is farther than `tolerance` from that of the
@@ -32,7 +32,7 @@ def fastest_leaping(
     repetitions: int = 5,
     **options: Any,
 ) -> tuple[jv.SpaceLeaping, list[tuple[jv.SpaceLeaping, float, float]]]:
-    """The fastest, and for each its median time in seconds and the share of pixels that are wrong. `march`:
+    """Find the fastest way, and the median time in seconds and the share of wrong pixels of each. `march`:
     without leaps. `options`: of `render`."""
 
     def image(leap: jv.SpaceLeaping) -> Any:

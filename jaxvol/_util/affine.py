@@ -24,15 +24,3 @@ def directions(what: str, columns: np.ndarray) -> np.ndarray:
         return turn
     left, _, right = np.linalg.svd(turn)
     return left @ right
-
-
-def place_of(what: str, affine: np.ndarray) -> dict[str, np.ndarray]:
-    """The `spacing`, `origin` and `direction` of a grid whose node (i, j, k) lies at `affine @ (i, j, k, 1)`.
-    Raises `ValueError`, which begins with `what`, for an affine that places nothing."""
-    columns, origin = np.asarray(affine, float)[:3, :3], np.asarray(affine, float)[:3, 3]
-    steps = np.linalg.norm(columns, axis=0)
-    if not (np.all(steps > 0) and np.all(np.isfinite(affine))):
-        raise ValueError(
-            f"{what} must be finite, with steps longer than 0; got {np.asarray(affine).tolist()}."
-        )
-    return {"spacing": steps, "origin": origin, "direction": directions(what, columns / steps)}

@@ -30,9 +30,9 @@ SLICER = "3D Slicer"
 
 
 def _add_presets(file: str) -> None:
-    """Ours, or those of 3D Slicer, of its Modules/Loadable/VolumeRendering/Resources/presets.xml: points at
-    the values of both its curves, colours made linear. Its opacity by the gradient, 1 above 0 in all of them,
-    is left out."""
+    """Add the presets of a file: ours, or those of 3D Slicer, from its
+    Modules/Loadable/VolumeRendering/Resources/presets.xml, with points at the values of both its curves, and
+    colours made linear. Its opacity by the gradient, 1 above 0 in all of them, is left out."""
     for name, entry in json.loads(Path(__file__).with_name(file).read_text("utf-8")).items():
         points = [(value, (r, g, b), opacity) for value, r, g, b, opacity in entry["points"]]
         low, high = entry.get("range") or (points[0][0], points[-1][0])
