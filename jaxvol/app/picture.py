@@ -90,6 +90,12 @@ class Scene(NamedTuple):
     march: Any = None
     others: tuple[tuple[Volume, Transfer], ...] = ()
 
+    @property
+    def coarser(self) -> float:
+        """How many times as long the voxels of `volume` are as those of `source`; 1 where there is none."""
+        own = np.min(np.asarray(self.volume.spacing))
+        return 1.0 if self.source is None else float(own / np.min(self.source.spacing))
+
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
         how = {"compositing": self.compositing, "lighting": self.lighting}
@@ -264,12 +270,12 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
     found = min(plans, key=lambda plan: float(plan.march.step))
     # a view in which cells must be integrated needs that at any step
     integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)
-    march, volume = found.march, scene.volume
-    step, transforms = float(march.step), march.transforms
-    if scene.source is not None:  # planned by a copy, which proves no block empty
-        step *= float(np.min(scene.source.spacing) / np.min(np.asarray(volume.spacing)))
-        transforms += () if any(isinstance(t, SpaceLeaping) for t in transforms) else (SpaceLeaping(),)
-    march = March(step, transforms, "preintegrated" if integrated else march.quadrature)
+    march, transforms = found.march, found.march.transforms
+    if scene.source is not None and not any(isinstance(t, SpaceLeaping) for t in transforms):
+        transforms = (*transforms, SpaceLeaping())  # a copy proves no block empty
+    if integrated or scene.source is not None:
+        quadrature = "preintegrated" if integrated else march.quadrature
+        march = March(float(march.step) / scene.coarser, transforms, quadrature)
     if not all(plan.within for plan in plans):
         told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
         warnings.warn(told, stacklevel=3)
