@@ -1,4 +1,4 @@
-"""What do photons, templates, occlusion, baking and deferring cost, and what do they gain?
+"""What do photons, templates and occlusion cost, and what do they gain?
 
 The head phantom under opaque skin, lit from the side. Each frame is rendered in turn with the unlit head, and
 with one that `lighting.Phong` shades; its time is the median of their ratios. Beside it stands the image's
@@ -6,12 +6,10 @@ RMSE against one that blends many templates under soft occlusion and lights all 
 
 Times are multiples of the unlit frame. The paper's own, 2.2 (Lee, Kwon and Shin 2016: 20-24 frames per
 second in place of 42-56), is of several materials and 56-63 photons a template, where there are one and 16-19
-here: `published_light.py` measures under its conditions. The goal for baked light is 1.2 times. Also
-measured: the error of deferred light under skin that is more and more
-translucent.
+here: `published_light.py` measures under its conditions. Rows of the record of light that was baked, or
+deferred, are by an earlier commit, which had these.
 """
 
-import time
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,13 +17,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from matplotlib.ticker import LogLocator, NullFormatter
 
 import jaxvol as jv
-from jaxvol.lighting import ConstantLight, Deferred, DirectionalLight, Lighting, Phong, ScattererTemplates
+from jaxvol.lighting import ConstantLight, DirectionalLight, Lighting, Phong, ScattererTemplates
 from jaxvol.metrics import rmse
 
 from . import charts, harness, timing
@@ -34,11 +30,10 @@ from .scenes import SKIN, Scene, skin_head
 
 
 GOALS = {"templates": 2.2, "baked": 1.2}
-FEW = 8  # photons per template, where several are blended and deferred
 FLESH = jv.Material(0.5, 0.05, 1.4)
 LIGHTS = DirectionalLight((0.9, 0.7, -0.6), (50.0, 50.0, 50.0)), ConstantLight((1.3, 1.3, 1.3))
 """Bright, since flesh that absorbs half at each scattering reflects a sixth of white light from all sides."""
-UNLIT, PHONG, BAKED = "unlit", "Phong", "baked"
+UNLIT, PHONG = "unlit", "Phong"
 STYLES = {
     PHONG: "kx",
     "photons": "C0o-",
@@ -46,7 +41,7 @@ STYLES = {
     "templates blended": "C1s-",
     "hard occlusion": "C3D",
     "hard, one for each material": "C3*",
-    BAKED: "C2^-",
+    "baked": "C2^-",
     "photons, deferred": "C4o--",
     "templates blended, deferred": "C6s--",
     "baked, deferred": "C5^--",
@@ -59,7 +54,7 @@ def march(scene: Scene, seed: int = 0) -> jv.March:
     return jv.March(scene.step, how)
 
 
-def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int]) -> dict[str, list[Any]]:
+def variants(photons: Sequence[int], blended: Sequence[int]) -> dict[str, list[Any]]:
     """Lightings grouped by the setting that is varied, each with its number."""
     of = partial(ScattererTemplates, FLESH, LIGHTS)
     whole = of().photons
@@ -71,12 +66,8 @@ def variants(photons: Sequence[int], blended: Sequence[int], baked: Sequence[int
         [(n, of(templates=n, blend=True)) for n in blended],
         [(whole, of(occlusion="hard"))],
         [(whole, of(occlusion="hard", templates=1))],
-        [(n, of(baked=n)) for n in baked],
-        [(n, Deferred(of(photons=n))) for n in photons],
-        [(n, Deferred(of(templates=n, blend=True, photons=FEW))) for n in blended],
-        [(n, Deferred(of(baked=n))) for n in baked],
     ]
-    return dict(zip(STYLES, found, strict=True))
+    return dict(zip(STYLES, found, strict=False))
 
 
 def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
@@ -84,7 +75,7 @@ def frame(scene: Scene, lighting: Lighting | None, seed: int) -> jv.Rendering:
 
 
 def measure(scene: Scene, lightings: dict[str, list[Any]], chosen: Namespace) -> dict[str, list[Any]]:
-    """Time and error of each lighting, one at a time, since a volume keeps the light of one baking only."""
+    """Time and error of each lighting, one at a time."""
     seed, many = chosen.seed, ScattererTemplates(FLESH, LIGHTS, templates=chosen.many, blend=True)
     truth = frame(scene, many, seed).rgba
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in lightings}
@@ -96,27 +87,8 @@ def measure(scene: Scene, lightings: dict[str, list[Any]], chosen: Namespace) ->
             error = rmse(frame(scene, lighting, seed).rgba, truth)
             row = {"number": number, **harness.row(seconds[kind], seconds[UNLIT], error)}
             row["ratio to Phong"] = timing.ratio(seconds[kind], seconds[PHONG])
-            if kind == BAKED:
-                row["seconds to bake"] = round(baking(scene, lighting, seed) - row["seconds"], 4)
             found[kind].append(row)
     return found
-
-
-def baking(scene: Scene, lighting: ScattererTemplates, seed: int) -> float:
-    """Seconds of a frame that must bake its light: dimmer than before, so that only the program is reused."""
-    dimmed = eqx.tree_at(lambda how: how.lights[0].irradiance, lighting, replace_fn=lambda e: e * 0.99)
-    start = time.perf_counter()
-    jax.block_until_ready(frame(scene, dimmed, seed).rgba)
-    return time.perf_counter() - start
-
-
-def deferring(scene: Scene, times: float, seed: int) -> dict[str, float]:
-    """Errors of deferred light, and of no light, against light on all samples, with every extinction
-    multiplied by `times`."""
-    lit = ScattererTemplates(FLESH, LIGHTS, photons=8)
-    thin = scene._replace(transfer=replace(scene.transfer, extinction=times * scene.transfer.extinction))
-    truth, once, unlit = (frame(thin, how, seed).rgba for how in (lit, Deferred(lit), None))
-    return {"extinction": times, "rmse": rmse(once, truth), "rmse of no light": rmse(unlit, truth)}
 
 
 def picture(templates: int, seed: int, path: Path, size: int, resolution: int) -> None:
@@ -138,7 +110,7 @@ def picture(templates: int, seed: int, path: Path, size: int, resolution: int) -
 
 
 def draw(result: dict[str, Any]) -> Any:
-    figure, ((cost, deferred),) = charts.panels(1, 2, 11, 5)
+    figure, ((cost,),) = charts.panels(1, 1, 7, 5)
     for kind, rows in result["frames"].items():
         error, ratio = [row["rmse"] for row in rows], [row["ratio"]["median"] for row in rows]
         cost.plot(error, ratio, STYLES[kind], label=kind, markersize=6)
@@ -157,14 +129,6 @@ def draw(result: dict[str, Any]) -> Any:
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter(NullFormatter())
     figure.legend(*cost.get_legend_handles_labels(), loc="outside upper center", ncols=5)
-
-    rows = result["deferring"]
-    for key, label, style in (("rmse", "deferred", "C4o--"), ("rmse of no light", "no light", "ko-")):
-        deferred.loglog([row["extinction"] for row in rows], [row[key] for row in rows], style, label=label)
-    deferred.set(xlabel="extinction, times that of opaque skin", ylabel="RMSE against light on all samples")
-    deferred.set_title("light once for each ray, from translucent to opaque skin")
-    charts.plain_numbers(deferred)
-    deferred.legend()
     return figure
 
 
@@ -174,9 +138,7 @@ def draw(result: dict[str, Any]) -> Any:
     resolution=96,
     photons=(1, 4, 8, 16),
     blended=(1, 2, 4, 8),
-    baked=(32, 64, 128),
     many={"type": int, "default": 32, "help": "templates blended in the reference"},
-    thinned=(1.0, 0.3, 0.1, 0.03, 0.01),
     picture=(512, 192),
     quick={
         "size": 24,
@@ -184,9 +146,7 @@ def draw(result: dict[str, Any]) -> Any:
         "repetitions": 2,
         "photons": (2,),
         "blended": (2,),
-        "baked": (16,),
         "many": 4,
-        "thinned": (1.0, 0.1),
         "picture": (48, 24),
     },
 )
@@ -194,8 +154,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
     scene = skin_head(chosen.size, chosen.resolution)
     result = {
         "goals": GOALS,
-        "frames": measure(scene, variants(chosen.photons, chosen.blended, chosen.baked), chosen),
-        "deferring": [deferring(scene, times, chosen.seed) for times in chosen.thinned],
+        "frames": measure(scene, variants(chosen.photons, chosen.blended), chosen),
     }
     picture(chosen.many // 2, chosen.seed, chosen.output / "lit.png", *chosen.picture)
     return result

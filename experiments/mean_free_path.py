@@ -160,7 +160,7 @@ class Scene:
         return self.volume, self.medium(given), camera, self.march, lit
 
     def transport(self, given: dict[str, Any], camera: jv.Camera) -> tuple:
-        how: dict[str, Any] = {"form": "transport", "baked": self.nodes, "levels": self.levels}
+        how: dict[str, Any] = {"form": "transport", "nodes": self.nodes, "levels": self.levels}
         lit = ScattererTemplates(given["materials"], lights(given["brightness"]), seed=self.seed, **how)
         return self.volume, self.medium(given), camera, self.fine, lit
 
@@ -245,11 +245,13 @@ def from_paths(
         how = {"constraints": constraints, "max_steps": chosen.steps, "patience": 3, "rtol": 1e-3}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            fits = jv.fit_in_stages(residuals, start, **how)
+            fits = []
+            for residual in residuals:  # each from where the last one ended
+                fits.append(jv.fit(residual, fits[-1].parameters if fits else start, **how))
         misfit = any(str(each.message).startswith(MISFIT) for each in caught)
         seconds = round(time.perf_counter() - begun, 1)
         for name, found in zip(names, fits, strict=True):
-            # of several fits, only the last one warns, and the time is that of all
+            # of several fits, the first one may warn, and the time is that of all
             last = {"warned of a misfit": misfit, "seconds": seconds} if found is fits[-1] else {}
             rows[name] = {**told(found, truth), **last}
             print(name, rows[name], flush=True)

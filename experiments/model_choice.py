@@ -11,8 +11,10 @@ alone, and the candidate of the least held-out loss.
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -80,8 +82,33 @@ def materials(resolution: int) -> Problem:
             if np.all(np.diff(np.sort(np.log(paths))) >= np.log(APART)):
                 return of_paths(list(paths[list(classes)]))
 
-    candidates = jv.nested_materials(of_paths([START] * len(CENTERS)), CLASSES)
+    candidates = nested_materials(of_paths([START] * len(CENTERS)), CLASSES)
     return Problem(scene, candidates, draw, [str(max(classes) + 1) for classes in CLASSES])
+
+
+def nested_materials(parts: Sequence[jv.Material], partitions: Sequence[Sequence[int]]) -> list[jv.Candidate]:
+    """Candidates in which more and more materials have a mean free path of their own. `partitions`: for each
+    the class of each material, numbered from 0 on, which divide those of the one before."""
+
+    def first_of_each(materials: Sequence[Any], classes: Sequence[int]) -> tuple[Any, ...]:
+        return tuple(materials[classes.index(number)] for number in range(max(classes) + 1))
+
+    def expand(classes: Sequence[int], found: Sequence[Any]) -> tuple[Any, ...]:
+        paths = [found[number].mean_free_path for number in classes]
+        return tuple(
+            eqx.tree_at(lambda m: m.mean_free_path, each, path)
+            for each, path in zip(parts, paths, strict=True)
+        )
+
+    def grow(before: Sequence[int], classes: Sequence[int], found: Sequence[Any]) -> tuple[Any, ...]:
+        return first_of_each(expand(before, found), classes)
+
+    made = []
+    for before, classes in zip([None, *partitions], partitions, strict=False):
+        start: dict[str, Any] = {"start": first_of_each(parts, classes)}
+        start = start if before is None else {"grow": partial(grow, before, classes)}
+        made.append(jv.Candidate(f"{max(classes) + 1} classes", expand=partial(expand, classes), **start))
+    return made
 
 
 def control_points(resolution: int, numbers: Sequence[int]) -> Problem:
@@ -115,11 +142,16 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
         camera = jv.Camera(position, (0, 0, 0), (0, 0, 1), 32, size=(size, size))
         image = jv.render(*problem.scene(parameters, camera)).image()
         views.append((camera, np.asarray(image) + noise * generator.normal(size=image.shape)))
-    residual = jv.ImageResidual(problem.scene, views[:SEEN])
-    choice = jv.choose(residual, problem.candidates, views[SEEN:], block=1, max_steps=40)
+
+    def residual(some: list[Any]) -> jv.ImageResidual:
+        return jv.ImageResidual(problem.scene, some)
+
+    how: dict[str, Any] = {"views": views[:SEEN], "block": 1, "max_steps": 40}
+    choice = jv.choose(residual, problem.candidates, views[SEEN:], **how)
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
     # of independent Gaussian residuals of one unknown variance; losses below -80 dB count as equal
-    count, least = residual.references.count, (1e-4 * residual.references.scale()) ** 2
+    references = residual(views[:SEEN]).references
+    count, least = references.count, (1e-4 * references.scale()) ** 2
     rows = [
         {
             "name": row.name,

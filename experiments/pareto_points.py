@@ -18,11 +18,10 @@ import numpy as np
 
 import jaxvol as jv
 from jaxvol.bricks.grid import COPIES
-from jaxvol.lighting import Lighting
 
 from . import peer_vtk, programs
 from .pareto_scenes import Kind, Row
-from .programs import DRJIT, LEFT, QUADRATURES, VTK, Case, Program, deferred, lighting_of, ours
+from .programs import DRJIT, LEFT, QUADRATURES, VTK, Case, Program, lighting_of, ours
 
 
 STEPS = (0.25, 0.5, 1.0, 2.0, 4.0)
@@ -51,21 +50,12 @@ def sweep(
 
 def lit(
     family: str,
-    by: Callable[..., Lighting] = lighting_of,
     step: float = 1.0,
     quadrature: Any = "midpoint",
     **how: Any,
 ) -> Setting:
     """A setting of light, by options of its templates."""
-    changed: Any = {"changed": copied} if "baked" in how else {}
-    return Setting(family, ours(lighting=partial(by, **how), step=step, quadrature=quadrature, **changed))
-
-
-def copied(case: Case) -> Case:
-    """The same volume in an array of its own, since a volume keeps one baked light only."""
-    volume = case.scene.volume
-    volume = jv.Volume(jnp.array(volume.data, copy=True), volume.spacing, volume.origin)
-    return case._replace(scene=case.scene._replace(volume=volume))
+    return Setting(family, ours(lighting=partial(lighting_of, **how), step=step, quadrature=quadrature))
 
 
 @cache
@@ -159,29 +149,20 @@ def of_templates() -> Settings:
     found = {}
     for q in ("midpoint", "left"):
         for step in (1.0, 0.5, 2.0, 4.0):
-            found[f"lit, {q}, step {step:g}"] = lit("deferred", deferred, step, q, photons=PHOTONS)
+            found[f"lit, {q}, step {step:g}"] = lit("photons", step, q, photons=PHOTONS)
     found |= {f"photons {n}": lit("photons", photons=n) for n in (1, 4, 8, 16)}
     found["all photons"] = lit("photons")
     found["all photons, hard occlusion"] = lit("photons", occlusion="hard")
-    found["all photons, deferred"] = lit("deferred", deferred)
     blended: Any = {"blend": True, "photons": PHOTONS}
     for n in (1, 2, 4):
         found[f"templates {n}, photons {PHOTONS}"] = lit("templates", templates=n, **blended)
-    for n in (2, 4, 8):
-        found[f"templates {n}, deferred"] = lit("deferred", deferred, templates=n, **blended)
-    for n in (32, 64, 128):
-        found[f"baked {n}"] = lit("baked", baked=n)
-        found[f"baked {n}, deferred"] = lit("baked", deferred, baked=n)
-    for step in (0.5, 2.0):
-        found[f"baked 64, step {step:g}"] = lit("baked", step=step, baked=64)
     return found
 
 
 def shaded() -> Settings:
     found = sweep("shaded", "shaded, midpoint", (1.0,), lighting=lighting_of)
-    for once, by in (("", lighting_of), (" once", deferred)):
-        for q in QUADRATURES:
-            found |= sweep(f"shaded{once}", f"shaded{once}, {q}", STEPS, quadrature=q, lighting=by)
+    for q in QUADRATURES:
+        found |= sweep("shaded", f"shaded, {q}", STEPS, quadrature=q, lighting=lighting_of)
     return found
 
 

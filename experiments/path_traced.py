@@ -45,7 +45,6 @@ LIGHTINGS: dict[str, dict[str, Any]] = {
     "hard, blended": {"occlusion": "hard", "blend": True},
     "soft": {},
     "soft, blended": {"blend": True},
-    "soft, baked": {"baked": 64},
 }
 """Options of the templates."""
 

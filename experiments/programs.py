@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 import jaxvol as jv
-from jaxvol.lighting import Deferred, Lighting
+from jaxvol.lighting import Lighting
 from jaxvol.metrics import rmse
 
 from . import harness, peer_vtk, timing
@@ -103,10 +103,6 @@ def converged(scene: Scene, finer: int) -> Image:
 def lighting_of(case: Case, **how: Any) -> Any:
     assert case.lighting is not None
     return case.lighting(**how)
-
-
-def deferred(case: Case, **how: Any) -> Lighting:
-    return Deferred(lighting_of(case, **how))
 
 
 def peers() -> dict[str, str]:

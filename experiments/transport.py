@@ -35,9 +35,9 @@ TRACED, UNLIT = "path traced", "unlit"
 FORMS: dict[str, dict[str, Any]] = {
     "published, hard": {"occlusion": "hard"},
     "published, soft": {"blend": True},
-    "transport, 32 nodes": {"form": "transport", "baked": 32},
+    "transport, 32 nodes": {"form": "transport", "nodes": 32},
     "transport, 48 nodes": {"form": "transport"},
-    "transport, 64 nodes": {"form": "transport", "baked": 64},
+    "transport, 64 nodes": {"form": "transport", "nodes": 64},
 }
 """Options of the templates."""
 

@@ -31,9 +31,7 @@ from .fitting import (
     choose as choose,
     fit as fit,
     fit_coarse_to_fine as fit_coarse_to_fine,
-    fit_in_stages as fit_in_stages,
     flat_grey as flat_grey,
-    nested_materials as nested_materials,
     nested_points as nested_points,
     read_transfer as read_transfer,
     read_views as read_views,
@@ -59,7 +57,7 @@ from .march.transforms import (
     ToroidalMap as ToroidalMap,
 )
 from .path_tracing import PathTraced as PathTraced, path_trace as path_trace
-from .planning import Plan as Plan, fastest_leaping as fastest_leaping, plan as plan
+from .planning import Plan as Plan, plan as plan
 from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .scene.camera import Camera as Camera

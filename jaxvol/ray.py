@@ -21,7 +21,6 @@ from ._util.checks import all_finite, check_answer, described
 from ._util.vec3 import Scalar, Vec3
 from .compositing.blending import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
-from .lighting.deferred import Deferred
 from .lighting.shading import Lighting, lit_classification
 from .march.march import Cell, March
 from .scene.camera import Camera, without_ends
@@ -83,7 +82,7 @@ class Scene(NamedTuple):
     @property
     def resolves(self) -> bool:
         """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
-        return self.compositing.resolves or isinstance(self.lighting, Deferred)
+        return self.compositing.resolves
 
     @property
     def marched(self) -> "Scene":
@@ -433,19 +432,14 @@ class Pixel(NamedTuple):
 
 
 def resolve(scene: Scene, line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Pixel:
-    """The pixel of a ray that is not transparent, from what its march found: by the compositing mode, or else
-    by the lighting."""
+    """The pixel of a ray that is not transparent, from what its march found, by the compositing mode."""
     compositing = scene.compositing
     if isinstance(compositing, Selection):
         return _selected(compositing, scene, line, rgba, selected)
-    if compositing.resolves:
-        assert isinstance(compositing, Weighting)
-        found = compositing.resolved(scene.classification, rgba)
-        check_answer(compositing, "resolved", found, rgba)
-        return Pixel(found, depth)
-    assert isinstance(scene.lighting, Deferred)
-    pixel = scene.lighting.shade_pixel(scene.classification, scene.space, line, rgba, depth)
-    return Pixel(pixel, depth)
+    assert isinstance(compositing, Weighting)
+    found = compositing.resolved(scene.classification, rgba)
+    check_answer(compositing, "resolved", found, rgba)
+    return Pixel(found, depth)
 
 
 def _selected(

@@ -119,7 +119,6 @@ def test_wrong_argument_types_are_named(case):
 
 FLAGS: dict[str, Callable[[Any], Any]] = {
     "antialias": lambda value: jv.path_trace(VOLUME, TRANSFER, CAMERA, LIGHT, paths=1, antialias=value),
-    "baked": lambda value: ScattererTemplates(Material(0.5, 0.1), LIGHT, baked=value).baked,
     "blend": lambda value: ScattererTemplates(Material(0.5, 0.1), LIGHT, blend=value).blend,
     "front_residual": lambda value: jv.Jitter(front_residual=value).front_residual,
     "gradients": lambda value: jv.plan(VOLUME, TRANSFER, CAMERA, 0.9, gradients=value),

@@ -1,5 +1,6 @@
 """From options, of a command or of `show`, to images: what is looked at, how, from where, by which march."""
 
+import math
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -23,7 +24,6 @@ from ..lighting import Lighting, Phong
 from ..march.march import March, Transform
 from ..march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
 from ..planning import Plan, plan
-from ..planning.memory import IN_MEMORY
 from ..render import PLANNED, render
 from ..scene.camera import Camera
 from ..scene.presets import SHADED, colormap, fitted_range, preset, preset_name
@@ -68,12 +68,15 @@ def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
 PIXEL = 160
 """Bytes that an image takes for each pixel, while it is rendered and written."""
 
+IN_MEMORY = 9
+"""Most bytes that `render` takes for each byte of voxels: these as read and in the device, a packed copy of
+8-bit ones, the extremes of blocks, and slopes."""
+
 
 class Scene(NamedTuple):
-    """What is looked at, and how. Of a volume that is read in bricks from `source`, with so many bytes of
-    memory, `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image,
-    with their transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it
-    is known."""
+    """What is looked at, and how. If `source` is read in bricks, since it does not fit into `memory` bytes,
+    `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image, with their
+    transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it is known."""
 
     volume: Volume
     transfer: Transfer
@@ -86,6 +89,12 @@ class Scene(NamedTuple):
     memory: int | None = None
     march: Any = None
     others: tuple[tuple[Volume, Transfer], ...] = ()
+
+    @property
+    def coarser(self) -> float:
+        """How many times as long the voxels of `volume` are as those of `source`; 1 where there is none."""
+        own = np.min(np.asarray(self.volume.spacing))
+        return 1.0 if self.source is None else float(own / np.min(self.source.spacing))
 
     def render(self, camera: Camera) -> Rendering:
         """An image by `march`."""
@@ -107,13 +116,10 @@ class Scene(NamedTuple):
         """The cheapest way to render the scene within a tolerance, for each camera."""
         if self.others:
             raise ValueError("others: several volumes are not planned for; render them by a step.")
-        what: Any = self.volume if self.source is None else self.source
         how: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
         how |= {"compositing": self.compositing, "lighting": self.lighting}
-        if self.source is not None:
-            how["memory"] = self.memory
         tolerance = PLANNED if tolerance is None else tolerance
-        return [plan(what, self.transfer, camera, tolerance, **how) for camera in cameras]
+        return [plan(self.volume, self.transfer, camera, tolerance, **how) for camera in cameras]
 
 
 def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
@@ -154,8 +160,6 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
             raise ValueError("memory is of files; volume is a Volume.")
         integer("memory", options.memory, 1)
         header = {name: value for name, value in header_of(options).items() if value is not None}
-        if index := {name[0]: header.pop(name) for name in ("time", "channel") if name in header}:
-            header["index"] = index
         try:
             source = levels_of(options.file, **header)[0]
         except TypeError as fault:  # such as a shape of what is no raw file
@@ -163,6 +167,8 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         volume = copy_of(source, options.memory)
         automatic = is_automatic(options)
         transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
+        if IN_MEMORY * source.dtype.itemsize * math.prod(source.shape) <= options.memory:
+            volume, source = source.subsampled(1), None
 
     warn_of_distance(volume, others)
     lighting = _lighting(options, mode, alone=not others)
@@ -264,14 +270,16 @@ def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> S
     found = min(plans, key=lambda plan: float(plan.march.step))
     # a view in which cells must be integrated needs that at any step
     integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)
-    march = found.march
-    if integrated:
-        march = March(march.step, march.transforms, "preintegrated")
+    march, transforms = found.march, found.march.transforms
+    if scene.source is not None and not any(isinstance(t, SpaceLeaping) for t in transforms):
+        transforms = (*transforms, SpaceLeaping())  # a copy proves no block empty
+    if integrated or scene.source is not None:
+        quadrature = "preintegrated" if integrated else march.quadrature
+        march = March(float(march.step) / scene.coarser, transforms, quadrature)
     if not all(plan.within for plan in plans):
         told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
         warnings.warn(told, stacklevel=3)
-    source = None if found.bricks is None else found.source
-    return scene._replace(volume=found.volume, march=march, source=source)
+    return scene._replace(march=march)
 
 
 def volume_of(options: Namespace) -> Volume:

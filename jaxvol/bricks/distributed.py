@@ -27,7 +27,6 @@ from ..ray import Scene
 from ..scene.rendering import Rendering
 from ..scene.volume import part_of, with_voxels
 from ..xla.compiling import compiled
-from ..xla.platform import is_traced
 from .cells import first_behind, straight_cells
 from .grid import BrickGrid, is_straight
 from .traversal import Load, Traversal
@@ -59,7 +58,6 @@ def check_joins(scene: Scene, method: Any) -> None:
         ),
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
-        "gradients": is_traced(scene),
     }
     for what, refuses in refused.items():
         if refuses:

@@ -33,10 +33,6 @@ MOST_BRICKS = 2**16  # that a user may ask for: each is searched for along all r
 COPIES = 2.5
 
 
-class TooLittleMemory(ValueError):
-    """The smallest bricks, with what is read around them, do not fit into the budget."""
-
-
 @dataclass(frozen=True)
 class BrickGrid:
     """Bricks of equally many cells, numbered in row-major order; the last ones along an axis may have fewer.
@@ -255,7 +251,7 @@ def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: in
         if margin.fits(stored, dtype, memory) and (grid.number >= devices or not divisible):
             return grid
         if not divisible:
-            raise TooLittleMemory(
+            raise ValueError(
                 f"memory must be at least {margin.bytes(stored, dtype)} bytes, for bricks of {grid.size} "
                 f"cells and what is read around them, less for a shorter step; got {memory}."
             )

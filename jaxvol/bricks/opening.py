@@ -17,7 +17,7 @@ import numpy as np
 
 from .._util.checks import Arrayable, described, shortened
 from .._util.files import MOST_VOXELS
-from .._util.image_record import DecodedArray, ImageRecord, warn_caller
+from .._util.image_record import DecodedArray, ImageRecord, choose, warn_caller
 from .._util.memory import memory_of_device, require_room
 from .._util.named_axes import cf_scale, even_step, record_of
 from .._util.units import axis_letters
@@ -61,7 +61,7 @@ def levels_of(
 
     | `thing` | read |
     |---|---|
-    | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | see `VoxelSource` |
+    | anything with `shape`, `dtype` and `[box]`: NumPy, zarr, h5py, dask, tensorstore | as data[x, y, z] |
     | an xarray `DataArray`; an image of nibabel, SimpleITK, itk, VTK | as by `Volume`; lazy: pass `.data` |
     | path of a raw file, `.npy`, MRC, HDF5 (`file.h5::/name`); as for `jv.load` | mapped, or by h5py |
     | path of a Zarr array, version 2 or 3, or an OME-Zarr image | by tensorstore: `jaxvol[bricks]` |
@@ -71,11 +71,10 @@ def levels_of(
         thing: what holds the voxels.
         spacing: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
         origin: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
-        **options: `shape` and `dtype` of a raw file, as in `jv.load`. `axes`, `index` and `nan`: see
-            `VoxelSource`; the axes of Zarr are by default its own (`dimension_names`, or xarray's
-            `_ARRAY_DIMENSIONS` in version 2). `missing`: what it means if a chunk of a path's Zarr array is
-            not there: `"fill"`, the default, as Zarr specifies, that all its voxels have the fill value;
-            `"error"`, that the data are incomplete.
+        **options: `nan`, see `VoxelSource`; `time` and `channel` of what has names of axes, and `shape`,
+            `dtype` and `offset` of a raw file, as in `jv.load`. The axes of Zarr are its own
+            (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in version 2); a chunk that is not there has
+            the fill value.
 
     Returns:
         A source for each level.
@@ -99,20 +98,17 @@ def levels_of(
             raise ValueError("source must be a Volume without labels and field. Use jv.render.")
         check_one_channel(thing, "bricks")
         own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
-        return (VoxelSource(thing.data, **(own | place), axes="xyz", **options, name="volume"),)
-    if (record := record_of(thing)) is not None and not ("axes" in options and hasattr(thing, "store")):
-        if "axes" in options:
-            raise TypeError(f"axes: the {type(thing).__name__} has its own.")
+        return (VoxelSource(thing.data, **(own | place), **options, name="volume"),)
+    if (record := record_of(thing)) is not None:
         return (_source(record, place, **options),)
     if not isinstance(thing, str | os.PathLike):
         return (VoxelSource(thing, **place, **options),)
     path = Path(thing)
     if is_zarr(path):
         is_image = not _is_zarr_array(path)
-        if is_image and (own := [name for name in ("spacing", "origin", "axes") if name in place | options]):
-            raise TypeError(f"{', '.join(own)}: the OME-Zarr image {path} has its own.")
-        fills = {"missing": options.pop("missing")} if "missing" in options else {}
-        records = _ome_records(path, **fills) if is_image else [_zarr_record(path, **fills)]
+        if is_image and place:
+            raise TypeError(f"{', '.join(place)}: the OME-Zarr image {path} has its own.")
+        records = _ome_records(path) if is_image else [_zarr_record(path)]
         return tuple(_source(record, place, **options) for record in records)
     name = path.name.lower()
     if path.exists() and (name.endswith(".gz") or not (name.endswith(READ_IN_BOXES) or "shape" in options)):
@@ -127,27 +123,35 @@ def levels_of(
 
 
 def _source(
-    record: ImageRecord, place: dict[str, Any], axes: Any = None, nan: float | None = None, **index: Any
+    record: ImageRecord,
+    place: dict[str, Any],
+    time: int | None = None,
+    channel: int | None = None,
+    nan: float | None = None,
 ) -> VoxelSource:
     """The source of a record's array: its axes along the world's, lengths in mm, values scaled. `place`: as
     the caller has it."""
     name, array = record.what.removeprefix("path: "), record.data
-    if axes is not None or not record.axes:
-        return VoxelSource(array, **place, axes=axes, nan=nan, name=name, **index)
-    letters = record.letters
+    if not record.axes:
+        raise ValueError(
+            f"{name} has {len(array.shape)} axes without names. Pass an xarray.DataArray, or the three axes "
+            "as data[x, y, z], such as dask.array.from_zarr(path)[0].T."
+        )
+    index, letters = choose(record, time, channel)
+    if "s" in letters:
+        at = record.letters.index("s")
+        raise ValueError(f"channel must be given, from 0 to {array.shape[at] - 1}, of {name}.")
+    shape = [n for n, part in zip(array.shape, index, strict=True) if isinstance(part, slice)]
     if not {*SPACE} <= {*letters}:
-        check_shape(tuple(array.shape[:2]))
-    order, signs, own = record.oriented([array.shape[letters.index(letter)] for letter in "xyz"])
+        check_shape(tuple(shape[:2]))
+    order, signs, own = record.oriented([shape[letters.index(letter)] for letter in SPACE])
     for text in record.assumed:
         warn_caller(f"{name}: {text}")
-    at = [letters.index("xyz"[axis]) for axis in order]
-    names = [*letters]
-    for axis, letter in zip(at, "xyz", strict=True):
-        names[axis] = letter
+    at = [record.letters.index("xyz"[axis]) for axis in order]
     reverse = [axis for axis, sign in zip(at, signs, strict=True) if sign < 0]
     if reverse or record.missing or record.unsigned or record.is_scaled:
         array = DecodedArray(record, reverse, nan)
-    return VoxelSource(array, **(own | place), axes=names, nan=nan, name=name, **index)
+    return VoxelSource(array, **(own | place), space=at, index=index, nan=nan, name=name)
 
 
 def is_zarr(path: Path) -> bool:
@@ -180,20 +184,17 @@ def _is_zarr_array(path: Path) -> bool:
     return (path / ".zarray").is_file()
 
 
-def _zarr_record(path: Path, missing: Any = "fill") -> ImageRecord:
+def _zarr_record(path: Path) -> ImageRecord:
     """The record of an array. Its axes, values and lengths are as xarray keeps them; of a Zarr without names
     of axes, `axes` is empty unless there are three."""
     try:
         import tensorstore
     except ImportError as fault:
         raise ImportError(f'{path} is read by tensorstore: pip install "jaxvol[bricks]".') from fault
-    if missing not in ("error", "fill"):
-        raise ValueError(f'missing must be "error" or "fill"; got {missing!r}.')
     version_2 = (path / ".zarray").is_file()
     spec = {
         "driver": "zarr" if version_2 else "zarr3",
         "kvstore": {"driver": "file", "path": f"{path.resolve()}{os.sep}"},
-        "fill_missing_data_reads": missing == "fill",
         "context": {"cache_pool": {"total_bytes_limit": CACHE}},
     }
     try:
@@ -242,7 +243,7 @@ def _attributes(path: Path) -> dict[str, Any]:
     return _read_json(path / "zarr.json").get("attributes") or {}
 
 
-def _ome_records(path: Path, **options: Any) -> list[ImageRecord]:
+def _ome_records(path: Path) -> list[ImageRecord]:
     """The levels of the first image in an OME-Zarr group, finest first."""
     try:
         from yaozarrs import v04, v05
@@ -284,7 +285,7 @@ def _ome_records(path: Path, **options: Any) -> list[ImageRecord]:
                     offset = offset + each.translation
         if not _is_zarr_array(path / dataset.path):
             raise ValueError(f"path: {path}: {dataset.path} is no Zarr array within the group.")
-        record = _zarr_record(path / dataset.path, **options)
+        record = _zarr_record(path / dataset.path)
         record.axes, record.units, record.format = names, units, "OME-Zarr"
         record.steps, record.origin = dict(zip(SPACE, scale[at].tolist(), strict=False)), offset[at]
         if placed:

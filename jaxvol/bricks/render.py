@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, Literal, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +14,7 @@ from ..compositing.modes import Mode, compositing_of
 from ..compositing.selection import Selection
 from ..engine import brick_march
 from ..engine.acceleration import NO_ACCELERATION, VolumeAcceleration
-from ..engine.devices import Devices, check_not_sharded, mesh_of, on_all
-from ..engine.gradients import of_all_outputs, of_perturbed
+from ..engine.devices import Devices, mesh_of, on_all
 from ..engine.image import RenderOutputs
 from ..engine.resolve import resolve_image
 from ..engine.tiling import RenderOptions
@@ -31,7 +29,6 @@ from ..scene.rendering import Details, Rendering
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, part_of
 from ..xla.compiling import compiled
-from ..xla.differentiation import forward_mode, transformations
 from ..xla.platform import is_traced
 from ..xla.trees import strong
 from .distributed import check_joins, render_distributed
@@ -86,9 +83,9 @@ def render_bricks(
         method: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
             left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as
             `memory` goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
-            (`bricks.traversal.Schedule`), which has no gradient.
+            (`bricks.traversal.Schedule`).
         compositing: as for `render`.
-        lighting: `Phong`, `ScattererTemplates` that are not baked, or another one that says how far it reads
+        lighting: `Phong`, `ScattererTemplates` as published, or another one that says how far it reads
             (`Lighting.farthest_read`).
         outputs: as for `render`.
         level: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
@@ -103,8 +100,7 @@ def render_bricks(
             what lies in front but by its transmittance (no `EmptySpaceJitter`; compositing by `"over"`). An
             `EarlyTermination` sees only what is in front on the same device: up to `opacity_left` of the
             colours behind are added, and depth changes with them; without it, depth agrees to 1e-5 of itself.
-            No gradients.
-        **options: for the source (`shape`, `dtype`, `axes`, `index`, `missing`), see `bricks.levels_of`.
+        **options: for the source (`shape`, `dtype`, `time`, `channel`, `nan`), see `bricks.levels_of`.
 
     Returns:
         As `render`, and in `Rendering.bricks` what it took.
@@ -112,13 +108,10 @@ def render_bricks(
     Raises:
         ValueError: naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
             whose file changed; for less memory than the smallest bricks take; for what needs the whole volume
-            at once (labels, baked or deferred light); and for what cannot be had with `own="bricks"`.
+            at once (labels, light by transport); and for what cannot be had with `own="bricks"`.
 
-    Reverse mode (`jax.grad`) has the gradients of `render` to the transfer function, camera, march, lighting,
-    spacing and origin: a second march reads the bricks again. Where the march leaps, the derivative by the
-    extinction of a control point of 0 misses what is leapt over, here and in `render`, and here other cells.
-    There is no gradient to the voxels, none of modes other than `"over"`, none in forward mode (`jax.jvp`) or
-    of second order, and none inside `jax.jit` or `jax.vmap`.
+    It has no gradients, since it reads its source while it runs; nor can it be called inside `jax.jit` or
+    `jax.vmap`. Fit with `render` to a copy that fits (`VoxelSource.subsampled`).
 
     Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3; their future work are ranges of values,
     by which empty bricks are not read. Unlike there, how far bricks overlap follows from the rays of the
@@ -140,28 +133,23 @@ def render_bricks(
     mesh = mesh_of(devices)
     if own == "bricks" and mesh is None:
         raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
-    place = {"spacing": spacing, "origin": origin}
-    traced = {name: value for name, value in place.items() if is_traced(value)}
-    concrete = {name: value for name, value in place.items() if name not in traced}
-    levels = levels_of(source, **concrete, **options)
-    if traced and len(levels) > 1:
-        raise ValueError("spacing and origin of a source with levels of detail must not be traced.")
+    if is_traced((transfer, camera, march, lighting, spacing, origin)):
+        raise ValueError(
+            "render_bricks reads its source while it runs, so not inside jax.jit, jax.vmap or jax.grad. "
+            "Gradients are those of jv.render, of a copy that fits (VoxelSource.subsampled)."
+        )
+    levels = levels_of(source, spacing=spacing, origin=origin, **options)
     room, chosen = budget(memory), _level(levels, level, camera, march)
     if len(levels) > 1:
         transfer = sized(transfer, levels[0])  # so that all levels are equally opaque
-    scene = scene_of(chosen, transfer, camera, march, compositing, lighting, **traced)
-    check_not_sharded(mesh, scene)
-    scene = on_all(mesh, scene)
+    scene = on_all(mesh, scene_of(chosen, transfer, camera, march, compositing, lighting))
     request = Request(chosen, room, bricks, method, progress, outputs, mesh, own == "bricks")
     if request.deals_bricks:
         check_joins(scene, method)
-    if forward_mode([transformations(leaf) for leaf in jax.tree.leaves(scene)]):
-        raise ValueError(
-            "render_bricks has gradients in reverse mode, but none in forward mode (jax.jvp) or of 2nd order."
-        )
-    rendering = _differentiable(scene, request) if is_traced(scene) else _image(scene, request)
-    report = request.traversals[0].report()
-    return Rendering(rendering.rgba, rendering.exhausted, rendering.details._replace(bricks=report))
+    traversal = Traversal(request, scene)
+    rendering = _image(scene, traversal)
+    details = rendering.details._replace(bricks=traversal.report())
+    return Rendering(rendering.rgba, rendering.exhausted, details)
 
 
 def budget(memory: int | Any | None) -> int:
@@ -178,9 +166,8 @@ def scene_of(
     march: March,
     compositing: Mode | Compositing[Any] | Any,
     lighting: Lighting | None,
-    **traced: Any,
 ) -> Scene:
-    """The scene of a source, without its voxels. `traced`: spacing and origin in place of the source's."""
+    """The scene of a source, without its voxels."""
     if isinstance(transfer, LabelTransferFunction):
         raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
@@ -192,8 +179,8 @@ def scene_of(
     if lighting is not None and lighting.farthest_read is None:
         needs = f"{type(lighting).__name__}, which needs the whole volume"
         raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); got {needs}.")
-    place = {"spacing": source.spacing, "origin": source.origin} | traced
-    volume = Volume(np.zeros((2, 2, 2), source.dtype), **place, direction=source.direction)
+    place = source.spacing, source.origin
+    volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
     return strong(
@@ -203,14 +190,12 @@ def scene_of(
 
 _begin_image, _march_brick = compiled(brick_march.begin_image), compiled(brick_march.march_brick)
 _finish_image, _resolve_image = compiled(brick_march.finish_image), compiled(resolve_image)
-_resolve_brick, _begin_vjp = compiled(brick_march.resolve_brick), compiled(brick_march.begin_vjp)
-_vjp_of_brick, _finish_vjp = compiled(brick_march.vjp_of_brick), compiled(brick_march.finish_vjp)
+_resolve_brick = compiled(brick_march.resolve_brick)
 
 
-def _image(scene: Scene, request: Request) -> Rendering:
+def _image(scene: Scene, traversal: Traversal) -> Rendering:
     mode, selects = scene.compositing, isinstance(scene.compositing, Selection)
-    traversal = Traversal(request, scene)
-    marched, options = traversal.scene, traversal.options
+    request, marched, options = traversal.request, traversal.scene, traversal.options
     if request.deals_bricks:
         assert request.mesh is not None
         return render_distributed(traversal, request.mesh)
@@ -237,46 +222,6 @@ def _image(scene: Scene, request: Request) -> Rendering:
     return Rendering(pixels[..., :4], rendering.exhausted, details)
 
 
-@eqx.filter_custom_vjp
-def _differentiable(scene: Scene, request: Request) -> Rendering:
-    if is_traced(scene):
-        raise ValueError(
-            "render_bricks reads its source while it runs, so not inside jax.jit, jax.vmap or forward mode."
-        )
-    return _image(scene, request)
-
-
-@_differentiable.def_fwd
-def _(perturbed: Any, scene: Scene, request: Request) -> tuple[Rendering, Rendering]:
-    mode = scene.compositing
-    if mode.resolves:
-        raise ValueError(f"compositing by {type(mode).__name__} has no gradient through bricks.")
-    if callable(request.method):
-        raise ValueError('method: a schedule of your own has no gradient; use "overlap".')
-    rendering = _differentiable(scene, request)
-    return rendering, rendering
-
-
-@_differentiable.def_bwd
-def _(rendering: Rendering, cotangent: Any, perturbed: Any, scene: Scene, request: Request) -> Any:
-    if is_traced(cotangent):
-        raise ValueError(
-            "the gradient by bricks reads its source while it is computed, and so not inside jax.jit, "
-            "jax.vmap or jax.jacrev: call what jax.vjp returns outside of them, once for each cotangent."
-        )
-    traversal = Traversal(request, scene)
-    options, whole = traversal.options, of_all_outputs(rendering, cotangent)
-    if not scene.march.leaps:  # the gradient with respect to an extinction of 0 is not 0
-        traversal.visible = np.ones_like(traversal.visible)
-    sums, replay = _begin_vjp(scene, perturbed, options, rendering, whole)
-    for brick, cells in traversal.bricks(replay.states.rays, replay.states.at):
-        sums, replay = _vjp_of_brick(*_on(brick, scene, options), perturbed, sums, replay, cells)
-        traversal.at = replay.states.at
-        del brick
-    found = _finish_vjp(scene, perturbed, options, sums, replay, rendering, whole)
-    return of_perturbed(found, perturbed, rendering, whole)
-
-
 def _on(
     brick: Volume, scene: Scene, options: RenderOptions
 ) -> tuple[Scene, RenderOptions, VolumeAcceleration]:
@@ -292,6 +237,4 @@ def _level(
     most = 0 if mapped else len(levels) - 1  # a map's ranges are those of the finest level
     if level != "auto":
         return levels[integer("level", level, 0, most, otherwise=', or "auto"')]
-    if most and is_traced(camera):
-        raise ValueError(f"level must be one of 0 to {most} under jax.grad; got 'auto'.")
     return levels[level_for(levels, camera) if most else 0]

@@ -4,7 +4,7 @@ import math
 import mmap
 import operator
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import pairwise, product
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._util.axes import XYZ, Axes, inverse, permuted
-from .._util.checks import Arrayable, described, finite_array, integer
+from .._util.checks import Arrayable, described, finite_array
 from .._util.voxels import DTYPES, WHOLE, check_shape, check_type
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
@@ -38,12 +38,12 @@ class VoxelSource:
     Args:
         array: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
             axis, such as an array of NumPy, zarr, h5py, dask or tensorstore. Several threads read it at once.
+            `source_of` takes data[x, y, z]; `dask.array` and xarray transpose and index others lazily.
         spacing: as in `Volume`.
         origin: as in `Volume`.
         direction: as in `Volume`.
-        axes: the name of each axis, such as "tczyx" or ["z", "y", "x"]; by default "xyz".
-        index: the entry of each axis other than x, y and z, such as {"c": 1, "t": 0}; by default the only
-            one.
+        space: the axes of the array that are x, y and z.
+        index: what is read along each axis: a number, and a slice along these three.
         nan: the value of voxels that are NaN or infinite; by default they are refused where they are read.
         name: what it is called in errors.
 
@@ -54,8 +54,7 @@ class VoxelSource:
         order: axes in the order of storage, the slowest first, 0 for x.
 
     Raises:
-        ValueError: for a shape or type that no volume has, for axes or an index that the array does not have,
-            and for a traced array.
+        ValueError: for a shape or type that no volume has, and for a traced array.
     """
 
     def __init__(
@@ -65,15 +64,15 @@ class VoxelSource:
         origin: Arrayable | None = None,
         *,
         direction: Any = None,
-        axes: str | Sequence[str] | Any | None = None,
-        index: Mapping[str, int] | None = None,
+        space: Sequence[int] = XYZ,
+        index: Sequence[int | slice] | None = None,
         nan: float | None = None,
         name: str = "array",
     ):
         if is_traced((array, spacing, origin, direction)):
             raise ValueError(
-                "source must not be traced: bricks have no gradients to voxels (jv.render has), and are not "
-                "read inside jax.jit and jax.vmap. Pass traced spacing and origin to render_bricks itself."
+                "source must not be traced: bricks have no gradients (jv.render has), and are not read "
+                "inside jax.jit and jax.vmap."
             )
         try:
             is_array = all(hasattr(array, attribute) for attribute in ("shape", "dtype", "__getitem__"))
@@ -97,9 +96,11 @@ class VoxelSource:
         if min(self.spacing) <= 0:
             raise ValueError(f"spacing must be positive along every axis; got {spacing!r}.")
         shape = tuple(map(int, array.shape))
-        if len(shape) < 3:
+        if index is None:
             check_shape(shape)
-        self._place, self._index = _axes(name, shape, axes, index or {})
+            if len(shape) > 3:
+                raise ValueError(f"{name} must be data[x, y, z]; got shape {shape}. Choose a channel first.")
+        self._place, self._index = list(space), [slice(None)] * 3 if index is None else list(index)
         self.shape: tuple[int, int, int] = permuted([shape[axis] for axis in self._place], XYZ)
         check_shape(self.shape)
         self.dtype = voxel_type(np.dtype(getattr(array.dtype, "numpy_dtype", array.dtype)))  # of tensorstore
@@ -259,25 +260,6 @@ def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[Any, list[int]]:
     if isinstance(array, np.ndarray):
         return None, sorted(axes, key=lambda axis: -abs(array.strides[axis]))
     return getattr(array, "chunks", None), axes
-
-
-def _axes(
-    name: str, shape: tuple[int, ...], axes: Any, index: Mapping[str, int]
-) -> tuple[list[int], list[int]]:
-    """The axes of the array that are x, y and z; and the entry to read along each axis, 0 along these."""
-    axes = SPACE if axes is None and len(shape) == 3 else axes
-    names = list(axes) if isinstance(axes, Sequence) else []
-    if len(names) != len(shape) or len({*names}) != len(shape) or not {*SPACE} <= {*names}:
-        raise ValueError(
-            f'axes must name each of the {len(shape)} axes of {name} once, such as "zyx"; got {axes!r}.'
-        )
-    if unknown := {*index} - ({*names} - {*SPACE}):
-        raise ValueError(f"index must name axes other than x, y, z of {names}; got {sorted(unknown)}.")
-    fixed = []
-    for axis, count in zip(names, shape, strict=True):
-        only = 0 if count == 1 or axis in SPACE else None
-        fixed.append(integer(f"index[{axis!r}]", index.get(axis, only), 0, max(count - 1, 0)))
-    return [names.index(axis) for axis in SPACE], fixed
 
 
 def _triple(name: str, value: Any) -> tuple[float, float, float]:

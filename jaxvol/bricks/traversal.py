@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
@@ -68,7 +68,6 @@ class Request:
     outputs: Any = "all"
     mesh: Mesh | None = None  # devices over which rays are dealt out, or bricks, if `deals_bricks`
     deals_bricks: bool = False
-    traversals: "list[Traversal]" = field(default_factory=list)  # so far; a gradient has a second one
 
 
 class Traversal:
@@ -116,7 +115,6 @@ class Traversal:
         # last, since it may read the whole source
         occupied = eqx.Partial(marched.compositing.occupied, marched.transfer)
         self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
-        request.traversals.append(self)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
         """Each brick that rays need, and their cells there, while the next one is read. Before this one is

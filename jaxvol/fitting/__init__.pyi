@@ -6,13 +6,13 @@ from .bijections import (
     Pose as Pose,
     Positive as Positive,
     ProbeGeometry as ProbeGeometry,
+    RigidMotion as RigidMotion,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
 )
 from .candidates import (
     Candidate as Candidate,
     flat_grey as flat_grey,
-    nested_materials as nested_materials,
     nested_points as nested_points,
     refined as refined,
 )
@@ -23,10 +23,9 @@ from .driver import (
     Outcome as Outcome,
     fit as fit,
     fit_coarse_to_fine as fit_coarse_to_fine,
-    fit_in_stages as fit_in_stages,
 )
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
 from .path_traced import PathTracedResidual as PathTracedResidual
-from .registration import Registration as Registration, RigidMotion as RigidMotion, register as register
+from .registration import Registration as Registration, register as register
 from .residuals import ImageResidual as ImageResidual
 from .uncertainty import Uncertainty as Uncertainty

@@ -5,7 +5,7 @@ allowed range. Free variables are of order 1 whatever the parameter's units, whi
 """
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,6 +22,30 @@ from ..scene.camera import Camera, axes_of
 MARGIN = 1e-3
 """Least distance of a start from an open end of the range, relative to the scale: at the end itself the map
 is flat, and a fit could never leave it."""
+
+
+class RigidMotion(NamedTuple):
+    """A rotation about a point, and a translation after it: p becomes R (p - center) + center + translation.
+
+    Attributes:
+        rotation: rotation vector (exponential map), (3,) radians; of many motions, (n, 3).
+        translation: (3,), in world length; of many motions, (n, 3).
+        center: the point, (3,), of all.
+    """
+
+    rotation: Arrayable
+    translation: Arrayable
+    center: Arrayable
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera, moved by a single motion. The volume that it sees moves the other way."""
+        turn, shift, center = (jnp.asarray(part, camera.position.dtype) for part in self)
+
+        def moved(point: Array) -> Array:
+            return rotate(turn, point - center) + center + shift
+
+        places = moved(camera.position), moved(camera.focal_point), rotate(turn, camera.view_up)
+        return eqx.tree_at(lambda c: (c.position, c.focal_point, c.view_up), camera, places)
 
 
 class Bijection(eqx.Module):
@@ -130,12 +154,8 @@ class Pose(Bijection):
 
     def forward(self, free: dict[str, Float[Array, "3"]]) -> Camera:
         start = jax.lax.stop_gradient(self.start)
-        arm = start.position - start.focal_point
-        focal_point = start.focal_point + jnp.linalg.norm(arm) * free["translation"]
-        position = focal_point + rotate(free["rotation"], arm)
-        return eqx.tree_at(
-            _moved, self.start, (position, focal_point, rotate(free["rotation"], start.view_up))
-        )
+        shift = _distance(start) * free["translation"]
+        return RigidMotion(free["rotation"], shift, start.focal_point).camera(start)
 
     def inverse(self, value: Camera, name: str = "value") -> dict[str, Float[Array, "3"]]:
         from scipy.spatial.transform import Rotation  # here, so that a first image does not wait for it
@@ -158,11 +178,7 @@ class Pose(Bijection):
         return {"rotation": jnp.asarray(rotation, shift.dtype), "translation": shift}
 
     def moved(self, value: Camera) -> dict[str, Float[Array, "3"]]:
-        return dict(zip(("position", "focal_point", "view_up"), _moved(value), strict=True))
-
-
-def _moved(camera: Camera) -> tuple[Any, Any, Any]:
-    return camera.position, camera.focal_point, camera.view_up
+        return {name: getattr(value, name) for name in ("position", "focal_point", "view_up")}
 
 
 def _distance(camera: Camera) -> Float[Array, ""]:

@@ -5,12 +5,10 @@ from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from .._util.checks import Arrayable, described, finite_array, integer, require
-from ..lighting import Material
 from ..scene.transfer import TransferFunction
 from ..scene.volume import Volume
 from ..xla.trees import PyTree
@@ -118,67 +116,3 @@ def nested_points(
     first = Candidate(f"{numbers[0]} points", refined(start, numbers[0]), **of_each)
     larger = (Candidate(f"{n} points", grow=partial(refined, points=n), **of_each) for n in numbers[1:])
     return [first, *larger]
-
-
-def nested_materials(
-    parts: Sequence[Any] | Any, partitions: Sequence[Sequence[int]] | Any
-) -> list[Candidate]:
-    """Candidates in which more and more materials have parameters of their own. The residual takes a tuple
-    like `parts`, whichever of them share parameters.
-
-    Args:
-        parts: the starting point: materials, which share their mean free path and nothing else; or other
-            trees of one kind, such as the transfer functions of labels, which are shared as a whole.
-        partitions: for each candidate the class of each part, numbered from 0 on: `[(0, 0, 0), (0, 1, 2)]`
-            for one mean free path for all and then one for each; `[(0, 0, 1), (0, 1, 2)]` to ask whether the
-            first two differ. Each divides classes of the one before.
-
-    Returns:
-        The candidates, for `choose`, in the order of `partitions`. The parameters of each are a tuple with
-        the first part of each class; `candidate._replace(where=...)` fixes some of them.
-
-    Raises:
-        ValueError: for no parts, and for partitions that do not match these or are not nested.
-    """
-    if not isinstance(parts, list | tuple) or not parts or len({type(part) for part in parts}) > 1:
-        raise ValueError(f"parts must be a list of materials or parameters of one kind; got {parts!r}.")
-    chain = [tuple(integer("partitions", number, 0) for number in classes) for classes in partitions]
-    for coarse, fine in pairwise([(), *chain]):
-        valid = len(fine) == len(parts) and set(fine) == set(range(max(fine) + 1))
-        divided = len(set(zip(coarse or fine, fine, strict=False))) == len(set(fine)) > len(set(coarse))
-        if not (valid and divided):
-            raise ValueError(
-                f"partitions must hold a class for each of {len(parts)} parts, numbered from 0 without gaps, "
-                f"and each divide classes of the one before; got {fine} after {coarse}."
-            )
-
-    candidates: list[Candidate] = []
-    for classes in chain:
-        numbers = range(max(classes) + 1)
-        members = ("+".join(str(i) for i, own in enumerate(classes) if own == number) for number in numbers)
-        name = f"{len(numbers)} class{'es' if len(numbers) > 1 else ''}: {', '.join(members)}"
-        expand = partial(_expand, parts, classes)
-        if candidates:
-            grow = partial(_grow, candidates[-1].expand, classes)
-            candidates.append(Candidate(name, grow=grow, expand=expand))
-        else:
-            candidates.append(Candidate(name, _first_of_each(parts, classes), expand=expand))
-    return candidates
-
-
-def _expand(parts: Sequence[Any], classes: tuple[int, ...], found: Sequence[Any]) -> tuple[Any, ...]:
-    """The parts, with what each shares with its class as `found` for that."""
-    of_class = tuple(found[number] for number in classes)
-    if not isinstance(parts[0], Material):
-        return of_class
-    pairs = zip(parts, of_class, strict=True)
-    return tuple(eqx.tree_at(lambda m: m.mean_free_path, each, own.mean_free_path) for each, own in pairs)
-
-
-def _grow(expand: Callable[..., Any], classes: tuple[int, ...], found: Sequence[Any]) -> tuple[Any, ...]:
-    """Parameters of each class, from those `found` for the classes that they divide."""
-    return _first_of_each(expand(found), classes)
-
-
-def _first_of_each(parts: Sequence[Any], classes: tuple[int, ...]) -> tuple[Any, ...]:
-    return tuple(parts[classes.index(number)] for number in range(max(classes) + 1))

@@ -26,7 +26,7 @@ from . import checkpoints
 from .candidates import Candidate
 from .constraints import Free, size
 from .driver import UNDETERMINED, Fit, fit
-from .residuals import ImageResidual, check_residual
+from .residuals import ImageResidual
 from .uncertainty import MISFIT
 
 
@@ -92,12 +92,11 @@ class Choice(NamedTuple):
 
 
 def choose(
-    residual: ImageResidual | Callable[[Sequence[Any]], Any] | Any,
+    residual: Callable[[Sequence[Any]], Any] | Any,
     candidates: Sequence[Candidate] | Any,
     held_out: Sequence[Any] | Any,
     *,
-    views: Sequence[Any] | Any | None = None,
-    weights: Any = None,
+    views: Sequence[Any] | Any,
     errors: float | Any = 2.0,
     block: int | Any = 4,
     checkpoint: str | PathLike[str] | None = None,
@@ -106,7 +105,8 @@ def choose(
     """Fit nested models and choose the smallest that agrees with held-out views as well as the best does.
 
         models = jv.nested_points(jv.flat_grey(volume, 2), (2, 4, 8, 16))
-        choice = jv.choose(jv.ImageResidual(scene, views[:4]), models, held_out=views[4:])
+        residual = lambda some: jv.ImageResidual(scene, some)
+        choice = jv.choose(residual, models, views=views[:4], held_out=views[4:])
         print(choice)
 
     Each candidate is fitted to the training views, and evaluated on the held-out views. The best one has the
@@ -123,13 +123,11 @@ def choose(
     noise, and too large a model may be chosen. A fit that ends in a wrong minimum counts against its model.
 
     Args:
-        residual: an `ImageResidual` of the training views; or `residual(views)`, a function from a list of
-            views, of any kind, to what `fit` takes.
+        residual: `residual(views)`, from a list of views, of any kind, to what `fit` takes.
         candidates: nested models, each with more free parameters than the one before, such as
-            `nested_points` and `nested_materials` make.
-        held_out: views that none is fitted to: pairs (camera, image), or what the function takes.
-        views: the training views, for a function.
-        weights: of the held-out views, with an `ImageResidual`, in the form of its own.
+            `nested_points` makes.
+        held_out: views that none is fitted to.
+        views: the training views.
         errors: standard errors of the difference up to which a candidate is not significantly worse, ≥ 0. If
             both models hold the truth, the larger one seems better by more than 2 in at most 2.3 % of trials.
         block: pixels along a side of blocks within which noise may be correlated: 1 for noise of single
@@ -143,15 +141,21 @@ def choose(
         fits is in `fit.uncertainty.reduced_chi_squared`.
 
     Raises:
-        ValueError: for no candidates, candidates that do not grow or have no start, no held-out views, a view
-            that is in both sets, and as `fit` does.
+        ValueError: for no candidates, candidates that do not grow or have no start, no views, a view that is
+            in both sets, and as `fit` does.
     """
     errors, block = float(not_negative("errors", errors)), integer("block", block, 1)
     if wrong := {"constraints", "where"} & set(options):
         raise ValueError(f"{' and '.join(sorted(wrong))} must be given with each Candidate, not to choose.")
     candidates, held_out = _list("candidates", candidates), _list("held_out", held_out)
+    views = _list("views", views)
+    if isinstance(residual, ImageResidual) or not callable(residual):
+        raise ValueError(f"residual must be a function of a list of views; got {described(residual)}.")
+    if any(eqx.tree_equal(view, other) for view in held_out for other in views):
+        raise ValueError("held_out must not be among the views that are fitted; one of them is.")
     _check(candidates)
-    training, validation = _residuals(residual, views, held_out, weights)
+    training: Any = residual(views)
+    validation: list[Any] = [residual([view]) for view in held_out]
 
     fits: list[Fit] = []
     found: list[list[np.ndarray]] = []
@@ -161,18 +165,16 @@ def choose(
         if checkpoint is not None:
             how["checkpoint"] = checkpoints.numbered(checkpoint, at)
         with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message=UNDETERMINED)
-            warnings.filterwarnings("ignore", message=MISFIT)
+            for message in (UNDETERMINED, MISFIT):
+                warnings.filterwarnings("ignore", message=message)
             fits.append(fit(_of_model(training, candidate), start, **how))
-        parameters = fits[-1].parameters
-        entries = (_entries(_of_model(view, candidate), parameters) for view in validation)
+        entries = (_entries(_of_model(view, candidate), fits[-1].parameters) for view in validation)
         found.append([np.asarray(each, np.float64) for each in entries])
 
     losses = [sum(float(np.sum(each**2)) for each in of_views) / 2 / len(of_views) for of_views in found]
     if not any(map(math.isfinite, losses)):
         raise ValueError("held_out must have finite residuals for one candidate at least; got none.")
-    best = int(np.nanargmin(losses))
-    images = isinstance(training, ImageResidual)
+    best, images = int(np.nanargmin(losses)), isinstance(training, ImageResidual)
     count = sum(view.references.count for view in validation) if images else None
     norm = training.references.scale() if images else math.sqrt(2 * fits[0].losses[0])
     rows, chosen = [], best
@@ -243,45 +245,12 @@ def _check(candidates: list[Any]) -> None:
     for at, candidate in enumerate(candidates):
         if not isinstance(candidate, Candidate):
             raise ValueError(f"candidates[{at}] must be a Candidate; got {described(candidate)}.")
-        name, before = candidate.name, numbers
         if (candidate.start is None) == (candidate.grow is None) or (at == 0 and candidate.start is None):
-            raise ValueError(f"candidates[{at}], {name!r}, must have a start, or, after the first, grow.")
+            raise ValueError(f"candidates[{at}] must have a start, or, after the first, grow.")
         start = candidate.start if candidate.grow is None else candidate.grow(start)
-        numbers = size(Free.of(start, candidate.constraints, candidate.where)[1])
+        before, numbers = numbers, size(Free.of(start, candidate.constraints, candidate.where)[1])
         if numbers <= before:
             raise ValueError(
                 "candidates must be in order, each with more free parameters than the one before; "
-                f"{name!r} has {numbers}, and {candidates[at - 1].name!r} {before}."
+                f"number {at}, {candidate.name!r}, has {numbers} after {before}."
             )
-
-
-def _residuals(residual: Any, views: Any, held_out: list[Any], weights: Any) -> tuple[Any, list[Any]]:
-    """The residual of the training views, and that of each held-out view."""
-    if isinstance(residual, ImageResidual):
-        if views is not None:
-            raise ValueError("views must not be given with an ImageResidual, which has views of its own.")
-        how = {"background": residual.references.background, "compositing": residual.compositing}
-        each = list(weights) if isinstance(weights, list | tuple) else [weights] * len(held_out)
-        if len(each) != len(held_out):
-            raise ValueError(f"weights must hold one entry for each of held_out; got {described(weights)}.")
-        training = residual
-        validation = [
-            ImageResidual(residual.scene, [view], **how, weights=None if weight is None else [weight])
-            for view, weight in zip(held_out, each, strict=True)
-        ]
-        # another picture by the same camera tells nothing of other views
-        fitted, others = residual.references.cameras(), [view[0] for view in held_out]
-    else:
-        check_residual(residual)
-        if weights is not None:
-            raise ValueError("weights go with an ImageResidual; a function weights its residual itself.")
-        fitted, others = _list("views", views), held_out
-        training, validation = residual(fitted), [residual([view]) for view in others]
-    for at, view in enumerate(others):
-        for number, other in enumerate(fitted):
-            if eqx.tree_equal(view, other):
-                raise ValueError(
-                    f"held_out[{at}] must not be among the views that are fitted; it is the same as number "
-                    f"{number} of these. Hold out views of other cameras."
-                )
-    return training, validation

@@ -9,7 +9,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from os import PathLike
 from typing import Any, ClassVar
 
@@ -26,10 +25,9 @@ from . import checkpoints
 from .constraints import Free, FreeVariables, Where, size
 from .damping import LevenbergMarquardt
 from .outcomes import Limits, Outcome as Outcome
-from .path_traced import PathTracedResidual, SampledProblem
+from .path_traced import PathTracedResidual, SampledProblem, SampledRun
 from .residuals import ImageResidual, Problem, Triangles, check_residual
-from .sampled_steps import SampledRun
-from .uncertainty import MISFIT, Uncertainty, uncertainty, warn_of_misfit
+from .uncertainty import Uncertainty, uncertainty, warn_of_misfit
 
 
 UNDETERMINED = ".*directions are not determined"
@@ -142,7 +140,7 @@ def fit(
         determine. If the noise of the references is known (`ImageResidual`), another one says that the model
         does not fit them: that the residual is larger than noise is once in 741 fits, even if the noise of
         neighbouring pixels is correlated. Standard errors don't cover the bias of such a fit. If the noise is
-        unknown, so is whether the model fits.
+        unknown, so is whether the model fits. A fit of a `PathTracedResidual` only reports χ².
 
     Raises:
         ValueError: for incompatible arguments, parameters that are not finite or out of bounds, a residual
@@ -162,13 +160,14 @@ def fit(
     problem: Any
     if isinstance(residual, PathTracedResidual):
         problem = SampledProblem.of(residual, free, y, max_jacobian)
-        run = SampledRun.of(problem, y)
+        run: Any = SampledRun.of(problem, y)
     else:
         least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
         problem = Problem.of(residual, free, y, max_jacobian, least_squares)
         run = _Run.of(solver, problem, y)
-    run = run.step(solver, problem)
-    if not math.isfinite(loss := run.losses[0]):
+    run, loss = run.step(solver, problem)
+    losses = [loss]
+    if not math.isfinite(loss):
         raise ValueError(f"residual must be finite at the parameters that the fit starts from; loss {loss}.")
     bounds = zip(free.paths, free.bijections, strict=True)
     about = {
@@ -178,61 +177,21 @@ def fit(
         "loss at the start": f"{loss:.3g}",  # other machines round differently
     }
     if file is not None and (found := checkpoints.load(file, run, about)) is not None:
-        run = replace(found[0], losses=found[1]["losses"])
+        run, losses = found[0], found[1]["losses"]
     due = 0.0
     try:
-        while (result := run.ended(problem, limits)) is None:
-            run = run.step(solver, problem)
+        while (result := run.ended(problem, losses, limits)) is None:
+            run, loss = run.step(solver, problem)
+            losses.append(loss)
             if callback is not None:
-                callback(len(run.losses), free.forward(run.evaluated), run.losses[-1])
+                callback(len(losses), free.forward(run.evaluated), loss)
             if file is not None and (begun := time.monotonic()) >= due:
-                checkpoints.save(file, run, {**about, "losses": run.losses})
+                checkpoints.save(file, run, {**about, "losses": losses})
                 due = time.monotonic() + (time.monotonic() - begun) / CHECKPOINTS
     finally:
         if file is not None:
-            checkpoints.save(file, run, {**about, "losses": run.losses})
-    return _report(run, problem, limits, result)
-
-
-def fit_in_stages(
-    residuals: Sequence[ImageResidual | PathTracedResidual | Callable[[Any], PyTree]] | Any,
-    parameters: PyTree,
-    *,
-    checkpoint: str | PathLike[str] | None = None,
-    **options: Any,
-) -> list[Fit]:
-    """Fit parameters to residuals in turn, each time from where the last fit ended.
-
-    For example to a model without noise first, and then to the one that the references are by:
-
-        templates = jv.ImageResidual(lit_scene, views, (0, 0, 0))
-        paths = jv.PathTracedResidual(traced_scene, views, (0, 0, 0))
-        *_, found = jv.fit_in_stages([templates, paths], parameters)
-
-    Args:
-        residuals: at least one, as those of `fit`, of the same parameters.
-        parameters: the starting point.
-        checkpoint: a file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
-        options: others of `fit`, for all of them.
-
-    Returns:
-        The fits, in order. The last one's `parameters` and `uncertainty` are the result. That the model does
-        not fit is told of the last one only.
-
-    Raises:
-        ValueError: for no residuals, and as `fit`.
-    """
-    if not isinstance(residuals, list | tuple) or not residuals:
-        raise ValueError(f"residuals must be a list of at least one; got {described(residuals)}.")
-    fits: list[Fit] = []
-    for at, residual in enumerate(residuals):
-        with warnings.catch_warnings():
-            if at + 1 < len(residuals):
-                warnings.filterwarnings("ignore", message=MISFIT)
-            file = None if checkpoint is None else checkpoints.numbered(checkpoint, at)
-            fits.append(fit(residual, parameters, checkpoint=file, **options))
-        parameters = fits[-1].parameters
-    return fits
+            checkpoints.save(file, run, {**about, "losses": losses})
+    return _report(run, problem, losses, limits, result)
 
 
 def fit_coarse_to_fine(
@@ -240,9 +199,10 @@ def fit_coarse_to_fine(
     parameters: PyTree,
     *,
     blurs: Sequence[Arrayable | None] | Any = (1 / 8, 1 / 32, None),
+    checkpoint: str | PathLike[str] | None = None,
     **options: Any,
 ) -> list[Fit]:
-    """Fit parameters to images blurred less and less, by `fit_in_stages`.
+    """Fit parameters to images blurred less and less, each fit from where the last ended.
 
     A derivative describes only features that move by less than their own size. In blurred images features are
     large, so that a pose or a geometry is found from farther away; sharp images at last make it exact. Steps
@@ -253,7 +213,8 @@ def fit_coarse_to_fine(
         parameters: the starting point.
         blurs: of each fit, in order, as `ImageResidual`'s. End with None: only the standard errors of an
             unblurred fit are right.
-        options: those of `fit_in_stages`, for all fits. A `patience` of 4 saves steps.
+        checkpoint: a file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
+        options: others of `fit`, for all fits. A `patience` of 4 saves steps.
 
     Returns:
         The fits, in order. The last one's `parameters` and `uncertainty` are the result.
@@ -265,7 +226,12 @@ def fit_coarse_to_fine(
         raise ValueError(f"residual must be an ImageResidual, to be blurred; got {described(residual)}.")
     if len(blurs) == 0:
         raise ValueError("blurs must hold at least one, such as None; got none.")
-    return fit_in_stages([residual.blurred(blur) for blur in blurs], parameters, **options)
+    fits: list[Fit] = []
+    for at, blur in enumerate(blurs):
+        file = None if checkpoint is None else checkpoints.numbered(checkpoint, at)
+        fits.append(fit(residual.blurred(blur), parameters, checkpoint=file, **options))
+        parameters = fits[-1].parameters
+    return fits
 
 
 def _solver(solver: Any, residual: Any, rtol: float, atol: float) -> tuple[Any, int]:
@@ -299,48 +265,43 @@ class _Run(eqx.Module):
     evaluated: FreeVariables
     """The solver's point whose loss is known."""
     best: FreeVariables
+    loss: Float[np.ndarray, ""]
+    """At the best point."""
     triangles: Triangles | None
     """At the best point."""
     done: Array
     result: Any
-    losses: list[float] = eqx.field(static=True)
 
     own: ClassVar[None] = None
-    loss_error: ClassVar[float] = 0.0
     """The fit is not random."""
 
     @classmethod
     def of(cls, solver: Any, problem: Problem, y: FreeVariables) -> "_Run":
-        """Before any step."""
+        """The state before any step."""
         state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
-        return cls(y, state, y, y, None, done, optx.RESULTS.successful, [])
+        return cls(y, state, y, y, np.asarray(np.inf), None, done, optx.RESULTS.successful)
 
-    @property
-    def loss(self) -> float:
-        """At the best point."""
-        return float(np.nanmin(self.losses))
-
-    def step(self, solver: Any, problem: Problem) -> "_Run":
+    def step(self, solver: Any, problem: Problem) -> tuple["_Run", float]:
+        """The state after a step, and the loss at the solver's point."""
         y, state, (loss, evaluated, triangles), done, result = _advance(solver, problem, self.y, self.state)
-        loss = float(loss)
-        better = loss < min(self.losses, default=math.inf)
-        best, triangles = (evaluated, triangles) if better else (self.best, self.triangles)
-        return _Run(y, state, evaluated, best, triangles, done, result, [*self.losses, loss])
+        loss = np.asarray(loss, np.float64)
+        known = (evaluated, loss, triangles) if loss < self.loss else (self.best, self.loss, self.triangles)
+        return _Run(y, state, evaluated, *known, done, result), float(loss)
 
     def message(self, problem: Problem, limits: Limits, result: Any) -> None:
         """Nothing more than the result says."""
 
-    def ended(self, problem: Problem, limits: Limits) -> Any:
+    def ended(self, problem: Problem, losses: list[float], limits: Limits) -> Any:
         """The result if the fit has ended, else None."""
         finite = all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(self.y))
-        if not finite or not math.isfinite(self.losses[-1]):
+        if not finite or not math.isfinite(losses[-1]):
             return Outcome.nonfinite
         if self.done or self.result != optx.RESULTS.successful:
             return Outcome.promote(self.result)
-        earlier, late = self.losses[: -limits.patience], self.losses[-limits.patience :]
+        earlier, late = losses[: -limits.patience], losses[-limits.patience :]
         if earlier and min(late) >= (1 - limits.rtol) * min(earlier):
             return Outcome.stalled
-        if len(self.losses) >= limits.max_steps:
+        if len(losses) >= limits.max_steps:
             return Outcome.nonlinear_max_steps_reached
         return None
 
@@ -367,13 +328,11 @@ def allow_promotion() -> Iterator[None]:
         yield
 
 
-def _report(run: Any, problem: Any, limits: Limits, result: Any) -> Fit:
+def _report(run: Any, problem: Any, losses: list[float], limits: Limits, result: Any) -> Fit:
     """The result of a run, a `_Run` or `SampledRun`, and its problem."""
-    estimate, chi_squared, slack = None, None, None
-    if problem.noise is not None:
-        # of Σ r², as the loss is half the mean square; and what is uncertain of it, as three standard errors
-        squares = 2 * problem.count * run.loss, 6 * problem.count * run.loss_error
-        chi_squared, slack = (problem.noise.reduced_chi_squared(each, size(run.best)) for each in squares)
+    estimate, chi_squared, loss = None, None, float(run.loss)
+    if problem.noise is not None:  # of Σ r², as the loss is half the mean square
+        chi_squared = problem.noise.reduced_chi_squared(2 * problem.count * loss, size(run.best))
     if run.triangles is not None:
         about = problem.free, run.best, problem.scale, chi_squared
         estimate = uncertainty(run.triangles, problem.count, *about, run.own)
@@ -384,10 +343,10 @@ def _report(run: Any, problem: Any, limits: Limits, result: Any) -> Fit:
                 f"by the residual; parameters they change most: {moved}.",
                 stacklevel=3,
             )
-    stats = {"num_steps": len(run.losses), "max_steps": limits.max_steps, "loss": run.loss}
+    stats = {"num_steps": len(losses), "max_steps": limits.max_steps, "loss": loss}
     stats["message"] = run.message(problem, limits, result)
-    solution = optx.Solution(run.best, result, None, stats, run.state)
-    found = Fit(problem.free.forward(run.best), solution, np.asarray(run.losses), estimate)
-    if problem.noise is not None and chi_squared is not None and slack is not None:
-        warn_of_misfit(problem.noise, chi_squared, slack, None if found.success else found.message)
+    solution = optx.Solution(run.best, result, None, stats, getattr(run, "state", run))
+    found = Fit(problem.free.forward(run.best), solution, np.asarray(losses), estimate)
+    if problem.noise is not None and chi_squared is not None and run.own is None:
+        warn_of_misfit(problem.noise, chi_squared, None if found.success else found.message)
     return found

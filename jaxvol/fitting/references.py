@@ -63,11 +63,6 @@ class References(eqx.Module):
         count = sum(math.prod(s) for s in shapes) if counted is None else sum(map(np.count_nonzero, counted))
         return cls(groups, stacked, color, told, int(count))
 
-    def cameras(self) -> list[Camera]:
-        """Cameras of all views."""
-        each = ((cameras, view) for cameras, images in self.groups for view in range(len(images)))
-        return [jax.tree.map(lambda leaf, view=view: leaf[view], cameras) for cameras, view in each]
-
     def size(self) -> int:
         """Total number of entries."""
         return sum(images.size for _, images in self.groups)

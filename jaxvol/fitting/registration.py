@@ -27,7 +27,7 @@ from ..render import Adjoint, render
 from ..scene.camera import Camera
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel
-from .bijections import rotate
+from .bijections import RigidMotion
 from .constraints import Free
 from .damping import LevenbergMarquardt
 from .driver import allow_promotion
@@ -40,31 +40,6 @@ Similarity = Literal["gradient_ncc", "ncc"]
 
 NEAR = 0.01
 """A search ends at a step that moves voxels by less than this part of a pixel."""
-
-
-class RigidMotion(NamedTuple):
-    """A rotation about a point, and a translation after it: p becomes R (p - center) + center + translation.
-
-    Attributes:
-        rotation: rotation vector (exponential map), (3,) radians; of many motions, (n, 3).
-        translation: (3,), in world length; of many motions, (n, 3).
-        center: the point, (3,), of all.
-    """
-
-    rotation: Arrayable
-    translation: Arrayable
-    center: Arrayable
-
-    @eqx.filter_jit
-    def camera(self, camera: Camera) -> Camera:
-        """The camera, moved by a single motion. The volume that it sees moves the other way."""
-        turn, shift, center = (jnp.asarray(part, camera.position.dtype) for part in self)
-
-        def moved(point: Array) -> Array:
-            return rotate(turn, point - center) + center + shift
-
-        places = moved(camera.position), moved(camera.focal_point), rotate(turn, camera.view_up)
-        return eqx.tree_at(lambda c: (c.position, c.focal_point, c.view_up), camera, places)
 
 
 class Registration(NamedTuple):
@@ -191,7 +166,8 @@ def register(
     reached = RigidMotion(ends[:, :3], ends[:, 3:] * radius, center)
     at = int(np.nanargmax(found[:, 1]))
     best = RigidMotion(reached.rotation[at], reached.translation[at], center)
-    moved = [best.camera(camera) for camera in cameras]
+    move = eqx.filter_jit(RigidMotion.camera)
+    moved = [move(best, camera) for camera in cameras]
     return Registration(best, moved, float(found[at, 1]), RigidMotion(turns, shifts, center), reached, found)
 
 

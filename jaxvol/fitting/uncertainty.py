@@ -131,10 +131,9 @@ def uncertainty(
     return Uncertainty(covariance(each), names, moved, covariance(equal), chi_squared)
 
 
-def warn_of_misfit(noise: Noise, chi_squared: float, slack: float, message: str | None) -> None:
-    """Warn if noise does not explain the residual, of which χ² is known only up to a `slack`. `message`: how
-    the fit ended, if it did not converge."""
-    if not chi_squared - slack > noise.largest_by_chance:
+def warn_of_misfit(noise: Noise, chi_squared: float, message: str | None) -> None:
+    """Warn if noise does not explain the residual. `message`: how the fit ended, if it did not converge."""
+    if not chi_squared > noise.largest_by_chance:
         return
     because = "" if message is None else f", or the fit is not at its minimum ({message})"
     warnings.warn(

@@ -1,6 +1,5 @@
 """Lighting of samples: light sources, and the materials that scatter their light."""
 
-from .deferred import Deferred as Deferred
 from .lights import (
     ConstantLight as ConstantLight,
     DirectionalLight as DirectionalLight,

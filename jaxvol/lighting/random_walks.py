@@ -1,17 +1,15 @@
-"""Templates of `form="transport"`: the vertices of random walks, in a medium without end.
+"""Random walks in a medium without end, by which `form="transport"` carries light.
 
 The light scattered at a point x of a homogeneous medium towards the camera is, in expectation,
 
     ω p E(x) + ω Σ_k ω^k p E(y_k)          ω: albedo; p: phase function; E: irradiance that arrives there
 
 where y_1, y_2, … are the vertices of a random walk from x with exponential flights of mean λ, whose
-directions follow the phase function, and which ends where it leaves the medium. With opacity α, ω = 1 - α for
-white; a template holds α (1 - α)^k at the k-th vertices, as the light that is absorbed there.
+directions follow the phase function, and which ends where it leaves the medium.
 """
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import jax
@@ -21,9 +19,8 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from .._util.checks import integer
 from .._util.vec3 import Scalar, golden_spiral, turned
 from ..xla.platform import is_traced
-from .materials import Material, Optics
+from .materials import Material
 from .phase import sample_phase
-from .template import ScattererTemplate
 
 
 def unit_walks(
@@ -59,24 +56,6 @@ def unit_walks(
     return (
         jnp.moveaxis(directions.reshape(*shape, 3), 0, 2),
         jnp.moveaxis(lengths.reshape(shape), 0, 2),
-    )
-
-
-@partial(jax.jit, static_argnums=(2, 3))
-def walk_template(
-    optics: Optics, key: PRNGKeyArray, levels: int, packets: int, anisotropy: Scalar
-) -> ScattererTemplate:
-    """The template of `form="transport"`."""
-    directions, lengths = unit_walks(key, 1, packets, levels, anisotropy)
-    vertices = jnp.cumsum(directions[0] * lengths[0, ..., None], axis=1) * optics.mean_free_path
-    by_level = jnp.moveaxis(vertices, 0, 1).reshape(-1, 3)
-    k = jnp.repeat(jnp.arange(1, levels + 1), packets)
-    light = optics.opacity * (1 - optics.opacity) ** k.astype(by_level.dtype) / packets
-    parents = jnp.maximum(jnp.arange(1, k.size + 1) - packets, 0)
-    return ScattererTemplate(
-        jnp.concatenate([jnp.zeros((1, 3), by_level.dtype), by_level]),
-        jnp.concatenate([optics.opacity[None], light]),
-        jnp.concatenate([jnp.full(1, -1), parents]),
     )
 
 

@@ -1,21 +1,17 @@
-"""Simulates scatterer templates: of one material or of several, as published or by random walks."""
+"""Simulates scatterer templates, as published: of one material or of several."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from .._util.checks import Arrayable, integer, number
+from .._util.checks import integer
 from .materials import Material, Optics, materials_of, optics_of
 from .packet_tree import MERGE, PacketTree, ThresholdOn
-from .random_walks import scatterings, walk_template
 from .template import ScattererTemplate
-
-
-Form = Literal["published", "transport"]
 
 
 def scatterer_template(
@@ -27,8 +23,6 @@ def scatterer_template(
     threshold_on: ThresholdOn | Any = "photon",
     merge: float = MERGE,
     levels: int | None = None,
-    form: Form | Any = "published",
-    anisotropy: Arrayable = 0.0,
 ) -> ScattererTemplate:
     """Simulate how light spreads around a point inside a material.
 
@@ -61,12 +55,6 @@ def scatterer_template(
         merge: photons closer than this fraction of λ are merged, as in the paper's tables.
         levels: of the tree; required if the opacity is traced. By default as many as may hold photons above
             the threshold.
-        form: `"published"`, or `"transport"`, which is ours: the photons are the vertices of `packets` random
-            walks, the first of them the point itself, and keep their `parent`. Flights are as long as above;
-            directions follow the phase function, and nothing is merged. Of the light, α (1 - α)^k is at the
-            k-th vertices, so that the sum over photons inside a homogeneous object, all of whose ancestors
-            are inside, estimates multiple scattering without bias.
-        anisotropy: g of the phase function (Henyey and Greenstein), in (-1, 1), for `"transport"`.
 
     Returns:
         A `ScattererTemplate`, differentiable in the material's mean free path, opacity and refractive index
@@ -76,9 +64,9 @@ def scatterer_template(
         ValueError: for numbers out of range, missing `levels`, and if all photons are below the threshold; of
             a traced opacity, intensities are then NaN. For whole levels of more than 4096 photons.
     """
-    how = packets, threshold, threshold_on, merge, levels, form, anisotropy
-    of_template, (own_levels,) = _simulation((material,), *how)
-    return of_template(material.optics, _key(key), own_levels, None)
+    tree = PacketTree(packets, threshold, threshold_on)
+    (own,) = tree.levels_of((material,), levels)
+    return tree.template(material.optics, _key(key), own, merge)
 
 
 def scatterer_templates(
@@ -91,8 +79,6 @@ def scatterer_templates(
     threshold_on: ThresholdOn | Any = "photon",
     merge: float = MERGE,
     levels: int | Sequence[int] | None = None,
-    form: Form | Any = "published",
-    anisotropy: Arrayable = 0.0,
 ) -> ScattererTemplate:
     """Several templates for each of several materials, simulated at once.
 
@@ -104,10 +90,7 @@ def scatterer_templates(
         threshold: as for `scatterer_template`.
         threshold_on: as for `scatterer_template`.
         merge: as for `scatterer_template`.
-        levels: as for `scatterer_template`; one number for all materials, or, of the published form, one for
-            each.
-        form: as for `scatterer_template`.
-        anisotropy: as for `scatterer_template`.
+        levels: as for `scatterer_template`; one number for all materials, or one for each.
 
     Returns:
         A `ScattererTemplate` with leading axes (materials, count).
@@ -116,67 +99,18 @@ def scatterer_templates(
         ValueError: as `scatterer_template` does.
     """
     materials, count, key = materials_of(materials), integer("count", count, 1), _key(key)
-    how = packets, threshold, threshold_on, merge, levels, form, anisotropy
-    of_template, own = _simulation(materials, *how)
+    tree = PacketTree(packets, threshold, threshold_on)
+    own = tree.levels_of(materials, levels)
 
     def one(
         optics: Optics, own_levels: Int[Array, ""], material: Int[Array, ""], template: Int[Array, ""]
     ) -> ScattererTemplate:
         draws = jax.random.fold_in(jax.random.fold_in(key, material), template)
-        return of_template(optics, draws, max(own), own_levels)
+        return tree.template(optics, draws, max(own), merge, own_levels if tree.whole_levels else None)
 
     several = jax.vmap(jax.vmap(one, in_axes=(None, None, None, 0)), in_axes=(0, 0, 0, None))
     numbers = jnp.arange(len(materials))
     return several(optics_of(materials), jnp.asarray(own), numbers, jnp.arange(count))
-
-
-def _simulation(
-    materials: Sequence[Material],
-    packets: int,
-    threshold: float,
-    threshold_on: Any,
-    merge: float,
-    levels: Any,
-    form: Any,
-    anisotropy: Arrayable,
-) -> tuple[Callable[..., ScattererTemplate], tuple[int, ...]]:
-    """What simulates one template, from its optics, key, the most levels of any and its own number; and the
-    number of levels of each material."""
-    check_form(form)
-    tree = PacketTree(packets, threshold, threshold_on)
-    if form == "transport":
-        for name, given, default in (("threshold_on", threshold_on, "photon"), ("merge", merge, MERGE)):
-            if given != default:
-                raise ValueError(f'{name} is of form="published"; got {given!r} for form="transport".')
-        g = number("anisotropy", anisotropy, above=-1, below=1)
-
-        def walks(optics: Optics, draws: PRNGKeyArray, most: int, _: Any) -> ScattererTemplate:
-            return walk_template(optics, draws, most, tree.packets, g)
-
-        return walks, (scatterings(materials, tree.threshold, levels),) * len(materials)
-    check_isotropic(anisotropy)
-
-    def photons(optics: Optics, draws: PRNGKeyArray, most: int, own: Any) -> ScattererTemplate:
-        return tree.template(optics, draws, most, merge, own if tree.whole_levels else None)
-
-    return photons, tree.levels_of(materials, levels)
-
-
-def check_isotropic(anisotropy: Any) -> None:
-    """Raise `ValueError` for an anisotropy with the published form, whose directions follow refraction."""
-    if not isotropic(anisotropy):
-        raise ValueError(f'anisotropy is of form="transport"; got {anisotropy!r} for form="published".')
-
-
-def isotropic(anisotropy: Any) -> bool:
-    """Whether an anisotropy is known to be 0 when a program is traced; None stands for 0."""
-    return anisotropy is None or (isinstance(anisotropy, int | float | np.number) and anisotropy == 0)
-
-
-def check_form(form: Any) -> None:
-    """Raise `ValueError` for what is no `Form`."""
-    if form not in get_args(Form):
-        raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
 
 
 def _key(key: PRNGKeyArray | int) -> PRNGKeyArray:

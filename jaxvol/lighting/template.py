@@ -5,7 +5,7 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from .._util.checks import integer
 
@@ -16,12 +16,10 @@ class ScattererTemplate(eqx.Module):
     Attributes:
         offset: from the sample, world length.
         intensity: the fraction of the light that each photon holds; 0 for padding.
-        parent: the photon from which light comes to each, -1 for the first; None where it is not kept.
     """
 
     offset: Float[Array, "*templates n 3"]
     intensity: Float[Array, "*templates n"]
-    parent: Int[Array, "*templates n"] | None = None
 
     def sorted(self) -> "ScattererTemplate":
         """The same photons, brightest first."""

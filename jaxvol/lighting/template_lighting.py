@@ -1,39 +1,38 @@
-"""Lighting by scatterer templates: which templates are used, and when light is baked. `photons` says what
-each photon adds to a sample.
+"""Lighting by scatterer templates: which templates are used. `photons` says what each photon adds to a
+sample, and `transport` how light is carried by random walks.
 
 Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
 volume rendering (2016), sections 3.3 and 3.4.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, flag, integer, is_flag, number
+from .._util.checks import Arrayable, flag, integer, number
 from ..march.march import March, Transform
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import computed_now
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
-from .baked import bake
-from .deferred import Deferred
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
 from .packet_tree import PacketTree, ThresholdOn
 from .photons import Interpolation, Occlusion, PhotonShading
 from .random_walks import scatterings
 from .shading import Lighting, Shading, Surroundings
-from .simulation import Form, check_form, check_isotropic, isotropic, scatterer_templates
+from .simulation import scatterer_templates
 from .template import ScattererTemplate
 from .transport import Transport
 from .voxel_photons import VoxelPhotons
 
+
+Form = Literal["published", "transport"]
 
 NODES = 48
 """Nodes of the grid of `form="transport"`, along the volume's longest side."""
@@ -82,15 +81,15 @@ class ScattererTemplates(Lighting):
     random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
     counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
     half-space's reflectance. Flights are as long as the matter in front of them, seen at 16 places, lets them
-    be. Light that was scattered before is computed on a grid of `baked` nodes, of which each turns a template
-    at random; direct light at each sample. Steps 1 to 6, refractive indices, `blend`, `photons`, `occlusion`,
-    `reach`, `cutoff` and `given` are of the published form alone. Its bias: the light of the last `levels`,
-    in materials at most `threshold` of all; the grid, which blurs light where nodes are further apart than
-    the mean free path (in thick matter, blotches are seen, of nodes whose walks differ; fewer with more
-    `packets`); places that flights see, which are farther apart the farther off they are; with anisotropy,
-    the directions of scattered light up to spherical harmonics of order 2 (up to 3 % at g = 0.5). Steps of
-    the march should be short against the mean free path, too: of a third of it, they make images up to 3 %
-    too bright. How near it comes to path tracing: `experiments/transport.py`.
+    be. Light that was scattered before is computed on a grid of `nodes`, of which each turns a template at
+    random, once for all images of a scene; direct light at each sample. Steps 1 to 6, refractive indices,
+    `blend`, `photons`, `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias:
+    the light of the last `levels`, in materials at most `threshold` of all; the grid, which blurs light where
+    nodes are further apart than the mean free path (in thick matter, blotches are seen, of nodes whose walks
+    differ; fewer with more `packets`); places that flights see, which are farther apart the farther off they
+    are; with anisotropy, the directions of scattered light up to spherical harmonics of order 2 (up to 3 % at
+    g = 0.5). Steps of the march should be short against the mean free path, too: of a third of it, they make
+    images up to 3 % too bright. How near it comes to path tracing: `experiments/transport.py`.
 
     Its derivatives are those of the mean over all walks: under them walks stay where they are, and count
     more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ or g change, so
@@ -125,10 +124,7 @@ class ScattererTemplates(Lighting):
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
             misses the photons that are skipped.
         seed: of the templates, and of their choice for each pixel.
-        baked: false, or the number of nodes, along the volume's longest side, of a grid on which the light of
-            all templates is computed once and then fetched, as long as volume, transfer function and lighting
-            stay the same; if any of them is traced, it is computed for each image. It carries no gradient.
-            With `"transport"`: the number of nodes, by default 48; its light carries gradients.
+        nodes: of the grid of `"transport"`, along the volume's longest side; by default 48.
         packets: of the templates, see `scatterer_template`; of `"transport"`, how many walks.
         threshold: of the templates.
         threshold_on: of the templates; the paper's is `"level"`.
@@ -158,7 +154,7 @@ class ScattererTemplates(Lighting):
     threshold: float = eqx.field(static=True)
     threshold_on: ThresholdOn = eqx.field(static=True)
     levels: tuple[int, ...] = eqx.field(static=True)
-    baked: int = eqx.field(static=True)
+    nodes: int = eqx.field(static=True)
     anisotropy: Float[Array, ""] | None
     form: Form = eqx.field(static=True)
 
@@ -175,7 +171,7 @@ class ScattererTemplates(Lighting):
         reach: Sequence[float] = (2.0, 4.0),
         cutoff: float | None = None,
         seed: int = 0,
-        baked: int | bool | Any = False,
+        nodes: int | Any | None = None,
         packets: int = 4,
         threshold: float = 0.01,
         threshold_on: ThresholdOn | Any = "photon",
@@ -184,7 +180,11 @@ class ScattererTemplates(Lighting):
         form: Form | Any = "published",
         anisotropy: Arrayable | None = 0.0,
     ):
-        check_form(form)
+        if form not in get_args(Form):
+            raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
+        isotropic = anisotropy is None or (
+            isinstance(anisotropy, int | float | np.number) and anisotropy == 0
+        )
         if form == "transport":
             published = {
                 "threshold_on": threshold_on,
@@ -195,12 +195,15 @@ class ScattererTemplates(Lighting):
             }
             _check_unused({**published, "cutoff": cutoff, "interpolation": interpolation, "given": given})
         else:
-            check_isotropic(anisotropy)
+            for name, value, unused in (
+                ("nodes", nodes, nodes is None),
+                ("anisotropy", anisotropy, isotropic),
+            ):
+                if not unused:
+                    raise ValueError(f'{name} is of form="transport"; got {value!r} for form="published".')
         templates = (256 if form == "transport" else 8) if templates is None else templates
         self.form = form
-        self.anisotropy = None
-        if anisotropy is not None and not isotropic(anisotropy):
-            self.anisotropy = number("anisotropy", anisotropy, above=-1, below=1)
+        self.anisotropy = None if isotropic else number("anisotropy", anisotropy, above=-1, below=1)
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         if occlusion not in get_args(Occlusion):
@@ -220,13 +223,12 @@ class ScattererTemplates(Lighting):
         cutoff = 0.02 * (occlusion == "hard") if cutoff is None else cutoff
         skips = is_traced(cutoff) or cutoff != 0
         self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
-        # True: 64 nodes, fine enough for light that scatters over several voxels
-        self.baked = 64 * bool(baked) if is_flag(baked) else integer("baked", baked, 2)
+        self.nodes = NODES if nodes is None else integer("nodes", nodes, 2)
         tree = PacketTree(packets, threshold, threshold_on)
         self.packets, self.threshold, self.threshold_on = tree.packets, tree.threshold, tree.threshold_on
         self.given = given
         if form == "transport":
-            self.baked, self.photons = self.baked or NODES, 0
+            self.photons = 0
             self.levels = (scatterings(self.materials, self.threshold, levels),)
             return
         if given is None:
@@ -249,7 +251,7 @@ class ScattererTemplates(Lighting):
 
     @property
     def farthest_read(self) -> float | None:
-        if self.baked:
+        if self.form == "transport":
             return None
         offset = np.asarray(self.simulated().offset)
         indices = [float(material.refractive_index) for material in self.materials]
@@ -259,9 +261,7 @@ class ScattererTemplates(Lighting):
     def for_image(self, around: Surroundings) -> Shading:
         if self.form == "transport":
             how = self.anisotropy, self.seed, self.templates, self.packets, *self.levels
-            return Transport(around, self.materials, self.lights, *how).solved(self.baked)
-        if self.baked:
-            return _baked(self, around).for_image(around)
+            return Transport(around, self.materials, self.lights, *how).solved(self.nodes)
         shading = PhotonShading(
             *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
             blended=self.templates if self.blend else 1,
@@ -306,38 +306,30 @@ def _check_unused(options: dict[str, Any]) -> None:
 
 
 @eqx.filter_jit
-def _baked(lighting: ScattererTemplates, around: Surroundings) -> Shading:
-    if lighting.form == "transport":
-        return lighting.for_image(around)
-    unbaked = replace(lighting, blend=True, cutoff=0.0, baked=False)
-    return bake(unbaked.for_image(around), around, lighting.baked)
+def _solved(lighting: ScattererTemplates, around: Surroundings) -> Shading:
+    return lighting.for_image(around)
 
 
 def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:
     """The lighting, with light that lies on a grid computed once for all images of a scene. Where anything is
-    traced, it is computed for this image: of the transport form here, so that JAX differentiates a program of
-    its own, and else by `for_image`."""
-    if isinstance(lighting, Deferred):
-        return Deferred(with_baked_light(lighting.lighting, volume, transfer, march))
-    if not isinstance(lighting, ScattererTemplates) or not lighting.baked:
+    traced, it is computed for this image, by a program of its own, which JAX differentiates."""
+    if not isinstance(lighting, ScattererTemplates) or lighting.form == "published":
         return lighting
     # of the march, only the transforms that locate points affect the light
     spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
     inputs = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
     if is_traced(inputs, volume.data):
-        if lighting.form == "published":
-            return lighting
-        return _baked(lighting, Surroundings(volume, transfer, march.locate(volume)))
-    cache = memoized(volume.data, _bake_cache)
+        return _solved(lighting, Surroundings(volume, transfer, march.locate(volume)))
+    cache = memoized(volume.data, _light_cache)
     if not cache or not _same(cache["inputs"], inputs):
         with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
             around = Surroundings(volume, transfer, march.locate(volume))
-        cache.update(inputs=inputs, light=computed_now(_baked, lighting, around))
+        cache.update(inputs=inputs, light=computed_now(_solved, lighting, around))
     return cache["light"]
 
 
-def _bake_cache(_: Array) -> dict[str, Any]:
-    """A volume's last baked light, and what it was computed from."""
+def _light_cache(_: Array) -> dict[str, Any]:
+    """A volume's last light on a grid, and what it was computed from."""
     return {}
 
 

@@ -25,7 +25,6 @@ from ..scene.space import Space, enter
 from ..scene.volume import without_voxels
 from ..scene.voxel_fetch import corners
 from ..xla.memory import gather
-from .baked import sum_neighbors
 from .harmonics import harmonics, packed, powers, unpacked
 from .lights import ConstantLight, Light
 from .materials import Material, shares
@@ -214,6 +213,13 @@ def _finer(shape: tuple[int, int, int]) -> tuple[int, ...]:
     return tuple(2 * n - 1 for n in shape)
 
 
+def sum_neighbors(values: Float[Array, "nx ny nz c"]) -> Float[Array, "nx ny nz c"]:
+    """Sum over each node and its 26 neighbours."""
+    for window in ((3, 1, 1, 1), (1, 3, 1, 1), (1, 1, 3, 1)):
+        values = jax.lax.reduce_window(values, 0.0, jax.lax.add, window, (1, 1, 1, 1), "SAME")
+    return values
+
+
 def _growing(steps: int) -> list[tuple[float, float]]:
     """Widths and middles of steps that divide 1 and grow in proportion to their number."""
     ends = [(i / steps) ** 2 for i in range(steps + 1)]
@@ -244,7 +250,7 @@ class Transport(NamedTuple):
         harmonics_ = 9 if self.order else 1
         require_room(
             4 * math.prod(_finer(grid.shape)) * COPIES * 3 * harmonics_,
-            f"light at {nx} x {ny} x {nz} nodes for baked={nodes}; use fewer",
+            f"light at {nx} x {ny} x {nz} nodes for nodes={nodes}; use fewer",
         )
         rates, near, far = grid.matter()
         depths = grid.depths(far)

@@ -11,12 +11,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from .._util.checks import flag, integer, number
-from ..bricks import VoxelSource, render_bricks
-from ..bricks.opening import Openable
 from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..engine.acceleration import visible_in_numpy
-from ..engine.image import render_scene
 from ..engine.stages import space_of
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
@@ -24,13 +21,12 @@ from ..march.transforms import AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
-from ..scene.rendering import BrickReport, Rendering
+from ..scene.rendering import Rendering
 from ..scene.several import Several
 from ..scene.space import median_node_distance
 from ..scene.transfer import Transfer, sized, with_shared_points
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
-from .memory import read_within, with_bricks
 from .probe import UNSEEN, Candidates, Probe, is_empty, rendered
 from .search import COARSEST, Part, Search
 
@@ -50,70 +46,30 @@ OPAQUE = 0.01
 EMPTY = 0.05
 """Fraction of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
 
-UNPROVEN = "not proven by a copy; kept"
-
 
 class Plan(NamedTuple):
     """How to render a scene within a tolerance. `print` shows it.
 
     Attributes:
-        march: what to pass to `render`, with `volume`, `lighting` and `compositing`.
-        volume: where `bricks` is given, only the copy that was planned with.
-        lighting: as given.
+        march: what to pass to `render`, with the same scene.
         tolerance: as given.
         error: predicted, on the safe side; above the tolerance where nothing could be proven.
         samples: predicted for each pixel.
         parts: what was kept or left out, and why.
         probed: seconds that planning took, compilation included.
-        compositing: as given.
-        source: the volume, if there was a budget of memory.
-        memory: the budget, bytes.
-        stride: of the copy that was planned with, to which `error` and `samples` belong; 1 if all fits.
-        bricks: what to expect of `render_bricks`; None if all fits.
     """
 
     march: March
-    volume: Volume
-    lighting: Lighting | None
     tolerance: float
     error: float
     samples: float
     parts: tuple[Part, ...]
     probed: float
-    compositing: Compositing[Any] = Over()
-    source: VoxelSource | None = None
-    memory: int | None = None
-    stride: int = 1
-    bricks: BrickReport | None = None
 
     @property
     def within(self) -> bool:
         """Whether the predicted error is within the tolerance."""
         return self.error <= self.tolerance
-
-    def render(self, transfer: Transfer | Any, camera: Camera | Any, **options: Any) -> Rendering:
-        """The image as planned.
-
-        Args:
-            transfer: as for the plan.
-            camera: as for the plan.
-            options: `outputs` and `devices`, as for `render`.
-
-        Returns:
-            As `render`.
-
-        Raises:
-            ValueError: as `render` does, and for other options.
-        """
-        if unknown := sorted(options.keys() - {"outputs", "devices"}):
-            raise ValueError(f"options must be outputs and devices; got {', '.join(unknown)}.")
-        how = {"compositing": self.compositing, "lighting": self.lighting, **options}
-        if self.bricks is not None:
-            return render_bricks(self.source, transfer, camera, self.march, memory=self.memory, **how)
-        transfer = sized(transfer, self.volume)
-        check_arguments("render(transfer, camera)", transfer=transfer, camera=camera)
-        scene = Scene(self.volume, transfer, camera, self.march, self.compositing, self.lighting)
-        return render_scene(scene, options.get("outputs", "all"), "replay", devices=options.get("devices"))
 
     def __str__(self) -> str:
         transforms = ", ".join(type(each).__name__ for each in self.march.transforms) or "no transform"
@@ -125,23 +81,15 @@ class Plan(NamedTuple):
             f"planned in {self.probed:.1f} s",
             *(f"  {'+' if part.kept else '-'} {part.name:16}  {part.why}" for part in self.parts),
         ]
-        if self.bricks is not None:
-            counts = " x ".join(map(str, self.bricks.counts))
-            copy = f"planned on a copy of one voxel in {self.stride} along each axis, with this error:"
-            lines.insert(0, f"{counts} bricks: at most {self.bricks.needed} are read; {copy}")
-        elif self.source is not None:
-            voxels = math.prod(self.source.shape) * self.source.dtype.itemsize
-            lines.insert(0, f"in memory: {voxels / 2**20:.1f} MiB of voxels fit")
         return "\n".join(lines)
 
 
 def plan(
-    volume: Volume | Openable,
+    volume: Volume | Any,
     transfer: Transfer | Any,
     camera: Camera | Any,
     tolerance: float | Any,
     *,
-    memory: int | Any | None = None,
     transforms: tuple[Transform, ...] | Any = (),
     compositing: Mode | Compositing[Any] | Any = "over",
     lighting: Lighting | Any | None = None,
@@ -160,14 +108,13 @@ def plan(
       not within the tolerance at an eighth of a voxel, or seems not to get there; it is kept where it is
       faster, by what a sample costs on CPU.
     - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
-      0 have no gradient from what is leapt over. `fastest_leaping` measures which of its methods is the
-      fastest.
+      0 have no gradient from what is leapt over.
     - **`AlphaCorrection`**: always kept.
     - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
       error (over the brightest colour, where that is above 1).
-    - **bricks**: for a volume that does not fit into `memory`, with what `render` makes of it, the march is
-      planned on a copy of every n-th voxel along each axis, and its step divided by n, or by more until
-      bricks fit. The error is that of the copy; `SpaceLeaping` is kept.
+
+    A volume that is rendered in bricks is planned for by a copy of every n-th voxel, `source.subsampled(n)`;
+    divide the step by n. The error is that of the copy, which does not prove that blocks are empty.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater: an estimate from
     some of the pixels, and from how images change with the last halvings of the step. The noise of a lighting
@@ -175,12 +122,10 @@ def plan(
     not its size. On other devices than CPUs, the errors hold, but what is cheapest was not measured.
 
     Args:
-        volume: a `Volume`, or what `bricks.source_of` opens: an array, a memory map, a path, a `VoxelSource`.
+        volume: a single one.
         transfer: as for `render`.
         camera: as for `render`. An image of another camera needs a plan of its own.
         tolerance: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
-        memory: bytes that the volume may take. By default as much as it needs if it is a `Volume`, and a
-            quarter of the device's memory otherwise.
         transforms: those that belong to the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
             kept.
         compositing: as for `render`.
@@ -198,21 +143,16 @@ def plan(
 
     Raises:
         ValueError: for arguments of another kind, a tolerance out of range, arrays that are traced (plan
-            outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides; for a source that
-            `bricks.source_of` refuses; and for less memory than a copy or the smallest bricks take.
+            outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
     """
     begun = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
     several = isinstance(volume, Volume) and isinstance(volume.field, Several)
     if several or isinstance(volume, list | tuple):
         raise ValueError("volume must be a single one to be planned for; got several. Pass a March.")
-    check_arguments(order, transfer=transfer, camera=camera, lighting=lighting)
+    check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
     gradients, once = flag("gradients", gradients), flag("once", once)
-    source, room, stride = None, None, 1
-    if memory is not None or not isinstance(volume, Volume):
-        volume, source, room, stride = read_within(volume, memory)
-    check_arguments(order, volume=volume)
-    transfer = sized(transfer, source or volume)
+    transfer = sized(transfer, volume)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, scene)
     space = space_of(March(1.0, given), volume)
@@ -221,7 +161,7 @@ def plan(
         shown, _ = mode.marched(transfer, March(1.0, given), volume)
     visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
     candidates, seed = Candidates.of(camera, space, visible), integer("seed", seed, 0)
-    proven, parts = chosen_transforms(visible, given, copy=stride > 1)
+    proven, parts = chosen_transforms(visible, given)
     voxel = float(median_node_distance(space, visible.shape))
 
     over = isinstance(scene.compositing, Over)
@@ -261,24 +201,13 @@ def plan(
     parts += tried
     if over:
         parts.append(Part("EarlyTermination", bool(share), f"{opaque:.1%} of the pixels become opaque"))
-    bricks = None
-    if source is not None and room is not None and stride > 1:
-        seen: Any = {"compositing": scene.compositing, "lighting": lighting}
-        march, bricks = with_bricks(source, transfer, camera, march, stride, memory=room, **seen)
     return Plan(
         march=march,
-        volume=volume,
-        lighting=lighting,
         tolerance=tolerance,
         error=max(chosen.error + share, unseen),
         samples=chosen.samples,
         parts=tuple(parts),
         probed=time.perf_counter() - begun,
-        compositing=scene.compositing,
-        source=source,
-        memory=room,
-        stride=stride,
-        bricks=bricks,
     )
 
 
@@ -300,10 +229,9 @@ def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[
 
 
 def chosen_transforms(
-    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...], *, copy: bool = False
+    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...]
 ) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that do not depend on the step, from the blocks that may hold anything visible. `copy`:
-    these are of a copy, which does not prove that there is nothing in between."""
+    """Transforms that do not depend on the step, from the blocks that may hold anything visible."""
     aligned = any(isinstance(each, AlphaCorrection) for each in given)
     why = (
         "part of the scene"
@@ -312,8 +240,8 @@ def chosen_transforms(
     )
     alpha = Part("AlphaCorrection", True, why)
     empty = float(np.mean(~visible))
-    leaps = (SpaceLeaping(),) if empty >= EMPTY or copy else ()
-    proof = f"{empty:.1%} of the blocks hold nothing visible" if empty >= EMPTY or not copy else UNPROVEN
+    leaps = (SpaceLeaping(),) if empty >= EMPTY else ()
+    proof = f"{empty:.1%} of the blocks hold nothing visible"
     added = () if aligned else (AlphaCorrection(),)
     return (*leaps, *added), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
 

@@ -22,126 +22,28 @@ from .transfer import TransferFunction, extinction_of
 # name: (what it is for, its range of values, control points (value, linear rgb, opacity per mm))
 Preset: TypeAlias = tuple[str, tuple[float, float], list[tuple[float, tuple[float, float, float], float]]]
 
-PRESETS: dict[str, Preset] = {
-    "ct_bone": (
-        "CT in Hounsfield units: bone only",
-        (-1000, 3000),
-        [
-            (130, (0.10, 0.06, 0.03), 0.0),
-            (220, (0.45, 0.33, 0.20), 0.15),
-            (350, (0.85, 0.75, 0.55), 0.5),
-            (800, (1.0, 0.97, 0.88), 0.9),
-            (3000, (1.0, 1.0, 1.0), 0.95),
-        ],
-    ),
-    "ct_skin_bone": (
-        "CT in Hounsfield units: bone under translucent skin and muscle",
-        (-1000, 3000),
-        [
-            (-550, (0.08, 0.03, 0.02), 0.0),
-            (-350, (0.18, 0.07, 0.04), 0.02),
-            (-100, (0.75, 0.42, 0.28), 0.07),
-            (100, (0.75, 0.30, 0.20), 0.03),
-            (180, (0.50, 0.30, 0.15), 0.03),
-            (320, (0.85, 0.72, 0.50), 0.45),
-            (800, (1.0, 0.97, 0.88), 0.9),
-            (3000, (1.0, 1.0, 1.0), 0.95),
-        ],
-    ),
-    "ct_airway": (
-        "CT in Hounsfield units: the walls of air-filled cavities, for a camera inside them",
-        (-1000, 3000),
-        [
-            (-920, (0.0, 0.0, 0.0), 0.0),
-            (-600, (0.12, 0.01, 0.01), 0.25),
-            (-200, (0.80, 0.28, 0.20), 0.6),
-            (100, (1.0, 0.75, 0.60), 0.95),
-            (400, (1.0, 0.95, 0.85), 0.98),
-        ],
-    ),
-    "ct_chest": (
-        "CT in Hounsfield units: lung, muscle and bones of the chest",
-        (-1000, 3000),
-        [
-            (-900, (0.02, 0.04, 0.08), 0.0),
-            (-800, (0.10, 0.22, 0.40), 0.002),
-            (-500, (0.25, 0.10, 0.08), 0.01),
-            (-150, (0.50, 0.15, 0.08), 0.03),
-            (60, (0.75, 0.25, 0.15), 0.10),
-            (180, (0.80, 0.55, 0.35), 0.3),
-            (350, (0.95, 0.90, 0.75), 0.8),
-            (1500, (1.0, 1.0, 1.0), 0.95),
-        ],
-    ),
-    "engine": (
-        "industrial CT, 8 bit: a translucent casting around denser parts",
-        (0, 255),
-        [
-            (55, (0.01, 0.012, 0.02), 0.0),
-            (75, (0.015, 0.02, 0.03), 0.05),
-            (110, (0.12, 0.20, 0.30), 0.10),
-            (145, (0.35, 0.45, 0.55), 0.12),
-            (160, (0.45, 0.22, 0.05), 0.10),
-            (190, (0.85, 0.38, 0.06), 0.5),
-            (235, (1.0, 0.85, 0.45), 0.9),
-        ],
-    ),
-    "mr_head": (
-        "MR of a head, T1, 8 bit: skin, with the brain showing through",
-        (0, 255),
-        [
-            (25, (0.05, 0.03, 0.03), 0.0),
-            (45, (0.20, 0.10, 0.08), 0.02),
-            (80, (0.60, 0.35, 0.28), 0.05),
-            (120, (0.75, 0.50, 0.42), 0.12),
-            (170, (0.95, 0.80, 0.68), 0.3),
-            (255, (1.0, 0.97, 0.92), 0.6),
-        ],
-    ),
-    "head": (
-        "the head phantom, 8 bit: skull under translucent skin and muscle",
-        (0, 255),
-        [
-            (40, (0.05, 0.02, 0.015), 0.0),
-            (58, (0.18, 0.07, 0.04), 0.03),
-            (80, (0.80, 0.46, 0.30), 0.045),
-            (100, (0.78, 0.30, 0.20), 0.018),
-            (140, (0.45, 0.25, 0.12), 0.03),
-            (165, (0.75, 0.60, 0.38), 0.25),
-            (200, (0.95, 0.88, 0.72), 0.6),
-            (235, (1.0, 0.98, 0.92), 0.7),
-            (255, (1.0, 1.0, 1.0), 0.8),
-        ],
-    ),
-    "bonsai": (
-        "CT of a potted tree, 8 bit: leaves, wood and pot",
-        (0, 255),
-        [
-            (28, (0.01, 0.03, 0.005), 0.0),
-            (36, (0.02, 0.07, 0.01), 0.12),
-            (48, (0.08, 0.30, 0.03), 0.35),
-            (62, (0.25, 0.55, 0.10), 0.35),
-            (85, (0.12, 0.06, 0.02), 0.2),
-            (120, (0.38, 0.20, 0.08), 0.6),
-            (160, (0.55, 0.33, 0.17), 0.8),
-            (200, (0.35, 0.40, 0.55), 0.8),
-            (255, (0.80, 0.85, 0.95), 0.95),
-        ],
-    ),
-}
-
-SHADED = set(PRESETS) - {"mr_head"}
+PRESETS: dict[str, Preset] = {}
+SHADED: set[str] = set()
 """Presets that the command line shades: gradients of magnetic resonance images are mostly noise."""
 
 SLICER = "3D Slicer"
 
-# Its presets, of its Modules/Loadable/VolumeRendering/Resources/presets.xml: points at the values of both its
-# curves, colours made linear. Its opacity by the gradient, 1 above 0 in all of them, is left out.
-for _name, _given in json.loads(Path(__file__).with_name("slicer_presets.json").read_text("utf-8")).items():
-    _points = [(value, (r, g, b), opacity) for value, r, g, b, opacity in _given["points"]]
-    _ends = (0.0, _points[-2][0]) if _name.startswith("MR") else (_points[0][0], _points[-1][0])
-    PRESETS[_name] = f"{SLICER}'s {_name}", _ends, _points
-    SHADED |= {_name} if _given["shaded"] else set()
+
+def _add_presets(file: str) -> None:
+    """Add the presets of a file: ours, or those of 3D Slicer, from its
+    Modules/Loadable/VolumeRendering/Resources/presets.xml, with points at the values of both its curves, and
+    colours made linear. Its opacity by the gradient, 1 above 0 in all of them, is left out."""
+    for name, entry in json.loads(Path(__file__).with_name(file).read_text("utf-8")).items():
+        points = [(value, (r, g, b), opacity) for value, r, g, b, opacity in entry["points"]]
+        low, high = entry.get("range") or (points[0][0], points[-1][0])
+        if "range" not in entry and name.startswith("MR"):
+            low, high = 0.0, points[-2][0]
+        PRESETS[name] = entry.get("purpose", f"{SLICER}'s {name}"), (low, high), points
+        SHADED.update({name} if entry["shaded"] else ())
+
+
+_add_presets("presets.json")
+_add_presets("slicer_presets.json")
 
 
 def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1.0) -> TransferFunction:

@@ -1,7 +1,6 @@
 """Are bricks seen? Images by bricks are those of the whole volume, and so are gradients; little is read."""
 
 import math
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -12,11 +11,10 @@ import pytest
 
 import jaxvol as jv
 from experiments.bricks import each_at_once
-from jaxvol.bricks import VoxelSource, summary
+from jaxvol.bricks import VoxelSource
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 
 from .scenes import (
-    AT,
     CAMERA,
     CURVED,
     FROM_THE_SIDE,
@@ -30,13 +28,9 @@ from .scenes import (
     assert_same,
     balls,
     fog,
-    gradient_of,
-    loss,
     raw_file,
-    weighted,
     whole,
     whole_fog,
-    whole_gradient,
 )
 
 
@@ -103,81 +97,19 @@ def test_what_nobody_sees_is_not_read(image, file):
     assert np.all(np.isinf(empty.depth))
 
 
-# ---- gradients ----
-
-
-def by_bricks(*parts):
-    """Not in a file, and of another order in memory."""
-    return jv.render_bricks(np.ascontiguousarray(balls()), *parts, **PLACE, bricks=(2, 1, 3))
-
-
-@pytest.fixture(scope="module")
-def gradient():
-    """Gradient and image, and how often all voxels were read for their ranges."""
-    passes, scan = [], summary.scan
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(summary, "scan", lambda *given, **more: passes.append(1) or scan(*given, **more))
-        return *gradient_of(*AT, by_bricks), len(passes)
-
-
-def assert_same_gradient(found, expected):
-    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
-        assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
-
-
-def test_image_and_gradient_by_bricks_are_those_of_the_whole(gradient):
-    (expected, one), (found, every, passes) = whole_gradient(), gradient
-    assert_same(every, one, fields=("exhausted", "samples"))
-    assert np.all(expected[0])  # also of what has no extinction, and is in no brick that shows anything
-    assert np.all(expected[1])
-    assert_same_gradient(found, expected)
-    assert passes == 1  # the second march has the ranges of the first
-
-
-def test_the_gradient_agrees_with_differences(gradient):
-    at, position = AT
-    for i, change in ((1, 2e-3), (2, 1e-2)):
-        more, less = (loss(at.at[i].add(sign * change), position, by_bricks)[0] for sign in (1, -1))
-        np.testing.assert_allclose(gradient[0][0][i], (more - less) / (2 * change), rtol=2e-3)
-
-
-def test_other_transformations_say_what_to_do():
-    def opacity(extinction):
-        return loss(extinction, AT[1], by_bricks)[1].rgba[..., 3]
+def test_what_is_traced_is_refused():
+    def image(extinction):
+        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
+        return jnp.sum(jv.render_bricks(ARRAY, transfer, WIDE, PLAIN).rgba)
 
     at = TRANSFER.extinction
-    seen, pull = jax.vjp(opacity, at)
-    for pulled in (lambda: jax.jit(pull)(seen), lambda: jax.vmap(pull)(seen[None])):
-        with pytest.raises(ValueError, match="the gradient by bricks reads its source"):
-            pulled()
-    for mapped in (jax.jit(opacity), lambda at: jax.vmap(opacity)(at[None])):
-        with pytest.raises(ValueError, match=r"not inside jax\.jit"):
-            mapped(at)
-    for forward in (
-        lambda: jax.jvp(opacity, (at,), (at,)),
-        lambda: jax.hessian(lambda a: opacity(a).sum())(at),
-    ):
-        with pytest.raises(ValueError, match=r"gradients in reverse mode.*none in forward mode \(jax\.jvp"):
-            forward()
-
-    def shown(how, extinction):
-        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
-        return jv.render_bricks(ARRAY, transfer, WIDE, PLAIN, **how).rgba
-
-    for how, message in (
-        ({"compositing": jv.Isosurface(0.5)}, "compositing by Isosurface has no gradient through bricks"),
-        ({"method": each_at_once}, "a schedule of your own has no gradient"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            jax.vjp(partial(shown, how), at)
-
-    def image(source):
-        return jnp.sum(jv.render_bricks(source, TRANSFER, WIDE, PLAIN).rgba)
-
-    data = jnp.asarray(balls(), jnp.float32)
-    for given, at in ((image, data), (lambda spacing: image(jv.Volume(data, spacing)), jnp.ones(3))):
-        with pytest.raises(ValueError, match=r"source must not be traced.*no gradients to voxels"):
-            jax.grad(given)(at)
+    for traced in (lambda: jax.grad(image)(at), lambda: jax.jit(image)(at)):
+        with pytest.raises(ValueError, match=r"not inside jax\.jit.*Gradients are those of jv\.render"):
+            traced()
+    with pytest.raises(ValueError, match=r"source must not be traced: bricks have no gradients"):
+        jax.grad(lambda data: jv.render_bricks(data, TRANSFER, WIDE, PLAIN).rgba.sum())(
+            jnp.asarray(balls(), jnp.float32)
+        )
 
 
 # ---- curved rays ----
@@ -219,7 +151,11 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
     ({"march": jv.March(1.0, (jv.SpaceLeaping("distance", block=1),))}, "block=1. needs the whole volume"),
     (
-        {"lighting": ScattererTemplates(jv.Material(0.5, 1.0, 1.4), DirectionalLight((1, 0, 0)), baked=True)},
+        {
+            "lighting": ScattererTemplates(
+                jv.Material(0.5, 1.0, 1.4), DirectionalLight((1, 0, 0)), form="transport"
+            )
+        },
         "farthest_read",
     ),
     ({"compositing": "over!"}, "compositing must be one of"),
@@ -319,29 +255,6 @@ def test_random_splits_and_cameras_look_like_the_whole(engine):
         bricks = tuple(int(n) for n in rng.integers(1, 5, 3))
         one = jv.render(engine, TRANSFER, camera, march)
         assert_same(jv.render_bricks(engine, TRANSFER, camera, march, bricks=bricks), one)
-
-
-@pytest.mark.slow
-def test_gradients_to_all_parts_of_a_lit_scene_are_those_of_the_whole():
-    """Of a transfer function without extinction 0, of which a leap would miss the gradient."""
-    least = eqx.tree_at(lambda t: t.extinction, TRANSFER, jnp.maximum(TRANSFER.extinction, 1e-3))
-    march = jv.March(0.5, (jv.SpaceLeaping(), jv.EmptySpaceJitter(1), jv.AlphaCorrection()))
-    parts = jnp.asarray(PLACE["spacing"]), least, CAMERA, march, Phong()
-
-    def by_bricks(spacing, *parts, lighting):
-        return jv.render_bricks(balls(), *parts, spacing=spacing, lighting=lighting, bricks=(2, 1, 3))
-
-    def whole(spacing, *parts, lighting):
-        return jv.render(jv.Volume(balls(), spacing), *parts, lighting=lighting)
-
-    found, expected = (
-        eqx.filter_grad(lambda parts, f=f: weighted(f(*parts[:-1], lighting=parts[-1])))(parts)
-        for f in (by_bricks, whole)
-    )
-    assert len(jax.tree.leaves(expected)) > 8
-    # by the step it is a sum over all samples, of which both lie 4e-5 to 7e-5 from its value in float64
-    np.testing.assert_allclose(found[3].step, expected[3].step, rtol=5e-5)
-    assert_same_gradient(*(eqx.tree_at(lambda g: g[3].step, g, jnp.zeros(())) for g in (found, expected)))
 
 
 HALF = math.pi / 2

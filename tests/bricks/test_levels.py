@@ -1,6 +1,5 @@
 """Is a level of detail no coarser than a pixel?"""
 
-import equinox as eqx
 import numpy as np
 import pytest
 
@@ -68,9 +67,3 @@ def test_an_image_of_ome_zarr_takes_the_level_of_its_pixels_or_the_one_that_is_a
         _level(found, 1, far, jv.March(1.0, (probe,)))
     with pytest.raises(ValueError, match=r'level must be an integer from 0 to 2, or "auto"; got 3'):
         _level(found, 3, far, march)
-
-    def traced(position):
-        return _level(found, "auto", eqx.tree_at(lambda c: c.position, far, position), march)
-
-    with pytest.raises(ValueError, match=r"level must be one of 0 to 2 under jax\.grad"):
-        eqx.filter_eval_shape(lambda p: traced(p) and p, far.position)

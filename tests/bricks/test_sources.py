@@ -83,7 +83,6 @@ def test_arrays_and_files_of_every_type(dtype, tmp_path):
     for order in ("C", "F"):
         np.save(tmp_path / "data.npy", np.asarray(data, order=order))
         assert_reads(source_of(str(tmp_path / "data.npy")), data)
-        assert_reads(source_of(tmp_path / "data.npy", axes="zyx"), data.T)
 
 
 class OfOurOwn:
@@ -101,17 +100,16 @@ class OfOurOwn:
 
 
 def kinds_of_arrays(data, folder):
-    """Arrays of the libraries that there are, of voxels that lie in another order, and those of a test."""
+    """Arrays of the libraries that there are, some of which transpose what lies in another order."""
     turned = np.ascontiguousarray(data.transpose(2, 0, 1))
-    yield OfOurOwn(data), {}
-    yield OfOurOwn(turned), {"axes": "zxy"}
-    yield zarr.create_array({}, data=turned, chunks=(8, 9, 10)), {"axes": "zxy"}
-    yield tensorstore.array(turned), {"axes": "zxy"}
+    yield OfOurOwn(data)
+    yield zarr.create_array({}, data=data, chunks=(8, 9, 10))
+    yield tensorstore.array(turned).transpose((1, 2, 0))
     dask, h5py = pytest.importorskip("dask.array"), pytest.importorskip("h5py")
-    yield dask.from_array(turned, chunks=(8, 9, 10)), {"axes": ("z", "x", "y")}
+    yield dask.from_array(turned, chunks=(8, 9, 10)).transpose(1, 2, 0)
     with h5py.File(folder / "a.h5", "w") as file:
-        yield file.create_dataset("a", data=turned, chunks=(8, 9, 10)), {"axes": "zxy"}
-        yield file.create_dataset("b", data=turned), {"axes": "zxy"}
+        yield file.create_dataset("a", data=data, chunks=(8, 9, 10))
+        yield file.create_dataset("b", data=data)
 
 
 def test_an_array_of_a_file_that_is_closed_is_refused(tmp_path):
@@ -125,10 +123,8 @@ def test_an_array_of_a_file_that_is_closed_is_refused(tmp_path):
 def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatch):
     monkeypatch.setattr(sources, "AT_ONCE", 3000)
     data = voxels("int16")
-    for array, options in kinds_of_arrays(data, tmp_path):
-        source = source_of(array, **options)
-        assert_reads(source, data)
-        assert source.order == ((2, 0, 1) if options else (0, 1, 2))
+    for array in kinds_of_arrays(data, tmp_path):
+        assert_reads(source_of(array), data)
     ours = OfOurOwn(data)
     source_of(ours).read((1, 2, 3), (9, 10, 11))
     assert len(ours.asked) == 4  # in layers of 3000 bytes, whole planes
@@ -145,7 +141,7 @@ def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatc
 def test_axes_beside_space_are_not_what_is_read_in_layers(monkeypatch):
     """A stack of channels, of which one is read plane by plane."""
     stack = OfOurOwn(voxels("uint8", (3, 40, 30, 20)))
-    source = source_of(stack, axes="czyx", index={"c": 1})
+    source = VoxelSource(stack, space=(3, 2, 1), index=(1, *3 * (slice(None),)))
     assert source.chunks == (20, 1, 1)
     monkeypatch.setattr(sources, "AT_ONCE", 2000)
     assert_reads(source, stack.data[1].T)
@@ -173,8 +169,8 @@ def test_what_an_array_returns_is_checked():
         with pytest.raises(ValueError, match=message):
             VoxelSource(array, **options)
     named = pytest.importorskip("xarray").DataArray(data, dims=("z", "y", "x"))
-    with pytest.raises(TypeError, match="axes: the DataArray has its own"):
-        source_of(named, axes="zyx")
+    with pytest.raises(ValueError, match=r"channel: .* has no such axis; it holds x 8, y 8, z 8"):
+        source_of(named, channel=1)
 
 
 def test_memory_maps_are_read_and_not_held(tmp_path):
@@ -308,10 +304,10 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
         (jv.Volume(np.zeros(SHAPE), labels=np.zeros(SHAPE, np.uint8)), {}, "a Volume without labels"),
         ("data.npy", {"shape": SHAPE}, "shape and dtype are for raw files"),
         ("data.h5", {}, "data.h5 cannot be read"),
-        (np.zeros(SHAPE), {"axes": "xyc"}, "axes must name each of the 3 axes of array once"),
-        (np.zeros(SHAPE), {"missing": "fill"}, "unexpected keyword argument 'missing'"),
+        (np.zeros((*SHAPE, 2)), {}, r"array must be data\[x, y, z\]; .* Choose a channel first"),
+        (np.zeros(SHAPE), {"channel": 1}, "unexpected keyword argument 'channel'"),
         ([[[1, 2], [3, 4]]], {}, "source must be an array, .* got "),
-        (source_of(np.zeros(SHAPE)), {"index": {"c": 0}}, "^index: a VoxelSource takes no options"),
+        (source_of(np.zeros(SHAPE)), {"channel": 0}, "^channel: a VoxelSource takes no options"),
     ]
     for thing, options, message in bad:
         given = tmp_path / thing if isinstance(thing, str) else thing

@@ -10,7 +10,7 @@ import jaxvol as jv
 from jaxvol.compositing import blending
 from jaxvol.compositing.blending import Fragment
 from jaxvol.compositing.modes import compositing_of
-from jaxvol.lighting import ConstantLight, Deferred, Material, ScattererTemplates
+from jaxvol.lighting import ConstantLight, Material, ScattererTemplates
 from jaxvol.march.march import Cell
 from jaxvol.scene.occupancy import Blocks
 
@@ -194,7 +194,7 @@ def average_that_is_lit():
     light = ScattererTemplates(
         Material(0.8, 0.1, 1.4), ConstantLight((1.0, 1.0, 1.0)), templates=1, photons=2
     )
-    traced(lambda: jv.render(*SCENE, jv.March(0.11), compositing="average", lighting=Deferred(light)))
+    traced(lambda: jv.render(*SCENE, jv.March(0.11), compositing="average", lighting=light))
 
 
 class Gained(jv.Over):

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
@@ -12,7 +11,6 @@ from . import Fault
 
 IMAGE = "bricks/test_images.py::test_bricks_of_a_file_look_like_the_whole_within_the_budget_of_memory"
 CURVED = "bricks/test_images.py::test_bricks_look_like_the_whole_where_rays_leave_them_and_come_back[overlap]"
-GRADIENT = "bricks/test_images.py::test_image_and_gradient_by_bricks_are_those_of_the_whole"
 DEVICES = (
     "engine/test_devices.py::"
     "test_work_is_balanced_and_image_gradient_and_owned_bricks_are_those_of_one_device"
@@ -32,10 +30,6 @@ def _all_of_its_cells(of_brick: Callable[..., Any]) -> Callable[..., Any]:
 def _only(brick: int, empty: Any) -> Any:
     """A ray goes on from a brick through none but itself, and what is empty."""
     return empty | (np.arange(len(empty)) == brick)
-
-
-def _without_carry(pulled: Any) -> Any:
-    return eqx.tree_at(lambda each: each.carry, pulled, jnp.zeros_like(pulled.carry))
 
 
 FAULTS = [
@@ -68,12 +62,6 @@ FAULTS = [
         "bricks.traversal:Traversal.cells_of",
         lambda of: lambda self, brick, _, empty, *given: of(self, brick, _only(brick, empty), empty, *given),
         (CURVED,),
-    ),
-    Fault(
-        "bricks: the second march of a gradient forgets what lies in front",
-        "bricks.render:_vjp_of_brick",
-        lambda pull: lambda *given: pull(*given[:5], _without_carry(given[5]), *given[6:]),
-        (GRADIENT,),
     ),
     Fault(
         "bricks: a file that changed after it was opened is read",

@@ -107,10 +107,10 @@ FAULTS: list[Fault] = [
         (f"{PHOTONS}test_each_step_at_voxels_is_that_at_interpolated_nodes",),
     ),
     Fault(
-        "light: baked while something is traced, it is kept as tracers",
+        "light by transport: computed while something is traced, it is kept as tracers",
         "lighting.template_lighting:computed_now",
         lambda f: lambda function, *of: function(*of),
-        ("lighting/test_baked.py::test_light_that_was_baked_inside_a_program_serves_outside",),
+        (f"{TRANSPORT}test_light_that_was_computed_inside_a_program_serves_outside",),
     ),
     Fault(
         "Phong: samples are shaded where their cells begin",

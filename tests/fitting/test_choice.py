@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments.model_choice import nested_materials
 from jaxvol.fitting.choice import standard_error
 
 
@@ -181,36 +182,22 @@ def test_a_refined_transfer_function_is_the_same_function():
     np.testing.assert_allclose(even.values, np.linspace(0, 1, 9), atol=1e-7)
 
 
-def grown_from(candidate, found):
-    assert candidate.start is None
-    assert candidate.grow is not None
-    return candidate.grow(found)
-
-
 def test_materials_share_what_they_have_in_common():
     parts = [jv.Material(0.5, path, values=(at, at + 1)) for at, path in enumerate((0.1, 0.2, 0.3))]
-    one, two, three = jv.nested_materials(parts, [(0, 0, 0), (0, 1, 1), (0, 1, 2)])
-    assert (one.name, two.name) == ("1 class: 0+1+2", "2 classes: 0, 1+2")
+    one, two = nested_materials(parts, [(0, 0, 0), (0, 1, 1)])
 
     def paths(materials):
         return [round(float(material.mean_free_path), 4) for material in materials]
 
     assert paths(one.expand(one.start)) == [0.1, 0.1, 0.1]
     moved = (eqx.tree_at(lambda m: m.mean_free_path, one.start[0], jnp.asarray(0.7)),)
-    grown = grown_from(two, moved)
+    assert two.grow is not None
+    grown = two.grow(moved)
     assert paths(grown) == [0.7, 0.7]
-    assert paths(two.expand(grown)) == [0.7, 0.7, 0.7]
     split = (grown[0], eqx.tree_at(lambda m: m.mean_free_path, grown[1], jnp.asarray(0.9)))
-    assert paths(two.expand(split)) == paths(three.expand(grown_from(three, split))) == [0.7, 0.9, 0.9]
+    assert paths(two.expand(split)) == [0.7, 0.9, 0.9]
     # where a material is, is its own
     assert [material.values.tolist() for material in two.expand(split)] == [[0, 1], [1, 2], [2, 3]]
-
-
-def test_transfer_functions_of_labels_are_merged_as_a_whole():
-    parts = [PLAIN, jv.refined(PLAIN, 2)]
-    one, two = jv.nested_materials(parts, [(0, 0), (0, 1)])
-    assert one.expand(one.start) == (PLAIN, PLAIN)
-    assert two.expand(grown_from(two, one.start)) == (PLAIN, PLAIN)
 
 
 # -- images -----------------------------------------------------------------------------------------------
@@ -225,9 +212,9 @@ def scene(transfer, camera):
     return VOLUME, transfer, camera, MARCH
 
 
-def blank(direction, value=0.0):
+def blank(direction):
     """A view that nothing was rendered for."""
-    return jv.Camera.looking_at(VOLUME, direction, size=(7, 6)), np.full((6, 7, 3), value, np.float32)
+    return jv.Camera.looking_at(VOLUME, direction, size=(7, 6)), np.zeros((6, 7, 3), np.float32)
 
 
 SEEN = [blank(direction) for direction in DIRECTIONS]
@@ -244,9 +231,13 @@ def test_control_points_are_counted_from_images():
         noisy = [(view, image + 0.02 * rng.normal(size=image.shape)) for view, image in clear]
         for views in (noisy, clear):
             rows, columns = np.indices((6, 7))
+            masks = dict(zip(map(id, views), [None, None, columns > 0, rows > 1], strict=True))
+
+            def residual(some, masks=masks):
+                return jv.ImageResidual(scene, some, weights=[masks[id(view)] for view in some])
+
             masked = [columns > 0, rows > 1]
-            training = jv.ImageResidual(scene, views[:2])
-            choice = jv.choose(training, models, views[2:], weights=masked, max_steps=20)
+            choice = jv.choose(residual, models, views[2:], views=views[:2], max_steps=20)
             assert choice.name == f"{len(points)} points"
             assert [row.numbers for row in choice.candidates] == [2, 3]
             # the loss of an image is half its mean square error, and that of several is their mean
@@ -263,7 +254,6 @@ def test_control_points_are_counted_from_images():
 
 
 NOISY = views_of(2, 0.1, 0)
-CLASSES = [(0, 0), (0, 1)]
 
 
 def one(name, n):
@@ -280,14 +270,6 @@ def given(*candidates, **changes):
     return lambda: jv.choose(arguments.pop("residual", polynomial), **arguments)
 
 
-def of_images(held_out, **how):
-    return lambda: jv.choose(jv.ImageResidual(scene, SEEN[:2]), jv.nested_points(PLAIN), held_out, **how)
-
-
-def merged(parts, partitions):
-    return lambda: jv.nested_materials(parts, partitions)
-
-
 def points(*numbers, start: Any = PLAIN):
     return lambda: jv.nested_points(start, numbers)
 
@@ -298,28 +280,21 @@ BAD = [
     (given(candidates=[]), "candidates must be a list of at least one"),
     (given(candidates=POLYNOMIALS[0]), "candidates must be a list"),
     (given(3), r"candidates\[0\] must be a Candidate; got 3"),
-    (given(one("b", 2), one("a", 1)), "candidates must be in order, .*'a' has 1, and 'b' 2"),
-    (given(one("b", 2), one("a", 2)), "'a' has 2, and 'b' 2"),
-    (given(*POLYNOMIALS[1:]), r"candidates\[0\], '2', must have a start, or, after the first, grow"),
-    (given(one("1", 1), jv.Candidate("b", zeros(2), one_more)), r"\[1\], 'b', must have a start, or"),
-    (given(held_out=NOISY[3:]), r"held_out\[0\] must not be among .*; it is the same as number 3"),
-    (given(held_out=[tuple(map(np.array, NOISY[1]))]), r"held_out\[0\] must not be among .* number 1"),
-    (of_images([SEEN[2], blank(DIRECTIONS[1], 0.1)]), r"held_out\[1\] must not be among .* number 1"),
-    (of_images(SEEN[2:], views=SEEN[:2]), "views must not be given with an ImageResidual"),
+    (given(one("b", 2), one("a", 1)), "candidates must be in order, .*'a', has 1 after 2"),
+    (given(one("b", 2), one("a", 2)), "'a', has 2 after 2"),
+    (given(*POLYNOMIALS[1:]), r"candidates\[0\] must have a start, or, after the first, grow"),
+    (given(one("1", 1), jv.Candidate("b", zeros(2), one_more)), r"\[1\] must have a start, or"),
+    (given(held_out=NOISY[3:]), "held_out must not be among the views that are fitted"),
+    (given(held_out=[tuple(map(np.array, NOISY[1]))]), "held_out must not be among the views"),
+    (given(residual=jv.ImageResidual(scene, SEEN)), "residual must be a function of a list of views; got"),
     (given(views=None), "views must be a list of at least one; got None"),
-    (given(residual=3), "residual must be an ImageResidual"),
+    (given(residual=3), "residual must be a function of a list of views; got 3"),
     (given(errors=-1), "errors must not be negative; got -1"),
     (given(block=0), "block must be an integer of at least 1; got 0"),
     (given(where=np.sum, constraints=None), "constraints and where must be given with each Candidate"),
     (lambda: jv.refined(PLAIN, 1), "points must be an integer of at least 2; got 1"),
     (points(4, 4), r"points must be increasing .*\(4, 4\)"),
     (points(2, start=zeros(3)), "start must be a TransferFunction; got a JAX array"),
-    (merged([], CLASSES), "parts must be a list"),
-    (merged([PLAIN, 1.0], CLASSES), "parts must be .* of one kind"),
-    (merged([1.0, 2.0], [(0, 2)]), r"without gaps.* got \(0, 2\)"),
-    (merged([1.0, 2.0], [(0,)]), r"a class for each of 2 parts.*\(0,\)"),
-    (merged([1.0, 2.0, 3.0], [(0, 0, 1), (0, 1, 1)]), r"got \(0, 1, 1\) after \(0, 0, 1\)"),
-    (merged([1.0, 2.0], CLASSES[::-1]), r"each divide classes of the one before; got \(0, 0\) after"),
 ]
 
 

@@ -408,11 +408,6 @@ BAD = [
     (of_curve(max_jacobian=100), "max_jacobian leaves room for 8 of the"),
     (coarse_to_fine(curve), "residual must be an ImageResidual, to be blurred; got"),
     (coarse_to_fine(blurs=()), "blurs must hold at least one"),
-    (lambda: jv.fit_in_stages([], GREY), "residuals must be a list of at least one; got a list of length 0"),
-    (
-        lambda: jv.fit_in_stages(images(), GREY),
-        "residuals must be a list of at least one; got a ImageResidual",
-    ),
 ]
 
 

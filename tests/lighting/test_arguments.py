@@ -10,7 +10,6 @@ import pytest
 import jaxvol as jv
 from jaxvol.lighting import (
     ConstantLight,
-    Deferred,
     DirectionalLight,
     HeadLight,
     Material,
@@ -122,10 +121,11 @@ BAD = {
     "reach's order": (lit(reach=(4.0, 2.0)), "reach must be multiples"),
     "cutoff": (lit(cutoff=1.0), "cutoff must be"),
     "seed": (lit(seed=-1), "seed must be an integer"),
-    "baked": (lit(baked=1), "baked must be an integer of at least 2"),
+    "nodes": (lit(form="transport", nodes=1), "nodes must be an integer of at least 2"),
+    "nodes as published": (lit(nodes=9), 'nodes is of form="transport"'),
     "a fine grid": (
-        lambda: with_baked_light(lit(baked=10**5)(), VOLUME, TRANSFER, jv.March(0.1)),
-        "nodes for baked=100000.*asks for .* GiB",
+        lambda: with_baked_light(lit(form="transport", nodes=10**5)(), VOLUME, TRANSFER, jv.March(0.1)),
+        "nodes for nodes=100000.*asks for .* GiB",
     ),
     "faint": (lit(FAINT), "opacity 0.031 leaves no photon"),
     "given": (lit([HALF, HALF], given=PAIR), "templates of 2 materials"),
@@ -144,7 +144,6 @@ BAD = {
         lambda: jv.render(VOLUME, TRANSFER, jv.Camera.looking_at(VOLUME), jv.March(0.1), lighting=3),
         "lighting must be None or a Lighting; got 3",
     ),
-    "deferred": (lambda: Deferred(3), "lighting must be a Lighting, such as ScattererTemplates; got 3"),
     "constant light": (
         lambda: Phong(ConstantLight()),
         "lights must hold jaxvol lights, of any kind but ConstantLight",
@@ -184,8 +183,8 @@ def test_a_lighting_keeps_as_many_photons_as_its_levels_hold():
     assert blended.shape[:2] == (1, 1)
 
 
-def test_baked_light_is_read_at_any_distance():
-    assert lit(baked=True)().farthest_read is None
+def test_light_by_transport_is_read_at_any_distance():
+    assert lit(form="transport")().farthest_read is None
     farthest = lit(given=jax.tree.map(jnp.ones_like, PAIR))().farthest_read
     assert farthest is not None
     assert 0 < farthest < np.inf

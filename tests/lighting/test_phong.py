@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.engine.acceleration import VolumeAcceleration, slopes_of, with_words, words_of
-from jaxvol.lighting import Deferred, DirectionalLight, HeadLight, Phong, PointLight
+from jaxvol.lighting import DirectionalLight, HeadLight, Phong, PointLight
 from jaxvol.lighting.shading import Shader
 from jaxvol.scene.space import Affine, world_gradient
 
@@ -66,7 +66,7 @@ def test_the_gradient_is_interpolated_between_central_differences(kind, shape):
 
 def test_slopes_are_stored_for_those_who_read_them():
     march = jv.March(0.1)
-    for lighting, stored in ((None, False), (Phong(), True), (Deferred(Phong()), True)):
+    for lighting, stored in ((None, False), (Phong(), True)):
         assert (VolumeAcceleration.of(shells(), soft(), march, lighting).slopes[0] is not None) == stored
 
 

@@ -15,7 +15,6 @@ import jaxvol as jv
 from jaxvol._util.vec3 import along, apart, plus, scaled
 from jaxvol.lighting import (
     ConstantLight,
-    Deferred,
     DirectionalLight,
     Material,
     ScattererTemplate,
@@ -24,8 +23,8 @@ from jaxvol.lighting import (
 )
 from jaxvol.lighting.shading import TOGETHER, Shader, terms_needed
 
-from ..scenes import around, in_float64, scaled_phantom, slow, soft_transfer
-from .samples import check_gradient, image_of_reference, in_double, program, sample_at, shaded, surroundings
+from ..scenes import around, scaled_phantom, slow, soft_transfer
+from .samples import image_of_reference, program, sample_at, shaded, surroundings
 
 
 class Fog(Shading):
@@ -83,34 +82,6 @@ def test_images_are_those_of_the_reference():
     np.testing.assert_allclose(found, image_of_reference(*scene, FOG), atol=2e-5)
 
 
-def test_deferred_light_is_that_of_one_sample_at_the_mean_depth():
-    """Of the ray's mean colour, which nothing hides."""
-    scene = volume, transfer, camera, _ = scene_of()
-    found, unlit = (jv.render(*scene, lighting=lighting) for lighting in (Deferred(FOG), None))
-    opacity = np.asarray(unlit.rgba[..., 3:])
-    rows, columns = np.nonzero(opacity[..., 0])
-    assert 0 < len(rows) < opacity.size
-    origins, directions = (np.asarray(each)[rows, columns] for each in camera.rays())
-
-    @jax.jit
-    def once(points, directions, colors):
-        around, zero = surroundings(volume, transfer), jnp.zeros(2, jnp.int32)
-
-        def sample(point, direction, color):
-            of_point = sample_at(around, point, jnp.ones(()), zero, direction)
-            return of_point._replace(color=apart(color))
-
-        shader = Shader.of(FOG, around)
-        return jnp.stack(shader(jax.vmap(sample)(points, directions, colors)), axis=-1)
-
-    points = origins + np.asarray(unlit.depth)[rows, columns][:, None] * directions
-    colors = np.asarray(unlit.rgba[..., :3])[rows, columns] / opacity[rows, columns]
-    expected = np.asarray(unlit.rgba).copy()
-    expected[rows, columns, :3] = opacity[rows, columns] * once(points, directions, colors)
-    assert np.abs(expected - unlit.rgba).max() > 0.1
-    np.testing.assert_allclose(found.rgba, expected, rtol=2e-5, atol=2e-5)
-
-
 def test_there_is_a_gradient_of_a_lit_image():
     """Its values are checked by slow tests, here and of templates, since it takes a minute to compile."""
 
@@ -132,25 +103,6 @@ LEAVES = {
     "position": lambda s: s[2].position,
     "step": lambda s: s[3].step,
 }
-
-
-@pytest.mark.slow
-def test_gradients_of_deferred_light_match_central_differences():
-    """Also where rays see nothing."""
-    with in_float64():
-        volume, transfer, camera, _ = scene_of()
-        # no voxel at a control point, where there would be a kink, and no extinction of 0
-        volume = eqx.tree_at(lambda v: v.data, volume, 0.02 + 0.93 * np.asarray(volume.data))
-        visible = np.asarray(transfer.extinction) + 0.1
-        transfer = jv.TransferFunction(transfer.values, transfer.colors, visible)
-        scene = in_double((volume, transfer, camera, jv.March(0.07, LEAPING[:2]), Deferred(FOG)))
-        weights = jnp.asarray(np.random.default_rng(5).normal(size=(16, 20, 4)))
-
-        def loss(scene):
-            return jnp.sum(jv.render(*scene[:4], lighting=scene[4]).rgba * weights)
-
-        program = eqx.filter_jit(eqx.filter_value_and_grad(loss))
-        check_gradient(program, scene, LEAVES, step=2e-8, rtol=1e-5, atol=1e-6, least=1e-3)
 
 
 # ---------------------------------------------------------------- many samples together

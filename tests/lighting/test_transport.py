@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,18 +16,17 @@ import pytest
 import jaxvol as jv
 from jaxvol.lighting import (
     ConstantLight,
-    Deferred,
     DirectionalLight,
     Material,
     PointLight,
     ScattererTemplates,
-    scatterer_template,
-    scatterer_templates,
     transport,
 )
 from jaxvol.lighting.materials import shares
 from jaxvol.lighting.medium import FADE, scattering_at
+from jaxvol.lighting.random_walks import unit_walks
 from jaxvol.lighting.shading import Surroundings
+from jaxvol.lighting.template_lighting import with_baked_light
 
 from ..scenes import in_float64
 
@@ -70,7 +70,7 @@ def materials(outer: float, inner: float, opacity: float = 0.1) -> tuple[Materia
 
 
 def light_of(of_materials: Any, lights: Any, **how: Any) -> ScattererTemplates:
-    how = {"baked": NODES, "levels": LEVELS} | how
+    how = {"nodes": NODES, "levels": LEVELS} | how
     return ScattererTemplates(of_materials, lights, form="transport", **how)
 
 
@@ -106,31 +106,13 @@ def test_two_labels_of_one_material_are_one():
 # ---------------------------------------------------------------- templates
 
 
-def test_a_walk_has_the_light_of_its_scatterings_and_keeps_parents():
-    template = scatterer_template(Material(0.3, 2.0), 0, packets=5, levels=6, form="transport")
-    assert template.intensity.shape == (31,)
-    level = np.repeat(np.arange(7), [1, 5, 5, 5, 5, 5, 5])
-    expected = 0.3 * 0.7**level / np.where(level == 0, 1, 5)
-    np.testing.assert_allclose(template.intensity, expected, rtol=1e-6)
-    np.testing.assert_array_equal(template.offset[0], 0)
-    parent = np.asarray(template.parent)
-    assert parent[0] == -1
-    np.testing.assert_array_equal(level[parent[1:]], level[1:] - 1)
-    np.testing.assert_array_equal(parent[6:] % 5, np.arange(6, 31) % 5)  # each walk stays its own
-    twice = scatterer_template(Material(0.3, 4.0), 0, packets=5, levels=6, form="transport")
-    np.testing.assert_allclose(twice.offset, 2 * template.offset, rtol=1e-6)
-
-
 @pytest.mark.parametrize("anisotropy", [0.0, 0.6])
 def test_flights_have_the_mean_free_path_and_turns_the_mean_cosine(anisotropy):
-    how: dict[str, Any] = {"count": 4, "packets": 64, "levels": 4, "form": "transport"}
-    found = scatterer_templates(Material(0.5, 3.0), 1, **how, anisotropy=anisotropy)
-    vertices = np.asarray(found.offset)[0, :, 1:].reshape(4, 4, 64, 3)
-    flights = np.diff(vertices, axis=1, prepend=0.0)
-    length = np.linalg.norm(flights, axis=-1)
-    np.testing.assert_allclose(length.mean(), 3.0, rtol=0.01)
-    np.testing.assert_allclose((length**2).mean(), 2 * 3.0**2, rtol=0.05)
-    unit = flights / length[..., None]
+    directions, length = unit_walks(jax.random.key(1), 4, 64, 4, jnp.float32(anisotropy))
+    unit, length = np.swapaxes(directions, 1, 2), np.asarray(length)
+    np.testing.assert_allclose(np.linalg.norm(unit, axis=-1), 1, rtol=1e-5)
+    np.testing.assert_allclose(length.mean(), 1.0, rtol=0.01)
+    np.testing.assert_allclose((length**2).mean(), 2.0, rtol=0.05)
     cosine = np.sum(unit[:, 1:] * unit[:, :-1], axis=-1)
     np.testing.assert_allclose(cosine.mean(), anisotropy, atol=0.02)
     np.testing.assert_allclose(unit[:, 0].mean(axis=(0, 1)), 0, atol=0.02)
@@ -338,8 +320,8 @@ def test_light_is_computed_once_for_all_images_of_a_scene(monkeypatch):
     from jaxvol.lighting import template_lighting
 
     calls = []
-    solved = template_lighting._baked
-    monkeypatch.setattr(template_lighting, "_baked", lambda *given: calls.append(1) or solved(*given))
+    solved = template_lighting._solved
+    monkeypatch.setattr(template_lighting, "_solved", lambda *given: calls.append(1) or solved(*given))
     scene = nested(), transfer(0.8, (1.0, 1.0, 1.0)), light_of(materials(1.2, 0.8, 0.0), lit(SKY))
     first, again = (np.asarray(image(*scene)) for _ in range(2))
     np.testing.assert_array_equal(first, again)
@@ -348,13 +330,15 @@ def test_light_is_computed_once_for_all_images_of_a_scene(monkeypatch):
     assert len(calls) == 2
 
 
-@pytest.mark.slow
-def test_a_ray_that_sees_one_surface_is_lit_alike_where_it_is_shaded_once():
-    volume, function = nested(), transfer(60.0)
-    lighting = light_of(materials(1 / 60, 1 / 60), lit(SUN))
-    whole, once = (np.asarray(image(volume, function, one)) for one in (lighting, Deferred(lighting)))
-    middle = whole[3:5, 3:5]
-    np.testing.assert_allclose(once[3:5, 3:5].mean(), middle.mean(), rtol=0.25)
+def test_light_that_was_computed_inside_a_program_serves_outside():
+    scene = nested(), transfer(0.8), MARCH
+
+    def prepared():
+        lighting = light_of(materials(1.2, 0.8), lit(SUN), nodes=2, levels=1, templates=1, packets=1)
+        return jax.tree.leaves(with_baked_light(lighting, *scene))
+
+    jax.eval_shape(lambda x: (prepared(), x)[1], 0.0)
+    assert not any(isinstance(leaf, jax.core.Tracer) for leaf in prepared())
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,10 @@
-"""Options of the subcommands of `jaxvol`: of the command line, or else of the file that `--config` names, or
-else of the picture that `--like` names. What takes long to import is imported where it is used."""
+"""Options of the subcommands of `jaxvol`, of the command line or of the picture that `--like` names.
+
+What takes long to import is imported where it is used.
+"""
 
 import argparse
 import re
-import tomllib
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from os.path import realpath  # unlike `Path.resolve`, it raises nothing for links in a circle
@@ -60,17 +61,16 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     found = parser.parse_known_args(words)[0]
     command: Parser = found.parser
     settings = command.given(words[1:])
-    for name, read in (("config", _of_toml), ("like", _of_picture)):
-        if name in settings:
-            try:
-                weaker = read(command, settings[name], named="file" in settings)
-            except ValueError as fault:
-                raise ValueError(f"--{name}: {str(fault)[:400]}") from fault
-            for option in weaker.pop("further", ()):
-                if option not in settings:
-                    told = f"the picture shows {option} of files that it may not name"
-                    raise ValueError(f"--{name}: {told}: give --{option.replace('others', 'with')}, too.")
-            settings = _over(settings, weaker)
+    if "like" in settings:
+        try:
+            weaker = _of_picture(command, settings["like"], named="file" in settings)
+        except ValueError as fault:
+            raise ValueError(f"--like: {str(fault)[:400]}") from fault
+        for option in weaker.pop("further", ()):
+            if option not in settings:
+                told = f"the picture shows {option} of files that it may not name"
+                raise ValueError(f"--like: {told}: give --{option.replace('others', 'with')}, too.")
+        settings = _over(settings, weaker)
     check_exclusive(settings)
     defaults = command.defaults()
     # that not every command has: as the viewer composites and fits begin, and what a picture may hold
@@ -106,23 +106,6 @@ def _over(settings: dict[str, Any], weaker: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in weaker.items() if name not in overridden} | settings
 
 
-def _of_toml(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
-    """The options in a TOML file, by their names."""
-    from ..recorded import words_of
-
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as fault:
-        raise ValueError(f"{path} cannot be read as TOML: {fault}") from fault
-    words = [str(content.pop("file"))] if "file" in content else []
-    known = {action.dest.replace("_", "-") for action in command._actions} - {"config", "like", "help"}
-    for name, value in content.items():
-        if name not in known:
-            raise ValueError(f"{path}: {command.prog} has no option {name!r}.")
-        words += words_of(name, value)
-    return command.given(words)
-
-
 def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
     from ..._util.checks import shortened
@@ -153,7 +136,7 @@ def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     another one."""
     from ...io.formats import files_of
 
-    read = [getattr(options, name, None) for name in ("file", "labels", "transfer", "config")]
+    read = [getattr(options, name, None) for name in ("file", "labels", "transfer")]
     read += [Path(row[0]) for row in getattr(options, "others", [])]
     used = [path for each in read if each for path in (each, *(files_of(each) if each.is_dir() else []))]
     for name in names:
@@ -262,8 +245,6 @@ def add_scene(parser: Parser) -> None:
     add_others(parser)
     text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
-    text = "options by their names, such as size = [640, 480]; those of the command line override them"
-    parser.add_argument("--config", type=Path, metavar="TOML", help=text)
     text = "read the volume in bricks, with so much memory for them, such as 256M: .raw, .npy and Zarr"
     parser.add_argument("--memory", type=memory_size, metavar="BYTES", help=text)
     text = "RMSE of linear colours, by which step and transforms are chosen (default: 1/255; not with --step)"

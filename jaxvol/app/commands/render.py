@@ -96,6 +96,10 @@ def _plan(options: argparse.Namespace) -> None:
     with progress("planning", quiet=options.quiet):
         plans = scene.plans([scene.camera], options.tolerance)
     print(*plans)
+    if scene.source is not None:
+        print(
+            f"by a copy whose voxels are {scene.coarser:.3g} times as long: render divides the step by that"
+        )
 
 
 def add_plan(parser: Parser) -> None:

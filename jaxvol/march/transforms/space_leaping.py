@@ -40,7 +40,7 @@ class SpaceLeaping(Transform):
             tells of a box of any size whether it is empty, as coarser levels would.
             `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
             proves empty. Leaps are short where a ray runs along a surface. In a cavity, with blocks of 1, it
-            is the fastest that misses nothing; elsewhere `"hierarchy"` is (`fastest_leaping` measures it).
+            is the fastest that misses nothing; elsewhere `"hierarchy"` is.
             `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
             the first hits of their four corner rays. **It is not a bound**: what is thinner than these
             pixels, and nearer than what their corners hit, is missing in the image.

@@ -59,7 +59,7 @@ def test_editors_complete_its_options():
 
 def test_it_has_the_options_of_the_command():
     found = parsed(parser_of_all(), ["render", "x.raw"]).defaults
-    own = {"file", "like", "config", "output", "transparent", "depth"}
+    own = {"file", "like", "output", "transparent", "depth"}
     assert {name: found[name] for name in found.keys() - own} == DEFAULTS
 
 
