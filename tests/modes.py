@@ -12,6 +12,7 @@ import jaxvol as jv
 
 from . import oracle
 from .scenes import LEAVES, RESOLUTION, soft_transfer
+from .test_agreement import random_numbers
 
 
 class Additive(jv.Weighting):
@@ -119,14 +120,6 @@ class Rays:
         return front, np.clip(self.length[:, None] - front, 0, step)
 
 
-def numbers(transform, camera):
-    """The random number of a transform for every pixel."""
-    width, height = camera.size
-    row, column = (jnp.asarray(index.reshape(-1), jnp.int32) for index in np.mgrid[:height, :width])
-    noise = jax.jit(jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32)))
-    return np.asarray(noise(column, row), np.float64)
-
-
 def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
     """What pixels show under a mode of `MODES`, by NumPy, with `EmptySpaceJitter` and cells that are cut at
     the exit: rgba, distance, and how many samples the rays have. `value`: of the isosurface."""
@@ -140,7 +133,7 @@ def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
             return ~crosses(front, width)
         return classified(transfer, rays.value(front))[1] == 0
 
-    start = None if name == "average" else numbers(jitter, camera)
+    start = None if name == "average" else random_numbers(jitter, camera)
     front, width = rays.cells(step, start, None if name == "average" else empty)
     depth, valid = front + width / 2 * (name == "average"), width > 0
     values = rays.value(depth)

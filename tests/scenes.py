@@ -118,6 +118,10 @@ def in_float64() -> Iterator[None]:
         yield
 
 
+rendered = eqx.filter_jit(jv.render)
+"""An image by one program, where one by stages would be five that no other test needs."""
+
+
 def same_trees(one, other) -> bool:
     """Whether all leaves are equal; by NumPy, which needs no program."""
     return eqx.tree_equal(*jax.device_get((one, other)))
