@@ -9,6 +9,8 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
+from jaxvol.fitting.bijections import Bijection, Fixed
+from jaxvol.fitting.constraints import _default
 
 from . import oracle
 from .scenes import LEAVES, RESOLUTION, soft_transfer
@@ -65,6 +67,12 @@ def scaled_transfer(top, transfer=None):
     """A transfer function for values from 0 to 1, by default the soft one, for values from 0 to `top`."""
     transfer = soft_transfer() if transfer is None else transfer
     return jv.TransferFunction(np.asarray(transfer.values) * top, transfer.colors, transfer.extinction)
+
+
+def free_leaves(parameters):
+    """Paths of the leaves that a fit changes by default."""
+    bounds = jax.tree.leaves_with_path(_default(parameters), is_leaf=lambda b: isinstance(b, Bijection))
+    return {jax.tree_util.keystr(path) for path, bound in bounds if not isinstance(bound, Fixed)}
 
 
 def classified(transfer, values):

@@ -75,8 +75,8 @@ def around(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
 
 def inside(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
     """A camera inside the volume."""
-    low, high = volume.corners
-    return jv.Camera(low + 0.4 * (high - low), high, (0, 0, 1), 70.0, size=size)
+    low, high = map(np.asarray, volume.corners)
+    return jv.Camera(low + np.float32(0.4) * (high - low), high, (0, 0, 1), 70.0, size=size)
 
 
 def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
@@ -118,7 +118,7 @@ def in_float64() -> Iterator[None]:
         yield
 
 
-rendered = eqx.filter_jit(jv.render)
+rendered, rendered_rays = eqx.filter_jit(jv.render), eqx.filter_jit(jv.render_rays)
 """An image by one program, where one by stages would be five that no other test needs."""
 
 

@@ -89,17 +89,18 @@ def test_what_nobody_sees_is_not_read(image, file):
     through = eqx.tree_at(
         lambda c: (c.position, c.focal_point, c.view_angle),
         CAMERA,
-        (jnp.asarray([50.0, 7.0, 96.5]), jnp.asarray([12.0, 5.7, 23.2]), jnp.asarray(4.0)),
+        jax.device_put(tuple(map(np.float32, ((50, 7, 96.5), (12, 5.7, 23.2), 4)))),
     )
     opaque = rendered(file, through, bricks=counts)
-    clear = eqx.tree_at(lambda t: t.extinction, TRANSFER, TRANSFER.extinction / 1e3)
-    assert float(opaque.rgba[..., 3].min()) > 0.99  # the nearer ball hides the other one
+    thin = np.asarray(TRANSFER.extinction) / np.float32(1e3)
+    clear = eqx.tree_at(lambda t: t.extinction, TRANSFER, jax.device_put(thin))
+    assert np.asarray(opaque.rgba)[..., 3].min() > 0.99  # the nearer ball hides the other one
     assert opaque.bricks.loads < rendered(file, through, clear, bricks=counts).bricks.loads
-    away = eqx.tree_at(lambda c: c.focal_point, CAMERA, jnp.asarray([400.0, 200, 400]))
+    away = eqx.tree_at(lambda c: c.focal_point, CAMERA, jax.device_put(np.float32([400, 200, 400])))
     assert rendered(file, away, bricks=counts).bricks.loads == 0
     empty = rendered(np.zeros(SHAPE, np.uint8, order="F"), bricks=counts)
     assert empty.bricks.needed == empty.bricks.loads == 0
-    assert not np.any(empty.rgba)
+    assert not np.asarray(empty.rgba).any()
     assert np.all(np.isinf(empty.depth))
 
 
@@ -121,36 +122,40 @@ def gradient():
 
 
 def assert_same_gradient(found, expected):
-    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+    leaves = (jax.tree.leaves(jax.device_get(each)) for each in (found, expected))
+    for own, other in zip(*leaves, strict=True):
         assert np.linalg.norm(own - other) <= 1e-5 * max(np.linalg.norm(other), 1e-3)
 
 
 def test_image_and_gradient_by_bricks_are_those_of_the_whole(gradient):
     (expected, one), (found, every, passes) = whole_gradient(), gradient
     assert_same(every, one, fields=("exhausted", "samples"))
-    assert np.all(expected[0])  # also of what has no extinction, and is in no brick that shows anything
-    assert np.all(expected[1])
+    assert np.asarray(
+        expected[0]
+    ).all()  # also of what has no extinction, and is in no brick that shows anything
+    assert np.asarray(expected[1]).all()
     assert_same_gradient(found, expected)
     assert passes == 1  # the second march has the ranges of the first
 
 
 def test_the_gradient_agrees_with_differences(gradient):
-    at, position = AT
+    (at, position), unit = AT, np.eye(3, dtype=np.float32)
     for i, change in ((1, 2e-3), (2, 1e-2)):
-        more, less = (loss(at.at[i].add(sign * change), position, by_bricks)[0] for sign in (1, -1))
-        np.testing.assert_allclose(gradient[0][0][i], (more - less) / (2 * change), rtol=2e-3)
+        ends = (jax.device_put(np.asarray(at) + sign * change * unit[i]) for sign in (1, -1))
+        more, less = (float(loss(end, position, by_bricks)[0]) for end in ends)
+        np.testing.assert_allclose(np.asarray(gradient[0][0])[i], (more - less) / (2 * change), rtol=2e-3)
 
 
 def test_other_transformations_say_what_to_do():
     def opacity(extinction):
-        return loss(extinction, AT[1], by_bricks)[1].rgba[..., 3]
+        return loss(extinction, AT[1], by_bricks)[1].rgba
 
     at = TRANSFER.extinction
     seen, pull = jax.vjp(opacity, at)
-    for pulled in (lambda: jax.jit(pull)(seen), lambda: jax.vmap(pull)(seen[None])):
+    for pulled in (lambda: jax.jit(pull)(seen), lambda: jax.vmap(pull)(np.asarray(seen)[None])):
         with pytest.raises(ValueError, match="the gradient by bricks reads its source"):
             pulled()
-    for mapped in (jax.jit(opacity), lambda at: jax.vmap(opacity)(at[None])):
+    for mapped in (jax.jit(opacity), lambda at: jax.vmap(opacity)(np.asarray(at)[None])):
         with pytest.raises(ValueError, match=r"not inside jax\.jit"):
             mapped(at)
     for forward in (
@@ -161,7 +166,7 @@ def test_other_transformations_say_what_to_do():
             forward()
 
     def shown(how, extinction):
-        transfer = jv.TransferFunction(TRANSFER.values, TRANSFER.colors, extinction)
+        transfer = eqx.tree_at(lambda t: t.extinction, TRANSFER, extinction)
         return jv.render_bricks(ARRAY, transfer, WIDE, PLAIN, **how).rgba
 
     for how, message in (
@@ -174,8 +179,9 @@ def test_other_transformations_say_what_to_do():
     def image(source):
         return jnp.sum(jv.render_bricks(source, TRANSFER, WIDE, PLAIN).rgba)
 
-    data = jnp.asarray(balls(), jnp.float32)
-    for given, at in ((image, data), (lambda spacing: image(jv.Volume(data, spacing)), jnp.ones(3))):
+    volume = jv.Volume(balls(), **PLACE)
+    placed = lambda spacing: image(eqx.tree_at(lambda v: v.spacing, volume, spacing))  # noqa: E731
+    for given, at in ((image, jax.device_put(np.float32(balls()))), (placed, volume.spacing)):
         with pytest.raises(ValueError, match=r"source must not be traced.*no gradients to voxels"):
             jax.grad(given)(at)
 
@@ -215,7 +221,7 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ({"source": None}, "source must be an array, a Volume, .* got None"),
     ({"source": {}}, "source must be an array, a Volume, "),
     ({"transfer": 3}, "transfer must be a transfer function"),
-    ({"transfer": jv.LabelTransferFunction({1: TRANSFER})}, "bricks have no labels"),
+    ({"transfer": jv.LabelTransferFunction([TRANSFER])}, "bricks have no labels"),
     ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
     ({"march": jv.March(1.0, (jv.SpaceLeaping("distance", block=1),))}, "block=1. needs the whole volume"),
     (

@@ -155,7 +155,7 @@ def test_leaps_are_over_what_cannot_win_alone():
     low, high = (np.float32(end).reshape(-1, 1, 1) for end in ([0.0, 0.2, 0.7], [0.1, 0.6, 0.8]))
     visible = jv.TransferFunction([0.0, 0.3, 0.4, 0.5, 0.65, 1.0], np.ones((6, 3)), [0.0, 0, 1, 0, 0, 0])
     labels = np.array([1, 1, 2], np.uint32).reshape(-1, 1, 1)
-    by_label = jv.LabelTransferFunction({0: uniform_transfer(0.5), 1: uniform_transfer(0.0)})
+    by_label = jv.LabelTransferFunction([uniform_transfer(0.5), uniform_transfer(0.0)])
 
     @jax.jit
     def occupied(low, high, labels):
@@ -190,7 +190,7 @@ class Scaled(Additive):
 
 def average_of_labels():
     labelled = jv.Volume(NOISE.data, NOISE.spacing, labels=np.zeros(NOISE.shape, np.uint8))
-    transfer = jv.LabelTransferFunction({0: soft_transfer()})
+    transfer = jv.LabelTransferFunction([soft_transfer()] * 2)
     traced(lambda: jv.render(labelled, transfer, SCENE[2], jv.March(0.11), compositing="average"))
 
 

@@ -16,7 +16,7 @@ from jaxvol.scene.space import Affine, enter, world_gradient
 from jaxvol.scene.transfer import classification_of
 
 from ..modes import classified
-from ..scenes import RESOLUTION, soft_transfer
+from ..scenes import RESOLUTION, rendered_rays, soft_transfer
 
 
 RAYS = 64
@@ -27,10 +27,8 @@ def seen(volume, origins, directions, step, value):
     """What rays see; always so many that all tests share a program."""
     origins, directions = (np.resize(np.asarray(part, float), (RAYS, 3)) for part in (origins, directions))
     march = jv.March(step)
-    return of_rays(volume, soft_transfer(), origins, directions, march, compositing=jv.Isosurface(value))
-
-
-of_rays = eqx.filter_jit(jv.render_rays)
+    mode = jv.Isosurface(value)
+    return rendered_rays(volume, soft_transfer(), origins, directions, march, compositing=mode)
 
 
 def ramp(values, spacing=0.1):

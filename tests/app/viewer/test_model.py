@@ -496,9 +496,11 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
     controls["opacity"].set(math.nan)
     assert equal_arrays(model.state.transfer, expected)
     data = np.asarray(LABELS.data)
-    unseen = jv.LabelTransferFunction({1: jv.TransferFunction([0, 1], np.ones((2, 3)), [0, 0])})
+    unseen, one = (
+        jv.LabelTransferFunction({1: jv.TransferFunction([0, 100, 255], np.ones((3, 3)), [0, top, 2 * top])})
+        for top in (0, 1)
+    )
     assert "label" not in controlled(LABELS_OF_ONES, unseen)[1]
-    one = jv.LabelTransferFunction({1: jv.colormap("gray", (0, 255), unit_distance=1.0)})
     assert "label" in controlled(jv.Volume(data, labels=data), one)[1]["slices"].get()  # of 2 there is none
     _, controls = controlled(jv.Volume(np.where(data == 2, np.uint8(9), data)), None)
     assert controls["label"].choices == ["1", "9"]  # as in the file
