@@ -16,7 +16,7 @@ from jaxvol.scene.transfer import Transfer
 
 from . import oracle
 from .modes import Rays, ball_in_a_corner, classified, scaled_transfer
-from .scenes import around, in_float64, scaled_phantom, slow, soft_transfer, to_float64
+from .scenes import around, in_float64, scaled_phantom, slow, soft_transfer, to_float64, with_voxels
 from .test_agreement import random_numbers
 
 
@@ -210,9 +210,7 @@ def test_what_hides_within_a_cell_is_within_its_bound():
 
 
 def test_nan_in_a_voxel_reaches_the_pixels_that_see_it():
-    data = np.array(LINEAR.data)
-    data[9, 12, 12] = np.nan
-    hurt = eqx.tree_at(lambda v: v.data, LINEAR, jax.device_put(data))
+    hurt = with_voxels(LINEAR, (9, 12, 12), np.nan)
     assert 0 < np.isnan(integrated(hurt, soft_transfer(5.0), 0.07)).any(axis=-1).mean() < 0.3
 
 

@@ -35,6 +35,7 @@ from ..scenes import (
     rendered,
     slow,
     soft_transfer,
+    with_voxels,
 )
 
 
@@ -152,14 +153,11 @@ def test_nan_is_passed_on():
     """From voxels into the pixels whose rays meet them, and from a parameter into all."""
     volume = anisotropic_noise()
     camera = around(volume)
-    data = np.array(volume.data)
-    data[10:14, 10:14, 10:14] = np.nan
-    hurt, high = (  # of which no surface is crossed in front
-        eqx.tree_at(lambda v: v.data, volume, jax.device_put(data + more)) for more in np.float32([0, 2])
-    )
-    nan = np.float32(np.nan)
-    lost = eqx.tree_at(lambda t: t.extinction, soft_transfer(), jax.device_put(np.full(8, nan)))
-    nowhere = eqx.tree_at(lambda mode: mode.value, MODES["isosurface"], jax.device_put(np.asarray(nan)))
+    higher = jv.Volume(np.asarray(volume.data) + 2, volume.spacing, volume.origin)  # no surface is in front
+    hurt, high = (with_voxels(each, np.s_[10:14, 10:14, 10:14], np.nan) for each in (volume, higher))
+    nan = jax.device_put(np.full(8, np.nan, np.float32))
+    lost = eqx.tree_at(lambda t: t.extinction, soft_transfer(), nan)
+    nowhere = eqx.tree_at(lambda m: m.value, MODES["isosurface"], jax.device_put(np.float32(np.nan)))
     for name, data, transfer, mode in (
         ("average", hurt, lost, MODES["average"]),
         ("isosurface", high, soft_transfer(), nowhere),

@@ -20,7 +20,7 @@ import jaxvol as jv
 from experiments import scenes as real_scenes
 
 from .. import switch
-from ..scenes import LEAVES, in_float64, to_float64
+from ..scenes import LEAVES, in_float64, to_float64, with_voxels
 from ..test_agreement import oracle_image
 
 
@@ -309,9 +309,7 @@ def test_nan_and_infinity_reach_image_and_gradient():
         # voxels that are seen, and some in the space that is leapt over: rays that do not meet them keep
         # their pixels
         for place in (np.s_[5:8, 9:13, 7:11], np.s_[2:5, 2:5, 22:27]):
-            data = np.array(scene[0].data)
-            data[place] = np.nan
-            image, found = gradient(eqx.tree_at(LEAVES["voxels"], scene, jax.device_put(data)))
+            image, found = gradient((with_voxels(scene[0], place, np.nan), *scene[1:]))
             assert np.isnan(image[..., 3]).any()
             assert not np.isnan(image[..., 3]).all()
             assert np.isnan(found["[1].colors"]).any()
@@ -350,17 +348,11 @@ def test_rays_that_are_not_finite_fail_when_the_program_runs():
     origins, directions = (np.asarray(rays)[::7, ::7] for rays in camera.rays())
     image = jax.jit(lambda *rays: jv.render_rays(volume, transfer, *rays, march=march, outputs="rgba").rgba)
     assert np.isfinite(image(origins, directions)).all()
-    for fault in (np.nan, np.inf):
-        with pytest.raises(Exception, match="origins must be finite"):
-            image(with_fault(origins, (0, 0, 0), fault), directions).block_until_ready()
-        with pytest.raises(Exception, match="directions must be finite"):
-            image(origins, with_fault(directions, (2, 1, 0), fault)).block_until_ready()
-
-
-def with_fault(rays, place, fault):
-    changed = rays.copy()
-    changed[place] = fault
-    return changed
+    for number, fault in ((0, np.nan), (0, np.inf), (1, np.nan), (1, np.inf)):
+        broken = origins.copy(), directions.copy()
+        broken[number][2, 1, 0] = fault
+        with pytest.raises(Exception, match=f"{('origins', 'directions')[number]} must be finite"):
+            image(*broken).block_until_ready()
 
 
 # Other ways to ask.

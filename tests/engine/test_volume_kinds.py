@@ -12,7 +12,6 @@ import jaxvol as jv
 from jaxvol.scene.occupancy import Blocks
 
 from ..scenes import around, soft_transfer
-from ..test_agreement import oracle_image
 
 
 class Inverted(jv.Field):
@@ -28,18 +27,6 @@ def inverted(dtype):
     data[3:11, 3:11, 3:11] = np.random.default_rng(0).integers(0, 60, (8, 8, 8))
     data[4:9, 4:9, 4:9] = 0
     return jv.Volume(data.astype(dtype), (0.1, 0.12, 0.08), field=Inverted())
-
-
-def test_a_custom_field_is_used_for_the_image():
-    """Compared with the independent marcher on a volume of the field's values. Method "distance", since the
-    beams of such a small image are as wide as the volume."""
-    volume, transfer = inverted("uint8"), soft_transfer(1.0)
-    plain = jv.Volume(1 - np.asarray(volume.data, np.float32) / 255, volume.spacing)
-    camera, march = around(volume), jv.March(0.07, (jv.AlphaCorrection(), jv.SpaceLeaping("distance")))
-    rgba, _ = oracle_image(plain, transfer, camera, march)
-    assert rgba[..., 3].max() > 0.3
-    found = np.asarray(jv.render(volume, transfer, camera, march, outputs="rgba").rgba)
-    assert np.mean(np.abs(found - rgba).max(axis=-1) > 2e-5) < 0.01
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from jaxvol.scene.occupancy import BLOCK, Blocks
 from jaxvol.scene.transfer import classification_of
 
 from ..modes import Rays, check_gradients, free_leaves, scaled_transfer
-from ..scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64
+from ..scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64, with_voxels
 from ..test_agreement import random_numbers
 
 
@@ -145,11 +145,7 @@ def patches(kind: str, seed: int = 0) -> jv.Volume:
     volume = jv.Volume(np.round(data).astype("float32" if kind == "NaN" else kind), (0.9, 2.0, 1.3))
     if kind == "float32":
         volume = jv.Volume(data, volume.spacing)
-    if kind == "NaN":
-        hurt = np.array(volume.data)
-        hurt[10, 5, 12] = np.nan
-        volume = eqx.tree_at(lambda v: v.data, volume, jax.device_put(hurt))
-    return volume
+    return with_voxels(volume, (10, 5, 12), np.nan) if kind == "NaN" else volume
 
 
 @eqx.filter_jit
