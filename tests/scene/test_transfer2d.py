@@ -103,11 +103,10 @@ POINTS = [
 
 def test_nothing_is_left_of_a_point_at_its_sides_and_beyond():
     """Where quotients that would be 1 are rounded, as of these numbers."""
-    for seed in range(50):
-        value, magnitude, reach, other = np.random.default_rng(seed).uniform(0.01, 1, 4).round(2)
-        point = (value, magnitude, (1.0, 0.5, 0.2), 0.9, (reach, other))
-        transfer = jv.TransferFunction2D.from_points([point])
-        extinction = np.asarray(transfer.extinction)
+    drawn = [np.random.default_rng(seed).uniform(0.01, 1, 4).round(2) for seed in range(50)]
+    points = [[(value, at, (1.0, 0.5, 0.2), 0.9, (reach, other))] for value, at, reach, other in drawn]
+    found = jax.jit(lambda: [jv.TransferFunction2D.from_points(each).extinction for each in points])()
+    for extinction in map(np.asarray, found):
         np.testing.assert_array_equal(extinction[[0, -1]], 0)
         np.testing.assert_array_equal(extinction[:, [0, -1]], 0)
         assert extinction.max() > 2

@@ -507,7 +507,7 @@ def test_labels_are_shown_and_changed_by_their_controls(controlled):
 
 
 def test_a_table_is_shown_and_not_edited(controlled):
-    given = jv.TransferFunction2D.from_points([(0.5, 10.0, (1, 0, 0), 0.5, (0.5, 8.0))])
+    given = jv.TransferFunction2D((0, 1), (2, 18), np.ones((2, 2, 3)), np.ones((2, 2)))
     model, controls = controlled(BALL, given)
     assert model.state.transfer is given
     assert not {"window", "level", "point"} & controls.keys()
