@@ -9,9 +9,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
+from jaxvol.fitting.bijections import Bijection, Fixed
+from jaxvol.fitting.constraints import _default
 
 from . import oracle
 from .scenes import LEAVES, RESOLUTION, soft_transfer
+from .test_agreement import random_numbers
 
 
 class Additive(jv.Weighting):
@@ -64,6 +67,12 @@ def scaled_transfer(top, transfer=None):
     """A transfer function for values from 0 to 1, by default the soft one, for values from 0 to `top`."""
     transfer = soft_transfer() if transfer is None else transfer
     return jv.TransferFunction(np.asarray(transfer.values) * top, transfer.colors, transfer.extinction)
+
+
+def free_leaves(parameters):
+    """Paths of the leaves that a fit changes by default."""
+    bounds = jax.tree.leaves_with_path(_default(parameters), is_leaf=lambda b: isinstance(b, Bijection))
+    return {jax.tree_util.keystr(path) for path, bound in bounds if not isinstance(bound, Fixed)}
 
 
 def classified(transfer, values):
@@ -119,14 +128,6 @@ class Rays:
         return front, np.clip(self.length[:, None] - front, 0, step)
 
 
-def numbers(transform, camera):
-    """The random number of a transform for every pixel."""
-    width, height = camera.size
-    row, column = (jnp.asarray(index.reshape(-1), jnp.int32) for index in np.mgrid[:height, :width])
-    noise = jax.jit(jax.vmap(lambda c, r: transform.noise((c, r), jnp.float32)))
-    return np.asarray(noise(column, row), np.float64)
-
-
 def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
     """What pixels show under a mode of `MODES`, by NumPy, with `EmptySpaceJitter` and cells that are cut at
     the exit: rgba, distance, and how many samples the rays have. `value`: of the isosurface."""
@@ -140,7 +141,7 @@ def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
             return ~crosses(front, width)
         return classified(transfer, rays.value(front))[1] == 0
 
-    start = None if name == "average" else numbers(jitter, camera)
+    start = None if name == "average" else random_numbers(jitter, camera)
     front, width = rays.cells(step, start, None if name == "average" else empty)
     depth, valid = front + width / 2 * (name == "average"), width > 0
     values = rays.value(depth)

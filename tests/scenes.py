@@ -68,6 +68,13 @@ VOLUMES: dict[str, Callable[[], jv.Volume]] = {
 }
 
 
+def with_voxels(volume: jv.Volume, place, value) -> jv.Volume:
+    """A volume with a value at some of its voxels, unchecked."""
+    data = np.array(volume.data)
+    data[place] = value
+    return eqx.tree_at(lambda v: v.data, volume, jax.device_put(data))
+
+
 def around(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
     """A camera that sees the whole volume, from an asymmetric direction."""
     return jv.Camera.looking_at(volume, (0.5, -0.9, 0.4), size=size)
@@ -75,8 +82,8 @@ def around(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
 
 def inside(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
     """A camera inside the volume."""
-    low, high = volume.corners
-    return jv.Camera(low + 0.4 * (high - low), high, (0, 0, 1), 70.0, size=size)
+    low, high = map(np.asarray, volume.corners)
+    return jv.Camera(low + np.float32(0.4) * (high - low), high, (0, 0, 1), 70.0, size=size)
 
 
 def orthographic(volume: jv.Volume, size: tuple[int, int] = SIZE) -> jv.Camera:
@@ -116,6 +123,15 @@ def in_float64() -> Iterator[None]:
     home: Any = jax if hasattr(jax, "enable_x64") else import_module("jax.experimental")
     with home.enable_x64(True):
         yield
+
+
+rendered, rendered_rays = eqx.filter_jit(jv.render), eqx.filter_jit(jv.render_rays)
+"""An image by one program, where one by stages would be five that no other test needs."""
+
+
+def same_trees(one, other) -> bool:
+    """Whether all leaves are equal; by NumPy, which needs no program."""
+    return eqx.tree_equal(*jax.device_get((one, other)))
 
 
 def to_float64(tree):

@@ -10,6 +10,7 @@ from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from hypothesis import strategies as st
 from jaxtyping import Array, Bool
 
@@ -185,7 +186,8 @@ def switch(transform: jv.Transform, on, part: str = "") -> jv.Transform:
     takes each class of transforms once."""
     if type(transform).locate is not jv.Transform.locate:
         raise ValueError("a space is static: compare marches with and without it.")
-    return _class(type(transform), part)(transform, jnp.asarray(on, bool))
+    on = jax.device_put(np.asarray(on, bool)) if isinstance(on, bool) else jnp.asarray(on, bool)
+    return _class(type(transform), part)(transform, on)
 
 
 ALONE = ("jitter", "residual"), ("clip", "hollow")

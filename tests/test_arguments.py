@@ -125,7 +125,7 @@ FLAGS: dict[str, Callable[[Any], Any]] = {
     "inside_out": lambda value: jv.Clip((0, 1, 0, 1, 0, 1), inside_out=value).inside_out,
     "labels": lambda value: jv.AlphaCorrection(value).labels,
     "parallel": lambda value: jv.Camera.looking_at(VOLUME, parallel=value).parallel_scale,
-    "speckle": lambda value: jv.toroidal_phantom("shells", (8, 8, 8), speckle=value)[0].data,
+    "speckle": lambda value: jv.toroidal_phantom("shells", (9, 11, 17), speckle=value)[0].data,
 }
 """What is made of an argument that is True or False."""
 
@@ -149,7 +149,9 @@ def test_a_very_long_number_is_shortened():
 
 
 def test_rays_of_any_type_of_numbers_see_the_same():
-    expected = jv.render_rays(VOLUME, TRANSFER, *(jnp.asarray(part) for part in RAYS), march=MARCH).rgba
+    expected = jv.render_rays(
+        VOLUME, TRANSFER, *(jax.device_put(np.float32(part)) for part in RAYS), march=MARCH
+    ).rgba
     assert np.asarray(expected)[0, 3] > 0.1
     several: list[Callable[[Any], Any]] = [np.int8, np.float16, np.float64, lambda rays: rays]
     for convert in several:

@@ -26,7 +26,7 @@ def rendered(scene, kind="", seed=0, refined=1):
     jitters = (switch(made(seed), name == kind) for name, made in KINDS.items())
     march = jv.March(step / refined, (*jitters, jv.AlphaCorrection()))
     rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba  # compiles fastest
-    return np.asarray(rgba[..., :3], np.float64)
+    return np.asarray(rgba, np.float64)[..., :3]
 
 
 # -- an inclined plane, and a block that the box cuts -----------------------------------------------------

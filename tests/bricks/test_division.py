@@ -29,8 +29,8 @@ def test_bricks_are_numbered_along_the_axes():
     grid = BrickGrid((9, 17, 5), (4, 8, 3))
     assert grid.counts == (2, 2, 2)
     assert grid.cells(7) == ((4, 8, 3), (8, 16, 4))
-    x, y, z = (jnp.asarray(c) for c in ([0.0, 4.0, 8.0, -1], [7.9, 8.0, 16.0, 99], [2.9, 3.0, 4.0, 0]))
-    assert grid.brick_of((x, y, z)).tolist() == [0, 7, 7, 2]
+    at = np.float32([[0.0, 4.0, 8.0, -1], [7.9, 8.0, 16.0, 99], [2.9, 3.0, 4.0, 0]])
+    assert jax.jit(lambda at: grid.brick_of((at[0], at[1], at[2])))(at).tolist() == [0, 7, 7, 2]
 
 
 DIRECTIONS = [(-1, 0, -1), (0.3, 0, 0.95), (-0.3, 0, -0.95), (0.2, -0.7, 0.4), (1e-3, 1, -1e-3), (0, 0, 1)]
@@ -160,10 +160,10 @@ def test_nothing_within_a_length_of_a_box_lies_outside_of_its_nodes(kind, length
         low = rng.uniform(0, last)
         high = np.minimum(low + rng.uniform(0, 12, 3), last)
         nodes = nodes_within(space, SHAPE, low, high, length)
-        begin = points_of(space, jnp.asarray(rng.uniform(low, high, (400, 3)), jnp.float32))
+        begin = points_of(space, np.float32(rng.uniform(low, high, (400, 3))))
         toward = rng.normal(size=(400, 3))
         toward *= length * rng.uniform(0, 1, (400, 1)) / np.linalg.norm(toward, axis=-1)[:, None]
-        found = np.asarray(coordinates_of(space, begin + jnp.asarray(toward, jnp.float32)))
+        found = np.asarray(coordinates_of(space, np.asarray(begin) + np.float32(toward)))
         inside = np.all((found >= 0) & (found <= last), axis=-1)
         assert np.all(found[inside] >= low - nodes - 1e-2)
         assert np.all(found[inside] <= high + nodes + 1e-2)
@@ -174,10 +174,10 @@ def test_nodes_that_lie_nearer_to_the_apex_than_a_box_are_closer_to_each_other()
     """From a node 13.4 mm from the apex, in random directions: 12 mm are an angle of asin(12 / 13.4), and not
     12 / 13.4."""
     space, length, at = space_of("near apex"), 12.0, np.array([20.0, 2.0, 12.0])
-    toward = np.random.default_rng(0).normal(size=(20_000, 3))
-    toward *= length / np.linalg.norm(toward, axis=-1)[:, None]
-    begin = points_of(space, jnp.asarray(at[None].repeat(400, 0), jnp.float32))[:1]
-    reached = np.asarray(coordinates_of(space, begin + jnp.asarray(toward, jnp.float32)))[:, 1]
+    toward = np.random.default_rng(0).normal(size=(50, 400, 3))
+    toward *= length / np.linalg.norm(toward, axis=-1)[..., None]
+    begin = np.asarray(points_of(space, np.float32(at[None].repeat(400, 0))))
+    reached = np.stack([coordinates_of(space, begin + np.float32(way)) for way in toward])[..., 1]
     assert 28 < np.max(reached) - at[1] <= nodes_within(space, SHAPE, at, at, length)[1]
 
 

@@ -15,7 +15,8 @@ from jaxvol.compositing.selection import RaySampler
 from jaxvol.scene.space import Affine, enter, world_gradient
 from jaxvol.scene.transfer import classification_of
 
-from ..scenes import RESOLUTION, soft_transfer
+from ..modes import classified
+from ..scenes import RESOLUTION, rendered_rays, soft_transfer
 
 
 RAYS = 64
@@ -26,9 +27,8 @@ def seen(volume, origins, directions, step, value):
     """What rays see; always so many that all tests share a program."""
     origins, directions = (np.resize(np.asarray(part, float), (RAYS, 3)) for part in (origins, directions))
     march = jv.March(step)
-    return jv.render_rays(
-        volume, soft_transfer(), origins, directions, march, compositing=jv.Isosurface(value)
-    )
+    mode = jv.Isosurface(value)
+    return rendered_rays(volume, soft_transfer(), origins, directions, march, compositing=mode)
 
 
 def ramp(values, spacing=0.1):
@@ -73,11 +73,13 @@ def test_a_plane_is_exact_up_to_the_exit():
     volume = ramp(np.linspace(0.0, 1.0, RESOLUTION), 1 / (RESOLUTION - 1))
     for value in (0.004, 0.33, 0.777, 0.985, 0.9999):
         found = seen(volume, [[-1.0, 0.2, 0.21]] * 2, [STRAIGHT, STEEP], 0.07, value)  # the second one misses
-        color, _ = soft_transfer()(jnp.asarray(value))
-        np.testing.assert_allclose(found.depth[:2], [1 + value, np.inf], rtol=1e-6)
-        np.testing.assert_allclose(found.rgba[:2], [[*color, 1.0], [0.0] * 4], atol=1e-6)
-        np.testing.assert_allclose(found.normal[:2], [[-1.0, 0, 0], [0, 0, 0]], atol=1e-6)
-        np.testing.assert_array_equal(found.samples[:2], [int(value / 0.07) + 1, 0])
+        color, _ = classified(soft_transfer(), value)
+        parts = found.depth, found.rgba, found.normal, found.samples
+        depth, rgba, normal, samples = (np.asarray(part)[:2] for part in parts)
+        np.testing.assert_allclose(depth, [1 + value, np.inf], rtol=1e-6)
+        np.testing.assert_allclose(rgba, [[*color, 1.0], [0.0] * 4], atol=1e-6)
+        np.testing.assert_allclose(normal, [[-1.0, 0, 0], [0, 0, 0]], atol=1e-6)
+        np.testing.assert_array_equal(samples, [int(value / 0.07) + 1, 0])
 
 
 def test_what_lies_on_the_value_is_not_below_it():

@@ -25,7 +25,18 @@ from ..modes import (
     scaled_transfer,
     shown,
 )
-from ..scenes import anisotropic_noise, around, in_float64, inside, orthographic, slow, soft_transfer
+from ..scenes import (
+    SIZE,
+    anisotropic_noise,
+    around,
+    in_float64,
+    inside,
+    orthographic,
+    rendered,
+    slow,
+    soft_transfer,
+    with_voxels,
+)
 
 
 STEP = 0.11
@@ -67,21 +78,23 @@ def test_of_equal_values_the_nearest_is_the_greatest():
     data = np.zeros((32, 32, 32), np.float32)
     data[10:] = 0.7
     volume, step = jv.Volume(data, (0.37, 0.41, 0.53)), 0.1
-    camera = jv.Camera.looking_at(volume, (-1, 0.23, 0.17), size=(24, 24))
+    camera = jv.Camera.looking_at(volume, (-1, 0.23, 0.17), size=SIZE)
     transfer = jv.TransferFunction([0, 0.7], [[0, 0, 0], [1, 1, 1]], [0, 5.0])
-    found = jv.render(volume, transfer, camera, jv.March(step), compositing="maximum").depth
+    found = rendered(volume, transfer, camera, jv.March(step), compositing="maximum").depth
     origins, directions = (np.asarray(part, float).reshape(-1, 3) for part in camera.rays())
     near, far = oracle.box_interval(origins, directions, [0] * 3, 31 * np.array([0.37, 0.41, 0.53]))
     saturated = (10 * 0.37 - origins[:, 0]) / directions[:, 0]
     first = near + step * np.ceil((np.maximum(saturated, near) - near) / step)
     some = (far > near) & (first < far - 0.01)
     off = np.abs(np.asarray(found).ravel() - first)[some]
-    assert some.sum() > 200
+    assert some.sum() > 80
     assert np.mean(off > 1e-4) < 0.02  # the first sample may be at 255 by rounding alone
     assert off.max() < 1.01 * step
 
 
 PLAIN = [name for name in MODES if name not in SIMILAR]
+IN_ONE = "additive", "integral"
+"""Whose images are of one program, since another mode's by stages stand for theirs."""
 MAPS = {"average": "voxels"}
 """A mode whose march is told another transfer function, by a map that is made before the image."""
 
@@ -96,17 +109,18 @@ MAPS = {"average": "voxels"}
 )
 def test_an_image_is_that_of_numpy(name, method, dtype):
     """Where rays leap, samples shift and cells are cut: of noise and, in empty space, of a ball."""
+    render = rendered if name in IN_ONE else jv.render
     for each, step, most in ((anisotropic_noise(), STEP, 1.001), (ball_in_a_corner(), 0.05, 0.7)):
         leaps = jv.SpaceLeaping("distance", block=1) if method == "voxels" else jv.SpaceLeaping(method)
         march = march_of(name, leaps, step=step)
         volume, transfer, mode = scene_of(name, each, dtype)
         for camera, rest in ((around(volume).zoom(2.0), 0), (inside(volume), 0.2)):
-            found = jv.render(volume, transfer, camera, march, compositing=mode)
+            found = render(volume, transfer, camera, march, compositing=mode)
             value = float(mode.value) if isinstance(mode, jv.Isosurface) else 0
             rgba, depth, samples = shown(name, volume, transfer, camera, step, JITTER, value)
             assert np.mean(rgba[..., 3] > 0) > 0.05
             same_image(found, rgba, depth)
-            taken = np.sum(found.samples) / samples
+            taken = np.sum(np.asarray(found.samples)) / samples
             assert taken == 1 if name == "average" else taken < most + rest
 
 
@@ -115,9 +129,7 @@ def test_the_reference_shows_the_same():
     names = "additive", "average", "maximum", "isosurface"
     volume, camera = anisotropic_noise(), around(anisotropic_noise())
     width, height = camera.size
-    column, row = (
-        jnp.asarray(index, jnp.int32) for index in np.meshgrid(np.arange(width), np.arange(height))
-    )
+    row, column = np.mgrid[:height, :width].astype(np.int32)
 
     @jax.jit
     @jax.vmap
@@ -141,10 +153,11 @@ def test_nan_is_passed_on():
     """From voxels into the pixels whose rays meet them, and from a parameter into all."""
     volume = anisotropic_noise()
     camera = around(volume)
-    hurt = eqx.tree_at(lambda v: v.data, volume, volume.data.at[10:14, 10:14, 10:14].set(jnp.nan))
-    high = eqx.tree_at(lambda v: v.data, hurt, hurt.data + 2)  # no surface is crossed in front
-    lost = eqx.tree_at(lambda t: t.extinction, soft_transfer(), jnp.full(8, jnp.nan))
-    nowhere = eqx.tree_at(lambda mode: mode.value, MODES["isosurface"], jnp.asarray(jnp.nan))
+    higher = jv.Volume(np.asarray(volume.data) + 2, volume.spacing, volume.origin)  # no surface is in front
+    hurt, high = (with_voxels(each, np.s_[10:14, 10:14, 10:14], np.nan) for each in (volume, higher))
+    nan = jax.device_put(np.full(8, np.nan, np.float32))
+    lost = eqx.tree_at(lambda t: t.extinction, soft_transfer(), nan)
+    nowhere = eqx.tree_at(lambda m: m.value, MODES["isosurface"], jax.device_put(np.float32(np.nan)))
     for name, data, transfer, mode in (
         ("average", hurt, lost, MODES["average"]),
         ("isosurface", high, soft_transfer(), nowhere),
@@ -155,7 +168,7 @@ def test_nan_is_passed_on():
         assert 0 < seen.mean() < 0.3
         if name == "isosurface":
             np.testing.assert_array_equal(np.isnan(found.depth), seen)
-            np.testing.assert_array_equal(found.rgba[~seen], 0)
+            np.testing.assert_array_equal(np.asarray(found.rgba)[~seen], 0)
         assert np.isnan(jv.render(volume, transfer, camera, march, compositing=mode).rgba).all()
 
 
@@ -194,9 +207,9 @@ def test_a_selected_sample_moves_with_the_face_that_cuts_its_cell():
     with in_float64():
         volume = jv.Volume(10 * (x + 0.5 * y + 0.2 * z))
         transfer = jv.TransferFunction([0, 20], [(0, 0, 0), (1, 1, 1)], [0.1, 0.1])
-        camera = jv.Camera((-30, -20, 9), volume.center, (0, 0, 1), size=(8, 8))
+        camera = jv.Camera((-30, -20, 9), (3.5, 3.5, 3.5), (0, 0, 1), size=(8, 8))
         plane = (5.0, 3.5, 3.5), (-0.8, -0.3, 0.5)
-        weights = jnp.asarray(np.random.default_rng(0).uniform(0.5, 1.5, (8, 8)))
+        weights = np.random.default_rng(0).uniform(0.5, 1.5, (8, 8))
 
         def shown(given):
             step, shift, origin, until = given
@@ -208,14 +221,15 @@ def test_a_selected_sample_moves_with_the_face_that_cuts_its_cell():
             return jnp.sum(weights * (seen.rgba[..., 0] + depth / 10))
 
         until = np.where(np.indices((8, 8))[1] < 4, 40.0, np.inf)
-        given = [jnp.asarray(0.6), jnp.zeros(3), jnp.asarray(plane[0]), jax.device_put(until)]
-        gradient, value = jax.jit(jax.grad(shown))(given), jax.jit(shown)
+        given = [np.asarray(0.6), np.zeros(3), np.asarray(plane[0]), until]
+        both = jax.jit(jax.value_and_grad(shown))
+        gradient = jax.device_get(both(given)[1])
         for at, along in enumerate((1.0, (0.5, 0.3, -0.8), (1.0, 0.0, 0.0), np.ones((8, 8)))):
             ends = []
             for step in (1e-6, -1e-6):
                 moved = list(given)
                 moved[at] = given[at] + step * np.asarray(along)
-                ends.append(float(value(moved)))
+                ends.append(float(both(moved)[0]))
             expected = (ends[0] - ends[1]) / 2e-6
             assert abs(expected) > 0.01
             np.testing.assert_allclose(np.sum(gradient[at] * np.asarray(along)), expected, rtol=1e-5)

@@ -68,10 +68,13 @@ def test_on_eight_devices(case, fault):
     on_eight_devices(fault, "", case)
 
 
+ZEROS = np.zeros((8, 3), np.float32)
+
+
 def test_rays_that_a_caller_sharded_are_traced_with_types_checked_and_devices_are_refused_there():
     """Traced only; on two devices it runs in the slow tests."""
     volume, transfer, mesh = anisotropic_noise(), soft_transfer(), Mesh(np.array(jax.devices()), ("rays",))
-    march, rays = jv.March(0.07, (jv.Jitter(5), jv.SpaceLeaping())), (jnp.zeros((8, 3)), jnp.ones((8, 3)))
+    march, rays = jv.March(0.07, (jv.Jitter(5), jv.SpaceLeaping())), (ZEROS, ZEROS + 1)
 
     def traced(devices, checked):
         def seen(transfer, origins, directions):

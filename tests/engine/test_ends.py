@@ -1,6 +1,7 @@
 """Rays that end at given depths, and several rays a pixel: against closed forms, and against a clip by the
 plane at which rays end."""
 
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -84,31 +85,36 @@ HOLLOW = 0.4, 1.2, 0.3, 1.1, 0.3, 1.1
 """A plane through the scene of `test_gradients`, and a normal toward its camera."""
 
 
-def in_both_ways(adjoint, on):
-    """Image and depths, and gradients by all leaves and by the plane: clipped by it, and ending at it."""
-    every = switch.transforms(box=HOLLOW, planes=()) | {"clip": jv.Clip(planes=[CUT])}
-    number = list(every).index("clip")
+EVERY = switch.transforms(box=HOLLOW, planes=()) | {"clip": jv.Clip(planes=[CUT])}
+
+
+@cache  # what checks numbers is not found in JAX's cache
+def in_one_program(adjoint):
+    """A loss, with its gradient, of a scene and a plane that clips rays or ends them."""
 
     def loss(given, clips):
         (volume, transfer, camera, march), (point, normal) = given
-        march = eqx.tree_at(_planes_of(number), march, [point[None], normal[None]])
+        clip = lambda march: march.transforms[list(EVERY).index("clip")].inner  # noqa: E731
+        where = lambda march: (clip(march).origins, clip(march).normals)  # noqa: E731
+        march = eqx.tree_at(where, march, (point[None], normal[None]))
         origins, directions = camera.rays()
         rate, height = directions @ normal, (origins - point[None, None]) @ normal
         until = jnp.where((rate < 0) & ~clips, -height / jnp.where(rate < 0, rate, 1), jnp.inf)
         image = jv.render(volume, transfer, camera, march, adjoint=adjoint, until=until)
         return weighed(image.rgba, image.depth), (image.rgba, image.depth)
 
-    program = eqx.filter_jit(eqx.filter_value_and_grad(loss, has_aux=True))
+    return eqx.filter_jit(eqx.filter_value_and_grad(loss, has_aux=True))
+
+
+def in_both_ways(adjoint, on):
+    """Image and depths, and gradients by all leaves and by the plane: clipped by it, and ending at it."""
+    program = in_one_program(adjoint)
     for clips in (True, False):
         chosen = on | ({"clip"} if clips else set())
-        given = [switch.switch(each, name in chosen, name.title()) for name, each in every.items()]
+        given = [switch.switch(each, name in chosen, name.title()) for name, each in EVERY.items()]
         scene = scene_of(tuple(given), "float64", most=128)
         (_, seen), found = jax.device_get(program(jax.device_put((scene, CUT)), np.asarray(clips)))
         yield seen, jax.tree.leaves((found[0][:3], found[0][3].step, found[1]))
-
-
-def _planes_of(number):
-    return lambda march: [getattr(march.transforms[number].inner, name) for name in ("origins", "normals")]
 
 
 @pytest.mark.parametrize("adjoint", ["replay", pytest.param("direct", marks=pytest.mark.slow)])

@@ -109,7 +109,7 @@ def test_images_and_gradients_are_those_of_the_tiling_for_cpus():
 
 
 def assert_same(found: jv.Rendering, expected: jv.Rendering) -> None:
-    assert 0.02 < np.mean(expected.rgba[..., 3] > 0) < 0.98
+    assert 0.02 < np.mean(np.asarray(expected.rgba)[..., 3] > 0) < 0.98
     for part in ("rgba", "depth", "samples", "aligned", "exhausted"):
         a, b = (np.asarray(getattr(each, part), float) for each in (found, expected))
         np.testing.assert_array_equal(np.isinf(a), np.isinf(b))

@@ -12,7 +12,7 @@ import jaxvol as jv
 from jaxvol.march.march import Cell
 from jaxvol.scene.space import Affine
 
-from ..scenes import around, scaled_phantom, soft_transfer, uniform_transfer
+from ..scenes import around, rendered_rays, scaled_phantom, soft_transfer, uniform_transfer
 from ..switch import switch
 
 
@@ -29,7 +29,7 @@ class Late(jv.Transform):
     by: jax.Array
 
     def __init__(self, by):
-        self.by = jnp.asarray(by, jnp.float32)  # an array, so that all values share one program
+        self.by = jax.device_put(np.float32(by))  # an array, so that all values share one program
 
     def shift(self, ray):
         return jnp.broadcast_to(self.by, ray.length.shape)
@@ -55,13 +55,17 @@ RAY = ([[-1.0, 1.0, 1.0]], [[1.0, 0.0, 0.0]])
 
 
 @eqx.filter_jit
-def reference(march):
-    return jv.render_ray_reference(
-        BOX, uniform_transfer(1.0), jnp.asarray(RAY[0][0]), jnp.asarray(RAY[1][0]), march
-    )
+def by_both_engines(transfer, fast, limited):
+    origin, direction = (jnp.asarray(part[0]) for part in RAY)
+    reference = jv.render_ray_reference(BOX, transfer, origin, direction, limited)
+    found = jv.render_rays(BOX, transfer, *RAY, fast), reference
+    return [(each.rgba[..., 3].sum(), each.samples.sum(), each.aligned.any()) for each in found]
 
 
-def opacity(quadrature="left", step=0.3, *, most=80, **on):
+OPAQUE = uniform_transfer(1.0)
+
+
+def opacity(quadrature="left", step=0.3, *, most=80, transfer=OPAQUE, **on):
     """Opacity, number of samples, and whether the last cell was cut, by both engines, with these transforms;
     all of which are in one program."""
     every = {
@@ -72,12 +76,8 @@ def opacity(quadrature="left", step=0.3, *, most=80, **on):
         "ended": jv.EarlyTermination(on.get("ended", 0.5)),
     }
     transforms = tuple(switch(each, name in on) for name, each in every.items())
-    fast = jv.render_rays(BOX, uniform_transfer(1.0), *RAY, jv.March(step, transforms, quadrature))
-    alone = reference(jv.March(step, transforms, quadrature, max_samples=most))
-    found = [
-        (float(each.rgba[..., 3].sum()), int(each.samples.sum()), bool(each.aligned.any()))
-        for each in (fast, alone)
-    ]
+    marches = (jv.March(step, transforms, quadrature, max_samples=limit) for limit in (None, most))
+    found = jax.tree.map(np.ndarray.item, jax.device_get(by_both_engines(transfer, *marches)))
     assert found[0][0] == pytest.approx(found[1][0], abs=1e-6)
     assert found[0][1:] == found[1][1:]
     return found[0]
@@ -116,52 +116,53 @@ def test_early_termination_stops_where_little_is_left():
 @pytest.mark.parametrize(("by", "samples"), [(0.0, 7), (-0.5, 8), (-3.0, 8), (0.5, 7)])
 def test_a_shift_is_made_once_and_within_the_cell_that_is_known_to_be_empty(by, samples):
     clear = jv.TransferFunction(np.linspace(0, 1, 8), np.ones((8, 3)), np.zeros(8))
-    rendering = jv.render_rays(BOX, clear, *RAY, jv.March(0.3, (Late(by),)))
     # at 0, and on from 0.3 (1 + by), limited to between 0 and 0.3
-    assert int(rendering.samples[0]) == samples
+    assert opacity(late=by, transfer=clear)[1] == samples
     assert opacity(late=by)[1] == 7, "where nothing is transparent"
 
 
 def test_locate_replaces_the_space():
     origins, directions = np.array(RAY)
     march = jv.March(0.3, (Moved(), jv.AlphaCorrection()))
-    rendering = jv.render_rays(
-        BOX, uniform_transfer(1.0), np.concatenate([origins, origins + 10]), directions.repeat(2, 0), march
-    )
-    np.testing.assert_allclose(rendering.rgba[:, 3], [0, 1 - np.exp(-2)], atol=1e-5)
+    rays = np.concatenate([origins, origins + 10]), directions.repeat(2, 0)
+    rgba = np.asarray(rendered_rays(BOX, OPAQUE, *rays, march).rgba)
+    np.testing.assert_allclose(rgba[:, 3], [0, 1 - np.exp(-2)], atol=1e-5)
 
 
 def test_early_termination_errs_by_less_than_what_is_left():
     volume, transfer = scaled_phantom("head"), soft_transfer(0.1)
     camera = around(volume)
-    full = jv.render(volume, transfer, camera, jv.March(0.05, (switch(jv.EarlyTermination(), False),)))
+
+    def image(*transforms):
+        found = jv.render(volume, transfer, camera, jv.March(0.05, transforms))
+        return np.asarray(found.rgba), np.asarray(found.samples)
+
+    full, most = image()
     for left in (1 / 255, 0.1):
-        ended = jv.render(
-            volume, transfer, camera, jv.March(0.05, (switch(jv.EarlyTermination(left), True),))
-        )
-        off = np.asarray(full.rgba - ended.rgba)
+        ended, samples = image(jv.EarlyTermination(left))
+        off = full - ended
         assert (off > -1e-6).all()
         assert 0 < off.max() <= left
-        assert (ended.samples <= full.samples).all()
-        assert int(ended.samples.sum()) < int(full.samples.sum())
-    sooner = jv.EarlyTermination(0.1, interval=3)
-    found = jv.render(volume, transfer, camera, jv.March(0.05, (switch(sooner, True),)))
-    np.testing.assert_allclose(found.rgba, ended.rgba, atol=1e-6)
-    np.testing.assert_array_equal(found.samples, ended.samples)
+        assert (samples <= most).all()
+        assert samples.sum() < most.sum()
+    sooner, as_many = image(jv.EarlyTermination(0.1, interval=3))
+    np.testing.assert_allclose(sooner, ended, atol=1e-6)
+    np.testing.assert_array_equal(as_many, samples)
 
 
 def test_a_march_that_runs_out_of_samples_says_so():
     march = jv.March(0.3, max_samples=5)
-    rendering = jv.render_rays(BOX, uniform_transfer(1.0), [RAY[0][0]] * 2, [[1, 0, 0], [0, 1, 0]], march)
+    rays = [RAY[0][0]] * 2, [[1, 0, 0], [0, 1, 0]]
+    rendering = jv.render_rays(BOX, OPAQUE, *rays, march)
     np.testing.assert_array_equal(rendering.exhausted, [True, False])
-    assert int(rendering.samples[0]) == 5
-    assert not jv.render_rays(BOX, uniform_transfer(1.0), *RAY, jv.March(0.3)).exhausted[0]
+    assert np.asarray(rendering.samples)[0] == 5
+    assert not np.asarray(jv.render_rays(BOX, OPAQUE, *rays, jv.March(0.3)).exhausted).any()
 
 
 def test_whole_numbers_of_any_library_are_taken():
-    for given in (5, np.int64(5), np.array(5), jnp.asarray(5)):
+    for given in (5, np.int64(5), np.array(5), jax.device_put(np.int32(5))):
         assert type(jv.March(0.3, max_samples=given).max_samples) is int
-    for step in (np.float64(0.25), np.array(0.25), jnp.float16(0.25)):
+    for step in (np.float64(0.25), np.array(0.25), jax.device_put(np.float16(0.25))):
         assert float(jv.March(step).step) == 0.25
 
 

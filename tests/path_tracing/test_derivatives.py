@@ -58,7 +58,7 @@ class Scene(NamedTuple):
     lights: tuple[Any, ...]
     materials: Any
     colors: Any = COLORS
-    anisotropy: Any = 0.4
+    anisotropy: Any = np.float32(0.4)  # an array, so that all share one program
 
     def changed(self, by: Any) -> "Scene":
         """The scene, changed by a vector."""
@@ -102,7 +102,7 @@ def derivatives(scene: Scene, **how: Any) -> tuple[np.ndarray, np.ndarray, np.nd
     """Images by groups, with their opacity; their derivatives, (groups, height, width, 4, parameters); and
     the derivatives of the image of all paths."""
 
-    how = {name: jnp.asarray(value) if name == "key" else value for name, value in how.items()}
+    how = {**how, "key": np.int32(how.get("key", 0))}
     groups, *tangents = _derivatives(scene, how)
     found, of_all = (np.asarray(each, float) for each in tangents)
     return np.asarray(groups), found, of_all
@@ -120,6 +120,11 @@ def _derivatives(scene: Scene, how: dict[str, Any]) -> tuple[jax.Array, ...]:
 
     (groups, _), tangents = jax.vmap(along, out_axes=(None, -1))(jnp.eye(len(KINDS)))
     return groups, *tangents
+
+
+def estimated(groups: Any) -> tuple[np.ndarray, np.ndarray]:
+    """`mean_and_standard_error` in NumPy, which compiles nothing."""
+    return np.mean(groups, axis=0), np.std(groups, axis=0, ddof=1) / np.sqrt(len(groups))
 
 
 def unit(kind: str) -> np.ndarray:
@@ -156,7 +161,7 @@ def test_derivatives_of_light_scattered_once_are_those_of_quadrature_and_errors_
     assert not found[..., KINDS.index("opacity")].any()  # of a material that is nowhere
     of_regions = []
     for kind in ("empty", "dense", "color", "anisotropy", "sun", "lamp"):
-        derivative, error = mean_and_standard_error(found[..., KINDS.index(kind)])
+        derivative, error = estimated(found[..., KINDS.index(kind)])
         expected = difference(
             lambda by: once_scattered_by(scene.changed(by)), unit(kind), 1e-3, one_sided=kind == "empty"
         )
@@ -177,7 +182,7 @@ def test_the_standard_error_of_a_derivative_is_its_standard_deviation_over_keys(
     scene, means, errors = SCENE._replace(lights=lit(SUN, LAMP)), [], []
     for key in range(48):
         found = derivatives(scene, max_scatterings=1, key=key)[1].mean(axis=(1, 2))[:, :3]
-        mean, error = mean_and_standard_error(found[..., np.array([0, 1, 2, 5, 6, 7])])
+        mean, error = estimated(found[..., np.array([0, 1, 2, 5, 6, 7])])
         means.append(mean)
         errors.append(error)
     ratio = np.std(means, axis=0, ddof=1) / np.sqrt(np.mean(np.square(errors), axis=0))
@@ -190,9 +195,9 @@ def test_the_derivative_of_a_half_space_by_its_opacity_is_chandrasekhars():
     sun = DirectionalLight((0.8, 0.0, 0.6), np.ones(3) * np.pi)
     materials = Material(opacity, 1 / 60, values=(-1.0, 2.0)), NOWHERE
     camera, extinction = far(volume, 0.01), np.full(8, 1.0)
-    scene = Scene(volume, camera, extinction, lit(sun), materials, np.tile(colors, (8, 1)), 0.0)
+    scene = Scene(volume, camera, extinction, lit(sun), materials, np.tile(colors, (8, 1)), np.float32(0))
     _, found, _ = derivatives(scene)
-    derivative, error = mean_and_standard_error(found.mean(axis=(1, 2)))
+    derivative, error = estimated(found.mean(axis=(1, 2)))
     ends = (np.pi * reflected(colors * (1 - opacity - side * step), 1.0, 0.6) for side in (1, -1))
     away = derivative[:3, KINDS.index("opacity")] - np.subtract(*ends) / (2 * step)
     assert np.all(error[:3, KINDS.index("opacity")] < 0.02 * abs(derivative[:3, KINDS.index("opacity")]))
@@ -219,12 +224,12 @@ def compared(scene: Scene, directions: np.ndarray, steps: dict[int, float], keys
     found = np.concatenate([derivatives(scene, key=key)[1].mean(axis=(1, 2)) for key in range(keys // 2)])
     for row, step in steps.items():
         direction = directions[row]
-        derivative, error = mean_and_standard_error(found @ direction)
+        derivative, error = estimated(found @ direction)
         by_keys = [
             difference(lambda by, key=key: mean(by, key), direction, abs(step), one_sided=step < 0)
             for key in range(100, 100 + keys)
         ]
-        expected, its_error = mean_and_standard_error(np.stack(by_keys))
+        expected, its_error = estimated(np.stack(by_keys))
         assert np.all(np.hypot(error, its_error)[:3] < 0.2 * abs(expected[:3]).max()), direction
         assert np.all(abs(derivative - expected) < 3 * np.hypot(error, its_error) + 1e-7), direction
 
@@ -305,20 +310,29 @@ def test_reverse_mode_is_refused(derivative):
         return SCENE._replace(lights=lit(SUN, LAMP, ConstantLight(radiance))).traced().radiance.sum()
 
     with pytest.raises(ValueError, match=r"forward mode only; take jax.jacfwd"):
-        jax.eval_shape(derivative(loss), jnp.ones(3))
+        jax.eval_shape(derivative(loss), np.ones(3, np.float32))
 
 
 def test_images_by_groups_are_over_a_background():
     traced, background = SCENE._replace(lights=lit(SUN, LAMP)).traced(max_scatterings=1), (0.2, 0.5, 1.0)
     assert traced.groups is not None
-    mean, error = mean_and_standard_error(traced.images(background))
-    np.testing.assert_allclose(mean, traced.image(background), atol=1e-6)
-    of_paths = np.asarray(traced.standard_error)
-    assert 0.9 < np.mean(mean_and_standard_error(traced.groups[..., :3])[1]) / of_paths.mean() < 1.1
-    assert error.shape == mean.shape
     other = SCENE._replace(lights=lit(SUN, LAMP)).traced(max_scatterings=1, key=1)
-    both = traced.joined(other)
-    np.testing.assert_allclose(both.images(background).mean(axis=0), both.image(background), atol=1e-6)
+
+    @eqx.filter_jit  # by themselves, the operations are thirty programs
+    def all_of(traced: jv.PathTraced, other: jv.PathTraced) -> Any:
+        assert traced.groups is not None
+        both = traced.joined(other)
+        errors = mean_and_standard_error(traced.groups[..., :3])[1], traced.standard_error
+        images = [(each.images(background), each.image(background)) for each in (traced, both)]
+        return images, mean_and_standard_error(traced.images(background)), errors
+
+    (own, joined), (mean, error), (of_groups, of_paths) = jax.device_get(all_of(traced, other))
+    for found, expected in zip((mean, error), estimated(own[0]), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    for images, image in (own, joined):
+        np.testing.assert_allclose(images.mean(axis=0), image, atol=1e-6)
+    assert 0.9 < of_groups.mean() / of_paths.mean() < 1.1
+    assert error.shape == mean.shape
     with pytest.raises(ValueError, match="groups must divide paths; got groups = 3"):
         trace(VOLUME, SCENE.transfer, SCENE.camera, SCENE.lights, groups=3)
     with pytest.raises(ValueError, match="images are by groups of paths"):

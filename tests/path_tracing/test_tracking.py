@@ -83,7 +83,7 @@ def test_no_extinction_exceeds_its_majorant(transfers, points, with_materials):
         random = np.random.default_rng(seed)
         volume, transfer = random_volume(random), transfers(random, points)
         materials = random_materials(random) if with_materials else ()
-        given = volume, Blocks.of(volume), transfer, materials, jnp.asarray(places(random))
+        given = volume, Blocks.of(volume), transfer, materials, places(random)
         extinction, albedo, entry = (np.asarray(a) for a in extinction_and_majorant(*given))
         assert extinction.max() > 0
         assert np.all(extinction <= np.maximum(entry, 0))
@@ -98,7 +98,7 @@ def test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_i
         volume, transfer = random_volume(random), random_labelled(random, 40)
         materials = random_materials(random)
         nodes = np.resize(np.indices(SHAPE, np.float32).reshape(3, -1).T, places(random).shape)
-        given = volume, Blocks.of(volume), transfer, materials, jnp.asarray(nodes)
+        given = volume, Blocks.of(volume), transfer, materials, nodes
         extinction, albedo, _ = (np.asarray(a) for a in extinction_and_majorant(*given))
         values, labels = (np.resize(np.asarray(leaf), len(nodes)) for leaf in (volume.data, volume.labels))
         shown, seen = extinction > 0, np.zeros(len(nodes), bool)
@@ -114,8 +114,8 @@ def test_a_material_has_the_extinction_of_its_mean_free_path_and_the_albedo_of_i
             np.testing.assert_allclose(extinction[here], 1 / np.asarray(material.mean_free_path), rtol=1e-6)
             for label in (0, 2):
                 function, of_label = transfer.stacked, here & (labels == label)
-                colors = np.asarray(function.colors[label]).T
-                color = [np.interp(values[of_label], function.values[label], part) for part in colors]
+                points, colors = (np.asarray(part)[label] for part in (function.values, function.colors))
+                color = [np.interp(values[of_label], points, part) for part in colors.T]
                 expected = np.stack(color, axis=1) * (1 - np.asarray(material.opacity))
                 np.testing.assert_allclose(albedo[of_label], expected, atol=1e-3)
     assert np.all(found > 100)
@@ -127,7 +127,7 @@ def test_bounds_are_no_larger_than_need_be():
     for points in (2, 33):
         transfer = random_transfer(random, points)
         low, high = np.sort(random.uniform(-0.1, 1.1, (2, 200)), axis=0).astype(np.float32)
-        bound = np.asarray(bounds(transfer.values, transfer.extinction, jnp.asarray(low), jnp.asarray(high)))
+        bound = np.asarray(bounds(transfer.values, transfer.extinction, low, high))
         values, extinction = (np.asarray(a, float) for a in (transfer.values, transfer.extinction))
         for a, b, upper in zip(low, high, bound, strict=True):
             inside = values[(values >= a) & (values <= b)]
@@ -185,8 +185,8 @@ def test_transmittance_is_that_of_the_optical_depth(name):
     values = np.linspace(0, 1, 8)
     transfer = jv.TransferFunction(values, np.ones((8, 3)), [0, 0, 0, 3, 0, 0.2, 1.5, 6])
     direction = np.asarray(direction) / np.linalg.norm(direction)
-    given = (jnp.asarray(a, jnp.float32) for a in (start, direction, length))
-    left, passes, done, _ = tracked(volume, transfer, *given)
+    given = map(np.float32, (start, direction, length))
+    left, passes, done, _ = jax.device_get(tracked(volume, transfer, *given))
     assert np.all(done)
 
     rate = direction / np.asarray(volume.spacing, float)

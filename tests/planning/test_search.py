@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies
@@ -55,9 +55,9 @@ class Known(Probe):
         step = float(march.step)
         samples = self.samples / step
         wrong = (self.integrated if march.quadrature == "preintegrated" else self.midpoint)(step)
-        rgba = jnp.asarray(np.asarray([3 * [0.5 + wrong] + [1.0]], np.float32))
-        counted = jnp.asarray([math.ceil(samples)], jnp.int32)
-        return jv.Rendering(rgba, jnp.asarray([self.exhausted]), Details(samples=counted))
+        rgba, counted = np.float32([3 * [0.5 + wrong] + [1.0]]), np.int32([math.ceil(samples)])
+        exhausted = np.asarray([self.exhausted])
+        return jax.device_put(jv.Rendering(rgba, exhausted, Details(samples=counted)))
 
 
 def search_of(known: Known, goal: float, mode: Any = None) -> Search:
@@ -147,8 +147,8 @@ def test_what_is_cheapest_within_the_goal_is_taken(case):
 
 
 def test_brightness_counts_where_anything_is_seen():
-    rgba = jnp.asarray(np.asarray([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]], np.float32))
-    assert brightest_of(jv.Rendering(rgba, jnp.zeros(3, bool))) == pytest.approx(2)
+    rgba = np.float32([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]])
+    assert brightest_of(jax.device_put(jv.Rendering(rgba, np.zeros(3, bool)))) == pytest.approx(2)
 
 
 @pytest.mark.parametrize("once", [False, True])

@@ -21,7 +21,7 @@ from jaxvol.xla.memo import memoized
 
 def blocks_of_ranges(low, high):
     """One block per range."""
-    low, high = (jnp.asarray(side, jnp.float32).reshape(-1, 1, 1) for side in (low, high))
+    low, high = (jax.device_put(np.reshape(np.float32(side), (-1, 1, 1))) for side in (low, high))
     return Blocks(low, high, None)
 
 
@@ -65,12 +65,14 @@ def test_blocks_know_their_labels():
     rng = np.random.default_rng(1)
     labels = rng.choice([0, 1, 2, 31, 34, 63, 200], (24, 20, 28)) * (rng.random((24, 20, 28)) < 0.01)
     blocks = Blocks.of(jv.Volume(np.zeros(labels.shape, np.uint8), labels=labels.astype(np.uint8)))
-    for label in (0, 1, 2, 3, 31, 34, 63, 200):
-        may = np.asarray(blocks.may_hold(label))
+    asked = 0, 1, 2, 3, 31, 34, 63, 200
+    without = blocks_of_ranges([0.0], [1.0])
+    found, any_label = jax.jit(lambda: ([blocks.may_hold(each) for each in asked], without.may_hold(3)))()
+    for label, may in zip(asked, map(np.asarray, found), strict=True):
         for block in np.ndindex(may.shape):
             part = labels[tuple(slice(i * BLOCK, i * BLOCK + BLOCK + 1) for i in block)]
             assert may[block] == np.any(part % 32 == label % 32)  # labels equal mod 32 share a bit
-    assert np.all(blocks_of_ranges([0.0], [1.0]).may_hold(3))  # without labels, any may be there
+    assert np.asarray(any_label).all()  # without labels, any may be there
 
 
 # ---- visibility under a transfer function ----
@@ -140,7 +142,7 @@ def test_what_is_called_invisible_has_no_extinction(points):
 
 
 def test_ranges_that_only_touch_visible_values_are_invisible():
-    values, extinction = jnp.asarray([0.0, 1, 2, 3, 4, 5]), jnp.asarray([0.0, 0, 0, 1, 0, 0])
+    values, extinction = np.float32([0, 1, 2, 3, 4, 5]), np.float32([0, 0, 0, 1, 0, 0])
     invisible, shown = [(-5, 0), (0, 2), (4, 9), (7, 9)], [(0, 2.001), (2.2, 2.3), (3.9, 9), (-9, 9), (3, 3)]
     low, high = np.array([*invisible, *shown], np.float32).T
     seen = jax.jit(positive_between)(values, extinction, low, high)
@@ -216,12 +218,12 @@ def test_memoized_results_are_freed_with_their_array():
 
     def double(array):
         calls.append(array.shape)
-        return array * 2
+        return jax.device_put(2 * np.asarray(array))
 
-    array = jnp.arange(5.0)
+    array, other = (jax.device_put(np.arange(5.0, dtype=np.float32)) for _ in range(2))
     first = memoized(array, double)
     assert memoized(array, double) is first
-    assert memoized(jnp.arange(5.0), double) is not first
+    assert memoized(other, double) is not first
     assert len(calls) == 2
     alive = weakref.ref(first)
     del first

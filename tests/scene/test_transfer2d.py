@@ -13,12 +13,12 @@ from scipy.interpolate import RegularGridInterpolator
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.engine.acceleration import VolumeAcceleration
-from jaxvol.fitting.constraints import Free
 from jaxvol.scene.occupancy import BLOCK, Blocks
 from jaxvol.scene.transfer import classification_of
 
-from ..modes import Rays, check_gradients, numbers, scaled_transfer
-from ..scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64
+from ..modes import Rays, check_gradients, free_leaves, scaled_transfer
+from ..scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64, with_voxels
+from ..test_agreement import random_numbers
 
 
 def random_table(n: int, m: int, seed: int = 0) -> jv.TransferFunction2D:
@@ -44,8 +44,13 @@ def all_of(transfer: jv.TransferFunction2D, places: Any, cotangent: Any) -> Any:
 
 def looked_up(transfer: jv.TransferFunction2D, values: Any, magnitudes: Any) -> np.ndarray:
     """Colour and extinction, (points, 4)."""
-    places = tuple(jnp.asarray(each, jnp.float32) for each in (values, magnitudes))
-    return np.asarray(all_of(transfer, places, jnp.zeros((len(values), 4)))[0])
+    places = tuple(np.float32(each) for each in (values, magnitudes))
+    return np.asarray(all_of(transfer, places, np.zeros((len(values), 4), np.float32))[0])
+
+
+def table_of(transfer: jv.TransferFunction2D) -> np.ndarray:
+    """The entries of `looked_up`."""
+    return np.concatenate([transfer.colors, np.asarray(transfer.extinction)[..., None]], axis=-1)
 
 
 # ---------------------------------------------------------------- the table
@@ -62,12 +67,12 @@ def test_the_table_is_bilinear_and_constant_beyond_its_lines(n, m):
             np.stack(np.meshgrid(*lines), axis=-1).reshape(-1, 2),  # the corners themselves
         ]
     )
-    cotangent = jnp.asarray(random.normal(size=(len(places), 4)), jnp.float32)
-    given = tuple(jnp.asarray(part, jnp.float32) for part in places.T)
+    cotangent = np.float32(random.normal(size=(len(places), 4)))
+    given = tuple(np.float32(places.T))
     found, expected, pulled = all_of(transfer, given, cotangent)
     for a, b in zip(jax.tree.leaves(pulled), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-4 * np.abs(b).max() + 1e-6)
-    table = np.concatenate([transfer.colors, transfer.extinction[..., None]], axis=-1)
+    table = table_of(transfer)
     inside = np.clip(places, [line[0] for line in lines], [line[-1] for line in lines])
     # of lines that lie close together, places are rounded
     near = min(float(np.diff(line).min()) for line in lines)
@@ -98,18 +103,17 @@ POINTS = [
 
 def test_nothing_is_left_of_a_point_at_its_sides_and_beyond():
     """Where quotients that would be 1 are rounded, as of these numbers."""
-    for seed in range(50):
-        value, magnitude, reach, other = np.random.default_rng(seed).uniform(0.01, 1, 4).round(2)
-        point = (value, magnitude, (1.0, 0.5, 0.2), 0.9, (reach, other))
-        transfer = jv.TransferFunction2D.from_points([point])
-        extinction = np.asarray(transfer.extinction)
+    drawn = [np.random.default_rng(seed).uniform(0.01, 1, 4).round(2) for seed in range(50)]
+    points = [[(value, at, (1.0, 0.5, 0.2), 0.9, (reach, other))] for value, at, reach, other in drawn]
+    found = jax.jit(lambda: [jv.TransferFunction2D.from_points(each).extinction for each in points])()
+    for extinction in map(np.asarray, found):
         np.testing.assert_array_equal(extinction[[0, -1]], 0)
         np.testing.assert_array_equal(extinction[:, [0, -1]], 0)
         assert extinction.max() > 2
 
 
 def test_points_are_tents_and_add_up():
-    transfer = jv.TransferFunction2D.from_points(POINTS, unit_distance=2.0)
+    transfer = jax.jit(lambda: jv.TransferFunction2D.from_points(POINTS, unit_distance=2.0))()
     random = np.random.default_rng(3)
     places = random.uniform((0, 0), (100, 12), (4000, 2))
     expected = np.zeros(len(places))
@@ -140,9 +144,7 @@ def patches(kind: str, seed: int = 0) -> jv.Volume:
     volume = jv.Volume(np.round(data).astype("float32" if kind == "NaN" else kind), (0.9, 2.0, 1.3))
     if kind == "float32":
         volume = jv.Volume(data, volume.spacing)
-    if kind == "NaN":
-        volume = eqx.tree_at(lambda v: v.data, volume, volume.data.at[10, 5, 12].set(jnp.nan))
-    return volume
+    return with_voxels(volume, (10, 5, 12), np.nan) if kind == "NaN" else volume
 
 
 @eqx.filter_jit
@@ -164,23 +166,23 @@ def measured_in_blocks(volume: jv.Volume, transfer: jv.TransferFunction2D) -> tu
     nodes = np.indices(volume.shape).reshape(3, -1).T
     places = np.concatenate([np.random.default_rng(5).uniform(0, last, (60_000, 3)), nodes])
     blocks = np.concatenate([places // BLOCK, np.maximum(-(-nodes // BLOCK) - 1, 0)])
-    places = jnp.asarray(np.concatenate([places, nodes]), jnp.float32)
+    places = np.float32(np.concatenate([places, nodes]))
     block = tuple(np.minimum(blocks, (last - 1) // BLOCK).astype(int).T)
     return *(np.asarray(each) for each in at_places(volume, transfer, places)), block
 
 
 @eqx.filter_jit
-def bounds(transfer, blocks):
+def bounds(transfer, volume):
+    blocks = Blocks.of(volume, slopes=True)
     return transfer.majorant(blocks), transfer.visible(blocks), blocks.magnitudes, blocks.unordered
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_ranges_of_magnitude_and_majorants_hold_all_that_is_in_a_block(kind):
     volume = patches(kind)
-    blocks = Blocks.of(volume, slopes=True)
     for seed in range(6):
         transfer = random_table(12, 9, seed)
-        bound, visible, (least, most), unordered = jax.tree.map(np.asarray, bounds(transfer, blocks))
+        bound, visible, (least, most), unordered = jax.tree.map(np.asarray, bounds(transfer, volume))
         assert np.any(unordered) == (kind == "NaN")
         magnitude, extinction, block = measured_in_blocks(volume, transfer)
         # a node on a face is interpolated with those above it, also in the block below: 0 · NaN is NaN
@@ -197,9 +199,7 @@ def test_slopes_of_large_doubles_are_not_lost():
     with in_float64():
         x = np.arange(9.0)
         volume = jv.Volume(np.broadcast_to((1e5 + 0.002 * np.sin(2 * x))[:, None, None], (9, 9, 9)))
-        *_, (least, most), _ = jax.tree.map(
-            np.asarray, bounds(random_table(12, 9), Blocks.of(volume, slopes=True))
-        )
+        *_, (least, most), _ = jax.tree.map(np.asarray, bounds(random_table(12, 9), volume))
         slopes = np.abs(np.gradient(np.asarray(volume.data), axis=0))
         for block in (0, 1):
             here = slopes[4 * block : 4 * block + 5]
@@ -214,8 +214,8 @@ def test_slopes_of_large_doubles_are_not_lost():
 def emphasised() -> jv.TransferFunction2D:
     """Boundaries alone: extinction grows with the magnitude."""
     transfer = soft()
-    colors = jnp.stack([transfer.colors, transfer.colors], axis=1)
-    extinction = jnp.stack([jnp.zeros_like(transfer.extinction), transfer.extinction], axis=1)
+    colors, extinction = np.asarray(transfer.colors), np.asarray(transfer.extinction)
+    colors, extinction = np.stack([colors] * 2, axis=1), np.stack([0 * extinction, extinction], axis=1)
     return jv.TransferFunction2D(transfer.values, (50.0, 250.0), colors, extinction)
 
 
@@ -241,7 +241,7 @@ def test_an_image_is_that_of_numpy(kind):
     )
     rays = Rays(volume, camera)
     slopes = np.gradient(rays.data, *rays.spacing)
-    table = np.concatenate([transfer.colors, transfer.extinction[..., None]], axis=-1).astype(float)
+    table = table_of(transfer).astype(float)
     lines = [np.asarray(line, float) for line in (transfer.values, transfer.magnitudes)]
 
     def classified(depth):
@@ -251,7 +251,7 @@ def test_an_image_is_that_of_numpy(kind):
         ]
         return RegularGridInterpolator(lines, table)(np.stack(places, axis=-1))
 
-    start = numbers(JITTER, camera)
+    start = random_numbers(JITTER, camera)
     front, width = rays.cells(step, start, lambda front, _: classified(front)[..., 3] == 0)
     *color, extinction = np.moveaxis(classified(front), -1, 0)
     depth = np.cumsum(extinction * width, axis=1)
@@ -287,7 +287,7 @@ def smooth() -> Any:
 def leapt() -> Any:
     """8-bit voxels, whose slopes are stored, and blocks that are empty because nothing is steep there."""
     volume = shells("uint8")
-    assert 0.1 < np.mean(bounds(emphasised(), Blocks.of(volume, slopes=True))[1]) < 0.8
+    assert 0.1 < np.mean(bounds(emphasised(), volume)[1]) < 0.8
     return volume, emphasised()
 
 
@@ -312,7 +312,7 @@ def test_nothing_that_is_steep_has_no_gradient_by_its_magnitude():
         measured = classification_of(transfer, jv.Volume(data)).at(apart(jnp.full(3, 1.3)))
         return transfer.classifier()(measured)[1]
 
-    np.testing.assert_array_equal(slope(jnp.full((4, 4, 4), 0.5)), 0)
+    np.testing.assert_array_equal(slope(np.full((4, 4, 4), np.float32(0.5))), 0)
 
 
 # ---------------------------------------------------------------- arguments
@@ -355,5 +355,4 @@ def test_what_needs_more_than_a_sample_is_refused():
 
 
 def test_a_fit_changes_colours_and_extinction_alone():
-    free, start = Free.of(emphasised(), None, None)
-    assert {name.split("[")[0] for name in free.names(start)} == {".colors", ".extinction"}
+    assert free_leaves(emphasised()) == {".colors", ".extinction"}

@@ -1,6 +1,6 @@
 """Commands without rendering: what they ask for is noted; they get a picture that only the camera changes."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
@@ -23,8 +23,8 @@ class Drawn:
         rgba = alpha * np.array([0.9, 0.5, 0.1, 1], np.float32)
         depth = np.full((height, width), 7.5, np.float32)
         depth[0, 0] = np.inf
-        details = Details(depth=jnp.asarray(depth), samples=jnp.ones((height, width), jnp.int32))
-        return jv.Rendering(jnp.asarray(rgba), jnp.zeros((height, width), bool), details)
+        details = Details(depth=depth, samples=np.ones((height, width), np.int32))
+        return jax.device_put(jv.Rendering(rgba, np.zeros((height, width), bool), details))
 
 
 @pytest.fixture

@@ -95,7 +95,7 @@ def test_errors_are_one_line_and_exit_code_2(case, volume_file, seen, tmp_path, 
 def test_pictures_cameras_and_transfer_functions_are_read_as_they_were_written(seen, tmp_path):
     views = jv.read_views(seen, tmp_path / "cameras.json")
     assert [camera.size for camera, _ in views] == [(16, 16)] * 2
-    assert np.array_equal(np.asarray(jv.to_srgb(views[1][1]) * 255).round(), imread(seen[1]))
+    assert np.array_equal((np.asarray(jv.to_srgb(views[1][1])) * 255).round(), imread(seen[1]))
     np.testing.assert_array_equal(views[0][0].position, (40, -30, 20))
     for cameras, message in (
         (

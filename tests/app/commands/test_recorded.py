@@ -7,7 +7,6 @@ import shutil
 import zlib
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import pytest
 from PIL import Image
@@ -18,6 +17,8 @@ import jaxvol as jv
 from jaxvol.app.cli import main, parser_of_all
 from jaxvol.app.commands.options import parsed
 from jaxvol.app.recorded import KEYWORD, checksum, text_of_options
+
+from ...scenes import same_trees
 
 
 SEEN = ["--preset", "engine", "--no-shade", "--size", "16", "16", "--step", "0.4"]
@@ -54,7 +55,7 @@ def test_a_picture_is_made_again_bit_by_bit(picture, volume_file, tmp_path, draw
     flags = [word.partition("=")[0] for word in said["options"] if word.startswith("--")]
     assert sorted(flags) == ["--background", "--direction", "--no-shade", "--preset", "--size", "--step"]
     assert like("b.png") == 0
-    assert eqx.tree_equal(*drawn.scenes)
+    assert same_trees(*drawn.scenes)
     assert drawn.how[0] == drawn.how[1]
     np.testing.assert_array_equal(imread("b.png"), imread(picture))
     assert text_in("b.png") == said
@@ -63,7 +64,7 @@ def test_a_picture_is_made_again_bit_by_bit(picture, volume_file, tmp_path, draw
     np.save("other.npy", np.asarray(jv.phantom("engine", 24).data)[::-1])  # another volume, alike
     assert main(["render", "other.npy", "--like", "a.png", "-o", "d.png"]) == 0
     assert text_in("d.png")["file"]["name"] == "other.npy"
-    assert not eqx.tree_equal(drawn.scenes[0][0], drawn.scenes[-1][0])
+    assert not same_trees(drawn.scenes[0][0], drawn.scenes[-1][0])
     # other commands take its settings, too
     assert options("plan", "--like", "a.png").direction == [1, -0.3, 0.7]
     found = options("animate", "--like", "a.png", "--frames", "3")
@@ -77,7 +78,7 @@ def test_a_transfer_function_from_a_file_is_in_the_picture(volume_file, tmp_path
     assert main(["render", volume_file.name, *words, "-o", "a.png"]) == 0
     (tmp_path / "t.json").unlink()
     assert like("b.png") == 0
-    assert eqx.tree_equal(*drawn.scenes)
+    assert same_trees(*drawn.scenes)
     assert text_in("b.png") == text_in("a.png")
     assert like("c.png", "--preset", "engine") == 0
     assert "transfer" not in text_in("c.png")

@@ -23,7 +23,7 @@ protocol = pytest.importorskip("websockets.client")
 uri = pytest.importorskip("websockets.uri")
 
 VOLUME = jv.Volume(np.arange(27, dtype=np.uint8).reshape(3, 3, 3))
-GRAY = jv.colormap("gray", (0, 26), n_colors=4)
+GRAY = jv.TransferFunction(np.linspace(0, 26, 4), np.linspace((0, 0, 0), (1, 1, 1), 4), np.linspace(0, 9, 4))
 VISER = [f"viser-v{viser.__version__}"]
 
 

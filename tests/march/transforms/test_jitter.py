@@ -16,7 +16,6 @@ from ...scenes import around
 
 BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
 SIDE = 128
-NO = jnp.zeros((), bool)
 
 
 @jax.jit
@@ -72,7 +71,8 @@ def test_white_numbers_are_independent_and_blue_ones_have_no_low_frequencies():
 
 @jax.jit
 def of_pixels(transforms):
-    """Start, shift, and first two cells of 200 rays along x through the box, at a step of 0.3."""
+    """Start, shift, and first two cells of 200 rays along x through the box, at a step of 0.3; what is left
+    of an empty piece before the entry."""
 
     def one(column):
         line = apart(jnp.array([-1.0, 1, 1])), apart(jnp.array([1.0, 0, 0])), (column, jnp.int32(0))
@@ -80,7 +80,8 @@ def of_pixels(transforms):
         start = march.start(ray)
         no = jnp.zeros((), bool)
         cells = [march.cut(Cell((start + i) * march.step, march.step, no), ray, BOX)[0] for i in range(2)]
-        return start, march.shift(ray), [(cell.front, cell.width) for cell in cells]
+        (nothing,) = transforms[0].cut(Cell(jnp.asarray(-0.2), jnp.asarray(0.0), no), ray, BOX)
+        return start, march.shift(ray), [(cell.front, cell.width) for cell in cells], nothing.width
 
     return jax.vmap(one)(jnp.arange(200))
 
@@ -92,7 +93,7 @@ def parts(jitter):
 
 def test_jitter_starts_a_part_of_a_step_in_and_empty_space_jitter_shifts_by_one():
     jitter, empty = jv.Jitter(1), jv.EmptySpaceJitter(2)
-    start, shift, cells = of_pixels((jitter, empty))
+    start, shift, cells, _ = of_pixels((jitter, empty))
     np.testing.assert_allclose(start, parts(jitter), atol=1e-7)
     np.testing.assert_allclose(shift, parts(empty) - 1, atol=1e-7)
     np.testing.assert_allclose(cells[0], [0.3 * parts(jitter), np.full(200, 0.3)], atol=1e-6)
@@ -100,26 +101,29 @@ def test_jitter_starts_a_part_of_a_step_in_and_empty_space_jitter_shifts_by_one(
 
 def test_front_residual_is_a_narrow_cell_of_its_own():
     jitter = jv.Jitter(1, "blue", front_residual=True)
-    _, _, (first, second) = of_pixels((jitter,))
+    _, _, (first, second), left_of_nothing = of_pixels((jitter,))
     narrow = 0.3 * parts(jitter)
     np.testing.assert_allclose(first, [0 * narrow, narrow], atol=1e-6)
     np.testing.assert_allclose(second, [narrow, np.full(200, 0.3)], atol=1e-6)
     # of an empty piece, which another transform left before the entry, nothing is left
-    pixel = jnp.int32(0), jnp.int32(0)
-    ray = enter(Affine(BOX), apart(jnp.array([-1.0, 1, 1])), apart(jnp.array([1.0, 0, 0])), pixel)
-    (cut,) = jitter.cut(Cell(jnp.asarray(-0.2), jnp.asarray(0.0), jnp.asarray(False)), ray, BOX)
-    assert float(cut.width) == 0
+    assert not np.any(left_of_nothing)
 
 
 def test_seeds_may_be_keys_and_traced():
     words = {int(jv.Jitter(seed).noise.seed) for seed in (0, 2**32 - 1, np.uint32(7), jnp.asarray(7))}
     assert words == {0, 2**32 - 1, 7}
-    for key in (jax.random.key(3), jax.random.PRNGKey(3)):
-        assert jv.EmptySpaceJitter(key).noise.seed == jax.random.bits(key, (), jnp.uint32)
-    keys = jax.random.split(jax.random.key(0), 3)
-    for seeds in (jnp.arange(3), keys):
-        mapped = jax.vmap(lambda seed: jv.Jitter(seed).noise.seed)(seeds)
-        np.testing.assert_array_equal(mapped, [jv.Jitter(seed).noise.seed for seed in seeds])
+
+    @jax.jit
+    def of_keys():
+        """Seeds of keys, and what they are; of several at once, and of each."""
+        both = jax.random.key(3), jax.random.PRNGKey(3)
+        own = [(jv.EmptySpaceJitter(key).noise.seed, jax.random.bits(key, (), jnp.uint32)) for key in both]
+        several = jnp.arange(3), jax.random.split(jax.random.key(0), 3)
+        seed_of = lambda seed: jv.Jitter(seed).noise.seed  # noqa: E731
+        return own + [(jax.vmap(seed_of)(seeds), jnp.stack([*map(seed_of, seeds)])) for seeds in several]
+
+    for found, expected in of_keys():
+        np.testing.assert_array_equal(found, expected)
     with pytest.raises(ValueError, match=r"seed must be an integer.*got a traced array .* float32"):
         jax.jit(lambda seed: jv.Jitter(seed).noise.seed)(0.5)
 
@@ -127,10 +131,15 @@ def test_seeds_may_be_keys_and_traced():
 def test_a_crop_has_the_rays_and_the_pixels_of_its_part_of_the_image():
     """So that it is jittered as this part is."""
     camera = around(BOX, (24, 20))
-    crops = {(9, 5): camera.crop(9, 5, 11, 8), (5, 4): camera.crop(4, 2, 18, 14).crop(1, 2, 11, 8)}
-    row, column = jnp.meshgrid(jnp.arange(8), jnp.arange(11), indexing="ij")
-    for (left, top), part in crops.items():
-        found, expected = lines(part, column, row, NO), lines(camera, column + left, row + top, NO)
+    row, column = jax.device_put([*np.mgrid[:8, :11].astype(np.int32)])
+
+    @jax.jit
+    def rays():
+        crops = (9, 5, camera.crop(9, 5, 11, 8)), (5, 4, camera.crop(4, 2, 18, 14).crop(1, 2, 11, 8))
+        seen = lambda camera, *at: lines(camera, *at, jnp.zeros((), bool))  # noqa: E731
+        return [(seen(part, column, row), seen(camera, column + x, row + y)) for x, y, part in crops]
+
+    for found, expected in rays():
         np.testing.assert_array_equal(found.pixel, expected.pixel)
         np.testing.assert_allclose(found.direction, expected.direction, atol=1e-6)
 
