@@ -46,7 +46,7 @@ def rendered(rgba, ended=None) -> jv.Rendering:
     exhausted = np.zeros(np.shape(rgba)[:-1], bool)
     if ended is not None:
         exhausted[ended] = True
-    return jax.device_put(jv.Rendering(np.asarray(rgba, np.float32), exhausted))
+    return jv.Rendering(*jax.device_put((np.asarray(rgba, np.float32), exhausted)))
 
 
 def at_pixels(probe: Probe, image: np.ndarray, ended=None) -> jv.Rendering:

@@ -57,7 +57,8 @@ class Known(Probe):
         wrong = (self.integrated if march.quadrature == "preintegrated" else self.midpoint)(step)
         rgba, counted = np.float32([3 * [0.5 + wrong] + [1.0]]), np.int32([math.ceil(samples)])
         exhausted = np.asarray([self.exhausted])
-        return jax.device_put(jv.Rendering(rgba, exhausted, Details(samples=counted)))
+        rgba, exhausted, counted = jax.device_put((rgba, exhausted, counted))
+        return jv.Rendering(rgba, exhausted, Details(samples=counted))
 
 
 def search_of(known: Known, goal: float, mode: Any = None) -> Search:
@@ -148,7 +149,7 @@ def test_what_is_cheapest_within_the_goal_is_taken(case):
 
 def test_brightness_counts_where_anything_is_seen():
     rgba = np.float32([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]])
-    assert brightest_of(jax.device_put(jv.Rendering(rgba, np.zeros(3, bool)))) == pytest.approx(2)
+    assert brightest_of(jv.Rendering(*jax.device_put((rgba, np.zeros(3, bool))))) == pytest.approx(2)
 
 
 @pytest.mark.parametrize("once", [False, True])

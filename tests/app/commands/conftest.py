@@ -23,8 +23,8 @@ class Drawn:
         rgba = alpha * np.array([0.9, 0.5, 0.1, 1], np.float32)
         depth = np.full((height, width), 7.5, np.float32)
         depth[0, 0] = np.inf
-        details = Details(depth=depth, samples=np.ones((height, width), np.int32))
-        return jax.device_put(jv.Rendering(rgba, np.zeros((height, width), bool), details))
+        parts = jax.device_put((rgba, np.zeros((height, width), bool), depth, np.ones_like(depth, np.int32)))
+        return jv.Rendering(*parts[:2], Details(*parts[2:]))
 
 
 @pytest.fixture

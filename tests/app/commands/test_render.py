@@ -321,7 +321,7 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
     volume = jv.Volume(np.linspace(20, 90, 8, dtype=np.float32).reshape(2, 2, 2))
     camera, march = jv.Camera.looking_at(volume, size=(8, 8)), jv.March(0.1)
     scene = Scene(volume, transfer, camera, Over(), None, (1, 1, 1), (), None, None, march)
-    empty = jax.device_put(jv.Rendering(np.zeros((8, 8, 4), np.float32), np.zeros((8, 8), bool)))
+    empty = jv.Rendering(*jax.device_put((np.zeros((8, 8, 4), np.float32), np.zeros((8, 8), bool))))
     said = why_empty(scene, empty)
     assert said is not None
     assert said.startswith(
