@@ -131,7 +131,7 @@ rendered, rendered_rays = eqx.filter_jit(jv.render), eqx.filter_jit(jv.render_ra
 
 def same_trees(one, other) -> bool:
     """Whether all leaves are equal; by NumPy, which needs no program."""
-    return eqx.tree_equal(*jax.device_get((one, other)))
+    return bool(eqx.tree_equal(*jax.device_get((one, other))))
 
 
 def to_float64(tree):

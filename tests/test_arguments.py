@@ -150,7 +150,7 @@ def test_a_very_long_number_is_shortened():
 
 def test_rays_of_any_type_of_numbers_see_the_same():
     expected = jv.render_rays(
-        VOLUME, TRANSFER, *(jax.device_put(np.float32(part)) for part in RAYS), march=MARCH
+        VOLUME, TRANSFER, *(jax.device_put(np.asarray(part, np.float32)) for part in RAYS), march=MARCH
     ).rgba
     assert np.asarray(expected)[0, 3] > 0.1
     several: list[Callable[[Any], Any]] = [np.int8, np.float16, np.float64, lambda rays: rays]

@@ -29,7 +29,7 @@ def test_bricks_are_numbered_along_the_axes():
     grid = BrickGrid((9, 17, 5), (4, 8, 3))
     assert grid.counts == (2, 2, 2)
     assert grid.cells(7) == ((4, 8, 3), (8, 16, 4))
-    at = np.float32([[0.0, 4.0, 8.0, -1], [7.9, 8.0, 16.0, 99], [2.9, 3.0, 4.0, 0]])
+    at = np.asarray([[0.0, 4.0, 8.0, -1], [7.9, 8.0, 16.0, 99], [2.9, 3.0, 4.0, 0]], np.float32)
     assert jax.jit(lambda at: grid.brick_of((at[0], at[1], at[2])))(at).tolist() == [0, 7, 7, 2]
 
 

@@ -152,7 +152,7 @@ def test_slopes_are_those_of_jax():
 
 def test_leaps_are_over_what_cannot_win_alone():
     """A block of the greatest values hides others, also where it shows nothing itself."""
-    low, high = (np.float32(end).reshape(-1, 1, 1) for end in ([0.0, 0.2, 0.7], [0.1, 0.6, 0.8]))
+    low, high = (np.asarray(end, np.float32).reshape(-1, 1, 1) for end in ([0.0, 0.2, 0.7], [0.1, 0.6, 0.8]))
     visible = jv.TransferFunction([0.0, 0.3, 0.4, 0.5, 0.65, 1.0], np.ones((6, 3)), [0.0, 0, 1, 0, 0, 0])
     labels = np.array([1, 1, 2], np.uint32).reshape(-1, 1, 1)
     by_label = jv.LabelTransferFunction([uniform_transfer(0.5), uniform_transfer(0.0)])

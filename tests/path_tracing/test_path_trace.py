@@ -387,7 +387,8 @@ def test_bad_arguments_are_named():
     fails("materials", materials=Material(0.5, 1.0, label=1))
     fails("labels", NOISE, jv.LabelTransferFunction([transfer] * 2), camera, FURNACE)
     flat, rgb = np.zeros((4, 4), np.float32), np.zeros((4, 4, 3), np.float32)
-    image = jv.PathTraced(*jax.device_put((rgb, flat, rgb, flat > 0)), 2, jax.device_put(np.uint32(0)))
+    flat, rgb, none, seed = jax.device_put((flat, rgb, flat > 0, np.uint32(0)))
+    image = jv.PathTraced(rgb, flat, rgb, none, 2, seed)
     with pytest.raises(ValueError, match="background"):
         image.image((1.0, 2.0))
     with pytest.raises(ValueError, match="other must be of another key"):

@@ -185,7 +185,7 @@ def test_transmittance_is_that_of_the_optical_depth(name):
     values = np.linspace(0, 1, 8)
     transfer = jv.TransferFunction(values, np.ones((8, 3)), [0, 0, 0, 3, 0, 0.2, 1.5, 6])
     direction = np.asarray(direction) / np.linalg.norm(direction)
-    given = map(np.float32, (start, direction, length))
+    given = (np.asarray(part, np.float32) for part in (start, direction, length))
     left, passes, done, _ = jax.device_get(tracked(volume, transfer, *given))
     assert np.all(done)
 

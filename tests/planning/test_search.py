@@ -55,7 +55,8 @@ class Known(Probe):
         step = float(march.step)
         samples = self.samples / step
         wrong = (self.integrated if march.quadrature == "preintegrated" else self.midpoint)(step)
-        rgba, counted = np.float32([3 * [0.5 + wrong] + [1.0]]), np.int32([math.ceil(samples)])
+        rgba = np.asarray([3 * [0.5 + wrong] + [1.0]], np.float32)
+        counted = np.asarray([math.ceil(samples)], np.int32)
         exhausted = np.asarray([self.exhausted])
         rgba, exhausted, counted = jax.device_put((rgba, exhausted, counted))
         return jv.Rendering(rgba, exhausted, Details(samples=counted))
@@ -148,7 +149,7 @@ def test_what_is_cheapest_within_the_goal_is_taken(case):
 
 
 def test_brightness_counts_where_anything_is_seen():
-    rgba = np.float32([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]])
+    rgba = np.asarray([[0.1, 0.1, 0.1, 1.0], [0.4, 0, 0, 0.2], [9, 9, 9, 1e-4]], np.float32)
     assert brightest_of(jv.Rendering(*jax.device_put((rgba, np.zeros(3, bool))))) == pytest.approx(2)
 
 

@@ -111,7 +111,7 @@ def test_gradients_of_opacity_are_those_of_the_closed_form(adjoint, cut):
     before, behind = np.exp(-0.35 * f), np.exp(-1.5 * g)
     exact = [-0.35 * before * (1 - behind), 1.5 * before * behind]
     take = jax.jacfwd if adjoint == "forward" else jax.grad
-    np.testing.assert_allclose(jax.jit(take(green))(np.float32([f, g])), exact, rtol=1e-4)
+    np.testing.assert_allclose(jax.jit(take(green))(np.asarray([f, g], np.float32)), exact, rtol=1e-4)
 
 
 def test_hidden_labels_are_leapt_over():

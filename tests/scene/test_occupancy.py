@@ -142,7 +142,7 @@ def test_what_is_called_invisible_has_no_extinction(points):
 
 
 def test_ranges_that_only_touch_visible_values_are_invisible():
-    values, extinction = np.float32([0, 1, 2, 3, 4, 5]), np.float32([0, 0, 0, 1, 0, 0])
+    values, extinction = np.array([[0, 1, 2, 3, 4, 5], [0, 0, 0, 1, 0, 0]], np.float32)
     invisible, shown = [(-5, 0), (0, 2), (4, 9), (7, 9)], [(0, 2.001), (2.2, 2.3), (3.9, 9), (-9, 9), (3, 3)]
     low, high = np.array([*invisible, *shown], np.float32).T
     seen = jax.jit(positive_between)(values, extinction, low, high)

@@ -1,6 +1,7 @@
 """Colour and extinction between control points; presets, colormaps, and invalid arguments."""
 
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -331,7 +332,11 @@ def test_nothing_is_proven_of_a_classifier_of_ones_own():
     """It may show what the points do not. Its derivative is that of its own look-up."""
     volume = anisotropic_noise()
     blocks = Blocks.of(volume)
-    known = eqx.filter_jit(lambda *of: [(t.visible(blocks), t.majorant(blocks)) for t in of])
+
+    @eqx.filter_jit
+    def known(*of: Any):
+        return [(t.visible(blocks), t.majorant(blocks)) for t in of]
+
     for n in (FEW, MANY):
         points = np.linspace(0, 1, n), np.full((n, 3), 0.5), np.zeros(n)
         gain, own = jax.device_put(np.float32(2)), jv.TransferFunction(*points)

@@ -68,7 +68,7 @@ def test_the_table_is_bilinear_and_constant_beyond_its_lines(n, m):
         ]
     )
     cotangent = np.float32(random.normal(size=(len(places), 4)))
-    given = tuple(np.float32(places.T))
+    given = tuple(np.asarray(places.T, np.float32))
     found, expected, pulled = all_of(transfer, given, cotangent)
     for a, b in zip(jax.tree.leaves(pulled), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-4 * np.abs(b).max() + 1e-6)

@@ -23,12 +23,14 @@ class Drawn:
         rgba = alpha * np.array([0.9, 0.5, 0.1, 1], np.float32)
         depth = np.full((height, width), 7.5, np.float32)
         depth[0, 0] = np.inf
-        parts = jax.device_put((rgba, np.zeros((height, width), bool), depth, np.ones_like(depth, np.int32)))
-        return jv.Rendering(*parts[:2], Details(*parts[2:]))
+        exhausted, samples = np.zeros((height, width), bool), np.ones_like(depth, np.int32)
+        rgba, exhausted, depth, samples = jax.device_put((rgba, exhausted, depth, samples))
+        return jv.Rendering(rgba, exhausted, Details(depth, samples))
 
 
 @pytest.fixture
-def drawn(monkeypatch):
+def drawn(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # where `show` writes a file if there is no display
     drawn = Drawn()
     monkeypatch.setattr("jaxvol.app.picture.render", drawn)
     return drawn

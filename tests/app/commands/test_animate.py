@@ -35,7 +35,7 @@ def test_a_camera_turns_about_its_focal_point():
     np.testing.assert_allclose(quarter.view_up, (0, 0, 1), atol=1e-6)
     np.testing.assert_allclose(turned(camera, 90, (1, 0, 0)).view_up, (0, -1, 0), atol=1e-6)
     np.testing.assert_array_equal(quarter.window, camera.window)
-    assert float(quarter.parallel_scale) == 2
+    assert np.asarray(quarter.parallel_scale) == 2
     with pytest.raises(ValueError, match="--axis must not be 0"):
         turned(camera, 1, (0, 0, 0))
 

@@ -35,7 +35,7 @@ def cut(labels, front, width, length, gaps):
     return jv.AlphaCorrection(labels=labels).cut(cell, ray, LABELLED if labels else BOX)
 
 
-def pieces(front, width, length=9, gaps=(), *, labels=False):
+def pieces(front, width, length: float = 9, gaps=(), *, labels=False):
     gaps = tuple(tuple(map(np.float32, gap)) for gap in gaps)
     found = jax.device_get(cut(labels, *map(np.float32, (front, width, length)), gaps))
     return [(float(p.front), float(p.width), bool(p.cut)) for p in found]

@@ -142,9 +142,9 @@ def test_derivatives_of_ends_are_finite_wherever_a_ray_runs():
             ends += [found.t_in, found.length]
         return jnp.concatenate(ends), ends
 
-    plane = np.float32([0.25, 0.0, 0.0]), np.float32([2.0, 0.0, 0.0])
+    plane = np.array([0.25, 0.0, 0.0], np.float32), np.array([2.0, 0.0, 0.0], np.float32)
     for box in ((0.25, 1, -1, 1, -1, 1), (0.25, 1, 2, 3, -1, 1)):
-        found = slopes((*map(np.float32, (box, origins, directions)), (plane,)))
+        found = slopes((*(np.asarray(part, np.float32) for part in (box, origins, directions)), (plane,)))
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found))
 
 

@@ -136,7 +136,7 @@ def test_a_crop_has_the_rays_and_the_pixels_of_its_part_of_the_image():
     @jax.jit
     def rays():
         crops = (9, 5, camera.crop(9, 5, 11, 8)), (5, 4, camera.crop(4, 2, 18, 14).crop(1, 2, 11, 8))
-        seen = lambda camera, *at: lines(camera, *at, jnp.zeros((), bool))  # noqa: E731
+        seen = lambda camera, x, y: lines(camera, x, y, jnp.zeros((), bool))  # noqa: E731
         return [(seen(part, column, row), seen(camera, column + x, row + y)) for x, y, part in crops]
 
     for found, expected in rays():

@@ -169,7 +169,9 @@ def test_values_and_gradients_are_finite_where_the_map_is_singular(name):
         ]
         return probe.to_toroidal(points), of
 
-    found, (backward, forward) = jax.device_get(derivatives(np.float32([*special, *points]), probe))
+    found, (backward, forward) = jax.device_get(
+        derivatives(np.asarray([*special, *points], np.float32), probe)
+    )
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((found, backward, forward)))
     np.testing.assert_array_equal(backward[0][0, 0], 0)  # of β on the axis
     if PROBES[name][0] > 0:  # else no world point is the apex
