@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..xla.memory import gather
-from ..xla.platform import on_gpu
+from ..xla.platform import gathers_are_fast, on_gpu
 from .vec3 import Scalar, Vec3
 
 
@@ -25,6 +25,13 @@ COMPARED = 16
 
 ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
 """By how much an interpolated extinction may exceed its bound, relative to the greatest of its table."""
+
+
+def few() -> int:
+    """Up to how many control points a row is chosen by comparing with each: where gathers are fast, up to
+    COMPARED. (16 points take twice as long as 9, of which programs are therefore not shared.)"""
+    return COMPARED if gathers_are_fast() and not on_gpu() else FEW
+
 
 Row: TypeAlias = tuple[Scalar, ...]
 """One row of a table."""

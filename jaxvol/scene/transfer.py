@@ -274,7 +274,7 @@ class TransferFunction(Transfer):
 
     def search(self) -> Callable[[Measured], Measured] | None:
         values, last = jax.lax.stop_gradient(self.values), self.values.shape[0] - 1
-        if last < linear.FEW:
+        if last < linear.few():
             return None
 
         def search(measured: Measured) -> Measured:
@@ -285,7 +285,7 @@ class TransferFunction(Transfer):
         return search
 
     def classifier(self) -> Classify:
-        rows, few = self.rows(), self.values.shape[0] <= linear.FEW
+        rows, few = self.rows(), self.values.shape[0] <= linear.few()
 
         def looked_up(measured: Measured) -> tuple[Vec3, Scalar]:
             _, interval, past = measured
@@ -306,7 +306,7 @@ class TransferFunction(Transfer):
         return chosen if few else looked_up
 
     def integrator(self) -> Classify:
-        rows, few = self.span_rows(), self.values.shape[0] <= linear.FEW
+        rows, few = self.span_rows(), self.values.shape[0] <= linear.few()
 
         def integrate(measured: Measured) -> tuple[Vec3, Scalar]:
             _, front, back = measured
@@ -338,7 +338,7 @@ class TransferFunction(Transfer):
             (transfer,) = pull_rows(fronts + backs)
             return transfer, (jnp.zeros_like(of_front), (of_front,), (of_back,))
         rows, value = self.rows(), measured[0]
-        if self.values.shape[0] <= linear.FEW:
+        if self.values.shape[0] <= linear.few():
             interval = jnp.maximum(linear.points_below(self.values, value) - 1, 0)
             past = linear.clip_below(value - linear.table_row(rows, interval)[0], jnp.zeros_like(value))
         else:
@@ -382,6 +382,8 @@ SHARED_POINTS = 8, 16, 256
 def with_shared_points(transfer: Any) -> Any:
     """The same function by one of a few numbers of points: beyond the last one it is constant."""
     if type(transfer) is not TransferFunction or transfer.values.shape[0] in SHARED_POINTS:
+        return transfer
+    if linear.FEW < transfer.values.shape[0] <= linear.few():
         return transfer
     given: tuple[Any, ...] = transfer.values, transfer.colors, transfer.extinction
     if not all(isinstance(leaf, jax.Array) and not is_traced(leaf) for leaf in given):

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather, in_memory, without_zeros
-from ..xla.platform import on_gpu
+from ..xla.platform import gathers_are_fast, on_gpu
 
 
 T = TypeVar("T")
@@ -85,7 +85,7 @@ class Fetch(eqx.Module):
     def cube(self, data: Voxels, coordinate: Vec3) -> tuple[Cube, Vec3]:
         """The eight voxels around a grid coordinate, and its fractional position between them."""
         place, always = partial(self.place, data), self._always(data)
-        if always is None or on_gpu() or self.steady:
+        if always is None or on_gpu() or gathers_are_fast() or self.steady:
             base, fraction = place(coordinate)
         else:
             # In memory, since LLVM computes one sample after the other where it fetches them, on processors
@@ -306,7 +306,11 @@ class Packed(Fetch):
             return cube_of(lambda x, y, z: _word(nodes, base + (x * ny + y) * nz + z))
 
         # in memory, for the reason of `cube`
-        words = words_from(base) if on_gpu() else in_memory(self._always(data), words_from, base)
+        words = (
+            words_from(base)
+            if on_gpu() or gathers_are_fast()
+            else in_memory(self._always(data), words_from, base)
+        )
 
         def slope(bits: int, word: Int[Array, ""]) -> Scalar:
             """The slope from so many bits below the highest one on, times a power of two."""

@@ -27,7 +27,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import mlir
 
 from .persistent_cache import kept_folder
-from .platform import platform
+from .platform import gathers_are_fast, platform
 
 
 MAGIC = b"jaxvol program 2\n"
@@ -69,7 +69,10 @@ def kept(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
         keeps = kept_folder() is not None and not any(getattr(leaf, "committed", False) for leaf in arrays)
         if keeps:
             types = tuple(getattr(leaf, "aval", None) or jax.typeof(leaf) for leaf in arrays)
-            key = *rest, (types, platform(), *(getattr(jax.config, name) for name in CONFIG))
+            key = (
+                *rest,
+                (types, platform(), gathers_are_fast(), *(getattr(jax.config, name) for name in CONFIG)),
+            )
         if key not in programs:
             flat = _flat(function, rest)
             found = _exported(function, args, flat, key[-1], options) if keeps else None

@@ -6,7 +6,8 @@ turn of a loop whose number of turns is not known when it is compiled; a number 
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -32,6 +33,18 @@ def platform() -> str:
 def on_gpu() -> bool:
     """Whether a program that is traced now is for a GPU."""
     return platform() in ("gpu", "cuda", "rocm")
+
+
+@cache
+def gathers_are_fast() -> bool:
+    """Whether LLVM gathers many values at once on this processor: one of Intel's with AVX-512. On others, it
+    computes a whole kernel with gathers for one sample after the other, so that what surrounds them is a
+    kernel of its own."""
+    try:
+        features = Path("/proc/cpuinfo").read_text()
+    except OSError:  # not Linux
+        return False
+    return "GenuineIntel" in features and "avx512f" in features
 
 
 def while_loop(

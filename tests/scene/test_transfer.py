@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol._util import piecewise_linear
 from jaxvol._util.piecewise_linear import points_below, positive_between
 from jaxvol.scene.occupancy import Blocks
 from jaxvol.scene.presets import SHADED, fitted_range, preset_name
-from jaxvol.scene.transfer import Transfer
+from jaxvol.scene.transfer import Transfer, with_shared_points
 
 from ..scenes import anisotropic_noise
 
@@ -354,3 +355,17 @@ def test_nothing_is_proven_of_a_classifier_of_ones_own():
             found, want = (getattr(of.function, name) for of in (pulled, expected))
             np.testing.assert_allclose(found, want, rtol=1e-4)
         np.testing.assert_allclose(of_value, slope, rtol=1e-4)
+
+
+@pytest.mark.parametrize("fast", [True, False])
+def test_a_row_of_a_dozen_is_compared_with_or_looked_up(fast, monkeypatch):
+    monkeypatch.setattr(piecewise_linear, "gathers_are_fast", lambda: fast)
+    assert (piecewise_linear.few() == piecewise_linear.COMPARED) is fast
+    at = np.linspace(0, 11, 12, dtype=np.float32)
+    table = jv.TransferFunction(at, np.stack([at, at, at], -1) % 3 / 3, at % 5)
+    values = np.linspace(-1, 12, 40, dtype=np.float32)
+    color, extinction = jax.jit(jax.vmap(table))(values)
+    np.testing.assert_allclose(extinction, np.interp(values, at, at % 5), atol=1e-6)
+    np.testing.assert_allclose(color[1], np.interp(values, at, at % 3 / 3), atol=1e-6)
+    shared = with_shared_points(table).values.shape[0]
+    assert shared == (12 if fast else 16)

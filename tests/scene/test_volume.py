@@ -11,6 +11,7 @@ from scipy.ndimage import map_coordinates
 import jaxvol as jv
 from jaxvol._util.vec3 import apart
 from jaxvol.engine.acceleration import unshaped, with_words, words_of
+from jaxvol.scene import voxel_fetch
 
 from ..scenes import in_float64
 
@@ -66,8 +67,9 @@ def test_values_are_trilinear_and_voxels_keep_their_type(dtype):
     assert np.isnan(looked_up(data, np.full_like(NODES, np.nan))[0]).all()
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "int16"])
-def test_a_packed_copy_whose_shape_is_data_gives_the_values_between_voxels(dtype):
+@pytest.mark.parametrize(("dtype", "fast"), [("uint8", True), ("int16", True), ("int16", False)])
+def test_a_packed_copy_whose_shape_is_data_gives_the_values_between_voxels(dtype, fast, monkeypatch):
+    monkeypatch.setattr(voxel_fetch, "gathers_are_fast", lambda: fast)
     data = random_data(dtype)
     volume = jv.Volume(data)
     packed = unshaped(with_words(volume, [words_of(volume)])).fetch
