@@ -6,7 +6,6 @@ Of each ray, it is kept where it has come to; in each brick it marches those of 
 
 from dataclasses import replace
 from functools import partial, reduce
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,12 +17,10 @@ from ..march.march import March
 from ..ray import Progress, Scene, by_rules, end, front, stopped
 from ..scene.rendering import Rendering
 from ..scene.space import Ray
-from ..xla.trees import PyTree, with_fields
-from .acceleration import NO_ACCELERATION, VolumeAcceleration, empty_space_of
+from ..xla.trees import with_fields
+from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import on_devices
-from .gradients import ImageVjp, Sums
 from .rays import RayTiles, vmap_rays
-from .replay import Cotangents
 from .resolve import resolve_pixels
 from .shifts import begin_rays
 from .tiling import RenderOptions
@@ -158,86 +155,3 @@ def finish_image(scene: Scene, options: RenderOptions, states: RayStates) -> Ren
 def _passed(march: March, at: Progress) -> Progress:
     """Finishes rays, behind whose last brick nothing lies, unless they ran out of samples."""
     return with_fields(at, finished=at.finished | (at.index < march.most_samples))
-
-
-# ---- the VJP, by a second march in the same order ----
-
-
-class ReplayState(eqx.Module):
-    """The second march of an image: cotangents `given` to the rays, what the samples so far are worth
-    (`carry`), and what they gave the rays; (tiles, groups, rays in a group)."""
-
-    states: RayStates
-    given: Cotangents
-    carry: Array
-    of_rays: PyTree
-
-
-@on_devices("both")
-def begin_vjp(
-    scene: Scene, perturbed: Any, options: RenderOptions, rendering: Rendering, cotangent: Rendering
-) -> tuple[Sums, ReplayState]:
-    """All rays at their entries, with the cotangents of their pixels. Of the volume, no voxel is read."""
-    image = ImageVjp.of(scene, perturbed, options, NO_ACCELERATION)
-    sums = image.zeros(perturbed)
-
-    def one(each: tuple[Int[Array, ""], Rendering, Rendering]) -> ReplayState:
-        number, rendering, cotangent = each
-        rays, _ = image.rays(number)
-        given = Cotangents.of(rays, rendering, cotangent)
-        replay = image.replay(rays, given, sums.total)
-        states = RayStates(rays, image.begin(rays, None))
-        return ReplayState(states, given, replay.carry, replay.sums)
-
-    return sums, image.tiles.map(one, *jax.tree.map(image.tiles.disassemble, (rendering, cotangent)))
-
-
-@on_devices("both", sharded=("replayed", "ranges"))
-def vjp_of_brick(
-    scene: Scene,
-    options: RenderOptions,
-    acceleration: VolumeAcceleration,
-    perturbed: Any,
-    sums: Sums,
-    replayed: ReplayState,
-    ranges: CellRange,
-) -> tuple[Sums, ReplayState]:
-    """The second march through `ranges`, as `march_brick`."""
-    image, shifts = ImageVjp.of(scene, perturbed, options, acceleration), scene.march.may_shift
-
-    def one(sums: Sums, each: tuple[Int[Array, ""], ReplayState, CellRange]) -> tuple[Sums, ReplayState]:
-        number, state, range_ = each
-        rays, at = state.states.rays, state.states.at
-        replay = image.replay(rays, state.given, sums.total)
-        replay.carry, replay.sums = state.carry, state.of_rays
-        found = image.march(rays, number, range_, replay, at, shifts=shifts)
-        after, (carry, of_rays, total) = found.at, found.visited
-        after = eqx.tree_at(lambda at: at.track.until, after, at.track.until)
-        over = at.finished | ended(image.prepared, rays, after)
-        states = RayStates(rays, with_fields(after, finished=over))
-        return sums._replace(total=total), ReplayState(states, state.given, carry, of_rays)
-
-    return image.tiles.scan(one, sums, replayed, ranges)
-
-
-@on_devices("replicated", sharded=("replayed",))
-def finish_vjp(
-    scene: Scene,
-    perturbed: Any,
-    options: RenderOptions,
-    sums: Sums,
-    replayed: ReplayState,
-    rendering: Rendering,
-    cotangent: Rendering,
-) -> Any:
-    """The cotangents of a scene's leaves, from a march through all bricks of its volume."""
-    image = ImageVjp.of(scene, perturbed, options, NO_ACCELERATION)
-
-    def one(sums: Sums, each: Any) -> tuple[Sums, None]:
-        number, of_rays, rendering, cotangent = each
-        _, pull = image.rays(number)
-        return image.of_rays(sums, pull, of_rays, rendering, cotangent), None
-
-    pixels = jax.tree.map(image.tiles.disassemble, (rendering, cotangent))
-    sums, _ = image.tiles.scan(one, sums, replayed.of_rays, *pixels)
-    return image.cotangents(sums)

@@ -23,12 +23,6 @@ def transformations(leaf: Any) -> list[str]:
     return names
 
 
-def forward_mode(kinds: list[list[str]]) -> bool:
-    """Whether `transformations` of the leaves of a tree are forward mode (`jax.jvp`, `jax.jacfwd`), or of
-    second order. A `custom_vjp` has no rule for these: JAX's own error names neither argument nor remedy."""
-    return any("JVPTracer" in kind or kind.count("LinearizeTracer") > 1 for kind in kinds)
-
-
 def check_captured(what: str, function: Any) -> None:
     """Raises `ValueError` for a function that captures a value to be differentiated in reverse mode, which no
     primitive with a derivative of its own would see."""

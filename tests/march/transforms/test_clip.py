@@ -126,7 +126,7 @@ def test_rays_within_a_plane_are_inside():
 
 def test_derivatives_of_ends_are_finite_wherever_a_ray_runs():
     """Within a plane, along an edge, past the volume, and where a face of the box is one of the volume."""
-    pixel = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+    pixel, volume = (jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)), constant()
     origins = np.array([[0.25, 0, -3], [0.25, -1, -3], [-0.5, 0, -3], [0.25, 0, 0], [1, 1, -3], [5, 5, 5]])
     directions = np.tile(np.array([[0, 0, 1.0]]), (6, 1))
 
@@ -136,7 +136,7 @@ def test_derivatives_of_ends_are_finite_wherever_a_ray_runs():
         box, origins, directions, planes = given
         ends = []
         for inside_out in (False, True):
-            space = jv.March(1.0, (jv.Clip(box, planes, inside_out=inside_out),)).locate(constant())
+            space = jv.March(1.0, (jv.Clip(box, planes, inside_out=inside_out),)).locate(volume)
             rays = jax.vmap(lambda o, d, space=space: enter(space, apart(o), apart(d), pixel))
             found = rays(origins, directions)
             ends += [found.t_in, found.length]
