@@ -74,7 +74,7 @@ def draw_scene(panel: Any, name: str, scene: dict[str, Any]) -> None:
     for setting, point in points.items():
         family = point["family"]
         style: Any = {"markersize": 6, "zorder": 3} if family in MARKS else {"markersize": 4.5, "zorder": 2}
-        style |= {"color": COLORS[family], "alpha": 0.8, "gid": identity(name, setting)}
+        style |= {"color": COLORS.get(family, "0.7"), "alpha": 0.8, "gid": identity(name, setting)}
         panel.plot(point["rmse"], point["time"] * 1e3, MARKS.get(family, "o"), **style)
     front = [points[n] for n in scene["front of jaxvol"]]
     corners = [(p["rmse"], p["time"] * 1e3) for p in front]
