@@ -53,8 +53,8 @@ class NotKept(Exception):
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`equinox.filter_jit(function, **options)`, which is called in a third of the time, and whose lowered
-    programs are kept where `keep_programs` keeps compiled ones.
+    """`equinox.filter_jit(function, **options)`, whose lowered programs are kept where `keep_programs` keeps
+    compiled ones.
 
     Args:
         function: of concrete arguments. It depends on nothing but these and the code of jaxvol. Where they
