@@ -18,6 +18,7 @@ from ..scene.labels import LabelTransferFunction
 from ..scene.presets import colormap
 from ..scene.transfer import Transfer, TransferFunction, extinction_of, voxel_size
 from ..scene.volume import Volume, check_one_channel
+from ..xla.memo import memoized_of
 from ..xla.platform import is_traced
 
 
@@ -162,7 +163,9 @@ def automatic_transfer(volume: Volume | Any) -> TransferFunction:
     check_one_channel(volume, "automatic_transfer")
     check_known("automatic_transfer", volume)
     with jax.ensure_compile_time_eval():  # of a volume from outside, also where something else is traced
-        return transfer_by_copy(volume, np.asarray(volume.data))
+        if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(volume)):
+            return _warning(memoized_of(volume, _of_volume))
+        return _warning(_of_volume(volume))
 
 
 def check_known(caller: str, *values: Any) -> None:
@@ -174,15 +177,30 @@ def check_known(caller: str, *values: Any) -> None:
 
 def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> TransferFunction:
     """The same from a copy of every n-th voxel, and a part at full resolution, which shows grain."""
+    return _warning(_of_histogram(copy, part))
+
+
+def _warning(found: tuple[TransferFunction, list[str]]) -> TransferFunction:
+    for told in found[1]:
+        warn_caller(told)
+    return found[0]
+
+
+def _of_volume(volume: Volume) -> tuple[TransferFunction, list[str]]:
+    return _of_histogram(volume, np.asarray(volume.data))
+
+
+def _of_histogram(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> tuple[TransferFunction, list[str]]:
+    """The transfer function, and what is to be warned of."""
     spread = spread_of(sampled(copy))
-    if spread.told:
-        warn_caller(spread.told)
+    told = [spread.told] if spread.told else []
+    if told:
         tame = jnp.asarray(spread.tame(np.asarray(copy.data)))
         copy, part = eqx.tree_at(lambda v: v.data, copy, tame), spread.tame(part)
     values = sampled(copy).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
     if side := side_of_distance(copy):
-        warn_caller("values on both sides of 0 with a slope of one are a distance: shown where they are 0")
+        told.append("values on both sides of 0 with a slope of one are a distance: shown where they are 0")
         d = side * float(voxel_size(copy)) / 2
         points = [(-d, BRIGHT, 0.9), (d, DENSE, 0.0)][::side]
     elif not low < high:
@@ -213,7 +231,7 @@ def transfer_by_copy(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> Tran
         ]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
-    return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy)))
+    return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy))), told
 
 
 def side_of_distance(volume: Volume) -> int:

@@ -9,6 +9,7 @@ Larger images are several tiles of rays. Inside of a larger program, `image.marc
 same functions, as a part of that.
 """
 
+import math
 from functools import cache, partial
 from typing import Any, NamedTuple, cast
 
@@ -26,9 +27,9 @@ from ..march.march import CellRules, March, Transform
 from ..march.transforms.space_leaping import SpaceLeaping
 from ..ray import NEVER, Progress, Scene, Track, begin, end, track_of
 from ..scene.camera import Camera, GivenRays, without_ends
-from ..scene.occupancy import Blocks, Occupancy, Sums
+from ..scene.occupancy import BLOCK, Blocks, Occupancy, Sums
 from ..scene.rendering import Rendering
-from ..scene.space import Line, Ray, Space
+from ..scene.space import Line, Ray, Space, median_node_distance
 from ..scene.transfer import Transfer, TransferFunction, classification_of, with_shared_points
 from ..scene.volume import Volume, grids, with_fetches, without_voxels
 from ..scene.voxel_fetch import Extent, Nodes, Packed
@@ -114,7 +115,7 @@ def staged_image(
     most = np.asarray(scene.march.most_samples, np.int32)
     passed, of_tile = [], None
     for tile in range(number):
-        lines = _lines(scene.source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
+        lines = _lines_of(scene.source, tiling, number, size, tile)
         started = _start(*lines, corners, seams, place, index, fault, tiling)
         none, zero, never, nowhere = _nothing(*started.rays.length.shape, started.rays.length.dtype)
         offset, shift = started.track.offset, started.track.shift
@@ -230,15 +231,62 @@ def _without_voxels(volume: Volume, seams: March) -> Volume:
     return unchecked(place, labels=None, label_ids=None)
 
 
-def space_of(march: March, volume: Volume) -> Space:
-    """`March.locate`, by a program for volumes of all shapes."""
-    seams = _only(march, "locate", "clip")
-    return _located(seams, _without_voxels(volume, seams))
+class Place(NamedTuple):
+    """Where a volume is, for programs for volumes of all shapes."""
+
+    seams: March
+    volume: Volume
+
+    @classmethod
+    def of(cls, march: March, volume: Volume) -> "Place":
+        seams = _only(march, "locate", "clip")
+        return cls(seams, _without_voxels(volume, seams))
+
+    @property
+    def space(self) -> Space:
+        return self.seams.locate(self.volume)
+
+    def voxel(self, blocks: tuple[int, ...]) -> float:
+        """The size of a voxel; where it differs, the median of the middles of some of so many blocks."""
+        if not self.seams.overriding("locate"):
+            return float(np.min(np.asarray(self.volume.spacing)))
+        middles = (BLOCK * (np.round(np.linspace(0, n - 1, MIDDLES)) + 0.5) for n in blocks)
+        return float(_median_distance(self, *middles))
+
+
+MIDDLES = 8
+"""Places along each axis at which the size of a voxel is measured."""
 
 
 @program
-def _located(seams: March, place: Volume) -> Space:
-    return seams.locate(place)
+def _median_distance(place: Place, *middles: Array) -> Array:
+    return median_node_distance(place.space, *middles)
+
+
+def _lines_of(
+    source: Any, tiling: Tiling, number: int, size: int, tile: int
+) -> tuple[Line, Bool[Any, "groups rays"]]:
+    """`RayTiles.ending_lines` of a tile before there is a fault; of given rays on a CPU in NumPy."""
+    if (
+        not isinstance(source, GivenRays)
+        or platform() != "cpu"
+        or getattr(source.origins, "committed", False)
+    ):
+        return _lines(source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
+    count = size * tiling.rays_per_beam
+    own = slice(tile * count, (tile + 1) * count)
+
+    def rows(leaf: Any) -> Any:
+        flat = np.asarray(leaf).reshape(-1, leaf.shape[-1])
+        flat = flat[own] if len(flat) else np.ones((1, leaf.shape[-1]), flat.dtype)
+        flat = np.pad(flat, ((0, count - len(flat)), (0, 0)), "edge")
+        return tuple(np.ascontiguousarray(flat.T).reshape(leaf.shape[-1], -1, tiling.group))
+
+    numbers = np.arange(own.start, own.stop, dtype=np.int32).reshape(-1, tiling.group)
+    first = np.asarray(source.first, np.int32)
+    pixel: Any = (first + numbers, 0 * numbers) if source.pixels is None else rows(source.pixels)
+    line: Any = Line(rows(source.origins), rows(source.directions), pixel)
+    return line, numbers < math.prod(source.origins.shape[:-1])
 
 
 @program

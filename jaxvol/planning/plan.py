@@ -14,7 +14,7 @@ from .._util.checks import flag, integer, number
 from ..compositing.blending import Compositing, Over
 from ..compositing.modes import Mode, compositing_of
 from ..engine.acceleration import visible_in_numpy
-from ..engine.stages import space_of
+from ..engine.stages import Place
 from ..lighting.shading import Lighting
 from ..march.march import March, Transform
 from ..march.transforms import AlphaCorrection, EarlyTermination, SpaceLeaping
@@ -23,7 +23,6 @@ from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.rendering import Rendering
 from ..scene.several import Several
-from ..scene.space import median_node_distance
 from ..scene.transfer import Transfer, sized, with_shared_points
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
@@ -155,14 +154,14 @@ def plan(
     transfer = sized(transfer, volume)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, given = _checked(tolerance, transforms, scene)
-    space = space_of(March(1.0, given), volume)
+    place = Place.of(March(1.0, given), volume)
     shown, mode = transfer, scene.compositing
     if mode.resolves:
         shown, _ = mode.marched(transfer, March(1.0, given), volume)
     visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
-    candidates, seed = Candidates.of(camera, space, visible), integer("seed", seed, 0)
+    candidates, seed = Candidates.of(camera, place, visible), integer("seed", seed, 0)
     proven, parts = chosen_transforms(visible, given)
-    voxel = float(median_node_distance(space, visible.shape))
+    voxel = place.voxel(visible.shape)
 
     over = isinstance(scene.compositing, Over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)

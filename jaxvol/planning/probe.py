@@ -13,13 +13,13 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Scalar, along, apart
 from ..engine.image import render_scene
 from ..engine.rays import RayTiles
+from ..engine.stages import Place
 from ..engine.tiling import Tiling
 from ..march.march import March
 from ..ray import Scene
 from ..scene.camera import Camera, GivenRays, axes_of
 from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
-from ..scene.space import Space
 from ..xla.kept_programs import kept
 
 
@@ -61,14 +61,14 @@ class Candidates(NamedTuple):
     likely: Bool[np.ndarray, " patches"]
 
     @classmethod
-    def of(cls, camera: Camera, space: Space, visible: Bool[np.ndarray, "bx by bz"]) -> "Candidates":
+    def of(cls, camera: Camera, place: Place, visible: Bool[np.ndarray, "bx by bz"]) -> "Candidates":
         """`visible`: blocks that may hold anything visible."""
         from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
 
         (width, height), (across, down) = camera.size, _patches(camera)
 
         def hits(pixels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-            enters, leaves = _intervals(space, *_rays(camera, pixels % width, pixels // width))
+            enters, leaves = _intervals(place, *_rays(camera, pixels % width, pixels // width))
             return leaves > np.maximum(enters, 0)
 
         parts = np.split(np.arange(width * height), range(RAYS, width * height, RAYS))
@@ -76,7 +76,7 @@ class Candidates(NamedTuple):
         hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
         hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
         near = maximum_filter(visible, 2 * NEAR + 1, mode="constant")
-        likely = hit & _passes(camera, space, near)
+        likely = hit & _passes(camera, place, near)
         hit[0] |= not hit.any()
         return cls(camera, hit, likely)
 
@@ -287,35 +287,35 @@ def _rays(camera: Camera, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarr
 
 
 @kept
-def _interval(space: Space, origins: Array, directions: Array) -> tuple[Array, Array]:
-    return space.interval(*(tuple(each.T) for each in (origins, directions)))
+def _interval(place: Place, origins: Array, directions: Array) -> tuple[Array, Array]:
+    return place.space.interval(*(tuple(each.T) for each in (origins, directions)))
 
 
-def _intervals(space: Space, *rays: np.ndarray) -> list[np.ndarray]:
+def _intervals(place: Place, *rays: np.ndarray) -> list[np.ndarray]:
     """Depths at which rays enter and leave the volume."""
-    parts = _in_parts(partial(_interval, space), RAYS, *rays)
+    parts = _in_parts(partial(_interval, place), RAYS, *rays)
     return [np.concatenate(ends) for ends in zip(*parts, strict=True)]
 
 
 def _passes(
-    camera: Camera, space: Space, blocks: Bool[np.ndarray, "bx by bz"]
+    camera: Camera, place: Place, blocks: Bool[np.ndarray, "bx by bz"]
 ) -> Bool[np.ndarray, " patches"]:
     """Whether the middle ray of each patch passes through one of the blocks."""
     across, down = _patches(camera)
     row, column = (SIDE * each + (SIDE - 1) / 2 for each in np.divmod(np.arange(across * down), across))
     rays = _rays(camera, column, row)
-    lines = *rays, *_intervals(space, *rays)
+    lines = *rays, *_intervals(place, *rays)
     last, found = np.array(blocks.shape) - 1, []
-    for at, crosses in _in_parts(partial(_along, space), LINES, *lines):
+    for at, crosses in _in_parts(partial(_along, place), LINES, *lines):
         i, j, k = np.clip(np.floor(at / BLOCK).T, 0, last[:, None, None]).astype(int)
         found.append(crosses & blocks[i, j, k].any(axis=0))
     return np.concatenate(found)
 
 
 @kept
-def _along(space: Space, origins: Array, directions: Array, nears: Array, fars: Array) -> tuple[Array, Array]:
+def _along(place: Place, origins: Array, directions: Array, nears: Array, fars: Array) -> tuple[Array, Array]:
     """Grid coordinates of `POINTS` points along each ray, and whether it meets the volume."""
-    parts = (jnp.arange(POINTS, dtype=nears.dtype) + 0.5) / POINTS
+    space, parts = place.space, (jnp.arange(POINTS, dtype=nears.dtype) + 0.5) / POINTS
 
     def at(origin: Array, direction: Array, entry: Scalar, leave: Scalar, part: Scalar) -> Array:
         line = apart(origin), apart(direction)

@@ -11,18 +11,12 @@ from typing import NamedTuple, TypeAlias, cast
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Frame, Scalar, Vec3, along, apart, minus, plus, times
-from ..xla.kept_programs import kept
 from .occupancy import BLOCK, Occupancy
 from .several import Several
 from .volume import Volume
-
-
-MIDDLES = 8
-"""Places along each axis at which the size of a voxel is measured."""
 
 
 class Path(eqx.Module):
@@ -319,15 +313,10 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
     return reduce(jnp.maximum, nears), reduce(jnp.minimum, fars)
 
 
-def median_node_distance(space: Space, shape: tuple[int, ...]) -> Scalar:
-    """The size of a voxel: the median, over `MIDDLES`³ of so many blocks, of the least world distance between
-    neighbouring nodes in the middle of each."""
-    middles = [BLOCK * (np.round(np.linspace(0, n - 1, MIDDLES)) + 0.5) for n in shape]
-    return _median_distance(space, *middles)
+def median_node_distance(space: Space, *middles: Array) -> Scalar:
+    """The size of a voxel: the median, over places at these grid coordinates along each axis, of the least
+    world distance between neighbouring nodes."""
 
-
-@kept  # operations by themselves take seconds to compile
-def _median_distance(space: Space, *middles: Array) -> Scalar:
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
         return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from jaxvol.engine.stages import Place
 from jaxvol.planning.probe import FEW, PATCHES, SIDE, Candidates, Probe, Truth
-from jaxvol.scene.space import Affine
 
 from ..scenes import scaled_phantom
 
@@ -28,7 +28,7 @@ def large() -> jv.Camera:
 
 def probe_of(camera: jv.Camera, seed: int = 0) -> Probe:
     """All blocks may be visible."""
-    return Probe.of(Candidates.of(camera, Affine(VOLUME), np.ones((6, 6, 6), bool)), seed)
+    return Probe.of(Candidates.of(camera, Place.of(jv.March(1.0), VOLUME), np.ones((6, 6, 6), bool)), seed)
 
 
 def error_of(probe: Probe, image: jv.Rendering, truth: jv.Rendering) -> float:
@@ -111,7 +111,7 @@ def test_most_patches_are_taken_where_something_is_visible():
     camera = camera_of((WIDTH, HEIGHT), zoom=2)
     visible = np.zeros((6, 6, 6), bool)
     visible[1, 4, 3] = True
-    probe = Probe.of(Candidates.of(camera, Affine(VOLUME), visible), 0)
+    probe = Probe.of(Candidates.of(camera, Place.of(jv.March(1.0), VOLUME), visible), 0)
     first = np.asarray(probe.source.pixels).reshape(PATCHES, -1, 2)[:, 0]
     middle = np.asarray(VOLUME.origin) + np.array([6, 18, 14]) * np.asarray(VOLUME.spacing)
     origin, directions = np.asarray(camera.position), camera.rays()[1]

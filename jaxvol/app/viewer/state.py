@@ -19,6 +19,7 @@ from ...compositing.blending import Compositing, Over
 from ...compositing.isosurface import Isosurface
 from ...compositing.line_integral import LineIntegral
 from ...compositing.modes import MODES, Mode, compositing_of
+from ...engine.stages import Place
 from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
@@ -34,7 +35,6 @@ from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.occupancy import BLOCK
 from ...scene.several import together, with_others
-from ...scene.space import median_node_distance
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
 from ..automatic import automatic_transfer, labels_if_any
@@ -302,7 +302,7 @@ def initial(
         raise ValueError(f"lighting must be None under {type(mode).__name__}, which shows no single place.")
     r, g, b = np.asarray(linear_color("background", background)).tolist()
     blocks = tuple(-(-n // BLOCK) for n in volume.shape)
-    voxel = float(median_node_distance(given.locate(volume), blocks))
+    voxel = Place.of(given, volume).voxel(blocks)
     finest = min([voxel, *(float(np.min(each.spacing)) for each, _ in others)])
     step = max(0.5 * finest / voxel, MIN_STEP) if march is None else float(given.step) / voxel
     if not MIN_STEP <= step <= MAX_STEP:
