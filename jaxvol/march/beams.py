@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3, along
-from ..scene.occupancy import Index, Occupancy, Sums
+from ..scene.occupancy import Occupancy, Sums
 from ..scene.space import Ray
 from ..scene.volume import Volume
 from ..xla.memory import gather
@@ -154,11 +154,14 @@ class Box(eqx.Module):
         bulges = bulge[None] / size
         return cls(near, far, low - slack, high + slack, low_rate - bulges, high_rate + bulges)
 
-    def between(self, first: Scalar, last: Scalar) -> tuple[Array, Array]:
-        """Bounding box of all rays from `near + first` to `near + last`, both ≥ 0."""
-        low = self.low + jnp.minimum(first * self.low_rate, last * self.low_rate)
-        high = self.high + jnp.maximum(first * self.high_rate, last * self.high_rate)
-        return low, high
+    def between(self, first: Scalar, last: Scalar) -> list[tuple[Scalar, Scalar]]:
+        """Bounding box of all rays from `near + first` to `near + last`, both ≥ 0: along each axis."""
+        ends = []
+        for axis in range(3):
+            low, high = self.low_rate[axis], self.high_rate[axis]
+            low = self.low[axis] + jnp.minimum(first * low, last * low)
+            ends.append((low, self.high[axis] + jnp.maximum(first * high, last * high)))
+        return ends
 
 
 class Stretches(Skips):
@@ -198,17 +201,17 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
 
     def occupied(at: Int[Array, ""]) -> Bool[Array, " beams"]:
         first = at.astype(length.dtype) * length
-        low, high = box.between(first - 1e-2 * length, first + 1.01 * length)
-        shape = jnp.stack([jnp.asarray(n, first.dtype) for n in occupancy.shape])[:, None]
-        inside = (first < across) & jnp.all((high >= 0) & (low <= shape), axis=0)
-
-        def cells(corner: Float[Array, "3 beams"]) -> Index:
-            """Cell indices of a corner, arbitrary for boxes outside the grid."""
-            at = jnp.floor(jnp.where(inside, corner, 0))
-            x, y, z = jnp.clip(at, 0, shape - 1).astype(jnp.int32)
-            return x, y, z
-
-        return inside & sums.any_between(cells(low), cells(high))
+        inside, corners = first < across, []
+        sides = box.between(first - 1e-2 * length, first + 1.01 * length)
+        counts = [jnp.asarray(n, first.dtype) for n in occupancy.shape]
+        for (low, high), count in zip(sides, counts, strict=True):
+            inside &= (high >= 0) & (low <= count)
+        for ends, count in zip(sides, counts, strict=True):
+            # arbitrary for boxes outside the grid
+            cells = (jnp.clip(jnp.floor(jnp.where(inside, each, 0)), 0, count - 1) for each in ends)
+            corners.append([each.astype(jnp.int32) for each in cells])
+        (x, right), (y, back), (z, top) = corners
+        return inside & sums.any_between((x, y, z), (right, back, top))
 
     if on_gpu():  # all at once: a loop would take longer to launch than to run
         at = jnp.arange(STRETCHES, dtype=jnp.int32)
