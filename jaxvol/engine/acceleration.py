@@ -243,13 +243,20 @@ def _slopes(data: Array) -> tuple[Array, Array]:
 
 
 def unshaped(volume: Volume) -> Volume:
-    """A volume of `Packed` voxels, so that kernels need not know its shape."""
-    fetch, data = cast(Packed, volume.fetch), volume.data
-    nodes = None if fetch.nodes is None else _slopes(data)[1]
-    sizes, kind = np.asarray(data.shape, np.int32), str(data.dtype)
-    return unchecked(
-        volume, fetch=replace(fetch, words=_words(data)[1], nodes=nodes, sizes=sizes, kind=kind), data=None
-    )
+    """A volume of one grid, so that kernels need not know its shape: of voxels that are `Packed`, or of
+    floats, in a copy; the same where it has neither."""
+    fetch, data = volume.fetch, volume.data
+    if isinstance(fetch, Packed):
+        nodes = None if fetch.nodes is None else _slopes(data)[1]
+        fetch = replace(fetch, words=_words(data)[1], nodes=nodes)
+    elif volume.field is None and fetch.window is None and data.ndim == 3 and data.dtype.kind == "f":
+        if platform() != "cpu" or data.nbytes > LIMIT:
+            return volume
+        fetch = Packed(memoized(data, _in_a_row, _in_a_row_in_numpy))
+    else:
+        return volume
+    sizes = np.asarray(data.shape, np.int32)
+    return unchecked(volume, fetch=replace(fetch, sizes=sizes, kind=str(data.dtype)), data=None)
 
 
 def slopes_of(volume: Volume) -> UInt32[Array, " voxels"] | None:
@@ -291,8 +298,19 @@ def _packed(data: Shaped[Array, "nx ny nz"]) -> tuple[Array, Array]:
 
 
 def _in_one_length(found: UInt32[Array, "nx ny nz"]) -> tuple[Array, Array]:
-    words = jnp.pad(found.reshape(-1), (0, shared_length(found.size) - found.size))
+    words = _in_a_row(found)
     return words, words
+
+
+@jax.jit
+def _in_a_row(data: Shaped[Array, "nx ny nz"]) -> Shaped[Array, " words"]:
+    return jnp.pad(data.reshape(-1), (0, shared_length(data.size) - data.size))
+
+
+def _in_a_row_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> Shaped[np.ndarray, " words"]:
+    _, reserve, planes = _reserved(data.shape, data.dtype)
+    planes[:] = data
+    return reserve
 
 
 def _packed_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> tuple[np.ndarray, np.ndarray]:
@@ -305,13 +323,13 @@ def _packed_in_numpy(data: Shaped[np.ndarray, "nx ny nz"]) -> tuple[np.ndarray, 
     return words, reserve
 
 
-def _reserved(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _reserved(shape: tuple[int, ...], dtype: Any = np.uint32) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The same words in a length that goes with their number, in one that goes with any, and by voxels."""
     count = math.prod(shape)
     try:
-        reserve = zeros_in_reserve(next(each for each in RESERVES if each >= count), np.uint32)
+        reserve = zeros_in_reserve(next(each for each in RESERVES if each >= count), dtype)
     except MemoryError:  # where addresses are limited
-        reserve = zeros_in_reserve(shared_length(count), np.uint32)
+        reserve = zeros_in_reserve(shared_length(count), dtype)
     return reserve[: shared_length(count)], reserve, reserve[:count].reshape(shape)
 
 

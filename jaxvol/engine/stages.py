@@ -32,7 +32,7 @@ from ..scene.rendering import Rendering
 from ..scene.space import Line, Ray, Space, median_node_distance
 from ..scene.transfer import Transfer, TransferFunction, classification_of, with_shared_points
 from ..scene.volume import Volume, grids, with_fetches, without_voxels
-from ..scene.voxel_fetch import Extent, Nodes, Packed
+from ..scene.voxel_fetch import Extent, Nodes
 from ..xla.compiling import OPTIONS
 from ..xla.kept_programs import kept
 from ..xla.memo import memoized_of, when_any_dies
@@ -390,7 +390,7 @@ def _kernel_of(scene: Scene, acceleration: VolumeAcceleration) -> Kernel:
     """The scene, so that its march is the same program as that of as many other scenes as possible."""
     volume, lighting = acceleration.packed(scene).volume, scene.lighting
     shared = lighting is None or (lighting.reads_gradient and lighting.farthest_read == 0)
-    if shared and len(grids(volume)) == 1 and isinstance(volume.fetch, Packed):
+    if shared and len(grids(volume)) == 1:
         volume = unshaped(volume)
     transfer = with_shared_points(scene.transfer)
     return Kernel(volume, transfer, scene.march.rules, scene.compositing, lighting)

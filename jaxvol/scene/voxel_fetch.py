@@ -239,13 +239,13 @@ class Zeros(Fetch):
 
 
 class Packed(Fetch):
-    """Fetches the same voxels from a packed copy, in half or a quarter of the fetches.
+    """Fetches the same voxels from a packed copy, integers in half or a quarter of the fetches.
 
     It needs no other array than that, so that kernels need not know the shape of the volume
     (`engine.acceleration.unshaped`)."""
 
-    words: UInt32[Array, " words"]
-    """At least as many as voxels."""
+    words: UInt32[Array, " words"] | Float[Array, " words"]
+    """At least as many as voxels; floats as they are."""
     nodes: UInt32[Array, " words"] | None = None
     """Of 8-bit voxels, doubled slopes of each node in 10 bits each: x in the highest, y from bit 12 on."""
     begin: Int[Array, ""] | None = None
@@ -263,7 +263,7 @@ class Packed(Fetch):
         return replace(self, begin=begin)
 
     def _always(self, data: Voxels) -> Bool[Array, ""]:
-        return self.words[0].astype(jnp.float32) + 1 != 0
+        return abs(self.words[0].astype(jnp.float32)) + 1 != 0
 
     def split(self, data: Voxels, coordinate: Vec3) -> tuple[Node, Vec3]:
         if self.steady or self.window is not None:
@@ -277,6 +277,8 @@ class Packed(Fetch):
         _, ny, nz = self._stored(data)
         kind = np.dtype(data.dtype if self.kind is None else self.kind)
         bits, signed = 8 * kind.itemsize, kind.kind == "i"
+        if kind.kind == "f":
+            return cube_of(lambda x, y, z: _word(self.words, base + (x * ny + y) * nz + z).astype(dtype))
 
         def voxel(word: Int[Array, ""], number: int) -> Scalar:
             if signed:  # shifting down from the top bits extends the sign
@@ -286,7 +288,7 @@ class Packed(Fetch):
         def row(flat: Int[Array, ""]) -> list[list[Scalar]]:
             fetched = [flat] if bits == 8 else [flat, flat + nz]
             # converted, or XLA repeats the fetch for each use
-            words = [_word(self.words, index) for index in fetched]
+            words = [_word(self.words, index).astype(jnp.int32) for index in fetched]
             a, b, c, d = (voxel(word, number) for word in words for number in range(32 // bits))
             return [[a, b], [c, d]]
 
@@ -303,7 +305,7 @@ class Packed(Fetch):
         shift = 32 - SLOPE_BITS
 
         def words_from(base: Int[Array, ""]) -> Cube:
-            return cube_of(lambda x, y, z: _word(nodes, base + (x * ny + y) * nz + z))
+            return cube_of(lambda x, y, z: _word(nodes, base + (x * ny + y) * nz + z).astype(jnp.int32))
 
         # in memory, for the reason of `cube`
         words = (
@@ -322,11 +324,11 @@ class Packed(Fetch):
         return x * factor, y * factor, z * factor
 
 
-def _word(words: UInt32[Array, " words"], index: Int[Array, ""]) -> Int[Array, ""]:
+def _word(words: Array, index: Int[Array, ""]) -> Array:
     """The word at an index, or any one if that is out of range."""
     # XLA keeps an index inside of the array by comparisons of 64 bits, a quarter of a fetch. LLVM leaves them
     # out where it sees that it is: where shapes are no data, or by these bits.
-    return gather(words, index & ((1 << (words.size - 1).bit_length()) - 1)).astype(jnp.int32)
+    return gather(words, index & ((1 << (words.size - 1).bit_length()) - 1))
 
 
 class Fetched(NamedTuple):

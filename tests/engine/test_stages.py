@@ -62,8 +62,17 @@ def test_one_march_serves_all_images_whose_differences_are_numbers(monkeypatch):
     image(ball(), quadrature="preintegrated")
     assert len(marched) == 1
 
+    def floats(shape):
+        whole = ball(shape)
+        return jv.Volume(np.asarray(whole.data, np.float32), whole.spacing)
 
-@pytest.mark.parametrize("dtype", [np.uint8, *slow(np.int16)])
+    of_floats = image(floats((20, 18, 16)))
+    image(floats((22, 17, 19)))
+    assert len(marched) == 2
+    np.testing.assert_allclose(of_floats.rgba, image(ball()).rgba, atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, *slow(np.int16, np.float32)])
 def test_an_image_of_several_tiles_is_that_of_one_program(dtype):
     volume, camera = ball(dtype=dtype), around(ball(), (160, 150))
     march = jv.March(0.06, ALL, "midpoint")
