@@ -14,7 +14,7 @@ from ..._util.checks import flag
 from ..._util.vec3 import Scalar
 from ...scene.space import Ray
 from ...scene.volume import Volume
-from ..march import Cell, CellRules, Transform, cut_at_exit
+from ..march import Cell, CellRules, Transform, cut_at_entry, cut_at_exit
 
 
 PROBES = 4
@@ -115,8 +115,8 @@ def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, 
     def region(s: Scalar) -> Int[Array, ""]:
         return jnp.where(ray.in_gap(s), -1, volume.label(ray.path(s)))
 
-    front, width = jax.lax.stop_gradient((cell.front, cell.width))
-    depths = [front + width * (i / PROBES) for i in range(PROBES + 1)]
+    cell = jax.lax.stop_gradient(cut_at_entry(cell))  # in front of the entry lies no face
+    depths = [cell.front + cell.width * (i / PROBES) for i in range(PROBES + 1)]
     regions = [region(depth) for depth in depths]
 
     def face(depths: list[Scalar], regions: list[Array]) -> tuple[Scalar, Scalar]:

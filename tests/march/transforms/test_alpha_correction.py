@@ -23,21 +23,23 @@ LABELLED = jv.Volume(np.ones(LABELS.shape, np.float32), labels=LABELS)  # the fa
 
 
 @partial(jax.jit, static_argnums=0)
-def cut(labels, front, width, length, gaps):
-    """The pieces of a cell of a ray along x; through `LABELLED` if by labels."""
+def cut(labels, front, width, length, gaps, line):
+    """The pieces of a cell of a ray along x; on a `line` through `LABELLED` if by labels."""
     zero, one, pixel = jnp.float32(0), jnp.float32(1), (jnp.int32(0), jnp.int32(0))
     path = Straight((zero, zero, zero), (one, zero, zero))
     ray = Ray((zero, zero, zero), (one, zero, zero), zero, length, path, pixel, gaps)
     if labels:
-        line = apart(jnp.array([-2.0, 1.3, 1.6])), apart(jnp.array([1.0, 0, 0]))
-        ray = enter(Affine(LABELLED), *line, pixel)
+        ray = enter(Affine(LABELLED), apart(line[0]), apart(line[1]), pixel)
     cell = Cell(front, width, jnp.zeros((), bool))
     return jv.AlphaCorrection(labels=labels).cut(cell, ray, LABELLED if labels else BOX)
 
 
-def pieces(front, width, length: float = 9, gaps=(), *, labels=False):
+ALONG_X = [-2, 1.3, 1.6], [1, 0, 0]
+
+
+def pieces(front, width, length: float = 9, gaps=(), *, labels=False, line=ALONG_X):
     gaps = tuple(tuple(map(np.float32, gap)) for gap in gaps)
-    found = jax.device_get(cut(labels, *map(np.float32, (front, width, length)), gaps))
+    found = jax.device_get(cut(labels, *map(np.float32, (front, width, length)), gaps, np.float32(line)))
     return [(float(p.front), float(p.width), bool(p.cut)) for p in found]
 
 
@@ -65,6 +67,9 @@ def test_a_cell_is_divided_where_the_label_changes():
     np.testing.assert_allclose([a, first, b, last], [7.1, 0.4, 7.5, 0], atol=1e-4)
     np.testing.assert_allclose([c, rest], [7.5, 0.6], atol=1e-4)
     assert [width for _, width, _ in pieces(8.1, 1, labels=True)] == [1, 0, 0]
+    # enters at x = 7.6: in front of that, the nearest labels change, but the ray crosses no face
+    oblique = [6.4, -1.6, 1.6], [0.6, 0.8, 0]
+    assert [width for _, width, _ in pieces(-0.5, 1, labels=True, line=oblique)] == [1, 0, 0]
 
 
 @pytest.mark.parametrize("fast", [True, False])
