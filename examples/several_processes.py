@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     jax.distributed.initialize(given.coordinator, given.processes, given.process)
     parts = scene(given.resolution, given.size)
     if given.bricks:
-        rendering = jv.render_bricks(*parts, devices=jax.devices(), own="bricks")
+        rendering = jv.render_bricks(*parts, devices=jax.devices())
     else:
         rendering = jv.render(*parts, devices=jax.devices())
 

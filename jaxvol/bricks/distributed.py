@@ -61,7 +61,7 @@ def check_joins(scene: Scene, method: Any) -> None:
     }
     for what, refuses in refused.items():
         if refuses:
-            raise ValueError(f'own="bricks" does not go with {what}. Use own="rays".')
+            raise ValueError(f"devices, which own bricks, do not go with {what}. Leave them out.")
 
 
 def render_distributed(traversal: Traversal, mesh: Mesh) -> Rendering:

@@ -54,7 +54,7 @@ def render_bricks(
     level: int | Literal["auto"] | Any = "auto",
     progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
-    own: Literal["rays", "bricks"] | Any = "rays",
+    own: Literal["bricks"] | Any = "bricks",
     **options: Any,
 ) -> Rendering:
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
@@ -92,14 +92,13 @@ def render_bricks(
             are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
         progress: called after each brick, with the numbers of bricks rendered so far and of those that hold
             anything visible, some of which may not be needed, or be read again.
-        devices: as for `render`. `memory` is that of each device.
-        own: what is dealt out to devices. `"rays"`: every device marches its rays through each brick, which
-            is read once and copied to all. `"bricks"`: each device reads its own bricks, marches all rays
-            through them, and the partial images are combined front to back: where reading takes longest, and
-            for several processes. Rays must be straight in the grid, and what a ray shows must not depend on
-            what lies in front but by its transmittance (no `EmptySpaceJitter`; compositing by `"over"`). An
+        devices: as for `render`, each of which has `memory`, but bricks are dealt out to them, not rays: each
+            reads its own bricks, marches all rays through them, and the partial images are combined front to
+            back. Rays must be straight in the grid, and what a ray shows must not depend on what lies in
+            front but by its transmittance (no `EmptySpaceJitter`; compositing by `"over"`). An
             `EarlyTermination` sees only what is in front on the same device: up to `opacity_left` of the
             colours behind are added, and depth changes with them; without it, depth agrees to 1e-5 of itself.
+        own: `"bricks"`: what devices own.
         **options: for the source (`shape`, `dtype`, `time`, `channel`, `nan`), see `bricks.levels_of`.
 
     Returns:
@@ -108,7 +107,7 @@ def render_bricks(
     Raises:
         ValueError: naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
             whose file changed; for less memory than the smallest bricks take; for what needs the whole volume
-            at once (labels, light by transport); and for what cannot be had with `own="bricks"`.
+            at once (labels, light by transport); and for what several devices cannot render.
 
     It has no gradients, since it reads its source while it runs; nor can it be called inside `jax.jit` or
     `jax.vmap`. Fit with `render` to a copy that fits (`VoxelSource.subsampled`).
@@ -123,7 +122,7 @@ def render_bricks(
         )
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, ("rays", "bricks"))]
+    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, ("bricks",))]
     words += [] if callable(method) else [("method", method, tuple(METHODS))]
     for name, given, known in words:
         if not isinstance(given, str) or given not in known:
@@ -131,8 +130,6 @@ def render_bricks(
     if progress is not None and not callable(progress):
         raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     mesh = mesh_of(devices)
-    if own == "bricks" and mesh is None:
-        raise ValueError('own="bricks" deals bricks out over devices; give these, as devices=jax.devices().')
     if is_traced((transfer, camera, march, lighting, spacing, origin)):
         raise ValueError(
             "render_bricks reads its source while it runs, so not inside jax.jit, jax.vmap or jax.grad. "
@@ -143,8 +140,8 @@ def render_bricks(
     if len(levels) > 1:
         transfer = sized(transfer, levels[0])  # so that all levels are equally opaque
     scene = on_all(mesh, scene_of(chosen, transfer, camera, march, compositing, lighting))
-    request = Request(chosen, room, bricks, method, progress, outputs, mesh, own == "bricks")
-    if request.deals_bricks:
+    request = Request(chosen, room, bricks, method, progress, outputs, mesh)
+    if mesh is not None:
         check_joins(scene, method)
     traversal = Traversal(request, scene)
     rendering = _image(scene, traversal)
@@ -196,8 +193,7 @@ _resolve_brick = compiled(brick_march.resolve_brick)
 def _image(scene: Scene, traversal: Traversal) -> Rendering:
     mode, selects = scene.compositing, isinstance(scene.compositing, Selection)
     request, marched, options = traversal.request, traversal.scene, traversal.options
-    if request.deals_bricks:
-        assert request.mesh is not None
+    if request.mesh is not None:
         return render_distributed(traversal, request.mesh)
     underway, pixels = _begin_image(marched, options), None
     for brick, cells in traversal.bricks(underway.rays, underway.at):

@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.files import MOST_VOXELS
 from .._util.memory import give_back
-from ..engine import devices
 from ..engine.tiling import RenderOptions, Tiling
 from ..engine.wavefront import CellRange
 from ..march.march import March
@@ -66,8 +65,7 @@ class Request:
     method: Method | Any = "overlap"
     progress: Callable[[int, int], Any] | None = None
     outputs: Any = "all"
-    mesh: Mesh | None = None  # devices over which rays are dealt out, or bricks, if `deals_bricks`
-    deals_bricks: bool = False
+    mesh: Mesh | None = None  # devices to which bricks are dealt out
 
 
 class Traversal:
@@ -84,16 +82,15 @@ class Traversal:
         assert isinstance(marched.source, Camera)
         self.request, self.source, self.scene = request, request.source, marched
         source, shape, counts = request.source, request.source.shape, request.counts
-        tiling = Tiling.of_backend(request.mesh)
+        tiling = Tiling.of_backend()
         if not tiling.turns:  # on a CPU
             tiling = tiling._replace(batch=BATCH)
-        tiling = tiling._replace(devices=None) if request.deals_bricks else tiling
         self.options = RenderOptions(outputs, tiling)
         self.done, self.bytes_read = 0, 0
         self.loads: list[int] = []  # bricks whose reading has begun
         self.space = marched.march.locate(marched.volume)
         margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
-        least = devices.number_of(request.mesh) if request.deals_bricks else 1
+        least = 1 if request.mesh is None else request.mesh.size
         if counts is None:
             self.grid = split(shape, source.dtype, request.memory, margin, least)
         else:
@@ -160,11 +157,11 @@ class Traversal:
     ) -> BrickCells | None:
         """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
         visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty)
-        mesh, march = self.options.tiling.devices, self.scene.march
+        march = self.scene.march
         # with their shift still ahead, or a cell that waits for a brick would leave it when its ray shifts
         at = with_fields(self.start, finished=self.at.finished)
         beams = BEAMS if self.options.tiling.turns else 1  # on a CPU
-        found = _curved(mesh, beams, self.grid, beyond, march, (self.rays, at, reached), visit)
+        found = _curved(beams, self.grid, beyond, march, (self.rays, at, reached), visit)
         return found if bool(found.any) else None
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
@@ -250,26 +247,14 @@ def _straight(
 
 @compiled
 def _curved(
-    mesh: Mesh | None,
-    beams: int,
-    grid: BrickGrid,
-    beyond: int,
-    march: March,
-    rays: CurvedRays,
-    visit: Visit,
+    beams: int, grid: BrickGrid, beyond: int, march: March, rays: CurvedRays, visit: Visit
 ) -> BrickCells:
     """By beams of rays, so many of them at a time."""
-
-    def program(whole: tuple[March, Visit], rays: CurvedRays) -> tuple[None, BrickCells]:
-        march, visit = whole
-        by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), rays)
-        found: BrickCells = jax.lax.map(
-            lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=beams
-        )
-        shape = rays[0].length.shape
-        cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
-        return None, found._replace(cells=cells, reached=found.reached.reshape(shape))
-
-    _, found = devices.split(mesh, program, (march, visit), rays)
-    low, high = jnp.min(found.low, 0), jnp.max(found.high, 0)
-    return found._replace(low=low, high=high, any=jnp.any(found.any))
+    by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), rays)
+    found: BrickCells = jax.lax.map(
+        lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=beams
+    )
+    shape = rays[0].length.shape
+    cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
+    low, high, any_ = jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any)
+    return BrickCells(cells=cells, reached=found.reached.reshape(shape), low=low, high=high, any=any_)

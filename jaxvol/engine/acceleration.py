@@ -201,7 +201,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         seen_by = lines(source, columns.reshape(1, -1), rows.reshape(1, -1), no_fault)
         begins = seen_by.origin if seen_by.beside is None else plus(seen_by.origin, seen_by.beside)
         own = GivenRays(jnp.stack(begins, axis=-1), jnp.stack(seen_by.direction, axis=-1))
-        one_tile = tiling._replace(tile=columns.size, devices=None)
+        one_tile = tiling._replace(tile=columns.size)
         tiles, only = RayTiles.of(own, one_tile), jnp.zeros((), jnp.int32)
         seen = by_rules(Scene(volume, transfer, own, plain, FirstVisible()).prepared())
         rays = tiles.rays(own, space, only, no_fault)

@@ -19,9 +19,8 @@ from ..scene.rendering import Rendering
 from ..scene.space import Ray
 from ..xla.trees import with_fields
 from .acceleration import VolumeAcceleration, empty_space_of
-from .devices import on_devices
 from .rays import RayTiles, vmap_rays
-from .resolve import resolve_pixels
+from .resolve import resolve_image
 from .shifts import begin_rays
 from .tiling import RenderOptions
 from .wavefront import CellRange, blinded, into_range, march_rays
@@ -34,7 +33,6 @@ class RayStates(eqx.Module):
     at: Progress
 
 
-@on_devices("sharded")
 def begin_image(scene: Scene, options: RenderOptions) -> RayStates:
     """All rays at their entries. Of the volume, no voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), scene.has_fault
@@ -48,7 +46,6 @@ def begin_image(scene: Scene, options: RenderOptions) -> RayStates:
     return tiles.map(one)
 
 
-@on_devices("sharded", sharded=("states", "ranges"))
 def march_brick(
     scene: Scene,
     options: RenderOptions,
@@ -91,7 +88,6 @@ def opaque(scene: Scene, at: Progress) -> Bool[Array, "groups rays"]:
     return vmap_rays(partial(stopped, scene))(at.composite)
 
 
-@on_devices("replicated", sharded=("before", "after"))
 def resolve_brick(
     scene: Scene,
     options: RenderOptions,
@@ -108,7 +104,7 @@ def resolve_brick(
     states = zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True)
     changed = tiles.assemble(jnp.any(jnp.stack([old != new for old, new in states]), axis=0))[..., None]
     found = jnp.where(changed, rendering.rgba, 0), rendering.depth, rendering.details.selected
-    resolved = resolve_pixels(scene, options, acceleration, found)
+    resolved = resolve_image(scene, options, acceleration, found)
     return resolved if pixels is None else jnp.where(changed, resolved, pixels)
 
 
@@ -145,7 +141,6 @@ def join_segments(scene: Scene, segments: RayStates) -> RayStates:
     )
 
 
-@on_devices("replicated", sharded=("states",))
 def finish_image(scene: Scene, options: RenderOptions, states: RayStates) -> Rendering:
     """The image of rays that have passed all bricks."""
     states = RayStates(states.rays, _passed(scene.march, states.at))

@@ -1,31 +1,33 @@
-"""Which device does which part of the work?
+"""Deals the rays of an image out to devices, each of which has the whole scene.
 
-A program of the engine runs on all devices (`split`), to which the scene is replicated. Beams of rays and
-chunks of pixels are sharded round-robin (`own_share`), so that each device has its share of what is expensive
-wherever that lies in the image. What they find is gathered (`gathered`), or summed (`summed`). Without
-several devices, all of this changes nothing.
+Beams of rays are dealt round-robin, so that each device has its share of what is expensive wherever that lies
+in the image. Each renders its own by the program of one device, and JAX sums their gradients.
 """
 
-import inspect
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, wraps
-from typing import Any, Literal, ParamSpec, TypeAlias, TypeVar
+from functools import cache
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from .._util.checks import described
+from ..ray import Scene
+from ..scene.camera import Camera, RaySubset, without_ends
+from ..scene.rendering import Rendering
+from ..xla.compiling import compiled
 from ..xla.memo import memoized
 from ..xla.platform import is_traced
 from ..xla.sharding import varies_over
 from ..xla.trees import PyTree
+from .acceleration import VolumeAcceleration
+from .rays import Source
+from .tiling import RenderOptions, Tiling
 
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 Devices: TypeAlias = Sequence[Any] | Mesh
 """What a caller may pass for devices."""
@@ -64,85 +66,63 @@ def mesh_of(devices: Any) -> Mesh | None:
     return Mesh(np.asarray(found), (AXIS,))
 
 
-def number_of(mesh: Mesh | None) -> int:
-    """Number of devices."""
-    return 1 if mesh is None else mesh.size
+def _dealt_image(
+    mesh: Mesh,
+    render: Callable[[Scene, RenderOptions, VolumeAcceleration], Rendering],
+    scene: Scene,
+    options: RenderOptions,
+    acceleration: VolumeAcceleration,
+) -> Rendering:
+    """What `render` returns, by all devices of a mesh, each of which renders its part of the rays. The image
+    is then on all of them."""
+    shape, *dealt = dealt_rays(scene.source, options.tiling, mesh.size)
+    indices, place = map(jnp.asarray, dealt)
+    arrays, rest = eqx.partition((scene, acceleration), eqx.is_array)
 
-
-def split(
-    mesh: Mesh | None, program: Callable[..., tuple[PyTree, PyTree]], replicated: PyTree, sharded: PyTree
-) -> tuple[PyTree, PyTree]:
-    """What `program(replicated, sharded)` returns on all devices.
-
-    Args:
-        replicated: what all devices have, not only arrays.
-        sharded: arrays of which each device has a part along the first axis, and is given that.
-
-    The program returns the same two: first what is the same on all devices, then what is sharded.
-    """
-    if mesh is None:
-        return program(replicated, sharded)
-    arrays, rest = eqx.partition(replicated, eqx.is_array)
-
-    def own(arrays: PyTree, sharded: PyTree) -> tuple[PyTree, PyTree]:
-        return program(eqx.combine(arrays, rest), sharded)
+    def own(arrays: PyTree, indices: Int[Array, " rays"]) -> Rendering:
+        scene, acceleration = eqx.combine(arrays, rest)
+        return render(scene._replace(source=RaySubset(scene.source, indices)), options, acceleration)
 
     # Types are not checked: every loop, in a user's transform too, would have to start with arrays that vary.
-    specs = (REPLICATED, SHARDED)
-    shared = jax.shard_map(own, mesh=mesh, in_specs=specs, out_specs=specs, check_vma=False)
-    return jax.jit(shared)(arrays, sharded)
+    how: Any = {"mesh": mesh, "in_specs": (REPLICATED, SHARDED), "out_specs": SHARDED, "check_vma": False}
+    found = jax.shard_map(own, **how)(arrays, indices)
+    whole = jax.tree.map(lambda leaf: leaf[place].reshape(*shape, *leaf.shape[1:]), found)
+    return jax.lax.with_sharding_constraint(whole, NamedSharding(mesh, REPLICATED))
 
 
-def on_devices(
-    gives: Literal["replicated", "sharded", "both"], *, sharded: tuple[str, ...] = ()
-) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Decorator: a function of `options` runs by `split` on their devices. `gives`: whether its result
-    is replicated, sharded, or a pair of both. `sharded`: names of the sharded arguments."""
-
-    def made(function: Callable[P, T]) -> Callable[P, T]:
-        signature = inspect.signature(function)
-        called: Callable[..., T] = function
-
-        def program(given: dict[str, Any], parts: dict[str, Any]) -> tuple[PyTree, PyTree]:
-            result: Any = called(**given, **parts)
-            return {"replicated": (result, None), "sharded": (None, result), "both": result}[gives]
-
-        @wraps(function)
-        def run(*args: P.args, **kwargs: P.kwargs) -> T:
-            given = signature.bind(*args, **kwargs).arguments
-            parts = {name: given.pop(name) for name in sharded}
-            result: Any = split(given["options"].tiling.devices, program, given, parts)
-            return {"replicated": result[0], "sharded": result[1], "both": result}[gives]
-
-        return run
-
-    return made
+over_devices = compiled(_dealt_image, has_jvp=True)
 
 
-def index_of(mesh: Mesh | None) -> Array | int:
-    """Number of this device, inside `split`."""
-    return 0 if mesh is None else jax.lax.axis_index(AXIS)
-
-
-def own_share(mesh: Mesh | None, things: Array) -> Array:
-    """This device's share of things, round-robin, inside `split`. Their number is a multiple of the
-    devices'."""
-    if mesh is None:
-        return things
-    return things.reshape(things.shape[0] // mesh.size, mesh.size, *things.shape[1:])[:, index_of(mesh)]
-
-
-def gathered(mesh: Mesh | None, things: Array) -> Array:
-    """The inverse of `own_share`, on all devices, inside `split`."""
-    if mesh is None:
-        return things
-    turns = jax.lax.all_gather(things, AXIS, axis=1)
-    return turns.reshape(things.shape[0] * mesh.size, *things.shape[1:])
-
-
-def summed(mesh: Mesh | None, tree: PyTree) -> PyTree:
-    """The sum of what each device has, inside `split`."""
-    return tree if mesh is None else jax.lax.psum(tree, AXIS)
+def dealt_rays(
+    source: Source, tiling: Tiling, devices: int
+) -> tuple[tuple[int, ...], Int[np.ndarray, " dealt"], Int[np.ndarray, " rays"]]:
+    """The shape of an image; the indices of its rays, those of each device in turn, beam by beam; and where
+    each ray of the image is among these. Beams that are not full repeat rays."""
+    rays = without_ends(source)
+    if isinstance(rays, Camera):
+        (width, height), side = rays.size, tiling.beam
+        across, down = -(-width // side), -(-height // side)
+        y, x = np.indices((down * side, across * side)).reshape(2, down, side, across, side)
+        inside = (y < height) & (x < width)
+        index = np.minimum(y, height - 1) * width + np.minimum(x, width - 1)
+        # where the columns are a multiple of the devices, each device would always get the same ones
+        row = np.arange(down)[:, None]
+        column = (np.arange(across) + row * (across % devices == 0)) % across
+        index, inside = (np.swapaxes(each, 1, 2)[row, column] for each in (index, inside))
+        index, inside = index.reshape(-1, side**2), inside.reshape(-1, side**2)
+        shape = height, width
+    else:
+        shape = rays.origins.shape[:-1]
+        count, size = int(np.prod(shape)), tiling.rays_per_beam
+        index = np.arange(-(-count // size) * size).reshape(-1, size)
+        index, inside = np.minimum(index, count - 1), index < count
+    missing = -len(index) % devices
+    index, inside = (np.pad(each, ((0, missing), (0, 0))) for each in (index, inside))
+    beams = np.arange(len(index)).reshape(-1, devices).T.reshape(-1)
+    index, inside = index[beams].reshape(-1), inside[beams].reshape(-1)
+    place = np.zeros(int(np.prod(shape)), int)
+    place[index[inside]] = np.flatnonzero(inside)
+    return shape, index.astype(np.int32), place
 
 
 def on_all(mesh: Mesh | None, tree: PyTree) -> PyTree:
@@ -170,14 +150,11 @@ def _copier(mesh: Mesh) -> Callable[[Array], Array]:
     return copied
 
 
-def check_not_sharded(mesh: Mesh | None, tree: PyTree) -> None:
+def check_not_sharded(tree: PyTree) -> None:
     """Raises `ValueError` inside of a `jax.shard_map`, where devices are shared out already."""
-    if mesh is not None and (jax.sharding.get_abstract_mesh().manual_axes or _varies(tree)):
+    varies = any(map(varies_over, filter(eqx.is_array, jax.tree.leaves(tree))))
+    if jax.sharding.get_abstract_mesh().manual_axes or varies:
         raise ValueError(
             "devices cannot be given inside jax.shard_map, which has dealt them out: leave it out there, or "
             "call the renderer outside."
         )
-
-
-def _varies(tree: PyTree) -> bool:
-    return any(map(varies_over, filter(eqx.is_array, jax.tree.leaves(tree))))

@@ -21,7 +21,6 @@ from ..scene.volume import Volume, voxels_of, with_voxels, without_voxels
 from ..xla.sharding import varying
 from ..xla.trees import PyTree, added, floats, zeros_of
 from .acceleration import VolumeAcceleration, empty_space_of
-from .devices import on_devices
 from .rays import RayTiles
 from .replay import Cotangents, Replay, Total
 from .shifts import begin_rays
@@ -226,7 +225,6 @@ class ImageVjp(NamedTuple):
         )
 
 
-@on_devices("replicated", sharded=("recorded",))
 def _vjp_by_tiles(
     scene: Scene,
     perturbed: Any,

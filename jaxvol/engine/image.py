@@ -16,6 +16,7 @@ from ..compositing.selection import Selection
 from ..lighting.template_lighting import with_baked_light
 from ..ray import Scene, by_rules, check_channels, end
 from ..reference import step, steps_across
+from ..scene.camera import GivenRays, without_ends
 from ..scene.rendering import Rendering
 from ..scene.space import Ray, Space
 from ..xla.compiling import compiled, in_program
@@ -25,7 +26,7 @@ from ..xla.platform import is_traced
 from ..xla.sharding import varying
 from ..xla.trees import constant, floats, strong
 from .acceleration import VolumeAcceleration, empty_space_of
-from .devices import check_not_sharded, mesh_of, on_all, on_devices
+from .devices import check_not_sharded, mesh_of, on_all, over_devices
 from .gradients import render_vjp
 from .rays import RayTiles, vmap_rays
 from .resolve import Found, resolve_image
@@ -60,9 +61,10 @@ def render_scene(
     for name, given, known in (("outputs", outputs, RenderOutputs), ("adjoint", adjoint, Adjoint)):
         if given not in get_args(known):
             raise ValueError(f"{name} must be one of {', '.join(get_args(known))}; got {given!r}.")
-    tiling = Tiling.of_backend(mesh_of(devices)) if tiling is None else tiling
+    mesh, tiling = mesh_of(devices), Tiling.of_backend() if tiling is None else tiling
     tiling = tiling._replace(cells=scene.march.tested_every or tiling.cells)
-    check_not_sharded(tiling.devices, scene)
+    if mesh is not None:
+        check_not_sharded(scene)
     scene = strong(scene)
     volume, march, lighting = scene.volume, scene.march, scene.lighting
     check_channels(volume, scene.transfer, march, scene.compositing, lighting)
@@ -74,10 +76,13 @@ def render_scene(
         scene = scene._replace(lighting=with_baked_light(lighting, volume, scene.transfer, march))
     options = RenderOptions(outputs, tiling, adjoint, steps)
     acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting, scene.compositing)
-    scene, acceleration = on_all(tiling.devices, varying((scene, acceleration)))
-    if scene.resolves:
-        return _resolved(scene, options, acceleration)
-    return _image(scene, options, acceleration)
+    scene, acceleration = varying((scene, acceleration))
+    image = _resolved if scene.resolves else _image
+    rays = without_ends(scene.source)
+    if mesh is None or (isinstance(rays, GivenRays) and rays.origins.size == 0):
+        return image(scene, options, acceleration)
+    scene, acceleration = on_all(mesh, (scene, acceleration))
+    return over_devices(mesh, image, scene, options, acceleration)
 
 
 def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
@@ -120,7 +125,6 @@ def _pixels(scene: Scene, options: RenderOptions, acceleration: VolumeAccelerati
     return forward_only(pixels, WRONG_MODE["forward"]) if options.adjoint == "forward" else pixels
 
 
-@on_devices("both")
 def march_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, Recorded]:
@@ -140,13 +144,12 @@ def march_image(
             recorded = recorded.with_rays(rays, skips)
         return vmap_rays(partial(end, prepared))(rays, found.at), recorded
 
-    only = tiles.number == 1 and tiling.devices is None
+    only = tiles.number == 1
     rendering, recorded = _over_tiles(scene, prepared.space, tiles, marched)
     own = jax.tree.map(lambda leaf: leaf[0], (recorded.rays, recorded.skips))
     return rendering, recorded._replace(rays=own[0], skips=own[1])
 
 
-@on_devices("replicated")
 def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
     """The image, by `options.steps` steps of the reference engine along each ray, which JAX can
     differentiate."""

@@ -2,8 +2,7 @@
 
 An image is divided into tiles (of 4096 beams by default), a tile into beams (8 x 8 pixels: four groups), and
 a beam into groups (4 x 4 pixels: 16 rays). Besides finished pixels, only the rays of one tile are in memory,
-as arrays (groups, rays in a group), however large the image; or those of one tile on each device, between
-which beams are sharded (`devices`).
+as arrays (groups, rays in a group), however large the image.
 """
 
 import math
@@ -20,29 +19,25 @@ from jaxtyping import Array, Bool, Int
 from .._util.checks import all_finite
 from .._util.vec3 import Scalar
 from ..march.beams import Box, EmptySpaceIndex, Skips
-from ..scene.camera import Camera, Ending, GivenRays, without_ends
+from ..scene.camera import Camera, Ending, GivenRays, RaySubset
 from ..scene.occupancy import Occupancy
 from ..scene.space import Line, Ray, Space, enter
 from ..xla.memory import in_memory
-from ..xla.trees import PyTree, added, unchecked
-from . import devices
+from ..xla.trees import PyTree, unchecked
 from .tiling import GROUPS_OF_BEAM, Tiling
 
 
 Lanes = Int[Array, "groups rays"]
 
-Source: TypeAlias = Camera | GivenRays | Ending
+Source: TypeAlias = Camera | GivenRays | Ending | RaySubset
 
 
 class RayTiles(eqx.Module):
     """The order of an image's rays.
 
     Attributes:
-        number: of tiles, on each device.
+        number: of tiles.
         beam_count: of beams in each tile.
-
-    Where there are several devices, all but `of` is called inside `devices.split`, and is about the tiles of
-    this device.
     """
 
     number: int = eqx.field(static=True)
@@ -64,24 +59,20 @@ class RayTiles(eqx.Module):
             direct: small ones, for `"direct"`.
             tiles: number of tiles, and of beams in each, in place of those that follow from the tiling.
         """
-        source, shares = without_ends(source), devices.number_of(tiling.devices)
+        source = source.rays if isinstance(source, Ending) else source
         most = tiling.direct_tile if direct else tiling.tile
 
         def divided(beams: Any) -> tuple[int, int]:
             if tiles is not None:
                 return tiles
-            count = max(min(most, -(-beams // shares)), 1)
-            return -(-beams // (count * shares)), count
+            count = max(min(most, beams), 1)
+            return -(-beams // count), count
 
         if isinstance(source, Camera):
             width, height = source.size
             across, down = -(-width // tiling.beam), -(-height // tiling.beam)
-            # if the columns were a multiple of the devices, each device would always get the same ones
-            if shares > 1 and across % shares == 0:
-                across += 1
             return _PixelTiles(*divided(across * down), tiling, source.size, across, down)
-        shape = source.origins.shape[:-1]
-        return _GivenRayTiles(*divided(_beams_of(source, tiling)), tiling, shape)
+        return _GivenRayTiles(*divided(_beams_of(source, tiling)), tiling, _shape_of(source))
 
     @staticmethod
     def shared(source: Camera | GivenRays, tiling: Tiling) -> tuple[int, int]:
@@ -101,13 +92,8 @@ class RayTiles(eqx.Module):
     def scan(
         self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
     ) -> tuple[PyTree, PyTree]:
-        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what else it returns. What it adds to
-        `sums` is summed over all devices."""
-        mesh, every = self.tiling.devices, (jnp.arange(self.number), *each)
-        if mesh is None:
-            return jax.lax.scan(f, sums, every)
-        found, results = jax.lax.scan(f, jax.tree.map(jnp.zeros_like, sums), every)
-        return added(sums, devices.summed(mesh, found)), results
+        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what else it returns."""
+        return jax.lax.scan(f, sums, (jnp.arange(self.number), *each))
 
     def map(self, f: Callable[[PyTree], PyTree], *each: PyTree) -> PyTree:
         """`f((tile, *each))` of the tiles, stacked."""
@@ -115,21 +101,16 @@ class RayTiles(eqx.Module):
 
     def beams(self, tile: Int[Array, ""]) -> Int[Array, " beams"]:
         """The numbers of a tile's beams."""
-        mesh = self.tiling.devices
-        turns = tile * self.beam_count + jnp.arange(self.beam_count)
-        return turns * devices.number_of(mesh) + devices.index_of(mesh)
+        return tile * self.beam_count + jnp.arange(self.beam_count)
 
     def of_beams(self, leaf: Array) -> Array:
-        """From (tiles, groups, rays in a group, *rest) of each device to (beams, rays of a beam, *rest) of
-        all, in their order."""
-        beams = leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
-        return devices.gathered(self.tiling.devices, beams)
+        """From (tiles, groups, rays in a group, *rest) to (beams, rays of a beam, *rest)."""
+        return leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
 
     def of_tiles(self, beams: Array) -> Array:
         """The inverse of `of_beams`; 0 for beams that are missing."""
-        mesh, rest, count = self.tiling.devices, beams.shape[2:], self.number * self.beam_count
-        missing = count * devices.number_of(mesh) - beams.shape[0]
-        beams = devices.own_share(mesh, jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1)))
+        rest, missing = beams.shape[2:], self.number * self.beam_count - beams.shape[0]
+        beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1))
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
         return beams.reshape(self.number, groups, self.tiling.group, *rest)
 
@@ -142,7 +123,7 @@ class RayTiles(eqx.Module):
         self, source: Source, tile: Int[Array, ""], fault: Bool[Array, ""]
     ) -> tuple[Line, Bool[Array, "groups rays"]]:
         """The rays of a tile, up to where they end, and which of them are of the image."""
-        found, wanted = self.lines_of(without_ends(source), tile, fault)
+        found, wanted = self.lines_of(source.rays if isinstance(source, Ending) else source, tile, fault)
         if isinstance(source, Ending):
             found = found._replace(until=self.disassemble(source.until)[tile])
         return found, wanted
@@ -172,12 +153,16 @@ class RayTiles(eqx.Module):
         """The inverse of `assemble`; 0 for rays that only fill up groups."""
 
 
-def _beams_of(source: Camera | GivenRays, tiling: Tiling) -> int:
+def _shape_of(source: GivenRays | RaySubset) -> tuple[int, ...]:
+    return source.indices.shape if isinstance(source, RaySubset) else source.origins.shape[:-1]
+
+
+def _beams_of(source: Camera | GivenRays | RaySubset, tiling: Tiling) -> int:
     """Number of beams that hold all rays."""
     if isinstance(source, Camera):
         width, height = source.size
         return -(-width // tiling.beam) * -(-height // tiling.beam)
-    return -(-math.prod(source.origins.shape[:-1]) // tiling.rays_per_beam)
+    return -(-math.prod(_shape_of(source)) // tiling.rays_per_beam)
 
 
 class _PixelTiles(RayTiles):
@@ -225,25 +210,35 @@ class _PixelTiles(RayTiles):
 
 
 class _GivenRayTiles(RayTiles):
-    """Given rays, in their order."""
+    """Given rays, or some of an image's, in their order."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
     def lines_of(
-        self, source: GivenRays, tile: Int[Array, ""], fault: Bool[Array, ""]
+        self, source: GivenRays | RaySubset, tile: Int[Array, ""], fault: Bool[Array, ""]
     ) -> tuple[Line, Bool[Array, "groups rays"]]:
         count = math.prod(self.shape)
+        if isinstance(source, RaySubset):
+            known, wanted = self._numbers(tile, count)
+            found = lines_at(source.rays, source.indices[known.reshape(-1)])
+            found = jax.tree.map(lambda leaf: leaf.reshape(known.shape), found)
+            x, y, z = found.origin
+            return found._replace(origin=(jnp.where(fault, jnp.nan, x), y, z)), wanted
         if count == 0:  # a row for the look-ups below
             source = GivenRays(
                 *(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions))
             )
-        size = self.tiling.rays_per_beam
-        number = (self.beams(tile)[:, None] * size + jnp.arange(size)[None]).reshape(-1, self.tiling.group)
-        known = jnp.minimum(number, max(count - 1, 0))
+        known, wanted = self._numbers(tile, count)
         x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
         dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
         own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
-        return own, number < count
+        return own, wanted
+
+    def _numbers(self, tile: Int[Array, ""], count: int) -> tuple[Lanes, Bool[Array, "groups rays"]]:
+        """The numbers of a tile's rays, the last one in place of those that are missing; and which exist."""
+        size = self.tiling.rays_per_beam
+        number = (self.beams(tile)[:, None] * size + jnp.arange(size)[None]).reshape(-1, self.tiling.group)
+        return jnp.minimum(number, max(count - 1, 0)), number < count
 
     def box(self, occupancy: Occupancy, rays: Ray) -> Box:
         return box_of_rays(self.tiling, rays, occupancy)
@@ -262,6 +257,8 @@ class _GivenRayTiles(RayTiles):
 
 def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
     """The rays of indices into the flattened image, as the march rounds them."""
+    if isinstance(source, RaySubset):
+        return lines_at(source.rays, source.indices[indices])
     if isinstance(source, Ending):
         return lines_at(source.rays, indices)._replace(until=source.until.reshape(-1)[indices])
     if not isinstance(source, Camera):

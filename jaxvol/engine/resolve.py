@@ -19,9 +19,7 @@ from ..scene.space import Line
 from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import in_front, in_place
 from ..xla.trees import PyTree
-from . import devices
 from .acceleration import VolumeAcceleration
-from .devices import on_devices
 from .rays import lines_at
 from .tiling import RenderOptions, Tiling
 
@@ -33,7 +31,7 @@ Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]
 """What a march found, of rays: `Rendering.rgba`, `Rendering.depth` and `Details.selected`."""
 
 
-def resolve_pixels(
+def resolve_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
     """Pixels, their depths, and their normals where these are asked for, from what the march found."""
@@ -57,9 +55,6 @@ def resolve_pixels(
     return resolved * jnp.where(scene.has_fault, jnp.nan, 1).astype(resolved.dtype)
 
 
-resolve_image = on_devices("replicated")(resolve_pixels)
-
-
 def of_visible(
     some: Callable[..., Float[Array, "chunk numbers"]],
     tiling: Tiling,
@@ -71,7 +66,7 @@ def of_visible(
     """Pixels of so many numbers by `some(indices, *found)`, called for a chunk of visible pixels at a time,
     or once, for all pixels, if `Tiling.chunk` is 0. Transparent pixels are 0, at infinite depth; they are
     computed, too, for their derivatives, if asked for the `whole`."""
-    shape, size, mesh = found[1].shape, tiling.chunk, tiling.devices
+    shape, size = found[1].shape, tiling.chunk
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
     visible = flat[0][:, 3] != 0
     nothing = jnp.zeros((visible.size, numbers), flat[0].dtype).at[:, 4].set(jnp.inf)
@@ -80,11 +75,7 @@ def of_visible(
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
     flat = (flat[0], *jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), flat[1:]))
     asked = jnp.ones_like(visible) if whole else visible
-    number, count = devices.number_of(mesh), jnp.sum(asked, dtype=jnp.int32)
-    if size > 0:
-        chosen = in_front(asked, size * number)
-    else:
-        chosen = in_place(jnp.pad(asked, (0, -visible.size % number)))
+    count, chosen = jnp.sum(asked, dtype=jnp.int32), in_front(asked, size) if size > 0 else in_place(asked)
 
     # recomputed in the backward pass, where its states would take memory for all rays
     @jax.checkpoint
@@ -97,11 +88,11 @@ def of_visible(
         none = jnp.zeros((size, numbers), nothing.dtype)
         return jax.lax.cond(start < count, computed, lambda _: none, indices)
 
-    starts = jnp.arange(0, chosen.size, size, dtype=jnp.int32) if size > 0 else chosen
-    own = devices.own_share(mesh, starts)
-    pixels = jax.lax.map(chunk, own) if size > 0 else computed(own)
-    pixels = devices.gathered(mesh, pixels).reshape(-1, numbers)
-    pixels = nothing.at[chosen].set(pixels, mode="drop")
+    if size > 0:
+        pixels = jax.lax.map(chunk, jnp.arange(0, chosen.size, size, dtype=jnp.int32))
+    else:
+        pixels = computed(chosen)
+    pixels = nothing.at[chosen].set(pixels.reshape(-1, numbers), mode="drop")
     if whole:
         pixels = pixels.at[:, 4].set(jnp.where(visible, pixels[:, 4], jnp.inf))
     return pixels.reshape(*shape, numbers)

@@ -92,7 +92,7 @@ class Passed(NamedTuple):
 
 def is_staged(scene: Scene, options: RenderOptions) -> bool:
     """Whether the image of a scene that is not traced is rendered here."""
-    if options.tiling.devices is not None or options.adjoint == "direct":
+    if options.adjoint == "direct":
         return False
     # an index of one's own may ask anything of the view
     return all(type(leap) is SpaceLeaping for leap in scene.march.overriding("empty_space"))

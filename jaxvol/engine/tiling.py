@@ -4,7 +4,6 @@ import math
 from typing import Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
-from jax.sharding import Mesh
 
 from ..compositing.blending import Outputs
 from ..xla.compaction import CHUNK
@@ -43,7 +42,6 @@ class Tiling(NamedTuple):
         chunk: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
         least: beams of a tile at least, so that a few rays are marched by the program of an image.
         squares: whether given rays are those of squares of a camera's pixels, beam by beam.
-        devices: between which beams are sharded, a mesh of one axis; None where JAX decides.
     """
 
     cells: int = 8
@@ -58,7 +56,6 @@ class Tiling(NamedTuple):
     chunk: int = CHUNK
     least: int = 0
     squares: bool = False
-    devices: Mesh | None = None
 
     def batch_of(self, groups: int) -> int:
         """Groups of so many that are marched at a time. Of few, a part only: an image that is one batch goes
@@ -82,10 +79,10 @@ class Tiling(NamedTuple):
         return self.beam**2
 
     @classmethod
-    def of_backend(cls, devices: Mesh | None = None) -> "Tiling":
-        """The sizes for programs that are traced now, on these devices: `GPU` where they are for one, the
-        defaults, which were measured on CPUs, elsewhere."""
-        return (GPU if on_gpu() else Tiling())._replace(devices=devices)
+    def of_backend(cls) -> "Tiling":
+        """The sizes for programs that are traced now: `GPU` where they are for one, the defaults, which were
+        measured on CPUs, elsewhere."""
+        return GPU if on_gpu() else Tiling()
 
 
 class RenderOptions(eqx.Module):

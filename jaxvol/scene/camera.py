@@ -378,9 +378,16 @@ class Ending(eqx.Module):
     until: Float[Array, "*rays"]
 
 
-def without_ends(source: Camera | GivenRays | Ending) -> Camera | GivenRays:
-    """Where rays come from, whether they end or not."""
-    return source.rays if isinstance(source, Ending) else source
+class RaySubset(eqx.Module):
+    """Some rays of an image, by indices into it as it is flattened."""
+
+    rays: Camera | GivenRays | Ending
+    indices: Int[Array, " n"]
+
+
+def without_ends(source: Camera | GivenRays | Ending | RaySubset) -> Camera | GivenRays:
+    """Where rays come from, whether they end or not, and whether they are all."""
+    return source if isinstance(source, Camera | GivenRays) else without_ends(source.rays)
 
 
 def finer(camera: Camera, n: int) -> Camera:

@@ -13,19 +13,18 @@ from jax.sharding import Mesh, PartitionSpec as P
 
 import jaxvol as jv
 from jaxvol.engine import devices
-from jaxvol.engine.rays import RayTiles
 from jaxvol.engine.tiling import Tiling
 from jaxvol.lighting import Phong
 
 from ..bricks import scenes
-from ..bricks.scenes import CAMERA, LEAPING, PLACE, TRANSFER, assert_same as assert_same_bricks
+from ..bricks.scenes import CAMERA, LEAPING, PLACE, TRANSFER
 from ..scenes import CAMERAS, RESOLUTION, anisotropic_noise, around, soft_transfer
 
 
 SIZE = (65, 43)  # 9 x 6 beams, the last ones cut
 MOVING = (jv.Jitter(5), jv.SpaceLeaping(), jv.AlphaCorrection(), jv.EarlyTermination(1e-3))
-SHIFTED = (jv.EmptySpaceJitter(4), jv.SpaceLeaping(), jv.AlphaCorrection())
-FIELDS = ("rgba", "depth", "samples", "aligned", "exhausted", "normal")
+FIELDS = ("rgba", "depth", "aligned", "exhausted", "normal")
+"""How many samples are taken depends on which rays leap together."""
 
 
 def all_devices() -> list[Any]:
@@ -103,24 +102,11 @@ def balance(_: Any):
         "a ball": np.hypot(x - 200, y - 270) < 60,
     }
     for name, seen in objects.items():
-        counts = on_each(jnp.asarray(seen, jnp.int32))
+        _, dealt, place = devices.dealt_rays(around(blocks(), (512, 512)), Tiling(), 8)
+        np.testing.assert_array_equal(dealt[place], np.arange(seen.size))
+        counts = seen.reshape(-1)[dealt].reshape(8, -1).sum(axis=1)
         assert counts.sum() == seen.sum()
         assert counts.min() > 0.8 * counts.mean(), (name, counts)
-
-
-def on_each(image: jax.Array) -> np.ndarray:
-    """The sum of an image's pixels over those that each of all devices has."""
-    height, width = image.shape
-    tiles = RayTiles.of(around(blocks(), (width, height)), Tiling(devices=devices.mesh_of(all_devices())))
-
-    def own(image: jax.Array, _: None) -> tuple[jax.Array, jax.Array]:
-        mine = tiles.disassemble(image)
-        return tiles.assemble(mine), jnp.sum(mine)[None]
-
-    whole, counts = devices.split(tiles.tiling.devices, own, image, None)
-    np.testing.assert_array_equal(whole, image)
-    assert [shard.device for shard in counts.addressable_shards] == all_devices()
-    return np.asarray(counts)
 
 
 # ---- slow ----
@@ -206,22 +192,15 @@ def rays(_: Any):
 
 
 def bricks(_: Any):
-    """Owned by more and by fewer devices than there are, lit and clipped. And with rays dealt out: with
-    shifts that depend on what lies in front, and with curved rays."""
+    """Owned by more and by fewer devices than there are, lit and clipped."""
     volume, every = blocks(), all_devices()
     clipped: tuple[jv.Transform, ...] = (jv.Jitter(2), jv.Clip((-0.2, 0.9, -0.9, 0.3, 0, 1.9)))
     given = volume, thin(), CAMERAS["orthographic"](volume, SIZE), jv.March(0.05, clipped)
     one = jv.render(*given, lighting=Phong())
     for number, counts in ((3, (2, 2, 2)), (8, (1, 1, 2))):
-        how = {"devices": every[:number], "own": "bricks", "lighting": Phong()}
+        how = {"devices": every[:number], "lighting": Phong()}
         found = jv.render_bricks(*given, bricks=counts, **how)
         assert_same(found, one, 2e-5, ("rgba", "depth", "aligned", "exhausted"))
-    given = volume, thin(), around(volume, SIZE), jv.March(0.05, SHIFTED)
-    dealt = jv.render_bricks(*given, bricks=(2, 2, 2), devices=every)
-    assert_same(dealt, jv.render(*given), 2e-5, ("rgba", "depth", "exhausted"))
-    given = scenes.fog(), scenes.SHEETS, scenes.FROM_THE_SIDE, scenes.CURVED
-    found = jv.render_bricks(*given, bricks=(1, 1, 4), devices=every)
-    assert_same_bricks(found, scenes.whole_fog())
 
 
 def run(known: str, *names: str) -> None:

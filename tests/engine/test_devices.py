@@ -158,11 +158,9 @@ def test_what_does_not_join_front_to_back_is_refused_where_bricks_are_owned(tran
     volume, march = anisotropic_noise(), jv.March(0.07, transforms)
 
     def image(transfer):
-        return jv.render_bricks(
-            volume, transfer, around(volume), march, devices=jax.devices(), own="bricks", **more
-        )
+        return jv.render_bricks(volume, transfer, around(volume), march, devices=jax.devices(), **more)
 
-    with pytest.raises(ValueError, match=f'own="bricks" does not go with {message}.* Use own="rays"'):
+    with pytest.raises(ValueError, match=f"devices, which own bricks, do not go with {message}"):
         image(soft_transfer())
 
 

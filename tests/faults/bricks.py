@@ -34,9 +34,9 @@ def _only(brick: int, empty: Any) -> Any:
 
 FAULTS = [
     Fault(
-        "devices: gradients are not summed over them",
-        "engine.devices:summed",
-        lambda _: lambda mesh, tree: tree,
+        "devices: each ray of a beam that is not full is taken for another",
+        "engine.devices:dealt_rays",
+        lambda dealt: lambda *given: (*dealt(*given)[:2], dealt(*given)[2][::-1]),
         (DEVICES,),
     ),
     Fault(
