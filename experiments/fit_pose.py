@@ -25,6 +25,15 @@ SIGMAS = {"from coarse to fine": (1 / 16, 1 / 48, 0.0), "as they are": (0.0,)}
 """Standard deviations of the blurs in the stages of a fit, as a part of the image's height."""
 
 
+def coarse_to_fine(residual: jv.ImageResidual, start: Any, blurs: Any, **options: Any) -> list[jv.Fit]:
+    """Fits to images blurred less and less, each from where the last one ended."""
+    fits: list[jv.Fit] = []
+    for blur in blurs:
+        start = fits[-1].parameters if fits else start
+        fits.append(jv.fit(residual.blurred(blur), start, **options))
+    return fits
+
+
 def measure(sigmas: tuple[float, ...], chosen: Namespace) -> list[dict[str, Any]]:
     """How far from the truth each start ends, for a sequence of blurs."""
     volume, transfer, march = fit_transfer.head(None, chosen.resolution)
@@ -36,7 +45,7 @@ def measure(sigmas: tuple[float, ...], chosen: Namespace) -> list[dict[str, Any]
         turn, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         off = {"rotation": np.deg2rad(ANGLE) * turn, "translation": SHIFT * shift}
         camera = pose.forward(jax.tree.map(jnp.float32, off))
-        fits = jv.fit_coarse_to_fine(residual, camera, blurs=sigmas, max_steps=40)
+        fits = coarse_to_fine(residual, camera, sigmas, max_steps=40)
         left = pose.inverse(fits[-1].parameters)
         rows.append(
             {

@@ -21,6 +21,7 @@ import numpy as np
 import jaxvol as jv
 
 from . import charts
+from .choice import Candidate, choose, nested_points
 from .harness import experiment
 from .scenes import grid, on_cube
 
@@ -47,7 +48,7 @@ class Problem(NamedTuple):
     """What is to be chosen: candidates, and parameters drawn from one of them, as a scene takes them."""
 
     scene: Callable[[Any, jv.Camera], tuple[Any, ...]]
-    candidates: list[jv.Candidate]
+    candidates: list[Candidate]
     draw: Callable[[np.random.Generator, int], Any]
     """`draw(generator, candidate)`: a truth."""
     labels: list[str]
@@ -86,7 +87,7 @@ def materials(resolution: int) -> Problem:
     return Problem(scene, candidates, draw, [str(max(classes) + 1) for classes in CLASSES])
 
 
-def nested_materials(parts: Sequence[jv.Material], partitions: Sequence[Sequence[int]]) -> list[jv.Candidate]:
+def nested_materials(parts: Sequence[jv.Material], partitions: Sequence[Sequence[int]]) -> list[Candidate]:
     """Candidates in which more and more materials have a mean free path of their own. `partitions`: for each
     the class of each material, numbered from 0 on, which divide those of the one before."""
 
@@ -107,7 +108,7 @@ def nested_materials(parts: Sequence[jv.Material], partitions: Sequence[Sequence
     for before, classes in zip([None, *partitions], partitions, strict=False):
         start: dict[str, Any] = {"start": first_of_each(parts, classes)}
         start = start if before is None else {"grow": partial(grow, before, classes)}
-        made.append(jv.Candidate(f"{max(classes) + 1} classes", expand=partial(expand, classes), **start))
+        made.append(Candidate(f"{max(classes) + 1} classes", expand=partial(expand, classes), **start))
     return made
 
 
@@ -129,7 +130,7 @@ def control_points(resolution: int, numbers: Sequence[int]) -> Problem:
         colors = generator.uniform(0.1, 0.9, (len(values), 3))
         return jv.TransferFunction(values, colors, np.exp(generator.uniform(-2, 1, len(values))))
 
-    return Problem(scene, jv.nested_points(functions[0], numbers), draw, list(map(str, numbers)))
+    return Problem(scene, nested_points(functions[0], numbers), draw, list(map(str, numbers)))
 
 
 def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any]:
@@ -147,7 +148,7 @@ def trial(problem: Problem, size: int, seed: int, noise: float) -> dict[str, Any
         return jv.ImageResidual(problem.scene, some)
 
     how: dict[str, Any] = {"views": views[:SEEN], "block": 1, "max_steps": 40}
-    choice = jv.choose(residual, problem.candidates, views[SEEN:], **how)
+    choice = choose(residual, problem.candidates, views[SEEN:], **how)
     print(f"seed {seed}, noise {noise}, truth {problem.candidates[truth].name}\n{choice}", flush=True)
     # of independent Gaussian residuals of one unknown variance; losses below -80 dB count as equal
     references = residual(views[:SEEN]).references

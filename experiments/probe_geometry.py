@@ -24,6 +24,7 @@ import numpy as np
 import jaxvol as jv
 
 from . import harness
+from .fit_pose import coarse_to_fine
 from .harness import experiment
 
 
@@ -112,7 +113,7 @@ def recovered(
     scene: Scene, targets: list[Any], truth: jv.ToroidalMap, start: jv.ToroidalMap
 ) -> dict[str, Any]:
     """Errors of all numbers and their standard errors, relative to `scales`, of the fit from this start."""
-    *_, fit = fits = jv.fit_coarse_to_fine(jv.ImageResidual(scene, targets), start, blurs=BLURS, **HOW)
+    *_, fit = fits = coarse_to_fine(jv.ImageResidual(scene, targets), start, BLURS, **HOW)
     assert fit.uncertainty is not None
     errors = (numbers(fit.parameters) - numbers(truth)) / scales(truth)
     deviations = np.sqrt(np.diag(fit.uncertainty.covariance)) / scales(truth)

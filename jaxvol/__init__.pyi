@@ -14,8 +14,6 @@ from .compositing.line_integral import LineIntegral as LineIntegral
 from .compositing.projections import Average as Average, Maximum as Maximum, Minimum as Minimum
 from .compositing.selection import FirstVisible as FirstVisible, Selection as Selection
 from .fitting import (
-    Candidate as Candidate,
-    Choice as Choice,
     Fit as Fit,
     Fixed as Fixed,
     ImageResidual as ImageResidual,
@@ -28,11 +26,8 @@ from .fitting import (
     Uncertainty as Uncertainty,
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
-    choose as choose,
     fit as fit,
-    fit_coarse_to_fine as fit_coarse_to_fine,
     flat_grey as flat_grey,
-    nested_points as nested_points,
     read_transfer as read_transfer,
     read_views as read_views,
     refined as refined,

@@ -10,22 +10,11 @@ from .bijections import (
     Unconstrained as Unconstrained,
     UnitInterval as UnitInterval,
 )
-from .candidates import (
-    Candidate as Candidate,
-    flat_grey as flat_grey,
-    nested_points as nested_points,
-    refined as refined,
-)
-from .choice import Choice as Choice, Evidence as Evidence, choose as choose
 from .constraints import unconstrain as unconstrain
-from .driver import (
-    Fit as Fit,
-    Outcome as Outcome,
-    fit as fit,
-    fit_coarse_to_fine as fit_coarse_to_fine,
-)
+from .driver import Fit as Fit, Outcome as Outcome, fit as fit
 from .files import read_transfer as read_transfer, read_views as read_views, write_transfer as write_transfer
 from .path_traced import PathTracedResidual as PathTracedResidual
 from .registration import Registration as Registration, register as register
 from .residuals import ImageResidual as ImageResidual
+from .starts import flat_grey as flat_grey, refined as refined
 from .uncertainty import Uncertainty as Uncertainty

@@ -1,7 +1,6 @@
 """Checkpoints, so that a fit survives being killed: one line of JSON that describes it, then its arrays."""
 
 import json
-from os import PathLike
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,12 +10,6 @@ from .._util.whole_files import whole_file
 
 
 T = TypeVar("T")
-
-
-def numbered(file: str | PathLike[str], at: int) -> Path:
-    """The file of one of several fits: `fit-1.ckpt` of the first, for `fit.ckpt`."""
-    path = Path(file)
-    return path.with_name(f"{path.stem}-{at + 1}{path.suffix}")
 
 
 def save(path: Path, state: Any, about: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ fit calls back, writes checkpoints, can be interrupted, and gives back the best 
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, described, integer, not_negative, output_file
+from .._util.checks import integer, not_negative, output_file
 from ..xla.trees import PyTree
 from . import checkpoints
 from .constraints import Free, FreeVariables, Where, size
@@ -192,46 +192,6 @@ def fit(
         if file is not None:
             checkpoints.save(file, run, {**about, "losses": losses})
     return _report(run, problem, losses, limits, result)
-
-
-def fit_coarse_to_fine(
-    residual: ImageResidual | Any,
-    parameters: PyTree,
-    *,
-    blurs: Sequence[Arrayable | None] | Any = (1 / 8, 1 / 32, None),
-    checkpoint: str | PathLike[str] | None = None,
-    **options: Any,
-) -> list[Fit]:
-    """Fit parameters to images blurred less and less, each fit from where the last ended.
-
-    A derivative describes only features that move by less than their own size. In blurred images features are
-    large, so that a pose or a geometry is found from farther away; sharp images at last make it exact. Steps
-    must be of a voxel or shorter: under longer ones, fine texture is sampled too sparsely, and fits stall.
-
-    Args:
-        residual: an `ImageResidual`. Its own `blur` is not used.
-        parameters: the starting point.
-        blurs: of each fit, in order, as `ImageResidual`'s. End with None: only the standard errors of an
-            unblurred fit are right.
-        checkpoint: a file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
-        options: others of `fit`, for all fits. A `patience` of 4 saves steps.
-
-    Returns:
-        The fits, in order. The last one's `parameters` and `uncertainty` are the result.
-
-    Raises:
-        ValueError: for no blurs, for what is not an `ImageResidual`, and as `fit`.
-    """
-    if not isinstance(residual, ImageResidual):
-        raise ValueError(f"residual must be an ImageResidual, to be blurred; got {described(residual)}.")
-    if len(blurs) == 0:
-        raise ValueError("blurs must hold at least one, such as None; got none.")
-    fits: list[Fit] = []
-    for at, blur in enumerate(blurs):
-        file = None if checkpoint is None else checkpoints.numbered(checkpoint, at)
-        fits.append(fit(residual.blurred(blur), parameters, checkpoint=file, **options))
-        parameters = fits[-1].parameters
-    return fits
 
 
 def _solver(solver: Any, residual: Any, rtol: float, atol: float) -> tuple[Any, int]:

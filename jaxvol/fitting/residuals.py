@@ -93,9 +93,12 @@ class ImageResidual(eqx.Module):
             loss is then half the weighted mean squared error, whatever the sum of the weights. For pixels of
             known noise, 1 / noise² gives the smallest standard errors.
         blur: compare blurred images: standard deviation of a Gaussian, as a fraction of the image's height,
-            for `fit_coarse_to_fine`. Whole images are then differentiated at once. Pixels beyond the border
-            do not count. Standard errors are too small, since the noise of blurred pixels is not independent:
-            take those of a last fit without blur.
+            to fit from coarse to fine. A derivative describes only features that move by less than their own
+            size: in blurred images these are large, so that a pose or a geometry is found from farther away
+            (fit `residual.blurred(blur)` for blurs such as 1/8, 1/32 and None, each from where the last one
+            ended). Whole images are then differentiated at once. Pixels beyond the border do not count.
+            Standard errors are too small, since the noise of blurred pixels is not independent: take those of
+            a last fit without blur.
 
     Raises:
         ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or

@@ -186,11 +186,11 @@ def test_cells_of_curved_rays_are_found_under_64_bits():
     scene = scene_of(source_of(fog()), SHEETS, FROM_THE_SIDE, CURVED, "over", None)
 
     def cells_of(scene):
-        underway = begin_image(scene, RenderOptions("all", Tiling.of_backend(None)))
+        underway = begin_image(scene, RenderOptions("all", Tiling.of_backend()))
         grid, empty = BrickGrid(fog().shape, (24, 16, 16)), jnp.zeros(5, bool).at[4].set(True)
         visit = jnp.asarray(0, jnp.int32), empty.at[0].set(True), empty
         reached = jnp.zeros(underway.rays.length.shape, jnp.int32)
-        return _curved(None, 1, grid, 11, scene.march, (underway.rays, underway.at, reached), visit)
+        return _curved(1, grid, 11, scene.march, (underway.rays, underway.at, reached), visit)
 
     with in_float64():
         found = eqx.filter_eval_shape(cells_of, to_float64(scene))

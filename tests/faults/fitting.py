@@ -96,12 +96,6 @@ FAULTS: list[Fault] = [
         ("fitting/test_probe_geometry.py::test_every_free_number_is_a_valid_probe_with_a_finite_slope",),
     ),
     Fault(
-        "choice: the least held-out loss decides",
-        "fitting.choice:standard_error",
-        lambda error: lambda *residuals: 0.0,
-        ("fitting/test_choice.py::test_the_truth_is_chosen_in_nine_of_ten_noisy_trials",),
-    ),
-    Fault(
         "plan: an error that is known from a part of the image is taken as it is",
         "planning.probe:CONFIDENT",
         lambda errors: 0.0,

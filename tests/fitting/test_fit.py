@@ -222,25 +222,6 @@ def test_what_a_mask_leaves_counts_as_the_cropped_image_does():
         np.testing.assert_allclose(masked, cropped, rtol=1e-4)
 
 
-def test_coarse_to_fine_is_one_fit_after_the_other(monkeypatch):
-    calls = []
-
-    def fit(residual, parameters, **options):
-        calls.append((residual.blur, parameters, options["patience"], options["checkpoint"]))
-        found = object.__new__(jv.Fit)
-        object.__setattr__(found, "parameters", parameters + 1)
-        return found
-
-    monkeypatch.setattr("jaxvol.fitting.driver.fit", fit)
-    residual = jv.ImageResidual(seen, [(camera(DIRECTIONS[0]), BLANK)], blur=0.3)
-    how: Any = {"patience": 4, "checkpoint": "folder/a.ckpt"}
-    fits = jv.fit_coarse_to_fine(residual, 5, blurs=(0.25, 0.125, None), **how)
-    stages = (0.25, 5), (0.125, 6), (None, 7)
-    files = [Path(f"folder/a-{number}.ckpt") for number in (1, 2, 3)]
-    assert calls == [(*stage, 4, file) for stage, file in zip(stages, files, strict=True)]
-    assert [each.parameters for each in fits] == [6, 7, 8]
-
-
 @pytest.mark.slow
 def test_tiles_make_no_difference_and_the_gradient_is_that_of_the_triangle():
     """Of views of two sizes, one of them with transparency."""
@@ -347,10 +328,6 @@ def of_images(scene=seen, max_jacobian=2**30, **how):
     return lambda: jv.fit(images(scene=scene, **how), GREY, max_jacobian=max_jacobian)
 
 
-def coarse_to_fine(residual=images, **how):
-    return lambda: jv.fit_coarse_to_fine(residual() if residual is images else residual, GREY, **how)
-
-
 HERE = Path(__file__).parent
 BAD = [
     (lambda: images(BLANK[:4]), r"views\[0\].*\(16, 20, n\).*\(4, 20, 3\)"),
@@ -406,8 +383,6 @@ BAD = [
     (of_curve(max_steps=0), "max_steps must be an integer of at least 1"),
     (of_curve(rtol=-1), "rtol must not be negative; got -1"),
     (of_curve(max_jacobian=100), "max_jacobian leaves room for 8 of the"),
-    (coarse_to_fine(curve), "residual must be an ImageResidual, to be blurred; got"),
-    (coarse_to_fine(blurs=()), "blurs must hold at least one"),
 ]
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from experiments.choice import Candidate, choose, nested_points, standard_error
 from experiments.model_choice import nested_materials
-from jaxvol.fitting.choice import standard_error
 
 
 # Polynomials through noisy points, which compile once for all trials. A view is a pair of arrays (x, y).
@@ -42,8 +42,8 @@ def zeros(n):
 
 
 POLYNOMIALS = [
-    jv.Candidate("1", zeros(1)),
-    *(jv.Candidate(str(n), grow=one_more) for n in range(2, DEGREES + 1)),
+    Candidate("1", zeros(1)),
+    *(Candidate(str(n), grow=one_more) for n in range(2, DEGREES + 1)),
 ]
 
 
@@ -59,7 +59,7 @@ def views_of(truth, noise, seed):
 
 
 def of_views(views, candidates=POLYNOMIALS, **options):
-    return jv.choose(polynomial, candidates, views[4:], views=views[:4], **options)
+    return choose(polynomial, candidates, views[4:], views=views[:4], **options)
 
 
 @cache
@@ -135,7 +135,7 @@ def test_the_table_marks_the_chosen_one():
 
 def test_undetermined_directions_and_fits_out_of_steps_are_told():
     # three numbers in place of one, which it cannot tell apart
-    apart = jv.Candidate("apart", zeros(3), expand=lambda c: jnp.stack([0 * c[0], 0 * c[0], jnp.sum(c)]))
+    apart = Candidate("apart", zeros(3), expand=lambda c: jnp.stack([0 * c[0], 0 * c[0], jnp.sum(c)]))
     views = views_of(3, 0.1, 1)
     choice = of_views(views, [*POLYNOMIALS[:2], apart])  # no warning: filterwarnings makes errors of them
     assert [(row.numbers, row.determined) for row in choice.candidates] == [(1, 1), (2, 2), (3, 1)]
@@ -223,7 +223,7 @@ SEEN = [blank(direction) for direction in DIRECTIONS]
 @pytest.mark.slow
 def test_control_points_are_counted_from_images():
     """Candidates of 2 and 3 points, with only their extinction free, and a truth of each."""
-    models = jv.nested_points(PLAIN, (2, 3), where=lambda transfer: transfer.extinction)
+    models = nested_points(PLAIN, (2, 3), where=lambda transfer: transfer.extinction)
     rng = np.random.default_rng(0)
     for points in ((0.2, 2.0), (0.2, 2.0, 0.5)):
         truth = jv.TransferFunction(np.linspace(0, 1, len(points)), np.full((len(points), 3), 0.5), points)
@@ -237,7 +237,7 @@ def test_control_points_are_counted_from_images():
                 return jv.ImageResidual(scene, some, weights=[masks[id(view)] for view in some])
 
             masked = [columns > 0, rows > 1]
-            choice = jv.choose(residual, models, views[2:], views=views[:2], max_steps=20)
+            choice = choose(residual, models, views[2:], views=views[:2], max_steps=20)
             assert choice.name == f"{len(points)} points"
             assert [row.numbers for row in choice.candidates] == [2, 3]
             # the loss of an image is half its mean square error, and that of several is their mean
@@ -257,7 +257,7 @@ NOISY = views_of(2, 0.1, 0)
 
 
 def one(name, n):
-    return jv.Candidate(name, zeros(n))
+    return Candidate(name, zeros(n))
 
 
 def given(*candidates, **changes):
@@ -267,11 +267,11 @@ def given(*candidates, **changes):
         "views": NOISY[:4],
         **changes,
     }
-    return lambda: jv.choose(arguments.pop("residual", polynomial), **arguments)
+    return lambda: choose(arguments.pop("residual", polynomial), **arguments)
 
 
 def points(*numbers, start: Any = PLAIN):
-    return lambda: jv.nested_points(start, numbers)
+    return lambda: nested_points(start, numbers)
 
 
 BAD = [
@@ -283,7 +283,7 @@ BAD = [
     (given(one("b", 2), one("a", 1)), "candidates must be in order, .*'a', has 1 after 2"),
     (given(one("b", 2), one("a", 2)), "'a', has 2 after 2"),
     (given(*POLYNOMIALS[1:]), r"candidates\[0\] must have a start, or, after the first, grow"),
-    (given(one("1", 1), jv.Candidate("b", zeros(2), one_more)), r"\[1\] must have a start, or"),
+    (given(one("1", 1), Candidate("b", zeros(2), one_more)), r"\[1\] must have a start, or"),
     (given(held_out=NOISY[3:]), "held_out must not be among the views that are fitted"),
     (given(held_out=[tuple(map(np.array, NOISY[1]))]), "held_out must not be among the views"),
     (given(residual=jv.ImageResidual(scene, SEEN)), "residual must be a function of a list of views; got"),

@@ -11,7 +11,10 @@ is confined to few blocks, the second is wrong where variances differ: the large
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import pairwise
 from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,18 +23,65 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from .._util.checks import described, integer, not_negative
-from ..xla.trees import PyTree
-from . import checkpoints
-from .candidates import Candidate
-from .constraints import Free, size
-from .driver import UNDETERMINED, Fit, fit
-from .residuals import ImageResidual
-from .uncertainty import MISFIT
+import jaxvol as jv
+from jaxvol import Fit, ImageResidual, fit
+from jaxvol._util.checks import described, integer, not_negative
+from jaxvol.fitting.constraints import Free, Where, size
+from jaxvol.fitting.driver import UNDETERMINED
+from jaxvol.fitting.uncertainty import MISFIT
+from jaxvol.xla.trees import PyTree
 
 
 RESOLUTION = 1e-4
 """Residuals below this fraction of the data's norm count as equal."""
+
+
+class Candidate(NamedTuple):
+    """A model that `choose` may choose.
+
+    Attributes:
+        name: in the table of results.
+        start: the parameters that its fit starts from, as for `fit`; or
+        grow: `grow(found)` makes them from the fitted parameters of the candidate before. Give one of the
+            two.
+        expand: `expand(parameters)` is what the residual takes; by default the parameters themselves.
+        constraints: as for `fit`, of the model's own parameters.
+        where: as for `fit`, of the model's own parameters.
+    """
+
+    name: str
+    start: PyTree = None
+    grow: Callable[[PyTree], PyTree] | None = None
+    expand: Callable[[PyTree], PyTree] = lambda parameters: parameters
+    constraints: PyTree = None
+    where: Where | None = None
+
+
+def nested_points(
+    start: jv.TransferFunction | Any, points: Sequence[int] | Any = (2, 4, 8, 16), **of_each: Any
+) -> list[Candidate]:
+    """Candidates that are transfer functions of more and more control points.
+
+    Args:
+        start: where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
+            of points.
+        points: increasing numbers of control points. Each candidate keeps those of the one before.
+        of_each: other fields of each `Candidate`, such as `constraints`.
+
+    Returns:
+        The candidates, for `choose`, from the fewest points to the most.
+
+    Raises:
+        ValueError: for numbers that do not increase, or fewer than `start` has.
+    """
+    if not isinstance(start, jv.TransferFunction):
+        raise ValueError(f"start must be a TransferFunction; got {described(start)}.")
+    numbers = [integer("points", number, 2) for number in points]
+    if not numbers or any(b <= a for a, b in pairwise(numbers)):
+        raise ValueError(f"points must be increasing numbers of control points; got {points!r}.")
+    first = Candidate(f"{numbers[0]} points", jv.refined(start, numbers[0]), **of_each)
+    larger = (Candidate(f"{n} points", grow=partial(jv.refined, points=n), **of_each) for n in numbers[1:])
+    return [first, *larger]
 
 
 class Evidence(NamedTuple):
@@ -104,9 +154,9 @@ def choose(
 ) -> Choice:
     """Fit nested models and choose the smallest that agrees with held-out views as well as the best does.
 
-        models = jv.nested_points(jv.flat_grey(volume, 2), (2, 4, 8, 16))
+        models = nested_points(jv.flat_grey(volume, 2), (2, 4, 8, 16))
         residual = lambda some: jv.ImageResidual(scene, some)
-        choice = jv.choose(residual, models, views=views[:4], held_out=views[4:])
+        choice = choose(residual, models, views=views[:4], held_out=views[4:])
         print(choice)
 
     Each candidate is fitted to the training views, and evaluated on the held-out views. The best one has the
@@ -163,7 +213,8 @@ def choose(
         start = candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters)
         how = {**options, "constraints": candidate.constraints, "where": candidate.where}
         if checkpoint is not None:
-            how["checkpoint"] = checkpoints.numbered(checkpoint, at)
+            path = Path(checkpoint)
+            how["checkpoint"] = path.with_name(f"{path.stem}-{at + 1}{path.suffix}")
         with warnings.catch_warnings():
             for message in (UNDETERMINED, MISFIT):
                 warnings.filterwarnings("ignore", message=message)

@@ -1,18 +1,14 @@
-"""Where fits start: from flat grey, or, for nested models, where the fit of a smaller one has ended."""
+"""Where fits of transfer functions start: from flat grey, or from one of fewer control points."""
 
-from collections.abc import Callable, Sequence
-from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._util.checks import Arrayable, described, finite_array, integer, require
+from .._util.checks import Arrayable, finite_array, integer, require
 from ..scene.transfer import TransferFunction
 from ..scene.volume import Volume
-from ..xla.trees import PyTree
-from .constraints import Where
 
 
 def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = None) -> TransferFunction:
@@ -68,51 +64,3 @@ def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
 
     rows = divided(values), divided(transfer.colors), divided(transfer.extinction)
     return TransferFunction(*rows, per_voxel=transfer.per_voxel)
-
-
-class Candidate(NamedTuple):
-    """A model that `choose` may choose.
-
-    Attributes:
-        name: in the table of results.
-        start: the parameters that its fit starts from, as for `fit`; or
-        grow: `grow(found)` makes them from the fitted parameters of the candidate before. Give one of the
-            two.
-        expand: `expand(parameters)` is what the residual takes; by default the parameters themselves.
-        constraints: as for `fit`, of the model's own parameters.
-        where: as for `fit`, of the model's own parameters.
-    """
-
-    name: str
-    start: PyTree = None
-    grow: Callable[[PyTree], PyTree] | None = None
-    expand: Callable[[PyTree], PyTree] = lambda parameters: parameters
-    constraints: PyTree = None
-    where: Where | None = None
-
-
-def nested_points(
-    start: TransferFunction | Any, points: Sequence[int] | Any = (2, 4, 8, 16), **of_each: Any
-) -> list[Candidate]:
-    """Candidates that are transfer functions of more and more control points.
-
-    Args:
-        start: where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
-            of points.
-        points: increasing numbers of control points. Each candidate keeps those of the one before.
-        of_each: other fields of each `Candidate`, such as `constraints`.
-
-    Returns:
-        The candidates, for `choose`, from the fewest points to the most.
-
-    Raises:
-        ValueError: for numbers that do not increase, or fewer than `start` has.
-    """
-    if not isinstance(start, TransferFunction):
-        raise ValueError(f"start must be a TransferFunction; got {described(start)}.")
-    numbers = [integer("points", number, 2) for number in points]
-    if not numbers or any(b <= a for a, b in pairwise(numbers)):
-        raise ValueError(f"points must be increasing numbers of control points; got {points!r}.")
-    first = Candidate(f"{numbers[0]} points", refined(start, numbers[0]), **of_each)
-    larger = (Candidate(f"{n} points", grow=partial(refined, points=n), **of_each) for n in numbers[1:])
-    return [first, *larger]
