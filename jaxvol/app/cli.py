@@ -54,7 +54,7 @@ examples:
   jaxvol info "$FILE"
   jaxvol render "$FILE"
   jaxvol render "$FILE" --preset engine --direction -0.7 -1 0.25 -o engine.png
-  jaxvol render --like engine.png --size 1024 1024 -o large.png
+  jaxvol render "$FILE" --like engine.png --size 1024 1024 -o large.png
   jaxvol animate "$FILE" --preset engine --frames 48 -o engine.gif
   jaxvol fit "$FILE" --images a.png b.png --cameras cameras.json -o transfer.json
 """

@@ -32,12 +32,6 @@ FAULTS: list[Fault] = [
         ("app/commands/test_command.py::test_bad_files_are_told_in_one_line",),
     ),
     Fault(
-        "like: what a picture names is read whatever it is",
-        "app.recorded:_is_ordinary",
-        lambda _: lambda path: path.is_file() or path.is_dir(),
-        ("app/commands/test_recorded.py::test_settings_that_others_may_have_made_are_checked[header]",),
-    ),
-    Fault(
         "DICOM: slices in the order of their names",
         "io.formats.dicom:_values",
         lambda values: lambda slices: values(sorted(slices, key=lambda each: each.file)),
@@ -88,12 +82,6 @@ FAULTS: list[Fault] = [
         "_util.whole_files:whole_file",
         lambda _: in_place,
         ("_util/test_whole_files.py::test_after_an_error_all_is_as_it_was",),
-    ),
-    Fault(
-        "command: a picture is made again of a volume that has changed",
-        "app.recorded:checksum",
-        lambda _: lambda path: 64 * "0",
-        ("app/commands/test_recorded.py::test_the_volume_may_lie_beside_the_picture_and_must_be_the_same",),
     ),
     Fault(
         "command: the light does not reach the image",

@@ -63,7 +63,7 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     settings = command.given(words[1:])
     if "like" in settings:
         try:
-            weaker = _of_picture(command, settings["like"], named="file" in settings)
+            weaker = _of_picture(command, settings["like"])
         except ValueError as fault:
             raise ValueError(f"--like: {str(fault)[:400]}") from fault
         for option in weaker.pop("further", ()):
@@ -75,8 +75,6 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
     defaults = command.defaults()
     # that not every command has: as the viewer composites and fits begin, and what a picture may hold
     options = {"compositing": "over", "preset": None, "recorded_transfer": None} | defaults | settings
-    if options.get("file", "") is None:
-        command.error("the following arguments are required: FILE")
     return argparse.Namespace(execute=found.execute, defaults=defaults, **options)
 
 
@@ -106,10 +104,10 @@ def _over(settings: dict[str, Any], weaker: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in weaker.items() if name not in overridden} | settings
 
 
-def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
-    """The options in a picture, which anyone may have written. `named`: whether the volume is named."""
+def _of_picture(command: Parser, path: Path) -> dict[str, Any]:
+    """The options in a picture, which anyone may have written."""
     from ..._util.checks import shortened
-    from ..recorded import recorded_in, volume_of_picture
+    from ..recorded import recorded_in
 
     found = recorded_in(path)
     own = [action for action in command._actions if action.type is not Path]
@@ -119,16 +117,11 @@ def _of_picture(command: Parser, path: Path, *, named: bool) -> dict[str, Any]:
     for word in words:
         if re.match(r"-[^\d.]", word) and word.partition("=")[0] not in flags:
             raise ValueError(f"{path}: {command.prog} takes no {shortened(word)} from a picture.")
-    settings = command.given(words)
-    if "file" in settings:
-        raise ValueError(f"{path}: a picture names its volume elsewhere; got {shortened(words)}.")
+    settings = command.given(["FILE", *words])  # so that another one is an error
+    del settings["file"]
     if "transfer" in found:
         settings["recorded_transfer"] = found["transfer"]
-    settings |= {"further": found["further"]} if "further" in found else {}
-    if not named:
-        file = found["file"]
-        settings["file"] = volume_of_picture(path, file["name"], file["bytes"], file["sha256"])
-    return settings
+    return settings | ({"further": found["further"]} if "further" in found else {})
 
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
@@ -177,10 +170,10 @@ def add_size(parser: Parser) -> None:
     add_vector(parser, "--size", "W H", text, type=int, default=(512, 512))
 
 
-def add_volume(parser: Parser, **more: Any) -> None:
+def add_volume(parser: Parser) -> None:
     """Add the volume that a command reads."""
     text = "volume: NAME_XxYxZ_TYPE.raw[.gz], .npy, .npz, and more with jaxvol[io]"
-    parser.add_argument("file", type=Path, metavar="FILE", help=text, **more)
+    parser.add_argument("file", type=Path, metavar="FILE", help=text)
     text = "labels of the voxels (a segmentation), each shown in a colour, and around them what is shown else"
     parser.add_argument("--labels", type=Path, metavar="FILE", help=text)
     group = parser.add_argument_group("data: needed if the file and its name do not specify it")
@@ -239,11 +232,11 @@ def add_scene(parser: Parser) -> None:
     """Add a volume that is looked at through a camera."""
     from ...compositing.modes import MODES
 
-    add_volume(parser, nargs="?")
+    add_volume(parser)
     add_sampling(parser)
     add_size(parser)
     add_others(parser)
-    text = "a picture that jaxvol wrote: take its options, and its volume unless another is named"
+    text = "a picture that jaxvol wrote: take its options"
     parser.add_argument("--like", type=Path, metavar="PNG", help=text)
     text = "read the volume in bricks, with so much memory for them, such as 256M: .raw, .npy and Zarr"
     parser.add_argument("--memory", type=memory_size, metavar="BYTES", help=text)

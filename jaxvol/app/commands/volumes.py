@@ -100,11 +100,8 @@ def _view(options: argparse.Namespace) -> None:
 
     how = {name: getattr(options, name) for name in ("port", "host", "token")}
     others = tuple(map(other_of, options.others or ()))
-    told = any(value is not None for value in header_of(options).values())
-    # a picture names no other file, and does not hold what is said of its own
-    file = None if options.labels or others or told else options.file
     look = (volume_of(options),) if is_automatic(options) else look_of(options)
-    page = serve(*look, lit=options.shade, title=options.file.name, file=file, others=others, **how)
+    page = serve(*look, lit=options.shade, title=options.file.name, others=others, **how)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)

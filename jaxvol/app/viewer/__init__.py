@@ -4,10 +4,8 @@ One `model`, whose `state` a thread draws in `tiles`, and one list of its `contr
 `notebook` and `page`.
 """
 
-import os
 import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..._util.checks import integer, shortened
@@ -95,7 +93,6 @@ def serve(
     title: str = "jaxvol",
     host: str = "127.0.0.1",
     token: str | None = None,
-    file: str | os.PathLike[str] | None = None,
     **how: Any,
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
@@ -114,7 +111,6 @@ def serve(
         host: the address to listen at. Another one than this machine's own, such as "0.0.0.0" for all, needs
             a token, which is made if none is given; what is sent is not encrypted.
         token: what a browser must tell, as part of `Page.url`, from 1 to 200 letters, digits, "-" and "_".
-        file: the volume's, which saved pictures name.
         how: `lighting`, `lit`, `compositing`, `background` and `others`, as for `view`.
 
     Returns:
@@ -133,5 +129,4 @@ def serve(
         raise ValueError(f'token must be letters, digits, "-" and "_", 1 to 200; got {shortened(token)}.')
     keep_programs_by_default()
     served: dict[str, Any] = {"port": port, "title": title, "host": host, "token": token}
-    served["file"] = None if file is None else Path(file)
     return Page(*initial(volume, transfer, camera, march, **how), **served)

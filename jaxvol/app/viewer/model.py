@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import Any, Literal
 
 from ..._util.srgb import png_of
@@ -56,7 +55,6 @@ class Model:
         show: called by that thread, until `close`, with an image to stretch over the view, and its `Stage`.
         set_status: called likewise with a status of two lines, or three.
         deliver: called by a thread of its own with the PNG of an image that is saved.
-        file: the volume's, which saved images name.
     """
 
     marked: Callable[[], None] = staticmethod(lambda: None)  # called when a point was marked
@@ -69,10 +67,9 @@ class Model:
         show: Callable[[Pixels, Stage], None],
         set_status: Callable[[str], None],
         deliver: Callable[[bytes], None] = lambda content: None,
-        file: Path | None = None,
     ):
         self.scene, self.state, self.first = scene, state, state
-        self._face, self._deliver, self._file = (show, set_status), deliver, file
+        self._face, self._deliver = (show, set_status), deliver
         self._status, self._compiling, self._begun = "", "", 0.0
         self._last: State | None = None
         self._shown: tuple[State, Pixels, Stage] | None = None
@@ -166,7 +163,7 @@ class Model:
             renderer.draw(pixels, grid, column, row)
         # of several files, or of labels, none, as of `jaxvol render`: another picture would come back
         whole = not self.scene.others and isinstance(state.transfer, TransferFunction)
-        text = text_of(self.scene.settings(state), self._file, state.transfer) if whole else {}
+        text = text_of(self.scene.settings(state), "", state.transfer) if whole else {}
         self._set_status(f"saved {width} x {height}\n")
         self._deliver(png_of(pixels[:height, :width], text))
 

@@ -11,7 +11,6 @@ import secrets
 import socket
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -62,7 +61,7 @@ class Page:
     Args:
         scene: what is looked at. `serve` makes it.
         state: how at first.
-        port: as for `serve`, as are `title`, `host`, `token` and `file`.
+        port: as for `serve`, as are `title`, `host` and `token`.
     """
 
     def __init__(
@@ -74,9 +73,8 @@ class Page:
         title: str = "jaxvol",
         host: str = HOST,
         token: str | None = None,
-        file: Path | None = None,
     ):
-        self.shown, self.file = (scene, state), file
+        self.shown = scene, state
         is_local = host in OWN_NAMES
         _check_host(host)
         self._token = secrets.token_urlsafe() if token is None and not is_local else token
@@ -191,7 +189,7 @@ class _Panel:
     def __init__(self, client: viser.ClientHandle, page: Page, turn: Callable[[Orbit], None]):
         self.client, self._turn = client, turn
         self.status = client.gui.add_markdown("starting …  \n")
-        self.model = Model(*page.shown, self._show, self._set_status, self._deliver, page.file)
+        self.model = Model(*page.shown, self._show, self._set_status, self._deliver)
         self._widgets: list[tuple[Any, Control]] = []
         for heading, controls in controls_of(self.model).items():
             with client.gui.add_folder(heading, expand_by_default=heading not in FOLDED):
