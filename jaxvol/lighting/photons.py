@@ -22,9 +22,6 @@ from .template import ScattererTemplate
 
 Occlusion = Literal["soft", "hard"]
 
-Interpolation = Literal["linear", "nearest"]
-"""Names as in VTK (`vtkVolumeProperty`)."""
-
 LIT_SIDE_COSINE = 0.25
 """With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
 

@@ -2,10 +2,10 @@
 
 The light scattered at a point x of a homogeneous medium towards the camera is, in expectation,
 
-    ω p E(x) + ω Σ_k ω^k p E(y_k)          ω: albedo; p: phase function; E: irradiance that arrives there
+    ω E(x) / 4π + ω Σ_k ω^k E(y_k) / 4π          ω: albedo; E: irradiance that arrives there
 
 where y_1, y_2, … are the vertices of a random walk from x with exponential flights of mean λ, whose
-directions follow the phase function, and which ends where it leaves the medium.
+directions are uniform, and which ends where it leaves the medium.
 """
 
 import math
@@ -17,14 +17,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._util.checks import integer
-from .._util.vec3 import Scalar, golden_spiral, turned
+from .._util.vec3 import golden_spiral, turned
 from ..xla.platform import is_traced
 from .materials import Material
 from .phase import sample_phase
 
 
 def unit_walks(
-    key: PRNGKeyArray, count: int, walks: int, levels: int, anisotropy: Scalar
+    key: PRNGKeyArray, count: int, walks: int, levels: int
 ) -> tuple[Float[Array, "count walks levels 3"], Float[Array, "count walks levels"]]:
     """Directions and lengths, in mean free paths, of the flights of random walks, in sets of `walks`.
 
@@ -45,7 +45,7 @@ def unit_walks(
     def flight(
         direction: Float[Array, "number 3"], u: Float[Array, "3 number"]
     ) -> tuple[Float[Array, "number 3"], tuple[Array, Array]]:
-        turn = sample_phase(anisotropy, u[1], u[2])
+        turn = sample_phase(jnp.zeros((), q.dtype), u[1], u[2])
         x, y, z = direction.T
         after = jnp.stack(turned(turn, (x, y, z)), axis=-1)
         after = after / jnp.linalg.norm(after, axis=-1, keepdims=True)

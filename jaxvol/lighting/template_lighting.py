@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import Arrayable, flag, integer, number
+from .._util.checks import flag, integer, number
 from ..march.march import March, Transform
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
@@ -23,13 +23,12 @@ from ..xla.platform import is_traced
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
 from .packet_tree import PacketTree, ThresholdOn
-from .photons import Interpolation, Occlusion, PhotonShading
+from .photons import Occlusion, PhotonShading
 from .random_walks import scatterings
 from .shading import Lighting, Shading, Surroundings
 from .simulation import scatterer_templates
 from .template import ScattererTemplate
 from .transport import Transport
-from .voxel_photons import VoxelPhotons
 
 
 Form = Literal["published", "transport"]
@@ -78,7 +77,7 @@ class ScattererTemplates(Lighting):
     1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the transfer function's,
     and samples in no material are lit, too. (Only the rays of the camera meet the transfer function's
     extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices of
-    random walks: the sample itself counts; directions follow the phase function, not refraction; a photon
+    random walks: the sample itself counts; directions are uniform, not of refraction; a photon
     counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
     half-space's reflectance. Flights are as long as the matter in front of them, seen at 16 places, lets them
     be. Light that was scattered before is computed on a grid of `nodes`, of which each turns a template at
@@ -87,12 +86,13 @@ class ScattererTemplates(Lighting):
     the light of the last `levels`, in materials at most `threshold` of all; the grid, which blurs light where
     nodes are further apart than the mean free path (in thick matter, blotches are seen, of nodes whose walks
     differ; fewer with more `packets`); places that flights see, which are farther apart the farther off they
-    are; with anisotropy, the directions of scattered light up to spherical harmonics of order 2 (up to 3 % at
-    g = 0.5). Steps of the march should be short against the mean free path, too: of a third of it, they make
-    images up to 3 % too bright. How near it comes to path tracing: `experiments/transport.py`.
+    are. Scattering is isotropic: of a material of anisotropy g, give the mean free path λ / (1 - g), which
+    spreads light as far (similarity). Steps of the march should be short against the mean free path, too: of
+    a third of it, they make images up to 3 % too bright. How near it comes to path tracing:
+    `experiments/transport.py`.
 
     Its derivatives are those of the mean over all walks: under them walks stay where they are, and count
-    more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ or g change, so
+    more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ changes, so
     that its differences show the derivative only over some 10 % of λ. If voxels change, edges of materials
     move under the derivative, but not the surface at which the extinction becomes 0.
 
@@ -116,9 +116,6 @@ class ScattererTemplates(Lighting):
             differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
             points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
             photons that become hidden or change their material.
-        interpolation: at the places of photons. `"nearest"`: the nearest voxel tells what is there, as in the
-            paper, in less time. For hard occlusion, voxels of 8- or 16-bit integers, transfer functions of
-            the value alone, and materials by values.
         reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
             for thin parts in front of others.
         cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
@@ -132,7 +129,6 @@ class ScattererTemplates(Lighting):
         given: templates to use as they are instead of simulated ones, with leading axes (materials,
             templates). Then nothing depends on the materials' mean free paths.
         form: `"published"`, or `"transport"`: see above.
-        anisotropy: g of the phase function, in (-1, 1), for `"transport"`.
 
     Raises:
         ValueError: for invalid arguments, missing `levels`, a material of which no photon is above the
@@ -147,7 +143,6 @@ class ScattererTemplates(Lighting):
     blend: bool = eqx.field(static=True)
     photons: int = eqx.field(static=True)
     occlusion: Occlusion = eqx.field(static=True)
-    interpolation: Interpolation = eqx.field(static=True)
     reach: tuple[float, ...] = eqx.field(static=True)
     seed: int = eqx.field(static=True)
     packets: int = eqx.field(static=True)
@@ -155,7 +150,6 @@ class ScattererTemplates(Lighting):
     threshold_on: ThresholdOn = eqx.field(static=True)
     levels: tuple[int, ...] = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
-    anisotropy: Float[Array, ""] | None
     form: Form = eqx.field(static=True)
 
     def __init__(
@@ -167,7 +161,6 @@ class ScattererTemplates(Lighting):
         blend: bool | Any = False,
         photons: int | None = None,
         occlusion: Occlusion | Any = "soft",
-        interpolation: Interpolation | Any = "linear",
         reach: Sequence[float] = (2.0, 4.0),
         cutoff: float | None = None,
         seed: int = 0,
@@ -178,13 +171,9 @@ class ScattererTemplates(Lighting):
         levels: int | Sequence[int] | None = None,
         given: ScattererTemplate | Any | None = None,
         form: Form | Any = "published",
-        anisotropy: Arrayable | None = 0.0,
     ):
         if form not in get_args(Form):
             raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
-        isotropic = anisotropy is None or (
-            isinstance(anisotropy, int | float | np.number) and anisotropy == 0
-        )
         if form == "transport":
             published = {
                 "threshold_on": threshold_on,
@@ -193,17 +182,11 @@ class ScattererTemplates(Lighting):
                 "occlusion": occlusion,
                 "reach": tuple(reach),
             }
-            _check_unused({**published, "cutoff": cutoff, "interpolation": interpolation, "given": given})
-        else:
-            for name, value, unused in (
-                ("nodes", nodes, nodes is None),
-                ("anisotropy", anisotropy, isotropic),
-            ):
-                if not unused:
-                    raise ValueError(f'{name} is of form="transport"; got {value!r} for form="published".')
+            _check_unused({**published, "cutoff": cutoff, "given": given})
+        elif nodes is not None:
+            raise ValueError(f'nodes is of form="transport"; got {nodes!r} for form="published".')
         templates = (256 if form == "transport" else 8) if templates is None else templates
         self.form = form
-        self.anisotropy = None if isotropic else number("anisotropy", anisotropy, above=-1, below=1)
         self.materials, self.lights = materials_of(materials), lights_of(lights)
         self.templates, self.blend = integer("templates", templates, 1), flag("blend", blend)
         if occlusion not in get_args(Occlusion):
@@ -212,14 +195,6 @@ class ScattererTemplates(Lighting):
         if multiples.ndim != 1 or not np.all(np.diff(multiples, prepend=1.0, append=np.inf) > 0):
             raise ValueError(f"reach must be multiples above 1, in increasing order; got {reach!r}.")
         self.occlusion, self.reach, self.seed = occlusion, tuple(multiples.tolist()), integer("seed", seed, 0)
-        self.interpolation = interpolation
-        if interpolation not in get_args(Interpolation):
-            expected = ", ".join(get_args(Interpolation))
-            raise ValueError(f"interpolation must be one of {expected}; got {interpolation!r}.")
-        if interpolation == "nearest" and occlusion != "hard":
-            raise ValueError(
-                'interpolation="nearest" needs occlusion="hard"; soft occlusion reads no voxels.'
-            )
         cutoff = 0.02 * (occlusion == "hard") if cutoff is None else cutoff
         skips = is_traced(cutoff) or cutoff != 0
         self.cutoff = number("cutoff", cutoff, above=0, below=1) if skips else None
@@ -260,16 +235,15 @@ class ScattererTemplates(Lighting):
 
     def for_image(self, around: Surroundings) -> Shading:
         if self.form == "transport":
-            how = self.anisotropy, self.seed, self.templates, self.packets, *self.levels
+            how = self.seed, self.templates, self.packets, *self.levels
             return Transport(around, self.materials, self.lights, *how).solved(self.nodes)
-        shading = PhotonShading(
+        return PhotonShading(
             *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
             blended=self.templates if self.blend else 1,
             occlusion=self.occlusion,
             reach=self.reach,
             seed=self.seed,
         )
-        return shading if self.interpolation == "linear" else VoxelPhotons.of(shading, around)
 
     def simulated(self) -> ScattererTemplate:
         """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
@@ -293,7 +267,6 @@ _DEFAULTS = {
     "occlusion": "soft",
     "reach": (2.0, 4.0),
     "cutoff": None,
-    "interpolation": "linear",
     "given": None,
 }
 

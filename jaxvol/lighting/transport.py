@@ -25,11 +25,9 @@ from ..scene.space import Space, enter
 from ..scene.volume import without_voxels
 from ..scene.voxel_fetch import corners
 from ..xla.memory import gather
-from .harmonics import harmonics, packed, powers, unpacked
 from .lights import ConstantLight, Light
 from .materials import Material, shares
 from .medium import FADE, Scattering, clipped, scattering_at
-from .phase import phase
 from .random_walks import unit_walks
 from .shading import Sample, Shading, Surroundings
 
@@ -79,18 +77,16 @@ class ScatteredLight(Shading):
     """Light in a scene, on grids that span the volume's.
 
     Attributes:
-        radiance: at each node of a finer grid, of light that was scattered before, and of constant lights, by
-            the direction from which it comes (`harmonics`), three channels each.
+        radiance: at each node of a finer grid, of light that was scattered before, and of constant lights:
+            the mean over all directions.
         depths: at each node, the optical depth up to each light that has a direction.
-        anisotropy: g; None for 0.
         shape: of the grid of depths.
     """
 
-    radiance: Float[Array, "finer channels"]
+    radiance: Float[Array, "finer 3"]
     depths: Float[Array, "nodes lights"]
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
-    anisotropy: Float[Array, ""] | None
     shape: tuple[int, int, int] = eqx.field(static=True)
 
     @property
@@ -103,8 +99,7 @@ class ScatteredLight(Shading):
         outside of matter and one inside, depths do not grow linearly, so that they are not interpolated at
         the sample.)"""
         coordinate = around.space.coordinate(sample.point)
-        row = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
-        light = _scattered(row, sample.direction, self.anisotropy)
+        r, g, b = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
         fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=FADE)
         kept = jnp.ones_like(fractions[0])
         for fraction, material in zip(fractions, self.materials, strict=True):
@@ -114,7 +109,7 @@ class ScatteredLight(Shading):
             point = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, point))
             beyond.append(jnp.where(lit, 0, row[light_]))
-        return light, kept, ways, tuple(beyond)
+        return (r, g, b), kept, ways, tuple(beyond)
 
     def term(
         self, around: Surroundings, sample: Sample, shared: _Begun, number: Int[Array, ""]
@@ -131,8 +126,7 @@ class ScatteredLight(Shading):
     def color(self, sample: Sample, shared: _Begun, sums: Any) -> Vec3:
         light, kept, _, beyond = shared
         for source, near, far in zip(located(self.lights), sums or (), beyond, strict=True):
-            how = self.anisotropy, jnp.exp(-near - far)
-            light = plus(light, arrived(source, sample.point, sample.direction, *how))
+            light = plus(light, arrived(source, sample.point, sample.direction, jnp.exp(-near - far)))
         r, g, b = (clipped(c) * kept for c in sample.color)
         return times((r, g, b), light)
 
@@ -168,14 +162,11 @@ def _way(light: Light, point: Vec3, direction: Vec3) -> tuple[Vec3, Scalar]:
     return arriving.toward, arriving.distance
 
 
-def arrived(
-    light: Light, point: Vec3, direction: Vec3, anisotropy: Scalar | None, transmittance: Scalar
-) -> Vec3:
+def arrived(light: Light, point: Vec3, direction: Vec3, transmittance: Scalar) -> Vec3:
     """Radiance that a light adds, scattered at a point into a ray of this direction; with albedo 1."""
     arriving = light.at(point, direction)
     assert arriving.toward is not None
-    density = 1 / (4 * math.pi) if anisotropy is None else phase(dot(arriving.toward, direction), anisotropy)
-    return scaled(arriving.irradiance, transmittance * density)
+    return scaled(arriving.irradiance, transmittance / (4 * math.pi))
 
 
 def interpolated(rows: Float[Array, "nodes channels"], at: tuple[Vec3, tuple[int, ...]]) -> Array:
@@ -232,7 +223,6 @@ class Transport(NamedTuple):
     around: Surroundings
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
-    anisotropy: Float[Array, ""] | None
     seed: int
     sets: int
     walks: int
@@ -247,32 +237,24 @@ class Transport(NamedTuple):
         space, tables = self.around.space.whole, self.around.classification
         around = dataclasses.replace(self.around, space=space, tables=tables)
         grid = _Grid(self._replace(around=around), (nx, ny, nz))
-        harmonics_ = 9 if self.order else 1
         require_room(
-            4 * math.prod(_finer(grid.shape)) * COPIES * 3 * harmonics_,
+            4 * math.prod(_finer(grid.shape)) * COPIES * 3,
             f"light at {nx} x {ny} x {nz} nodes for nodes={nodes}; use fewer",
         )
         rates, near, far = grid.matter()
         depths = grid.depths(far)
-        radiance = refined(grid.radiance(near, rates, depths).reshape(*grid.shape, -1))
-        if self.order == 0:
-            radiance = jnp.maximum(radiance, 0)
-        radiance = radiance.reshape(-1, radiance.shape[-1])
+        radiance = refined(grid.radiance(near, rates, depths).reshape(*grid.shape, 3))
+        radiance = jnp.maximum(radiance, 0).reshape(-1, 3)
         # checked here, since comparisons would hide a NaN
         data = volume.data if jnp.issubdtype(volume.data.dtype, jnp.inexact) else None
         inputs = without_voxels(volume), data, self.around.transfer, self.materials, self.lights
-        valid = all_finite((inputs, self.anisotropy))
+        valid = all_finite(inputs)
         radiance, depths = (jnp.where(valid, each, jnp.nan) for each in (radiance, depths))
-        return ScatteredLight(radiance, depths, self.materials, self.lights, self.anisotropy, grid.shape)
+        return ScatteredLight(radiance, depths, self.materials, self.lights, grid.shape)
 
     @property
     def dtype(self) -> Any:
         return self.around.volume.spacing.dtype
-
-    @property
-    def order(self) -> int:
-        """Of the `harmonics` that tell directions."""
-        return 0 if self.anisotropy is None else 2
 
     @property
     def sky(self) -> Vec3:
@@ -283,8 +265,7 @@ class Transport(NamedTuple):
     def flights(self) -> Float[Array, "flights 4"]:
         """Direction and length, in mean free paths, of each flight: by level, walk and set."""
         key = jax.random.key(self.seed)
-        g = jnp.zeros((), self.dtype) if self.anisotropy is None else jax.lax.stop_gradient(self.anisotropy)
-        directions, lengths = unit_walks(key, self.sets, self.walks, self.levels, g)
+        directions, lengths = unit_walks(key, self.sets, self.walks, self.levels)
         return jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(-1, 4)
 
     def at(self, point: Vec3) -> Scattering:
@@ -391,7 +372,7 @@ class _Grid(NamedTuple):
 
     def radiance(
         self, near: Int[Array, " nodes"], rates: Float[Array, " nodes"], depths: Float[Array, "nodes lights"]
-    ) -> Float[Array, "nodes channels"]:
+    ) -> Float[Array, "nodes 3"]:
         """Radiance at nodes of light that was scattered before, or that comes from a constant light."""
         transport, flights = self.transport, self.transport.flights()
         levels, walks, dtype = transport.levels, transport.walks, transport.dtype
@@ -414,18 +395,12 @@ class _Grid(NamedTuple):
                     u = hashed_uniforms_4(*words)[0].astype(dtype)
                     direction, length = flight(level)
                     quantile = -jnp.expm1(-length)
-                    if (g := transport.anisotropy) is not None:  # 1, with the derivative of turns
-                        before, _ = flight(jnp.maximum(level - 1, 0))
-                        density = jnp.where(level > 0, phase(dot(before, direction), g), 1)
-                        turned = scaled(state.throughput, density / jax.lax.stop_gradient(density))
-                        state = state._replace(throughput=turned)
                     return self.advanced(state, direction, quantile, u, depths), None
 
                 none, all_ = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
                 start = _State(self.point(number), rates[number], all_, none)
                 end, _ = jax.lax.scan(advance, start, jnp.arange(levels, dtype=jnp.int32))
-                basis = harmonics(flight(jnp.zeros((), jnp.int32))[0], transport.order)
-                return packed([scaled(end.light, 4 * math.pi * each) for each in basis])
+                return jnp.stack(end.light)
 
             return jnp.mean(jax.vmap(walk)(jnp.arange(walks, dtype=jnp.int32)), axis=0)
 
@@ -445,7 +420,7 @@ class _Grid(NamedTuple):
         throughput = times(scaled(throughput, weight), there.albedo)
         row = interpolated(depths, _on_grid(transport.around, self.shape, end))
         for i, source in enumerate(located(transport.lights)):
-            added = arrived(source, end, direction, transport.anisotropy, jnp.exp(-row[i]))
+            added = arrived(source, end, direction, jnp.exp(-row[i]))
             light = plus(light, times(throughput, added))
         return _State(end, jnp.where(there.extinction > 0, there.extinction, rate), throughput, light)
 
@@ -489,18 +464,6 @@ def _ending(extinction: Float[Array, "looks"], looks: _Looks, u: Scalar) -> tupl
     values = looks.places, looks.density * each / drawn
     distance, weight = (jnp.sum(jnp.where(chosen, value, 0)) for value in values)
     return distance, weight
-
-
-def _scattered(row: Float[Array, "channels"], direction: Vec3, anisotropy: Scalar | None) -> Vec3:
-    """Radiance scattered into a ray of this direction, from the radiance that arrives; with albedo 1."""
-    order = 0 if anisotropy is None else 2
-    g = jnp.zeros_like(direction[0]) if anisotropy is None else anisotropy
-    zero = jnp.zeros_like(row[0])
-    total = zero, zero, zero
-    each = zip(unpacked(row), harmonics(direction, order), powers(g, order), strict=True)
-    for coefficient, basis, power in each:
-        total = plus(total, scaled(coefficient, basis * power))
-    return total
 
 
 def _rotation(u: Scalar, v: Scalar, w: Scalar) -> tuple[Vec3, Vec3, Vec3]:

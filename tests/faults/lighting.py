@@ -101,12 +101,6 @@ FAULTS: list[Fault] = [
         (f"{TRANSPORT}test_where_two_materials_meet_nothing_is_in_neither",),
     ),
     Fault(
-        "light: photons at voxels are not moved by refraction",
-        "lighting.voxel_photons:VoxelPhotons._ratios",
-        lambda f: lambda self, *of: (f(self, *of)[0] ** 0, f(self, *of)[1]),
-        (f"{PHOTONS}test_each_step_at_voxels_is_that_at_interpolated_nodes",),
-    ),
-    Fault(
         "light by transport: computed while something is traced, it is kept as tracers",
         "lighting.template_lighting:computed_now",
         lambda f: lambda function, *of: function(*of),

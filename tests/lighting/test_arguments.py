@@ -44,9 +44,6 @@ def lit(materials: Any = HALF, lights: Any = SUN, **how):
     return lambda: ScattererTemplates(materials, lights, **how)
 
 
-AT_VOXELS = lit(interpolation="nearest", occlusion="hard", given=PAIR)
-
-
 def render_far_away():
     volume = jv.Volume(np.zeros((4, 4, 4), np.float32), (0.05,) * 3, (615_840.0, 5_846_926.0, 758.0))
     camera = jv.Camera.looking_at(volume, size=(2, 2))
@@ -81,15 +78,6 @@ BAD = {
         "levels must be given where opacity is traced",
     ),
     "count": (lambda: scatterer_templates(HALF, 0, count=0), "count must be an integer of at least 1"),
-    "interpolation": (
-        lit(interpolation="cubic"),
-        "interpolation must be one of linear, nearest; got 'cubic'",
-    ),
-    "soft at voxels": (lit(interpolation="nearest"), 'interpolation="nearest" needs occlusion="hard"'),
-    "voxels of floats": (
-        lambda: shaded(AT_VOXELS(), VOLUME, TRANSFER, np.zeros((1, 3))),
-        'interpolation="nearest" takes voxels of 8- or 16-bit integers; got float32',
-    ),
     "photons kept": (lambda: PAIR.brightest(0), "photons must be an integer"),
     # materials
     "opacity below 0": (lambda: Material(-0.1, 1.0), r"opacity must be in \[0, 1\]; got -0.1"),

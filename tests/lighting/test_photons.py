@@ -151,22 +151,6 @@ def test_each_step_is_that_of_the_paper(occlusion):
         same(found, arriving * brightness * (COLOR[SKIN] + inner), name)
 
 
-def test_each_step_at_voxels_is_that_at_interpolated_nodes():
-    """Places in the table above are nodes. Voxels are ten times the values, in 8 bits."""
-    transfer = jv.TransferFunction(10 * TRANSFER.values, TRANSFER.colors, TRANSFER.extinction)
-    ten = [eqx.tree_at(lambda m: m.values, each, replace_fn=lambda v: 10 * v) for each in MATERIALS[:2]]
-    photons = jax.tree.map(lambda leaf: leaf[:2], given(PAIR))
-    for name, (places, light, (brightness, inner), _) in STEPS.items():
-        lighting = ScattererTemplates(
-            *(ten, lights(**light)), given=photons, occlusion="hard", cutoff=1e-6, interpolation="nearest"
-        )
-        volume = nodes(places)
-        volume = jv.Volume(np.round(10 * np.asarray(volume.data)).astype(np.uint8), origin=volume.origin)
-        found = colors_of(lighting, volume, transfer, [(0, 0, 0), (0.2, -0.3, 0.1)])[0]
-        arriving = POWER * (np.pi if "sky" in light else 1)
-        same(found, arriving * brightness * (COLOR[SKIN] + inner), name)
-
-
 def test_steps_4_and_5_as_printed():
     """Inner colours under the light's full irradiance; in another material also the brightness is scaled."""
     for name, (places, light, (brightness, inner), _) in STEPS.items():
