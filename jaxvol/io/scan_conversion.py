@@ -5,19 +5,13 @@ import math
 from typing import Any
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Shaped
 
 from .._util.checks import Arrayable, described, finite_array, integer, require
 from .._util.files import MOST_VOXELS
 from .._util.memory import require_room
-from .._util.vec3 import Scalar, apart
-from ..march.march import March
 from ..march.transforms import ToroidalMap
-from ..scene.volume import Volume
-from ..xla.platform import is_traced
+from ..scene.volume import Volume, check_one_channel
 
 
 def scan_convert(
@@ -37,14 +31,10 @@ def scan_convert(
     nodes, as rendering does, blurs what is smaller than the spacing, and mixes `fill_value` into the sector's
     faces, over one spacing. What it does to images: `experiments/scan_conversion.py`.
 
-    Differentiable with respect to float voxels and to the probe. For the probe, the grid must be given
-    (`spacing`, `shape` and `origin`), since its size cannot depend on traced values; where a node crosses a
-    face its value jumps, which the gradient does not see. Memory is taken for the result and for one plane of
-    nodes at a time; for floats, which are checked to be finite, as much again.
+    It has no derivatives, and takes memory for the result and for one plane of nodes at a time.
 
     Args:
-        volume: as acquired, `data[β, σ, γ]`. Its labels, if any, become those of the nearest sample, and 0
-            outside.
+        volume: as acquired, `data[β, σ, γ]`, without labels (convert a volume of these).
         probe: the map that places the samples; the result lies in the same world.
         spacing: of the grid, one number or three, world length (mm); by default the distance between the
             samples of a beam, as fine as they are anywhere.
@@ -59,88 +49,46 @@ def scan_convert(
         ValueError: for arguments of other kinds, a spacing that is not positive, a grid of 2**31 nodes or
             more or larger than the device's memory, and a `fill_value` that the voxels' type does not hold.
     """
-    if not isinstance(volume, Volume):
-        raise ValueError(f"volume must be a Volume; got {described(volume)}.")
+    from scipy.ndimage import map_coordinates  # here, so that a first image does not wait for it
+
+    if not isinstance(volume, Volume) or volume.labels is not None:
+        raise ValueError(f"volume must be a Volume without labels; got {described(volume)}.")
+    check_one_channel(volume, "scan_convert")
+    if volume.direction is not None:
+        raise ValueError("volume must have no direction: ToroidalMap places its voxels by the probe.")
     if not isinstance(probe, ToroidalMap):
         raise ValueError(f"probe must be a ToroidalMap; got {described(probe)}.")
-    dtype = volume.data.dtype
-    try:
-        fill = float(fill_value)
-    except (TypeError, ValueError) as fault:
-        raise ValueError(f"fill_value must be a number; got {described(fill_value)}.") from fault
-    limits, whole = (np.iinfo(dtype), True) if dtype.kind in "ui" else (jnp.finfo(dtype), False)
-    if not float(limits.min) <= fill <= float(limits.max) or (whole and not fill.is_integer()):
-        raise ValueError(f"fill_value must be of the voxels' type, {dtype.name}; got {fill_value!r}.")
-    first, last = probe.gamma_range
-    wide: Any = (last - first) / (volume.shape[2] - 1) if spacing is None else spacing
-    steps = require(
-        finite_array("spacing", [wide] * 3 if np.ndim(wide) == 0 else wide, (3,)),
-        lambda steps: steps > 0,
-        "spacing must be positive along every axis; got {got}.",
-    )
-    nodes, first = _grid(probe, steps, shape, origin)
-    itemsize = dtype.itemsize + (0 if volume.labels is None else volume.labels.dtype.itemsize)
-    sizes = " x ".join(map(str, nodes))
-    require_room(math.prod(nodes) * itemsize, f"a grid of {sizes} nodes (spacing, shape)")
-    data, labels = _resampled(volume, probe, first, steps, nodes, fill)
-    return Volume(data, steps, first, labels)
-
-
-@eqx.filter_jit
-def _resampled(
-    volume: Volume,
-    probe: ToroidalMap,
-    origin: Float[Array, "3"],
-    spacing: Float[Array, "3"],
-    shape: tuple[int, int, int],
-    fill: float,
-) -> tuple[Shaped[Array, "nx ny nz"], Shaped[Array, "nx ny nz"] | None]:
-    """Voxels and labels at the nodes, plane by plane."""
-    space = March(1.0, (probe,)).locate(volume)
-    x, y, z = (
-        first + jnp.arange(n, dtype=first.dtype) * step
-        for first, n, step in zip(apart(origin), shape, apart(spacing), strict=True)
-    )
-    # the rounding of a face's place, in nodes
-    slack = [64 * float(jnp.finfo(y.dtype).eps) * n for n in volume.shape]
-    dtype = volume.data.dtype
-
-    def node(x: Scalar, y: Scalar, z: Scalar) -> tuple[Array, Array | None]:
-        at = space.coordinate((x, y, z))
-        inside = jnp.array(True)
-        for c, n, more in zip(at, volume.shape, slack, strict=True):
-            inside = inside & (c >= -more) & (c <= n - 1 + more)
-        value = jnp.where(inside, volume.value(at), fill)
-        value = (jnp.rint(value) if dtype.kind in "ui" else value).astype(dtype)
-        if volume.labels is None:
-            return value, None
-        return value, jnp.where(inside, volume.label(at), 0).astype(volume.labels.dtype)
-
-    @jax.checkpoint  # else a gradient keeps the coordinates of all planes
-    def plane(x: Scalar) -> tuple[Array, Array | None]:
-        return jax.vmap(jax.vmap(node, (None, None, 0)), (None, 0, None))(x, y, z)
-
-    return jax.lax.map(plane, x)
-
-
-def _grid(
-    probe: ToroidalMap, spacing: Float[Array, "3"], shape: Any, origin: Arrayable | None
-) -> tuple[tuple[int, int, int], Float[Array, "3"]]:
-    """Number of nodes along each axis, and the place of the first one."""
-    if shape is None:
-        if is_traced(probe, spacing):
-            raise ValueError(
-                "shape, spacing and origin must be given where the probe is traced: no size can depend on it."
-            )
-        low, high = (np.asarray(corner, np.float64) for corner in probe.corners)
-        # a sector that is a whole number of spacings wide gets no further node from rounding
-        wide = np.ceil((high - low) / np.asarray(spacing, np.float64) - 1e-4)
-        shape = [int(min(n, MOST_VOXELS)) + 1 for n in np.maximum(wide, 1)]
+    data, fill = np.asarray(volume.data), np.asarray(fill_value)
+    is_whole, limits = data.dtype.kind in "iu", (0, 0)
+    if is_whole:
+        limits = np.iinfo(data.dtype).min, np.iinfo(data.dtype).max
+    is_held = fill.dtype.kind in "iuf" and fill.ndim == 0
+    if not is_held or (is_whole and not (limits[0] <= fill <= limits[1] and fill % 1 == 0)):
+        raise ValueError(f"fill_value must be of the voxels' type, {data.dtype.name}; got {fill_value!r}.")
+    ends, last = np.array([np.asarray(each, float) for each in probe.ranges]), np.array(data.shape) - 1
+    low, high = (np.asarray(corner, float) for corner in probe.corners)
+    wide = (ends[2, 1] - ends[2, 0]) / last[2] if spacing is None else spacing
+    given = finite_array("spacing", [wide] * 3 if np.ndim(wide) == 0 else wide, (3,))
+    steps = require(given, lambda steps: steps > 0, "spacing must be positive along every axis; got {got}.")
+    steps = np.asarray(steps, float)
+    if shape is None:  # a sector that is a whole number of spacings wide gets no further node from rounding
+        shape = np.minimum(np.maximum(np.ceil((high - low) / steps - 1e-4), 1) + 1, MOST_VOXELS).tolist()
     if not isinstance(shape, tuple | list) or len(shape) != 3:
         raise ValueError(f"shape must be three numbers of nodes, along x, y and z; got {shape!r}.")
-    nodes = nx, ny, nz = tuple(integer("shape", n, 2) for n in shape)
+    nodes = tuple(integer("shape", int(n) if n == int(n) else n, 2) for n in shape)
     if math.prod(nodes) > MOST_VOXELS:
         raise ValueError(f"spacing and shape must make a grid of fewer than 2**31 nodes; got {nodes}.")
-    if origin is None:
-        return (nx, ny, nz), probe.center - (jnp.asarray(nodes, spacing.dtype) - 1) * spacing / 2
-    return (nx, ny, nz), finite_array("origin", origin, (3,))
+    sizes = " x ".join(map(str, nodes))
+    require_room(math.prod(nodes) * data.itemsize, f"a grid of {sizes} nodes (spacing, shape)")
+    middle = (low + high) / 2 - (np.array(nodes) - 1) * steps / 2
+    first = middle if origin is None else np.asarray(finite_array("origin", origin, (3,)), float)
+    x, y, z = (start + step * np.arange(n) for start, step, n in zip(first, steps, nodes, strict=True))
+    slack = 1e-5 * (last + 1)  # the rounding of a face's place, in samples
+    found, forward = np.full(nodes, fill, data.dtype), eqx.filter_jit(ToroidalMap.to_toroidal)
+    for plane, here in zip(found, x, strict=True):
+        points = np.stack(np.broadcast_arrays(here, y[:, None], z), axis=-1)
+        at = (np.asarray(forward(probe, points), float) - ends[:, 0]) / (ends[:, 1] - ends[:, 0]) * last
+        inside = np.all((at >= -slack) & (at <= last + slack), axis=-1)
+        values = map_coordinates(data, np.clip(at[inside], 0, last).T, float, order=1)
+        plane[inside] = np.rint(values) if is_whole else values
+    return Volume(found, steps, first)
