@@ -31,7 +31,6 @@ COMMANDS = {
         "pages",
         "make the figures and tables of the source papers, and a page of them, from recorded results",
     ),
-    "warm": ("warm", "compile the programs of usual pictures, and keep them, so that these take less time"),
     "info": (
         "volumes",
         "print shape, type, place in the world and values of a volume file, as jaxvol loads it",
@@ -42,7 +41,7 @@ COMMANDS = {
     ),
     "view": (
         "volumes",
-        "look at a volume file in the browser; without --host only on this machine; Ctrl-C ends it",
+        "look at a volume file in the browser of this machine; Ctrl-C ends it",
     ),
 }
 """By name, the module in `commands/` whose `add_NAME` adds a command's options, and what it does."""

@@ -98,10 +98,9 @@ def _view(options: argparse.Namespace) -> None:
     from ..picture import is_automatic, look_of, other_of, volume_of
     from ..viewer import serve
 
-    how = {name: getattr(options, name) for name in ("port", "host", "token")}
     others = tuple(map(other_of, options.others or ()))
     look = (volume_of(options),) if is_automatic(options) else look_of(options)
-    page = serve(*look, lit=options.shade, title=options.file.name, others=others, **how)
+    page = serve(*look, lit=options.shade, title=options.file.name, others=others, port=options.port)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)
@@ -116,8 +115,4 @@ def add_view(parser: Parser) -> None:
     parser.add_argument("--shade", action=SWITCH, default=True, help="with light at first")
     text = "of the page (default: 8080, or the next free)"
     parser.add_argument("--port", type=int, default=8080, help=text)
-    text = "address to listen at, such as 0.0.0.0: whoever knows the --token may connect, unencrypted"
-    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help=text)
-    text = "letters and digits that a browser must tell (default: none on this machine, else random)"
-    parser.add_argument("--token", metavar="TEXT", help=text)
     parser.add_argument("--browser", action=SWITCH, default=True, help="open it")

@@ -4,11 +4,10 @@ One `model`, whose `state` a thread draws in `tiles`, and one list of its `contr
 `notebook` and `page`.
 """
 
-import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..._util.checks import integer, shortened
+from ..._util.checks import integer
 from ...compositing.blending import Compositing
 from ...compositing.modes import Mode
 from ...lighting.shading import Lighting
@@ -91,15 +90,13 @@ def serve(
     *,
     port: int | Any = 8080,
     title: str = "jaxvol",
-    host: str = "127.0.0.1",
-    token: str | None = None,
     **how: Any,
 ) -> "Page":
     """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
 
-    Without a token only this machine can connect, and only pages that this server sent (others that a browser
-    shows may not); with one, whoever knows it, from any page. What a browser sends are numbers, colors and
-    names of controls; nothing of it is evaluated or used as a path. It needs `pip install "jaxvol[view]"`.
+    Only this machine can connect, and only pages that this server sent (others that a browser shows may not);
+    from another machine, by `ssh -L 8080:localhost:8080`. What a browser sends are numbers, colors and names
+    of controls; nothing of it is evaluated or used as a path. It needs `pip install "jaxvol[view]"`.
 
     Args:
         volume: as for `view`.
@@ -108,16 +105,13 @@ def serve(
         march: as for `view`.
         port: from 1 to 65535; if it is taken, the next free one.
         title: of the page's panel.
-        host: the address to listen at. Another one than this machine's own, such as "0.0.0.0" for all, needs
-            a token, which is made if none is given; what is sent is not encrypted.
-        token: what a browser must tell, as part of `Page.url`, from 1 to 200 letters, digits, "-" and "_".
         how: `lighting`, `lit`, `compositing`, `background` and `others`, as for `view`.
 
     Returns:
         The `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
 
     Raises:
-        ValueError: as `view` does, and for another port or token.
+        ValueError: as `view` does, and for another port.
         ImportError: without viser.
     """
     try:
@@ -125,8 +119,5 @@ def serve(
     except ImportError as fault:
         raise ImportError(f"serve needs {fault.name}: pip install 'jaxvol[view]'") from fault
     port = integer("port", port, 1, 65535)
-    if token is not None and not re.fullmatch("[A-Za-z0-9_-]{1,200}", token):
-        raise ValueError(f'token must be letters, digits, "-" and "_", 1 to 200; got {shortened(token)}.')
     keep_programs_by_default()
-    served: dict[str, Any] = {"port": port, "title": title, "host": host, "token": token}
-    return Page(*initial(volume, transfer, camera, march, **how), **served)
+    return Page(*initial(volume, transfer, camera, march, **how), port=port, title=title)

@@ -22,7 +22,6 @@ from .model import Model
 MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
 BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
 GIVEN = "as given"
-COLORMAPS = "gray", "viridis", "inferno", "magma", "cividis", "turbo", "jet", "hot", "bone", "coolwarm"
 
 
 def transfer_controls(model: Model) -> list[Control]:
@@ -89,7 +88,7 @@ def _point_controls(model: Model) -> list[Control]:
     the opacity that of a layer as thick as a voxel."""
     low, high, bars = histogram(model.scene.volume)
     voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
-    names, base = {"preset": GIVEN, "colors": GIVEN}, given
+    shown = GIVEN
 
     def transfer() -> TransferFunction:
         return cast(TransferFunction, model.state.transfer)
@@ -100,17 +99,12 @@ def _point_controls(model: Model) -> list[Control]:
         chosen = min(chosen, len(transfer().values) - 1)
 
     def choose_preset(name: str) -> None:
-        nonlocal note, base
+        nonlocal note, shown
         values = sampled(model.scene.volume)
         clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
-        names.update(preset=name, colors=GIVEN)
         note = f'<div style="font-size: 11px">{told or ""}</div>'
-        base = given if name == GIVEN else preset(name, clim, preset_unit(model.scene.volume))
-        put(lambda _: base)
-
-    def choose_colors(name: str) -> None:
-        names["colors"] = name
-        put(*(editing.colored_as, base) if name == GIVEN else (editing.recolored, name))
+        shown = name
+        put(lambda _: given if name == GIVEN else preset(name, clim, preset_unit(model.scene.volume)))
 
     def press(message: str) -> None:
         nonlocal chosen, gesture
@@ -153,10 +147,8 @@ def _point_controls(model: Model) -> list[Control]:
     first, last = min(low, level - window / 2), max(high, level + window / 2)
     span = editing.rounded(last - first, last - first)
     unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
-    presets, colors = (GIVEN, *PRESETS), (GIVEN, *COLORMAPS)
     controls = [
-        Control("dropdown", "preset", lambda: names["preset"], choose_preset, choices=presets),
-        Control("dropdown", "colors", lambda: names["colors"], choose_colors, choices=colors),
+        Control("dropdown", "preset", lambda: shown, choose_preset, choices=(GIVEN, *PRESETS)),
         Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen) + note, press),
         of_range("window", 0, (min(unit, window), 2 * span, unit)),
         of_range("level", 1, (middle - span, middle + span, unit)),

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from matplotlib import colormaps
 from matplotlib.colors import to_hex, to_rgb
 
 from ..._util.srgb import from_srgb, to_srgb
@@ -15,9 +14,6 @@ from ...scene.transfer import TransferFunction, extinction_of
 
 MAX_POINTS = 16
 """Control points that a viewer edits."""
-
-COLOR_POINTS = 7
-"""Control points that are added to show the colours of a colormap."""
 
 POINTS = "values", "colors", "extinction"
 
@@ -93,29 +89,6 @@ def without_point(transfer: TransferFunction, index: int) -> TransferFunction:
         raise ValueError("a transfer function has at least 2 points.")
     points = (np.asarray(getattr(transfer, name)) for name in POINTS)
     return TransferFunction(*(np.delete(p, index, axis=0) for p in points))
-
-
-def recolored(transfer: TransferFunction, cmap: str) -> TransferFunction:
-    """With the colours of a matplotlib colormap over the range of its values, and the same opacities; with
-    `COLOR_POINTS` more points, where there is room for them."""
-    values = np.asarray(transfer.values)
-    low, high = values[[0, -1]]
-    if len(values) + COLOR_POINTS <= MAX_POINTS:
-        at = np.linspace(low, high, COLOR_POINTS + 2, dtype=values.dtype)
-        transfer = with_points_at(transfer, np.setdiff1d(at, values))
-    values = np.asarray(transfer.values, np.float64)
-    display = colormaps[cmap]((values - low) / ((high - low) or 1.0))
-    return TransferFunction(values, from_srgb(display[:, :3]), transfer.extinction)
-
-
-def colored_as(transfer: TransferFunction, other: TransferFunction) -> TransferFunction:
-    """With the colours of another function, stretched to the range of its values, and the same opacities."""
-    values, its = (np.asarray(each.values, np.float64) for each in (transfer, other))
-    colors = np.asarray(other.colors)
-    if len(values) != len(its):  # two points at a value, a step, would become one colour
-        at = np.interp(values, values[[0, -1]], its[[0, -1]])
-        colors = np.stack([np.interp(at, its, each) for each in colors.T], axis=1)
-    return TransferFunction(values, colors, transfer.extinction)
 
 
 def _with_point(transfer: TransferFunction, index: int, **changed: Any) -> TransferFunction:

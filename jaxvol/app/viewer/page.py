@@ -7,8 +7,6 @@ import io
 import logging
 import math
 import re
-import secrets
-import socket
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -29,9 +27,6 @@ from .tiles import Pixels
 
 HOST = "127.0.0.1"
 OWN_NAMES = {HOST, "localhost"}
-ANY = {"0.0.0.0", "::", ""}
-"""Hosts that mean all addresses of this machine, which a browser is told by its name."""
-
 PAD = """<style>.mantine-Flex-root:has(> div label[for="{field}"]) {{ position: absolute; height: 0; width: 0;
 opacity: 0; overflow: hidden }}</style><div onpointerdown="({pressed})(event, text => {{
 const label = [...document.querySelectorAll('label')].find(each => each.htmlFor === '{field}');
@@ -61,7 +56,7 @@ class Page:
     Args:
         scene: what is looked at. `serve` makes it.
         state: how at first.
-        port: as for `serve`, as are `title`, `host` and `token`.
+        port: as for `serve`, as is `title`.
     """
 
     def __init__(
@@ -71,13 +66,8 @@ class Page:
         *,
         port: int = 8080,
         title: str = "jaxvol",
-        host: str = HOST,
-        token: str | None = None,
     ):
         self.shown = scene, state
-        is_local = host in OWN_NAMES
-        _check_host(host)
-        self._token = secrets.token_urlsafe() if token is None and not is_local else token
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
         # viser's cameras have limits that suit scenes of about this size
         self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
@@ -86,12 +76,9 @@ class Page:
         log = logging.getLogger("websockets.server")
         log.addFilter(_in_one_line)
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
-            self._server = _Server(host=host, port=port, label=title, verbose=False)
+            self._server = _Server(host=HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
-        known = "localhost" if is_local else socket.gethostname() if host in ANY else host
-        place = f"{known}:{self.port}"
-        told = "" if self._token is None else f"/?websocket=ws://{place}/{self._token}"
-        self.url = f"http://{place}{told}"
+        self.url = f"http://localhost:{self.port}"
         self._server._websock_server.on_client_connect(self._only_own_pages)
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._server.gui.main_panel.dock_right()
@@ -115,11 +102,7 @@ class Page:
         messages only after this call, so that those of others are read here, and dropped."""
         client = self._server._websock_server._live_connections[connection.client_id]
         origin = urlsplit(client.request.headers.get("Origin", "") if client.request else "")
-        is_own = origin.hostname in OWN_NAMES and origin.port == self.port
-        if self._token is not None:  # a page of whichever name that a proxy gives it
-            given = urlsplit(client.request.path if client.request else "").path.rsplit("/", 1)[-1]
-            is_own = secrets.compare_digest(given.encode(), self._token.encode())
-        if not is_own:
+        if origin.hostname not in OWN_NAMES or origin.port != self.port:
             await client.close(1008, "this viewer is shown by its own pages only")
             with contextlib.suppress(ConnectionClosed):
                 while True:
@@ -160,17 +143,6 @@ class Page:
         model = self.models.pop(client.client_id, None)
         if model is not None:
             model.close(wait=False)  # viser's loop must not wait
-
-
-def _check_host(host: str) -> None:
-    """Raise a `ValueError` unless this machine can listen there; viser would wait for ever."""
-    try:
-        found = socket.getaddrinfo(host or None, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        with socket.socket(found[0][0], socket.SOCK_STREAM) as tried:
-            tried.bind(found[0][4])
-    except (OSError, UnicodeError) as fault:
-        told = getattr(fault, "strerror", None) or fault
-        raise ValueError(f"host must be an address of this machine; got {host!r} ({told}).") from fault
 
 
 def _in_one_line(record: logging.LogRecord) -> bool:

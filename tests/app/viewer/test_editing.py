@@ -8,9 +8,7 @@ import pytest
 import jaxvol as jv
 from jaxvol.app.viewer.editing import (
     MAX_POINTS,
-    colored_as,
     display_color,
-    recolored,
     window_level,
     with_color,
     with_opacity,
@@ -92,18 +90,6 @@ def test_a_point_that_is_added_changes_nothing():
         without_point(without_point(without_point(GIVEN, 0), 0), 0)
     with pytest.raises(ValueError, match="no room for another"):
         with_points_at(GIVEN, np.linspace(1, 9, MAX_POINTS))
-
-
-def test_a_colormap_leaves_the_opacity():
-    colored = recolored(GIVEN, "gray")
-    np.testing.assert_allclose(looked_up(colored)[:, 3], looked_up(GIVEN)[:, 3], atol=1e-6)
-    grey = np.clip((np.asarray(colored.values) - 10) / 40, 0, 1)[:, None]
-    linear = np.where(grey < 0.04, grey / 12.92, ((grey + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(colored.colors, linear * np.ones(3), atol=0.01)  # of 256 colours
-    plain = without_point(GIVEN, 2)
-    for one in (GIVEN, plain):
-        assert_same_function(colored_as(with_color(one, 1, "#8040ff"), one), one)
-    assert_same_function(colored_as(recolored(plain, "gray"), plain), plain)
 
 
 def test_a_step_alone_is_shared_and_moved():
