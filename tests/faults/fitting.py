@@ -102,12 +102,6 @@ FAULTS: list[Fault] = [
         ("planning/test_probe.py::test_from_a_part_the_error_is_a_bound_in_most_cases",),
     ),
     Fault(
-        "scan conversion: the grid begins at the middle of the sector",
-        "io.scan_conversion:_grid",
-        lambda grid: lambda probe, *how: (grid(probe, *how)[0], probe.center),
-        ("io/test_scan_conversion.py::test_the_grid_encloses_the_sector_and_is_centred_on_it",),
-    ),
-    Fault(
         "wood grain: what noise has by chance counts",
         "metrics:_share_of_largest",
         lambda share: lambda m, n: 0.0,

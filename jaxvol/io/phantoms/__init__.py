@@ -12,9 +12,8 @@ import numpy as np
 
 from ..._util.checks import integer
 from ...scene.volume import Volume
-from .bodies import draw_frog, draw_head
+from .bodies import draw_engine, draw_frog, draw_head
 from .canvas import Canvas
-from .engine import draw_engine
 from .shapes import Block
 from .toroidal import toroidal_phantom as toroidal_phantom
 from .tubes import colon_path as colon_path, draw_colon, draw_vessels

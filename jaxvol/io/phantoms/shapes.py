@@ -7,7 +7,7 @@ for the others.
 from collections.abc import Callable, Sequence
 from functools import reduce
 from itertools import pairwise
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -130,3 +130,16 @@ def pair(*shapes: Shape) -> list[Shape]:
 def lengths(line: Float[np.ndarray, "points axes"]) -> Float[np.ndarray, " points"]:
     """Length of a polyline from its first point up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+
+
+KINDS: dict[str, Callable[..., Shape]] = {
+    each.__name__: each for each in (ellipsoid, ball, capsule, box, cylinder, ring)
+}
+
+
+def shapes_of(specs: Sequence[Any]) -> list[Shape]:
+    """Shapes from their kinds and arguments, as JSON holds them; `pair` has shapes as its arguments."""
+    found = []
+    for kind, *args in specs:
+        found += pair(*shapes_of(args)) if kind == "pair" else [KINDS[kind](*args)]
+    return found

@@ -14,8 +14,9 @@ from jaxtyping import Float
 from ..._util.checks import flag, integer
 from ...march.transforms.toroidal_map import ToroidalMap
 from ...scene.volume import Volume
+from .bodies import parts
 from .canvas import SLAB, smooth_min
-from .shapes import Block, Shape, ball, capsule, ellipsoid, tube
+from .shapes import Block, ellipsoid, shapes_of
 
 
 SOFT = 1.2  # mm over which a boundary falls from full to none
@@ -117,72 +118,35 @@ def _shells(x: Block, y: Block, z: Block, gamma: Block) -> Block:
 
 
 def _spheres(x: Block, y: Block, z: Block, gamma: Block) -> Block:
-    return _painted(np.full_like(x, 60), ((value, sphere.distance(x, y, z)) for value, sphere in SPHERES))
+    spheres = ((value, *shapes_of([sphere])) for value, sphere in parts()["spheres"])
+    return _painted(np.full_like(x, 60), ((value, sphere.distance(x, y, z)) for value, sphere in spheres))
 
 
 def _wires(x: Block, y: Block, z: Block, gamma: Block) -> Block:
-    return _painted(_spheres(x, y, z, gamma), ((255, wire.distance(x, y, z)) for wire in WIRES))
+    wires = shapes_of(parts()["wires"])
+    return _painted(_spheres(x, y, z, gamma), ((255, wire.distance(x, y, z)) for wire in wires))
 
 
 def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     # origin at the navel; x from crown to rump, y from right to left, z from back to front
     at = x, y, 100 - z
     either_side = x, abs(y), at[2]
-    head, limbs = _joined(HEAD, at, 4), _joined(LIMBS, either_side, 2)
-    body = _joined(TRUNK, at, 8)
-    body = smooth_min(smooth_min(_joined([*FACE, *EARS], either_side, 1), head, 2), body, 4)
-    body = smooth_min(smooth_min(limbs, body, 4), _joined(CORD, at, 0), 2)
+    head, limbs = _joined("head", at, 4), _joined("limbs", either_side, 2)
+    body = _joined("trunk", at, 8)
+    face = smooth_min(_joined("face", either_side, 1), _joined("ears", either_side, 1), 1)
+    body = smooth_min(smooth_min(face, head, 2), body, 4)
+    body = smooth_min(smooth_min(limbs, body, 4), _joined("cord", at, 0), 2)
     fluid = ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at)
     skull = (170, head + 2.5), (40, head + 4.5)
-    bones = (170, _joined(SPINE, at, 0)), (170, _joined(BONES, either_side, 0))
+    bones = (170, _joined("spine", at, 0)), (170, _joined("bones", either_side, 0))
     return _painted(np.full_like(x, 30), [(4, fluid), (120, body), (70, body + 2), *skull, *bones])
 
 
-def _joined(shapes: Iterable[Shape], at: tuple[Block, Block, Block], blend: float) -> Block:
-    """Distance to the union of shapes, with rounded seams."""
-    return reduce(lambda a, b: smooth_min(a, b, blend), (shape.distance(*at) for shape in shapes))
-
-
-SPHERES = [
-    (value, ball((across, side, 95), radius))
-    for radius, across, target in ((6, -30, 130), (9, -4, 160), (12, 28, 190))
-    for value, side in ((4, -20), (target, 20))
-]
-
-WIRES = [
-    capsule((-60, 0, 110), (60, 0, 110), 1.5),
-    capsule((0, -55, 75), (0, 55, 75), 1.5),
-    capsule((-25, -15, 65), (25, 15, 130), 1.5),
-    capsule((25, -15, 65), (-25, 15, 130), 1.5),
-]
-
-# parts of the fetus; of paired ones, that at y > 0
-SHOULDER, ELBOW, WRIST, FINGERS = (-11, 13, 0), (3, 20, 7), (-10, 13, 17), (-16, 11, 20)
-HIP, KNEE, ANKLE, TOES = (27, 8, -2), (19, 15, 19), (39, 9, 13), (43, 8, 21)
-HEAD = [ellipsoid((-33, 0, 2), (16, 13.5, 15)), ellipsoid((-27, 0, 6), (11, 9.5, 11))]
-FACE = [
-    capsule((-31, 0, 15.5), (-26.5, 0, 18.5), 1.6, 2.4),  # nose
-    ellipsoid((-22.5, 0, 15.5), (2.2, 3.5, 2.0)),  # lips
-    ball((-18.5, 0, 11.5), 4),  # chin
-]
-EARS = [ellipsoid((-29, 13.5, -1), (4, 1.5, 3))]
-TRUNK = [
-    capsule((-25, 0, -2), (-14, 0, -4), 8),  # neck
-    ellipsoid((-3, 0, -3), (17, 13, 13)),
-    ellipsoid((13, 0, -2), (17, 14.5, 14.5)),
-    ellipsoid((27, 0, -6), (12, 13, 11)),
-]
-LIMBS = [
-    capsule(SHOULDER, ELBOW, 5, 4),
-    capsule(ELBOW, WRIST, 4, 3),
-    capsule(WRIST, FINGERS, 3.5, 2.5),
-    capsule(HIP, KNEE, 8, 5.5),
-    capsule(KNEE, ANKLE, 5.5, 3.5),
-    capsule(ANKLE, TOES, 3.5, 3),
-]
-BONES = [capsule(a, b, 1.2) for a, b in ((SHOULDER, ELBOW), (ELBOW, WRIST), (HIP, KNEE), (KNEE, ANKLE))]
-SPINE = [ball((x, 0, -10 - 0.004 * (30 - abs(x - 4)) * x), 1.8) for x in range(-18, 32, 5)]
-CORD = tube([(13, 0, 12), (11, -9, 20), (18, -19, 21), (29, -25, 15), (36, -27, 4), (38, -27, -10)], 2.2)
+def _joined(part: str, at: tuple[Block, Block, Block], blend: float) -> Block:
+    """Distance to the union of the shapes of a part of the fetus, with rounded seams. Of paired parts, those
+    at y > 0 are listed."""
+    distances = (shape.distance(*at) for shape in shapes_of(parts()[f"fetus {part}"]))
+    return reduce(lambda a, b: smooth_min(a, b, blend), distances)
 
 
 SCENES = {"shells": _shells, "spheres": _spheres, "wires": _wires, "fetus": _fetus}
