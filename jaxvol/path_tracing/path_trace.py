@@ -152,30 +152,6 @@ def _background(background: Any, image: Float[Array, "height width 3"]) -> Float
     return jnp.broadcast_to(background, image.shape)
 
 
-def mean_and_standard_error(groups: Any) -> tuple[Any, Any]:
-    """Estimate and its standard error, from independent estimates by groups of paths.
-
-    Args:
-        groups: a tree of arrays whose first axis is that of groups: `PathTraced.images`, what is computed of
-            each, or their derivatives.
-
-    Returns:
-        Mean, and standard error of the mean, of each array. The latter itself has a relative error of
-        1 / sqrt(2 (groups - 1)).
-
-    Raises:
-        ValueError: for fewer than two groups.
-    """
-    few = {len(leaf) for leaf in jax.tree.leaves(groups) if len(leaf) < 2}
-    if few:
-        raise ValueError(f"groups must be 2 or more along the first axis; got {few.pop()}.")
-
-    def error(leaf: Array) -> Array:
-        return jnp.std(leaf, axis=0, ddof=1) / np.sqrt(leaf.shape[0])
-
-    return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=0), groups), jax.tree.map(error, groups)
-
-
 def path_trace(
     volume: Volume | Any,
     transfer: Transfer | Any,
@@ -210,7 +186,7 @@ def path_trace(
     colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit,
     and, without materials, voxels. They are unbiased: decisions stay as drawn, and their probabilities enter
     as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns; with
-    `groups`, a derivative has a standard error (`mean_and_standard_error`).
+    `groups`, a derivative has a standard error, too: that of the mean over groups.
 
     Their noise is greater than that of the image, and grows with the number of collisions of a path: in very
     thick media of high albedo, take many paths. At a colour of 0 or 1, where the albedo is clipped, and an
@@ -241,7 +217,7 @@ def path_trace(
         lanes: paths that are traced side by side. Memory grows with it; the result does not change.
         groups: that paths are split into, a divisor of `paths`. Of several, each keeps an image,
             16 bytes a pixel, and as much for each derivative; so whatever is computed of images has a
-            standard error: see `PathTraced.images` and `mean_and_standard_error`.
+            standard error, `std(axis=0, ddof=1) / sqrt(groups)` over `PathTraced.images`.
 
     Returns:
         A `PathTraced`, with the standard error of each pixel.
