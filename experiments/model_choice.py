@@ -21,7 +21,7 @@ import numpy as np
 import jaxvol as jv
 
 from . import charts
-from .choice import Candidate, choose, nested_points
+from .choice import Candidate, choose, nested_points, refined
 from .harness import experiment
 from .scenes import grid, on_cube
 
@@ -120,7 +120,7 @@ def control_points(resolution: int, numbers: Sequence[int]) -> Problem:
     march = marching(volume)
     functions = [jv.flat_grey(volume, 2, (0, 1))]
     for number in numbers[1:]:
-        functions.append(jv.refined(functions[-1], number))
+        functions.append(refined(functions[-1], number))
 
     def scene(transfer: Any, camera: jv.Camera) -> tuple[Any, ...]:
         return volume, transfer, camera, march

@@ -30,7 +30,6 @@ from .fitting import (
     flat_grey as flat_grey,
     read_transfer as read_transfer,
     read_views as read_views,
-    refined as refined,
     register as register,
     unconstrain as unconstrain,
     write_transfer as write_transfer,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from experiments.choice import Candidate, choose, nested_points, standard_error
+from experiments.choice import Candidate, choose, nested_points, refined, standard_error
 from experiments.model_choice import nested_materials
 
 
@@ -171,14 +171,14 @@ PLAIN = jv.TransferFunction((0, 1), np.full((2, 3), 0.5), (0.5, 0.5))
 def test_a_refined_transfer_function_is_the_same_function():
     values, colors = (0.0, 10.0, 10.0, 40.0), np.random.default_rng(0).random((4, 3))
     transfer = jv.TransferFunction(values, colors, (0.0, 3.0, 1.0, 2.0))
-    finer = jv.refined(transfer, 9)
+    finer = refined(transfer, 9)
     assert len(finer.values) == 9
     assert set(values) <= set(np.asarray(finer.values).tolist())
     at = np.array([-1.0, 3.0, 9.0, 10.0, 14.0, 27.5, 41.0], np.float32)
     one, other = (jax.jit(jax.vmap(each.__call__))(at) for each in (transfer, finer))
     for before, after in zip(one, other, strict=True):
         np.testing.assert_allclose(before, after, atol=1e-6)
-    even = jv.refined(jv.refined(PLAIN, 3), 9)
+    even = refined(refined(PLAIN, 3), 9)
     np.testing.assert_allclose(even.values, np.linspace(0, 1, 9), atol=1e-7)
 
 
@@ -292,7 +292,7 @@ BAD = [
     (given(errors=-1), "errors must not be negative; got -1"),
     (given(block=0), "block must be an integer of at least 1; got 0"),
     (given(where=np.sum, constraints=None), "constraints and where must be given with each Candidate"),
-    (lambda: jv.refined(PLAIN, 1), "points must be an integer of at least 2; got 1"),
+    (lambda: refined(PLAIN, 1), "points must be an integer of at least 2; got 1"),
     (points(4, 4), r"points must be increasing .*\(4, 4\)"),
     (points(2, start=zeros(3)), "start must be a TransferFunction; got a JAX array"),
 ]

@@ -16,5 +16,5 @@ from .files import read_transfer as read_transfer, read_views as read_views, wri
 from .path_traced import PathTracedResidual as PathTracedResidual
 from .registration import Registration as Registration, register as register
 from .residuals import ImageResidual as ImageResidual
-from .starts import flat_grey as flat_grey, refined as refined
+from .starts import flat_grey as flat_grey
 from .uncertainty import Uncertainty as Uncertainty

@@ -1,6 +1,5 @@
-"""Where fits of transfer functions start: from flat grey, or from one of fewer control points."""
+"""Where fits of transfer functions start: from flat grey."""
 
-from itertools import pairwise
 from typing import Any
 
 import jax.numpy as jnp
@@ -32,35 +31,3 @@ def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = No
     extent = float(jnp.mean(volume.bounds[1::2] - volume.bounds[::2]))
     values = np.linspace(float(low), float(high), points)
     return TransferFunction(values, np.full((points, 3), 0.5), np.full(points, 1 / extent))
-
-
-def refined(transfer: TransferFunction, points: int | Any) -> TransferFunction:
-    """The same transfer function with more control points.
-
-    All points are kept. Each new one goes where the gap is widest, and those of one gap divide it evenly:
-    even points become even ones again from n to 2n - 1, as 2, 3, 5, 9, and nearly even ones otherwise.
-
-    Args:
-        transfer: the transfer function.
-        points: their number, at least that of `transfer`.
-
-    Returns:
-        A `TransferFunction` that shows the same.
-
-    Raises:
-        ValueError: for fewer points than `transfer` has.
-    """
-    values = np.asarray(transfer.values)
-    points = integer("points", points, len(values))
-    gaps = np.diff(values.astype(float))
-    pieces = np.ones(len(gaps), int)
-    for _ in range(points - len(values)):
-        pieces[np.argmax(gaps / pieces)] += 1
-
-    def divided(rows: Any) -> np.ndarray:
-        rows = np.asarray(rows)
-        each = zip(pairwise(rows), pieces, strict=True)
-        return np.concatenate([*(np.linspace(a, b, n, endpoint=False) for (a, b), n in each), rows[-1:]])
-
-    rows = divided(values), divided(transfer.colors), divided(transfer.extinction)
-    return TransferFunction(*rows, per_voxel=transfer.per_voxel)
