@@ -158,15 +158,14 @@ class ImageVjp(NamedTuple):
         start: Progress,
         *,
         skips: Skips | None = None,
-        shifts: bool = False,
     ) -> Marched:
         """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
         tiles, step = self.tiles, self.scene.march.step
         skips = tiles.skips(self.empty_space, rays, step) if skips is None else skips
         start = blinded(skips, start)
         if range_ is not None:
-            start = into_range(self.prepared, rays, start, range_, shifts=shifts)
-        return march_rays(self.lit, rays, start, tiles.tiling, skips, replay, shifts=shifts)
+            start = into_range(self.prepared, rays, start, range_, shifts=False)
+        return march_rays(self.lit, rays, start, tiles.tiling, skips, replay, shifts=False)
 
     def begin(self, rays: Ray, shifted: Int[Array, "groups rays"] | None) -> Progress:
         """Rays at their entries, of which nothing but the opacity is computed. `shifted`: where they shift;

@@ -5,6 +5,7 @@ Lee, Kwon and Shin: Scattered light representation in accordance with the materi
 volume rendering (2016), sections 3.3 and 3.4.
 """
 
+import inspect
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
@@ -260,21 +261,11 @@ class ScattererTemplates(Lighting):
         return blended.brightest(self.photons * self.templates)
 
 
-_DEFAULTS = {
-    "threshold_on": "photon",
-    "blend": False,
-    "photons": None,
-    "occlusion": "soft",
-    "reach": (2.0, 4.0),
-    "cutoff": None,
-    "given": None,
-}
-
-
 def _check_unused(options: dict[str, Any]) -> None:
     """Raise `ValueError` for what the published form alone has."""
+    known = inspect.signature(ScattererTemplates.__init__).parameters
     for name, value in options.items():
-        if value is not _DEFAULTS[name] and value != _DEFAULTS[name]:
+        if value is not known[name].default and value != known[name].default:
             raise ValueError(f'{name} is of form="published"; got {value!r} for form="transport".')
 
 
