@@ -31,6 +31,7 @@ COMMANDS = {
         "pages",
         "make the figures and tables of the source papers, and a page of them, from recorded results",
     ),
+    "warm": ("warm", "compile the programs of usual pictures, and keep them, so that these take less time"),
     "info": (
         "volumes",
         "print shape, type, place in the world and values of a volume file, as jaxvol loads it",

@@ -30,7 +30,7 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     some 4 s. Call this before the first image of a script: it turns on JAX's persistent compilation cache for
     this process, and keeps traced programs beside it (`kept_programs`), unless code of one's own is a part of
     them, or a `jax.jit` is around them. The command `jaxvol` does so by itself, and so do notebooks, `show`,
-    `view` and the page of `jaxvol view`, unless JAX has a folder already. Programs
+    `view` and the page of `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. Programs
     are those of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete
     the folder. Keep it where nobody else can write: programs in it are executed.
 
