@@ -68,7 +68,11 @@ def box_of(origins, directions):
     others = {"length": jnp.zeros(4), "path": None, "pixel": None, "gaps": (), "spans": (), "reach": None}
     box = Box.within(occupancy(jnp.zeros(BLOCKS, bool)), unchecked(Ray, **places, **others))
     at = jnp.linspace(0, 1, 9) * (box.far - box.near)
-    return box, at, jax.vmap(lambda u: tuple(jnp.stack(corner) for corner in box.between(u, u)))(at)
+    return (
+        box,
+        at,
+        jax.vmap(lambda u: tuple(jnp.stack(ends) for ends in zip(*box.between(u, u), strict=True)))(at),
+    )
 
 
 def blocks_at(rays, distance):
