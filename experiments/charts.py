@@ -69,11 +69,14 @@ def _labelled(leads: Sequence[int], value: float, _: Any) -> str:
 
 
 def draw_record(file: Path, path: Path) -> None:
-    """Draws a record into a file by the `draw` of its experiment, if that has one; next to it its page."""
+    """Draws a record into a file by the `draw` of its experiment, if that has one; next to it its page, and
+    the charts that it calls `more`, by their names."""
     found = record.read(file)
     module = import_module(shlex.split(found["command"])[2])
     if hasattr(module, "draw"):
         save(module.draw(found["result"]), path)
+    for name, chart in getattr(module, "more", {}).items():
+        save(chart(found["result"]), path.with_name(f"{name}{path.suffix}"))
     if hasattr(module, "page"):
         module.page(file, path.with_suffix(".html"))
 

@@ -8,8 +8,8 @@ white against a converged image, whose own error is estimated (`pareto_measure`)
 
 `--scene` measures some scenes again and keeps what the record says of the others, with the commit that they
 are of. `--point` renders one point of one scene again, times it and saves its picture beside its error. The
-record is `pareto.json`, the chart `pareto.png`, the page `pareto.html` (see `pareto_page`), the pictures
-that it shows are in the folder `pareto/`.
+record is `pareto.json`, the charts are `pareto.png` and `pareto_grain.png`, the page is `pareto.html` (see
+`pareto_page`), and the pictures that it shows are in the folder `pareto/`.
 
 Where VTK shades, it lights nodes and interpolates what that gives, along the camera's axis: a part of its
 distance to our image, up to 3 / 255, is that and not an error.
@@ -114,6 +114,7 @@ def again(name: str, chosen: Namespace, output: Path, present: dict[str, str]) -
 
 
 draw, page = pareto_page.chart, pareto_page.write
+more = {"pareto_grain": pareto_page.grain_chart}
 
 
 @experiment(

@@ -64,6 +64,50 @@ def chart(result: dict[str, Any]) -> Any:
     return figure
 
 
+GRAIN = {
+    "equidistant": [f"midpoint, step {step}" for step in ("0.25", "0.5", "1", "2", "4")],
+    "jittered": ["jittered, step 1", "jittered, step 2"],
+    "jittered, first cell cut at the entry": [
+        "jittered, front residual, step 1",
+        "jittered, front residual, step 2",
+    ],
+    "empty-space jittered": ["empty-space jittered, step 1", "empty-space jittered, step 2"],
+}
+"""Settings of the chart of wood grain, all by the midpoint rule and aligned."""
+GRAIN_OF = "head phantom", "engine", "bonsai", "lidc0314_airway"
+NO_GRAIN = 1e-8
+"""Below it, an energy is that of noise, or 0."""
+
+
+def grain_chart(result: dict[str, Any]) -> Any:
+    """Time against the energy of wood grain: of jitter, and of shorter steps."""
+    scenes = {name: result["scenes"][name] for name in GRAIN_OF if name in result["scenes"]}
+    figure, axes = charts.panels(1, max(len(scenes), 1), 4 * max(len(scenes), 1), 4.4)
+    for panel, (name, scene) in zip(axes.flat, scenes.items(), strict=False):
+        base = scene["points"]["midpoint, step 1"]["time"]
+        for label, settings in GRAIN.items():
+            chosen = {n: scene["points"][n] for n in settings if n in scene["points"]}
+            places = [(max(p["wood grain"], NO_GRAIN), p["time"] / base) for p in chosen.values()]
+            if not places:
+                continue
+            panel.plot(*zip(*places, strict=True), "o-", markersize=4.5, linewidth=0.8, label=label)
+            for setting, place in zip(chosen, places, strict=True):
+                panel.annotate(
+                    setting.rsplit(" ", 1)[1], place, (3, 3), textcoords="offset points", fontsize=8
+                )
+        panel.set(xscale="log", xlabel="energy of wood grain", title=f"{name}, {scene['pixels']}²")
+        panel.grid(which="major", linewidth=0.3)
+    axes.flat[0].set_ylabel("time of a frame / at one voxel")
+    figure.suptitle(
+        "Time against wood grain: of jitter, and of shorter equidistant steps. Numbers are steps in voxels; "
+        "below and to the left is better",
+        fontsize=10,
+    )
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
+    return figure
+
+
 def identity(scene: str, setting: str) -> str:
     """Of a point, in the chart of the page."""
     return f"point-{slug(scene)}-{slug(setting)}"

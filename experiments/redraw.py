@@ -18,7 +18,15 @@ NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
 IMAGES = {"path_traced", "tomography", "transport"}
 """Records whose charts show images that no record holds."""
 OTHERS = {
-    *("adaptive_error", "bricks", "compare", "compare_gpu", "compare_small", "compare_untuned"),
+    *(
+        "adaptive_error",
+        "bricks",
+        "compare",
+        "compare_avx512",
+        "compare_gpu",
+        "compare_small",
+        "compare_untuned",
+    ),
     *("gradient_agreement", "gradient_agreement_gpu", "out_of_core", "probe_geometry", "shading"),
     *("viewer_latency", "visible_shading"),
 }
