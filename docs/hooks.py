@@ -4,8 +4,8 @@
   places: a page of `docs/` names `../paper_figs/README.md`, as it must where the repository is read.
 - Charts and pages of records are drawn from these, as `python -m experiments.redraw` does.
 - `<!-- section FILE: HEADING -->` is replaced by the text under that heading of a Markdown file.
-- `<!-- table failures -->`, `<!-- table pictures -->` and `<!-- table references -->` are replaced by tables,
-  made from the record of the failure atlas and from CITATION.cff.
+- `<!-- table failures -->`, `<!-- table pictures -->`, `<!-- table records -->` and `<!-- table references
+  -->` are replaced by tables, made from the failure atlas' record, all records, and CITATION.cff.
 """
 
 import json
@@ -171,7 +171,28 @@ def references() -> str:
     return "\n".join(lines)
 
 
-TABLES = {"failures": failures, "pictures": pictures, "references": references}
+def records() -> str:
+    """A table of what was measured at which commit, on which machine, and how."""
+    lines = ["| record | commit | commits since | machine | command |", "|---|---|---|---|---|"]
+    for file in sorted((ROOT / "experiments/results").glob("*.json")):
+        found = json.loads(file.read_text(encoding="utf-8"))
+        commit, device = found["commit"], found["device"]
+        machine = device["kind"] if device["platform"] != "cpu" else device.get("processor", "CPU")
+        since = commits_since(commit.rstrip("+"))
+        lines.append(f"| {file.stem} | `{commit}` | {since} | {machine} | `{found['command']}` |")
+    return "\n".join(lines)
+
+
+def commits_since(commit: str) -> str:
+    """How many commits lie behind one; nothing where that is not known, as in a copy without history."""
+    command = ["git", "rev-list", "--count", f"{commit}..HEAD"]
+    try:
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+TABLES = {"failures": failures, "pictures": pictures, "records": records, "references": references}
 
 
 def on_post_build(config: Any) -> None:
