@@ -136,8 +136,7 @@ def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
 
 
 def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Float[np.ndarray, "n 3"]:
-    """Points in the world around what a transfer function shows, specks left out; the corners of the volume
-    where nothing is visible, or that is not known."""
+    """World points around what is shown, without specks; else the volume's corners."""
     from scipy.ndimage import label, maximum_filter
     from scipy.spatial import ConvexHull, QhullError
 
@@ -163,8 +162,7 @@ def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -
 def clipped_points(
     points: Float[np.ndarray, "n 3"], planes: Sequence[tuple[Any, Any]]
 ) -> Float[np.ndarray, "m 3"]:
-    """Points whose hull is that of the given ones on the sides of all planes (point, normal): those that lie
-    there, and where lines to the others cross. None where nothing is left."""
+    """Points whose hull is what planes (point, normal) leave of the given hull, if anything."""
     for at, normal in planes:
         height = (points - np.asarray(at, float)) @ np.asarray(normal, float)
         kept, cut = points[height >= 0], points[height < 0]

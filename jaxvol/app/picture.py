@@ -69,14 +69,12 @@ PIXEL = 160
 """Bytes that an image takes for each pixel, while it is rendered and written."""
 
 IN_MEMORY = 9
-"""Most bytes that `render` takes for each byte of voxels: these as read and in the device, a packed copy of
-8-bit ones, the extremes of blocks, and slopes."""
+"""Most bytes of `render` for each byte of voxels: on host and device, packed, and the blocks' ranges."""
 
 
 class Scene(NamedTuple):
-    """What is looked at, and how. If `source` is read in bricks, since it does not fit into `memory` bytes,
-    `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image, with their
-    transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it is known."""
+    """What is looked at. `volume` is a coarser copy of `source`, if that is read in bricks of `memory`
+    bytes."""
 
     volume: Volume
     transfer: Transfer
@@ -238,8 +236,7 @@ def _camera(
 
 
 def other_of(each: Any) -> tuple[Volume, Transfer]:
-    """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
-    and HIGH, or over what stands out of the background."""
+    """A further volume, and the given transfer function, or a colormap over LOW to HIGH."""
     file, *look = each if isinstance(each, Sequence) and not isinstance(each, str) else (each,)
     volume = file if isinstance(file, Volume) else load(file)
     if look and isinstance(look[0], Transfer):
@@ -256,8 +253,7 @@ def other_of(each: Any) -> tuple[Volume, Transfer]:
 
 
 def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> Scene:
-    """The scene with the given step; without one, with the shortest of those planned for the cameras (of
-    several volumes, with half of their shortest spacing)."""
+    """The scene with the given step, or the shortest one planned for the cameras."""
     step = options.step
     if step is None and scene.others:
         if options.tolerance is not None:
@@ -314,8 +310,7 @@ def background_of(options: Namespace) -> tuple[float, float, float]:
 
 
 def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
-    """The transfer function that the options ask for. `source`: of which `volume` is a copy with fewer
-    voxels."""
+    """The transfer function of the options. `source`: what `volume` is a coarser copy of."""
     if options.recorded_transfer is not None:
         return options.recorded_transfer
     if options.transfer is not None:
@@ -367,8 +362,7 @@ def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lig
 
 
 def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel, stretched to the bounds of the whole: of those by which colours are chosen
-    for the whole, if they fit into so many bytes, and of fewer if not."""
+    """A copy of every n-th voxel that fits into memory, stretched to the whole's bounds."""
     most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
     copy = source.subsampled(min(stride_of(source.shape, most), min(source.shape) // 2))
     whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, source.spacing, copy.shape, strict=True)]

@@ -127,8 +127,7 @@ class VoxelSource:
         return None
 
     def check_unchanged(self) -> None:
-        """Raises if the file under a memory map was written to since the source was made. To read one that
-        became shorter would end the process."""
+        """Raises if the mapped file changed: to read a shorter one would end the process."""
         now = self._file_state()
         if now is not None and now != self._file:
             raise ValueError(f"{self.name} changed after it was opened as a source. Open it again.")
@@ -185,8 +184,7 @@ class VoxelSource:
         return Volume(found, [stride * s for s in self.spacing], self.origin)
 
     def boxes(self, box: Box, most: int) -> Iterator[Box]:
-        """Cuts a box between chunks, into boxes of at most `most` bytes or of one chunk, in the order of
-        storage."""
+        """Cuts a box between chunks, into boxes of one chunk or `most` bytes, in the order of storage."""
         extent, item = list(self.chunks), self.dtype.itemsize
         for axis in reversed(self.order):  # rows first
             while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= most:
@@ -251,8 +249,7 @@ def voxel_type(stored: np.dtype) -> np.dtype:
 
 
 def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[Any, list[int]]:
-    """Voxels of a chunk along each axis, None where there are no chunks; and the axes in the order of
-    storage, the slowest first."""
+    """Voxels of a chunk along each axis, or None; and the axes in the order of storage, slowest first."""
     axes, layout = list(range(len(shape))), getattr(array, "chunk_layout", None)
     if layout is not None:  # tensorstore
         chunks = [c or n for c, n in zip(layout.read_chunk.shape, shape, strict=True)]

@@ -69,8 +69,7 @@ class Request:
 
 
 class Traversal:
-    """An image's rays on their way through all bricks. Its `scene` is as rays are marched, and its volume is
-    without voxels."""
+    """An image's rays through all bricks. `scene`: as rays are marched, without voxels."""
 
     rays: Ray
     start: Progress  # at their entries
@@ -114,8 +113,7 @@ class Traversal:
         self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
-        """Each brick that rays need, and their cells there, while the next one is read. Before this one is
-        asked for, `at` is set to where rays have come, and the brick dropped."""
+        """Each needed brick and its cells, while the next is read; drop it and set `at` before that."""
         self.rays, self.start, self.at, given_back = rays, at, at, self.bytes_read
         method = self.request.method
         if not callable(method):
@@ -165,8 +163,7 @@ class Traversal:
         return found if bool(found.any) else None
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
-        """The box that is read for these cells, for which `stored` is enlarged; None if it, or then any
-        single brick, does not fit into memory."""
+        """Box to read for these cells, which enlarges `stored`; None if memory does not suffice."""
         shape = self.grid.shape
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
         around = self.margin.of_points(self.space, shape, low, high)
@@ -182,8 +179,7 @@ class Traversal:
     def load(
         self, brick: int, cells: CellRange | None, box: tuple[np.ndarray, np.ndarray] | None = None
     ) -> Load:
-        """Starts to read a brick, from a multiple of BLOCK on. `box`: nodes that it holds, by default what
-        all of its cells need."""
+        """Starts to read a brick, from a multiple of BLOCK on: `box`, or the nodes of all its cells."""
         if box is None:
             low, high = (np.asarray(end) for end in self.grid.cells(brick))
             box = low - self.margin.cells, high + self.margin.cells

@@ -1,9 +1,5 @@
-"""Which single value of a ray does a pixel show? Its greatest, its least, or its mean.
-
-A projection turns all values along a ray into one number, and looks that up in the transfer function. The
-opacity is that of a layer of a `thickness`. VTK and PyVista show the opacity of a layer of the unit distance;
-so do these modes by default, since both lengths are 1.
-"""
+"""Shows one value of a ray, its greatest, least or mean, looked up in the transfer function, as opaque as a
+layer of a `thickness`: by default 1, as by VTK and PyVista."""
 
 from abc import abstractmethod
 from typing import Any, TypeAlias

@@ -1,8 +1,5 @@
-"""Templates as published: packets of light that are refracted and reflected at each scatterer.
-
-Packets start from the origin. Each travels to its next scatterer, leaves a photon there, and goes on as two
-packets, one refracted and one reflected. This binary tree is simulated level by level in arrays of static
-shape, so that many templates of many materials are simulated at once.
+"""Templates as published: packets of light from the origin leave a photon at each scatterer and go on as two,
+refracted and reflected, a binary tree that is simulated level by level in arrays of static shape.
 
 Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
 volume rendering (2016), section 3.
@@ -72,16 +69,14 @@ class PacketTree:
         return math.inf if self.whole_levels else math.floor(1 / self.faintest + 1e-9)
 
     def levels(self, opacity: float) -> int:
-        """Number of levels that may hold a photon above the threshold. The brightest possible photon of level
-        k has `α (1 - α)^k / packets`."""
+        """Levels with photons above the threshold: the brightest of level k has `α (1 - α)^k / packets`."""
         if opacity == 1:
             return 1
         return 1 + math.floor(math.log(self.faintest * self.packets / opacity) / math.log(1 - opacity) + 1e-9)
 
     def levels_of(self, materials: Sequence[Material], levels: int | Sequence[int] | None) -> tuple[int, ...]:
-        """The number of levels of each material, by default as many as its opacity allows. **Raises**
-        `ValueError` for an opacity that leaves no photon, for one that is traced, if no number is given, and
-        for too many photons."""
+        """Levels of each material, by default as its opacity allows. **Raises** `ValueError` for no photon,
+        too many, or a traced opacity without a number."""
         found = []
         for material in materials:
             if is_traced(material.opacity):
@@ -112,8 +107,7 @@ class PacketTree:
         return tuple(found)
 
     def capacity(self, levels: int, opacity: float | None = None) -> int:
-        """Upper bound of a template's photons: in each level at most twice as many as in the one before, and,
-        for a given opacity, no more than its energy allows."""
+        """Upper bound of a template's photons: levels at most double, and, by opacity, energy limits them."""
         total = 0
         for k in range(levels):
             most = self.max_width
@@ -130,8 +124,7 @@ class PacketTree:
         merge: float = MERGE,
         own_levels: Int[Array, ""] | None = None,
     ) -> ScattererTemplate:
-        """The photons of a tree of so many levels, merged and sorted; NaN if a traced opacity leaves none.
-        `own_levels`: of this material, if it has fewer than others."""
+        """Photons of a tree, merged and sorted; NaN if a traced opacity leaves none."""
         origin, draws = jax.random.split(key)
         # evenly spread over the sphere and rotated at random, so that each alone is uniformly distributed
         q, r = jnp.linalg.qr(jax.random.normal(origin, (3, 3)))

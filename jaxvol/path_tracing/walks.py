@@ -1,8 +1,6 @@
-"""Random walks of light, traced backwards from the camera: flights, scatterings and next-event estimation.
-
-A walk is always on one flight: its own, or one from its last scattering towards a light. Both query the
-volume in the same way, so that walks at different stages run side by side, a step at a time.
-"""
+"""Random walks of light, from the camera: flights, scatterings, next-event estimation. A walk is on its own
+flight or on one towards a light; both query the volume alike, so that walks run side by side, a step at a
+time."""
 
 from collections.abc import Callable
 from functools import partial
@@ -37,8 +35,7 @@ Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Arra
 
 
 class WalkResult(NamedTuple):
-    """Of a path: its radiance, the opacity (1 if the camera's ray met anything, else 0), its scatterings,
-    whether it was cut."""
+    """A path's radiance, opacity (0 or 1), number of scatterings, and whether it was cut."""
 
     radiance: Vec3
     opacity: Scalar
@@ -112,8 +109,7 @@ class WalkScene(NamedTuple):
         return Flight.to(self.medium.majorants, start, space.frame.components(direction), space.spacing, end)
 
     def light(self, coordinate: Vec3, direction: Vec3, uniform: Scalar) -> Arriving:
-        """Light at a grid coordinate of a walk in this direction, from one located light, chosen at random,
-        weighted by their number."""
+        """Light at a grid coordinate from a random located light, weighted by their number."""
         x, y, z = self.space.point(coordinate)
         count = len(self.located)
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
@@ -137,8 +133,7 @@ class Scattering(NamedTuple):
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
-    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome. Whatever is
-    expensive is put in memory, since XLA would recompute it for each of its uses."""
+    """Advance many walks by a part of a flight. Expensive values are stored, or XLA recomputes them."""
     live = jnp.any(walks.alive)
 
     def uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -181,8 +176,7 @@ def _scatter(
     choose: Scalar,
     survive: Scalar,
 ) -> Scattering:
-    """The outcome for a walk that is scattered at `coordinate`. `collided`: the weight of this collision;
-    `turn`: the direction around the z axis."""
+    """Outcome of a scattering. `collided`: the collision's weight; `turn`: direction around z."""
     kept = scaled(albedo, collided)
     before_roulette = times(walk.throughput, kept)
     least = scene.sampling.importance
@@ -268,8 +262,7 @@ def _where(condition: Bool[Array, ""], a: T, b: T) -> T:
 
 
 def _roulette(importance: Scalar, uniform: Scalar) -> tuple[Scalar, Scalar]:
-    """Russian roulette: what is of small importance ends, or is divided by the probability of survival.
-    Returns its weight, a constant for derivatives, and the importance then."""
+    """Russian roulette: weight by the importance, a constant for derivatives; and importance then."""
     importance = jax.lax.stop_gradient(importance)
     small = importance < ROULETTE
     survives = uniform * ROULETTE < importance

@@ -1,8 +1,5 @@
-"""What do several volumes show together? `render([ct, pet], [of_ct, of_pet], camera, march)`.
-
-They become one volume, a grid that just holds them all, whose field (`Several`) reads each at its place,
-and one transfer function (`Together`): extinctions add, and colours are means, weighted by extinction.
-"""
+"""Several volumes in one image, `render([ct, pet], [of_ct, of_pet], …)`: a grid that just holds them, whose
+field (`Several`) reads each at its place, and one transfer function (`Together`), of added extinctions."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -104,8 +101,7 @@ class Several(Field):
         return tuple(value for each, at in read for value in each.values(at))
 
     def coordinates(self, volume: Volume, coordinate: Vec3) -> list[Vec3]:
-        """A grid coordinate of `volume`, in the grid of each; outside of that, the nearest one, since a cell
-        which a face divides is sampled in its middle."""
+        """A coordinate of `volume` in each grid, clamped: a divided cell is sampled in its middle."""
         at = [GridMap.between(volume, each)(coordinate) for each in self.volumes]
         return [_within(place, each.shape) for place, each in zip(at, self.volumes, strict=True)]
 
@@ -270,8 +266,7 @@ class Together(Transfer):
     def emission_vjp(
         self, measured: Measured, emission: Vec3, extinction: Scalar
     ) -> tuple["Together", Measured]:
-        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction: where
-        that is 0, the cotangents of colours, which it weights, say nothing."""
+        """As `vjp`, by cotangents of emission and extinction, which suffice where the extinction is 0."""
         own, shares = self._own(measured)
         of_transfers, of_values, of_attributes, of_shares = [], [], [], []
         for transfer, count, part, share in zip(self.transfers, self.counts, own, shares, strict=True):

@@ -40,8 +40,7 @@ Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 
 
 class Classification(NamedTuple):
-    """A transfer function applied to one volume: `measure` at a grid coordinate fetches from memory; what it
-    found, `classify` turns into colour and extinction."""
+    """A transfer function of one volume: `measure` fetches at a grid coordinate, `classify` the rest."""
 
     measure: Callable[[Vec3], Measured]
     attributes: Callable[[Vec3], Measured]
@@ -50,11 +49,9 @@ class Classification(NamedTuple):
     search: Callable[[Measured], Measured] | None = None
     """`Transfer.search`; what it finds is appended to the measured values."""
     integrate: Classify | None = None
-    """From what is measured of a cell (`spanned`) to its mean colour and extinction, if the value is linear
-    along it. None: a cell is as its sample."""
+    """From a cell (`spanned`) to mean colour and extinction, values linear; None: as its sample."""
     light: Callable[[Any], Vec3] | None = None
-    """From a `lighting.shading.Sample`, or many along one axis, to the shaded colours. None: colours are as
-    classified."""
+    """From a `lighting.shading.Sample`, or many, to shaded colours; None: as classified."""
 
     def at(self, coordinate: Vec3) -> Measured:
         """What `classify` needs at a grid coordinate."""
@@ -430,9 +427,8 @@ def voxel_size(volume: Any) -> Any:
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -> Float[Array, " n"]:
-    """The extinction (1/length) under which a layer of thickness `unit_distance` (of a volume, its
-    `voxel_size`) has this opacity, of which more than 1 - 2⁻²⁴, the largest float32 below 1, counts as that.
-    """
+    """Extinction (1/length) of a layer of thickness `unit_distance` (or a volume's `voxel_size`) with this
+    opacity, which counts as 1 - 2⁻²⁴ at most."""
     if hasattr(unit_distance, "spacing"):
         unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)

@@ -378,16 +378,14 @@ def _is_volume(node: Any) -> bool:
 def part_of(
     volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
-    """The volume as a part of a grid of `whole` nodes that begins at the node `first`; beyond it, its faces
-    are read. Spacing, origin and direction are those of the whole. `axes`: as in `Window`; by default those
-    of `volume`."""
+    """The volume as a part of a grid of `whole` nodes, from the node `first` on, with the grid's place;
+    beyond, its faces are read. `axes`: as in `Window`; by default unchanged."""
     window = Window(first, whole, volume.fetch.axes if axes is None else axes)
     return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=lambda leaf: leaf is None)
 
 
 def read_as(volume: Volume, *fetches: Fetch | None) -> Volume:
-    """The volume with other ways to read the voxels of its `grids`, which are the same, and the same windows;
-    None: as before."""
+    """The volume with other fetches of its `grids`, in the same windows; None: as before."""
 
     def in_window(grid: Volume, fetch: Fetch | None) -> Fetch:
         if fetch is None:

@@ -1,10 +1,7 @@
-"""Gives a function derivatives in both modes: a push-forward of tangents, and its transpose, a pull-back.
-
-JAX has one or the other: it transposes the rule of a `custom_jvp` operation by operation, which is impossible
-for a loop of unknown length, and a `custom_vjp` has no forward mode. Here tangents are pushed by a primitive,
-which JAX transposes as a whole. So `jax.jvp`, `jax.linearize`, `jax.grad`, and forward mode over these, work,
-also of a function under `jax.jit`.
-"""
+"""Gives a function derivatives in both modes: a push-forward of tangents, a primitive that JAX transposes as
+a whole, and its transpose, a pull-back. JAX transposes the rule of a `custom_jvp` operation by operation,
+which fails for a loop of unknown length; a `custom_vjp` has no forward mode. So forward mode over reverse
+works."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -103,8 +100,8 @@ def differentiable(
 
 
 def recomputed(function: Callable[..., PyTree], message: str) -> Callable[..., PyTree]:
-    """The function, from trees to arrays, as one program, and its derivative in reverse mode as another,
-    which recomputes the function instead of keeping residuals. `message`: as for `differentiable`."""
+    """The function and its derivative in reverse mode as programs, of which the second recomputes the
+    first."""
 
     def floats_of(args: tuple[Any, ...], moving: PyTree) -> PyTree:
         return floats(function(*eqx.combine(moving, args)))

@@ -1,7 +1,5 @@
-"""Holds the arrays of many rays as the rows of a few, so that each is gathered and scattered at once.
-
-XLA compiles a kernel for each array that is gathered: of a ray with twenty numbers, twenty.
-"""
+"""Holds the arrays of rays as rows of a few, gathered and scattered at once: XLA compiles a kernel for
+each."""
 
 import math
 from collections.abc import Callable
@@ -68,8 +66,7 @@ class Layout(NamedTuple):
 
 
 class Packed(eqx.Module):
-    """A tree of arrays as rows of a few arrays, by kind. Where a branch is given this rather than the tree,
-    XLA need not store each leaf for it."""
+    """A tree of arrays as rows of a few arrays, by kind: a branch then need not store each leaf."""
 
     rows: dict[str, Array]
     layout: Layout = eqx.field(static=True)

@@ -16,8 +16,7 @@ _CHOSEN: set[str] = set()
 
 
 def default_programs() -> Path:
-    """The folder of kept programs: JAX's own if `JAX_COMPILATION_CACHE_DIR` is set, else one in the user's
-    cache."""
+    """Folder of kept programs: `JAX_COMPILATION_CACHE_DIR`, or one in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(chosen) if chosen else caches / "jaxvol" / "programs"

@@ -12,8 +12,7 @@ PyTree: TypeAlias = Any
 
 
 def unchecked(module: Any, **changes: Any) -> Any:
-    """The module with other values for these fields, static ones too, without its constructor's checks; or
-    one of a class, from all of its fields."""
+    """A module (or a class's) with these fields, also static ones, without its constructor's checks."""
     new = isinstance(module, type)
     copy = object.__new__(module if new else type(module))
     for name, value in {**({} if new else vars(module)), **changes}.items():
@@ -22,8 +21,7 @@ def unchecked(module: Any, **changes: Any) -> Any:
 
 
 def with_fields(tree: Any, **changes: Any) -> Any:
-    """A module with other values for these fields, of many rays (`dataclasses.replace` would check the shapes
-    of one)."""
+    """A module with other fields, of many rays, whose shapes `dataclasses.replace` would check."""
     names = list(changes)
     return eqx.tree_at(
         lambda tree: [getattr(tree, name) for name in names],
@@ -49,8 +47,7 @@ def constant(tree: PyTree) -> PyTree:
 
 
 def strong(tree: PyTree) -> PyTree:
-    """The tree with leaves of weak type, which come from Python numbers, as plain arrays: `jax.custom_vjp`
-    loses the gradients of weak ones."""
+    """The tree without weak types (of Python numbers), whose gradients `jax.custom_vjp` loses."""
 
     def plain(leaf: Any) -> Any:
         return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf

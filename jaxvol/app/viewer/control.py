@@ -8,9 +8,8 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Control:
-    """Something to look at or to change, by a widget of a kind: "buttons", "number", "checkbox", "color",
-    "slider", "log slider", "range" or "dropdown"; or "pad", HTML with boxes in which the pointer presses and
-    drags: elements with `data-pad`, the name of the box, and in them `data-part`."""
+    """A widget: "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown"; or
+    "pad", HTML in which the pointer drags, with boxes `data-pad` (their name) of elements `data-part`."""
 
     kind: str
     label: str = ""
@@ -21,9 +20,8 @@ class Control:
 
 
 def press_of(message: str) -> tuple[str, str, str, bool, float, float]:
-    """What a face tells of a press of the pointer that goes on: a number of its own, the box, its part, empty
-    for none, whether it is the second one, and where it is now, from the upper left corner, 0 to 1. Some
-    messages may be lost. **Raises** `ValueError` for another text."""
+    """Parses a face's message on a press: its number, the box, its part or "", whether it is the second, and
+    the place from the upper left, 0 to 1. **Raises** `ValueError` for another text."""
     press, pad, part, twice, *at = message.split(",")
     x, y = (min(max(float(each), 0.0), 1.0) for each in at)
     if math.isnan(x + y):

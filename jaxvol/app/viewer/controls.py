@@ -23,8 +23,7 @@ SIDES = {f"{'+-'[sign < 0]}{name}": (axis, sign) for axis, name in enumerate("xy
 
 
 def controls_of(model: Model) -> dict[str, list[Control]]:
-    """A viewer's controls, by the heading of their group. When one has changed the model, others may have
-    something else to show."""
+    """Controls by the heading of their group. A change of one may change what others show."""
     groups = {"view": _view_controls, "transfer function": transfer_controls, "slices": slice_controls}
     groups |= {"clip": _clip_controls, "save": _save_controls, "march": _march_controls}
     made = {heading: controls(model) for heading, controls in groups.items()}

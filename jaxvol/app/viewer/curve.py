@@ -49,8 +49,7 @@ def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]
 
 
 def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel: float, chosen: int) -> str:
-    """A pad with the histogram, and as a line the square root of the opacity, which shows thin materials; its
-    points, in their colours, are parts of the pad."""
+    """A pad: histogram, square root of the opacity (which shows thin materials), and the points as parts."""
     at, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction)
     across = WIDTH * np.clip((at - low) / (high - low), 0, 1)
     colors = [editing.display_color(color) for color in np.asarray(transfer.colors)]
@@ -84,8 +83,7 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
 
 
 def _point_controls(model: Model) -> list[Control]:
-    """Presets, the curve, window and level; and value, colour and opacity of the point that was pressed last,
-    the opacity that of a layer as thick as a voxel."""
+    """Presets, curve, window and level; value, colour and opacity (in a voxel) of the chosen point."""
     low, high, bars = histogram(model.scene.volume)
     voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
     shown = GIVEN
@@ -160,8 +158,7 @@ def _point_controls(model: Model) -> list[Control]:
 
 
 def _label_controls(model: Model) -> list[Control]:
-    """A label that can be seen, by name or densest colour, whether it is shown, and the factor of its
-    extinction."""
+    """A visible label, by name or densest colour, whether it is shown, and its extinction's factor."""
     stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()

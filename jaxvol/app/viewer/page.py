@@ -98,8 +98,7 @@ class Page:
         self._server.stop()
 
     async def _only_own_pages(self, connection: Any) -> None:
-        """Any page that a browser shows may connect to a port of this machine; viser takes them all. It reads
-        messages only after this call, so that those of others are read here, and dropped."""
+        """Refuse pages of others; viser reads messages only after this, so theirs are dropped here."""
         client = self._server._websock_server._live_connections[connection.client_id]
         origin = urlsplit(client.request.headers.get("Origin", "") if client.request else "")
         if origin.hostname not in OWN_NAMES or origin.port != self.port:
@@ -146,8 +145,7 @@ class Page:
 
 
 def _in_one_line(record: logging.LogRecord) -> bool:
-    """Whether to log something; what a client's message did to viser, if that knows none such, without the
-    place in viser's code."""
+    """Whether to log a record; a client's unknown message is told in one line."""
     told = record.getMessage()
     if told == "connection handler failed" and record.exc_info:
         fault = shortened(record.exc_info[1])

@@ -1,8 +1,5 @@
-"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace.
-
-The camera turns about its focal point as on a turntable: `view_up` stays up. Drags are given in units of the
-view's height, to the right and down, as the pointer moved.
-"""
+"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace. The camera turns as
+on a turntable. Drags are in units of the view's height, to the right and down."""
 
 import math
 from collections.abc import Sequence
@@ -86,8 +83,7 @@ class Orbit:
         return orbit.zoomed(orbit.half_height / float(camera.parallel_scale))
 
     def turned(self, right: float, down: float) -> "Orbit":
-        """After a drag that turns what is seen, as if the pointer held its front: by half a turn for a drag
-        over the height of the view."""
+        """Turned by a drag, as if the pointer held the front: half a turn over the view's height."""
         up = self.view_up
         height = math.asin(float(np.clip(self.toward @ up, -1, 1)))
         level = self.toward - (self.toward @ up) * up
@@ -163,8 +159,7 @@ class State:
 
 
 PROGRAM = {"enabled": "", "lit": "light", "mode": "mode", "parallel": "orthographic", "clip": "clip"}
-"""Fields of a state of whose values each has a program of its own, and their controls. So has each form of
-transfer function."""
+"""Fields of which each value has a program of its own, as each form of transfer function has."""
 
 
 @dataclass(frozen=True)
