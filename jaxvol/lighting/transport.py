@@ -22,7 +22,7 @@ from ..scene.space import Space, enter
 from ..scene.volume import without_voxels
 from ..scene.voxel_fetch import corners
 from ..xla.memory import gather
-from .lights import ConstantLight, Light
+from .lights import Light, located, sky_of
 from .materials import Material, shares
 from .medium import FADE, Scattering, clipped, scattering_at
 from .random_walks import unit_walks
@@ -141,11 +141,6 @@ def _exit(space: Space, point: Vec3, direction: Vec3) -> Scalar:
     return enter(space.whole, point, direction, (pixel, pixel)).length
 
 
-def located(lights: tuple[Light, ...]) -> list[Light]:
-    """The lights that reach a point from a single direction."""
-    return [light for light in lights if not isinstance(light, ConstantLight)]
-
-
 def _way(light: Light, point: Vec3, direction: Vec3) -> tuple[Vec3, Scalar]:
     """Direction and distance of a light."""
     arriving = light.at(point, direction)
@@ -245,12 +240,6 @@ class Transport(NamedTuple):
     @property
     def dtype(self) -> Any:
         return self.around.volume.spacing.dtype
-
-    @property
-    def sky(self) -> Vec3:
-        """Radiance of all constant lights."""
-        constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
-        return apart(sum(constant, jnp.zeros(3, self.dtype)))
 
     def flights(self) -> Float[Array, "flights 4"]:
         """Direction and length, in mean free paths, of each flight: by level, walk and set."""
@@ -404,7 +393,7 @@ class _Grid(NamedTuple):
         end = along(point, direction, distance)
         there = transport.at(end)
         # the mean of 1 - weight is the fraction of flights that leave
-        light = plus(light, scaled(times(throughput, transport.sky), 1 - weight))
+        light = plus(light, scaled(times(throughput, sky_of(transport.lights, transport.dtype)), 1 - weight))
         throughput = times(scaled(throughput, weight), there.albedo)
         row = interpolated(depths, _on_grid(transport.around, self.shape, end))
         for i, source in enumerate(located(transport.lights)):

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.noise import hashed_uniforms_4
-from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, select, times
-from ..lighting.lights import Arriving, ConstantLight, Light
+from .._util.vec3 import Scalar, Vec3, dot, greatest, plus, scaled, select, times
+from ..lighting.lights import Arriving, Light, located, sky_of
 from ..lighting.phase import phase, sample_phase, scattered
 from ..scene.space import Affine
 from ..scene.volume import Volume
@@ -89,17 +89,6 @@ class WalkScene(NamedTuple):
     sampling: Sampling
 
     @property
-    def located(self) -> tuple[Light, ...]:
-        """The lights that reach each point from a single direction."""
-        return tuple(light for light in self.lights if not isinstance(light, ConstantLight))
-
-    @property
-    def surroundings(self) -> Vec3:
-        """Radiance of all constant lights."""
-        constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
-        return apart(sum(constant, jnp.zeros(3, jnp.float32)))
-
-    @property
     def space(self) -> Affine:
         return Affine(self.volume)
 
@@ -111,9 +100,9 @@ class WalkScene(NamedTuple):
     def light(self, coordinate: Vec3, direction: Vec3, uniform: Scalar) -> Arriving:
         """Light at a grid coordinate from a random located light, weighted by their number."""
         x, y, z = self.space.point(coordinate)
-        count = len(self.located)
+        count = len(lights := located(self.lights))
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
-        each = [light.at((x, y, z), direction) for light in self.located]
+        each = [light.at((x, y, z), direction) for light in lights]
         one = jax.tree.map(lambda *parts: jnp.select([chosen == i for i in range(count)], parts), *each)
         r, g, b = one.irradiance
         toward, distance = constant(LIGHTS, (one.toward, one.distance))
@@ -159,7 +148,7 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
         walk: Walk, candidate: Candidate, decision: Decision, scattering: Scattering, u: Scalar
     ) -> Walk:
         advanced = _delta_tracking(scene, walk, candidate, decision, scattering, u)
-        if not scene.located:
+        if not located(scene.lights):
             return advanced
         return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, decision, u), advanced)
 
@@ -189,7 +178,7 @@ def _scatter(
     throughput = scaled(before_roulette, weight)
     direction = scattered(turn, walk.direction)
     endless = jnp.full_like(survive, jnp.inf)
-    if not scene.located:
+    if not located(scene.lights):
         no = jnp.zeros(survive.shape, bool)
         return Scattering(direction, throughput, importance, walk.unoccluded, no, direction, endless)
     light = scene.light(coordinate, walk.direction, choose)
@@ -214,7 +203,7 @@ def _delta_tracking(
     collides = candidate.found & (decide < decision.chance)
     capped = collides & (before.scatterings >= scene.max_scatterings)
     scatters, met = collides & ~capped, before.scatterings > 0
-    gathered = times(walk.throughput, scene.surroundings)
+    gathered = times(walk.throughput, sky_of(scene.lights, jnp.float32))
     gathered = scaled(gathered, (candidate.over & met).astype(decision.share.dtype))
     passed = jnp.where(candidate.found & ~collides, decision.passed, 1)
     opacity = jnp.where(candidate.over & ~met, 1 - walk.throughput[0], before.opacity)
