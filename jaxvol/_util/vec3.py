@@ -60,10 +60,15 @@ def dot(a: Vec3, b: Vec3) -> Scalar:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def root(square: Scalar) -> Scalar:
+    """Square root; up to 0, it is 0 with the derivative 0. NaN stays NaN."""
+    clamped = square <= 0
+    return jnp.where(clamped, 0, jnp.sqrt(jnp.where(clamped, 1, square)))
+
+
 def length(a: Vec3) -> Scalar:
     """Length of a vector. Of that of length 0, the derivative is 0."""
-    square = dot(a, a)
-    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), square)
+    return root(dot(a, a))
 
 
 def greatest(a: Vec3) -> Scalar:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._util.checks import integer, number
-from .._util.vec3 import Scalar, golden_spiral, turned
+from .._util.vec3 import Scalar, golden_spiral, root, turned
 from ..xla.platform import is_traced
 from .materials import Material, Optics, smoothstep
 from .template import ScattererTemplate
@@ -132,7 +132,7 @@ class PacketTree:
         directions = jnp.asarray(spread, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
         packets = jnp.zeros((self.packets, 3)), directions, jnp.full(self.packets, 1 / self.packets)
         sine_of_critical_angle = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
-        cone = 1 - _root(1 - sine_of_critical_angle**2)
+        cone = 1 - root(1 - sine_of_critical_angle**2)
 
         def advance(packets: Packets, level: Any) -> tuple[Packets, ScattererTemplate]:
             """The packets that go on from a level, and the photons that they leave (lengths in λ)."""
@@ -185,15 +185,9 @@ class PacketTree:
         return light * smoothstep((opacity * light / self.threshold - FADES) / (1 - FADES))
 
 
-def _root(squared: Scalar) -> Scalar:
-    """Square root; 0 with derivative 0 for arguments up to 0. NaN stays NaN."""
-    clamped = squared <= 0
-    return jnp.where(clamped, 0, jnp.sqrt(jnp.where(clamped, 1, squared)))
-
-
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
     """Directions at an angle to `direction` given by its cosine; `u` in [0, 1) selects the azimuth."""
     x, y, z = direction.T
-    sine = _root(1 - cosine**2)
+    sine = root(1 - cosine**2)
     around = 2 * jnp.pi * u
     return jnp.stack(turned((sine * jnp.cos(around), sine * jnp.sin(around), cosine), (x, y, z)), axis=-1)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..._util.vec3 import Scalar, Vec3, along
+from ..._util.vec3 import Scalar, Vec3, along, root
 from ...scene.space import Gap, slab_interval
 from ...xla.platform import while_loop
 
@@ -180,6 +180,4 @@ def _farthest(to_faces: list[ToFace]) -> ToFace:
 
 def hypot(a: Scalar, b: Scalar) -> Scalar:
     """sqrt(a² + b²), with gradient 0 at the origin."""
-    square = a * a + b * b
-    away = square > 0
-    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)
+    return root(a * a + b * b)
