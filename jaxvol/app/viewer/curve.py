@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from string import Template
 from typing import Any, cast
 
 import numpy as np
@@ -22,6 +24,7 @@ from .model import Model
 MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
 BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
 GIVEN = "as given"
+PLOT = Template(Path(__file__).with_name("curve.html").read_text("utf-8"))
 
 
 def transfer_controls(model: Model) -> list[Control]:
@@ -69,17 +72,9 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
         for i, (x, y, color) in enumerate(dots)
     )
     line = height(np.interp(np.linspace(low, high, 4 * BINS), at, extinction))
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}"'
-        f' style="overflow: visible; touch-action: none; cursor: crosshair; width: 100%; display: block">'
-        f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#8882" />'
-        f'<polygon points="0,{HEIGHT} {points(HEIGHT * (1 - bars))} {WIDTH},{HEIGHT}" fill="#8888" />'
-        f'<polyline points="{points(line)}" fill="none" stroke="currentColor" />'
-        f"{circles if len(at) <= editing.MAX_POINTS else ''}</svg>"
-        f'<div style="height: 8px; background: linear-gradient(to right, {stops})"></div>'
-        f'<div style="display: flex; justify-content: space-between; font-size: 10px">'
-        f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
-    )
+    shown = {"width": WIDTH, "height": HEIGHT, "low": f"{low:.4g}", "high": f"{high:.4g}", "stops": stops}
+    shown |= {"bars": points(HEIGHT * (1 - bars)), "line": points(line)}
+    return PLOT.substitute(shown, circles=circles if len(at) <= editing.MAX_POINTS else "")
 
 
 def _point_controls(model: Model) -> list[Control]:

@@ -206,16 +206,7 @@ def _widget_of_value(control: Control) -> Any:
 class Pad(anywidget.AnyWidget):
     """HTML whose boxes tell where they are pressed."""
 
-    _esm = f"""
-    const pressed = {PRESSED};
-    export default {{ render({{ model, el }}) {{
-      const show = () => {{ el.innerHTML = model.get('value'); }};
-      const send = text => {{ model.set('sent', text); model.save_changes(); }};
-      show();
-      model.on('change:value', show);
-      el.onpointerdown = event => pressed(event, send);
-    }} }};
-    """
+    _esm = Path(__file__).with_name("pad.js").read_text("utf-8").replace("$pressed", PRESSED)
     value = traitlets.Unicode().tag(sync=True)
     sent = traitlets.Unicode().tag(sync=True)
 
