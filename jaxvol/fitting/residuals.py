@@ -27,7 +27,7 @@ from ..render import Adjoint, render
 from ..scene.camera import Camera
 from ..scene.several import together
 from ..scene.transfer import Transfer
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, is_none
 from .constraints import Free, FreeVariables, size
 from .noise import Noise
 from .references import References
@@ -127,7 +127,7 @@ class ImageResidual(eqx.Module):
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
         sigma = None if blur is None else not_negative("blur", blur)
-        return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=is_none)
 
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most `most` entries."""

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._util.checks import described
 from .._util.vec3 import Scalar, Vec3, apart
+from ..xla.trees import is_none
 from .occupancy import BLOCK, Blocks, Sums
 from .transfer import Classify, Measured, Transfer, sized
 from .volume import Field, Volume
@@ -24,12 +25,8 @@ ROUNDING = 1e-3
 
 
 def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
-    """One volume and transfer function for lists of them; anything else as it is. Transfer functions whose
-    lengths are counted in voxels are those of their volumes.
-
-    Raises:
-        ValueError: for lists of other things, or of different lengths.
-    """
+    """One volume and transfer function for lists of them; anything else as it is. Lengths counted in voxels
+    are those of each volume. **Raises** `ValueError` for lists of other things, or of different lengths."""
     if (pairs := pairs_of(volume, transfer)) is None:
         return volume, sized(transfer, volume)
     volume, transfer = zip(*pairs, strict=True)
@@ -76,9 +73,7 @@ def _holding(largest: Volume, volumes: Sequence[Volume]) -> Volume:
     """A grid along the axes of the largest volume, with as many nodes, that just holds all of them."""
     grid = _empty(largest)
     parts = *_around(grid, list(map(_empty, volumes))), Several(tuple(volumes))
-    return eqx.tree_at(
-        lambda v: (v.origin, v.spacing, v.field), grid, parts, is_leaf=lambda leaf: leaf is None
-    )
+    return eqx.tree_at(lambda v: (v.origin, v.spacing, v.field), grid, parts, is_leaf=is_none)
 
 
 def _empty(volume: Volume) -> Volume:

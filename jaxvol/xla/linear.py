@@ -18,7 +18,7 @@ from jaxtyping import Array
 from .compiling import compiled
 from .differentiation import forward_only, not_transposed
 from .platform import is_traced
-from .trees import PyTree, floats
+from .trees import PyTree, floats, is_none
 
 
 def differentiable(
@@ -127,12 +127,7 @@ def recomputed(function: Callable[..., PyTree], message: str) -> Callable[..., P
 
 def moving_leaves(tree: PyTree, tangents: PyTree) -> PyTree:
     """The leaves of a tree that have a tangent; None in place of the others."""
-    return jax.tree.map(
-        lambda leaf, tangent: None if tangent is None else leaf,
-        tree,
-        tangents,
-        is_leaf=lambda leaf: leaf is None,
-    )
+    return jax.tree.map(lambda leaf, of: None if of is None else leaf, tree, tangents, is_leaf=is_none)
 
 
 # From constants, of which there are `count`, and tangents to tangents, in which it is linear.

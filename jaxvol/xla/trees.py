@@ -11,6 +11,11 @@ PyTree: TypeAlias = Any
 """A tree of arrays. The type of this name in jaxtyping is one that type checkers cannot know, on purpose."""
 
 
+def is_none(leaf: Any) -> bool:
+    """For `is_leaf`, where None is to be replaced or kept."""
+    return leaf is None
+
+
 def unchecked(module: Any, **changes: Any) -> Any:
     """A module (or a class's) with these fields, also static ones, without its constructor's checks."""
     new = isinstance(module, type)
@@ -23,12 +28,8 @@ def unchecked(module: Any, **changes: Any) -> Any:
 def with_fields(tree: Any, **changes: Any) -> Any:
     """A module with other fields, of many rays, whose shapes `dataclasses.replace` would check."""
     names = list(changes)
-    return eqx.tree_at(
-        lambda tree: [getattr(tree, name) for name in names],
-        tree,
-        [changes[name] for name in names],
-        is_leaf=lambda leaf: leaf is None,
-    )
+    parts = [changes[name] for name in names]
+    return eqx.tree_at(lambda tree: [getattr(tree, name) for name in names], tree, parts, is_leaf=is_none)
 
 
 def floats(tree: PyTree) -> PyTree:
