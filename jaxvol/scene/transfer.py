@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util import piecewise_linear as linear
-from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
+from .._util.checks import Arrayable, finite_array, flag, increasing, not_negative, number, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.srgb import warn_of_8_bits
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
-from ..xla.platform import is_traced
+from ..xla.platform import in_numpy, is_traced
 from ..xla.trees import unchecked
 from .occupancy import Blocks
 from .volume import Volume
@@ -206,8 +206,7 @@ class TransferFunction(Transfer):
         n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
         warn_of_8_bits("colors", self.colors)
-        extinction = finite_array("extinction", extinction, (n,))
-        self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
+        self.extinction = not_negative("extinction", extinction, (n,))
 
     @classmethod
     def from_points(
@@ -433,12 +432,5 @@ def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -
         unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)
     opacity = unit_interval("opacity", opacity, (None,))
-    if not is_traced(opacity, unit_distance):  # without a program for each number of points
-        opacity, unit_distance = np.asarray(opacity), np.asarray(unit_distance)
-        return jnp.asarray(-np.log1p(-np.minimum(opacity, 1 - 2.0**-24)) / unit_distance, opacity.dtype)
-    return _extinction(opacity, unit_distance)
-
-
-@jax.jit  # one program, rather than one for each operation
-def _extinction(opacity: Float[Array, " n"], unit_distance: Float[Array, ""]) -> Float[Array, " n"]:
-    return -jnp.log1p(-jnp.minimum(opacity, 1 - 2.0**-24)) / unit_distance
+    xp, (opacity, unit_distance) = in_numpy(opacity, unit_distance)
+    return jnp.asarray(-xp.log1p(-xp.minimum(opacity, 1 - 2.0**-24)) / unit_distance, opacity.dtype)
