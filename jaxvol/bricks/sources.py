@@ -18,6 +18,7 @@ from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, described, finite_array
 from .._util.voxels import DTYPES, WHOLE, check_shape, check_type
 from ..scene.volume import Volume
+from ..xla.memory import zeros_in_reserve
 from ..xla.platform import is_traced
 
 
@@ -26,7 +27,6 @@ Box: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]  # the first voxel, and
 
 SPACE = ("x", "y", "z")
 AT_ONCE = 2**23  # bytes of voxels that are read at a time: a larger box is read in several steps
-ALIGNED = 64  # JAX uses an array of NumPy in place if its address is a multiple of so many bytes
 READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
 
@@ -163,10 +163,7 @@ class VoxelSource:
             return self._read_at_once(box, axes)
         self.check_unchanged()
         shape = permuted([b - a for a, b in zip(*box, strict=True)], axes)
-        size = math.prod(shape) * self.dtype.itemsize
-        memory = np.empty(size + ALIGNED, np.uint8)
-        start = -memory.ctypes.data % ALIGNED
-        voxels = memory[start : start + size].view(self.dtype).reshape(shape)
+        voxels = zeros_in_reserve(math.prod(shape), self.dtype).reshape(shape)
         for low, high in self.boxes(box, AT_ONCE):
             place = [slice(a - x, b - x) for a, b, x in zip(low, high, box[0], strict=True)]
             voxels[permuted(place, axes)] = self._read_at_once((low, high), axes)
