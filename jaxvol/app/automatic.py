@@ -117,10 +117,13 @@ def sampled(volume: Volume, data: Any = None) -> Shaped[np.ndarray, "nx ny nz *c
 def unit_of(volume: Volume) -> float:
     """Length to which opacities refer, whatever the volume's units: a hundredth of its diagonal."""
     across = (np.array(volume.shape) - 1) * np.asarray(volume.spacing)
-    return (
-        float(np.linalg.norm(across if volume.direction is None else np.asarray(volume.direction) @ across))
-        / 100
-    )
+    across = across if volume.direction is None else np.asarray(volume.direction) @ across
+    return float(np.linalg.norm(across)) / 100
+
+
+def faces_of(data: Shaped[np.ndarray, "nx ny nz"]) -> Shaped[np.ndarray, " n"]:
+    """The values on a volume's six faces."""
+    return np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
 
 
 def preset_unit(volume: Any) -> float:
@@ -200,9 +203,7 @@ def _of_histogram(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> tuple[T
         first, second = thresholds(values)
         d = (second - first) / 4
         points = [(second, DENSE, 0.45), (max((second + high) / 2, second + d / 2), BRIGHT, 0.9)]
-        data = np.asarray(copy.data)
-        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
-        if np.mean(outer > first) < CUT and is_body(part, first, second):
+        if np.mean(faces_of(np.asarray(copy.data)) > first) < CUT and is_body(part, first, second):
             depth, usual = depth_of_object(copy, first, second)
             w = min(first - low, second - first) / 3
             border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, max(0.07, depth))]
@@ -210,7 +211,7 @@ def _of_histogram(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> tuple[T
                 border = [(first, EDGE, 0.0), (min(usual, second - 2 * d), SKIN, depth)]
             points = [*border, (second - d, TISSUE, depth), *points]
         else:
-            foot, opacity = (second - 2 * d, 0.02)
+            foot, opacity = second - 2 * d, 0.02
             if np.mean(values > first) < SPARSE:  # vessels, of which the thin ones are darker
                 foot, opacity = first, 0.2
             points = [(foot, EDGE, 0.0), (second - d, TISSUE, opacity), *points]
@@ -233,8 +234,7 @@ def side_of_distance(volume: Volume) -> int:
     slope = np.sqrt(sum(np.square(each) for each in np.gradient(data, *step.tolist())))
     if np.mean(np.abs(slope[slope > 0] - 1) < 0.1) < 0.7:
         return 0
-    outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
-    return 1 if np.mean(outer > 0) > 0.5 else -1
+    return 1 if np.mean(faces_of(data) > 0) > 0.5 else -1
 
 
 def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float, float]:

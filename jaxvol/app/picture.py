@@ -35,6 +35,7 @@ from .automatic import (
     SAMPLED,
     automatic_transfer,
     brightest_mean,
+    faces_of,
     labels_if_any,
     labels_shown,
     preset_unit,
@@ -121,13 +122,9 @@ class Scene(NamedTuple):
 
 
 def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
-    """The scene that the options describe, without a march.
-
-    Args:
-        options: those of `DEFAULTS`, `recorded_transfer`, and `file`, a path or a `Volume`. `transfer` may be
-            a `Transfer`, and entries of `others` what `other_of` takes.
-        orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
-    """
+    """The scene of the options (`DEFAULTS`, `recorded_transfer`, and `file`, a path or `Volume`) without a
+    march. `orbit`: the views of a camera that turns, in which the automatic camera shows all that is
+    visible."""
     width, height = np.broadcast_to(getattr(options.camera, "size", options.size), 2).tolist()
     if width * height < 2**31:  # more are refused otherwise
         require_room(width * height * PIXEL, f"size {width} x {height}")
@@ -170,7 +167,8 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
 
     warn_of_distance(volume, others)
     lighting = _lighting(options, mode, alone=not others)
-    camera = _camera(options, volume, transfer, others, orbit).zoom(options.zoom)
+    seen = () if options.clip_inside_out else planes
+    camera = _camera(options, volume, transfer, others, orbit, seen).zoom(options.zoom)
     how = mode, lighting, background, transforms, source, options.memory
     return Scene(volume, transfer, camera, *how, others=others)
 
@@ -199,8 +197,9 @@ def _camera(
     transfer: Transfer,
     others: Sequence[tuple[Volume, Transfer]],
     orbit: Callable[[Camera], Sequence[Camera]] | None,
+    planes: Sequence[Any],
 ) -> Camera:
-    """That of the options; or else one as near as what is visible allows."""
+    """That of the options; or else one as near as what is visible on one side of `planes` allows."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if isinstance(options.camera, Camera):
         return options.camera
@@ -211,8 +210,7 @@ def _camera(
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
     if options.compositing == "isosurface":  # seen is what lies within, which most of the faces do not
-        step, data = np.full(2, options.isovalue), np.asarray(volume.data)
-        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
+        step, outer = np.full(2, options.isovalue), faces_of(np.asarray(volume.data))
         opacity = np.array([0.0, 1e6 / unit_of(volume)])[:: -1 if np.mean(outer > step[0]) > 0.5 else 1]
         transfer = TransferFunction(step, np.ones((2, 3)), opacity)
     given["parallel"] = options.parallel
@@ -220,11 +218,6 @@ def _camera(
     what = with_others(volume, transfer, others)
     camera = automatic_camera(*what, options.direction, options.view_up, **given)
     clipped = options.clip_box is not None and not options.clip_inside_out
-    planes = (
-        []
-        if options.clip_inside_out
-        else [(each[:3], each[3:]) for each in np.reshape(options.clip_plane, (-1, 6))]
-    )
     if orbit is None and not clipped and not planes:
         return camera
     points = []
