@@ -192,7 +192,9 @@ def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, l
     least distances between nodes in both, also beyond the grid, where a ray may return to it."""
     nodes = np.zeros(3)
     while length > 0:
-        distances = _distances(space, low - nodes, high + nodes)
+        box = (low - nodes).tolist(), (high + nodes).tolist()
+        ends = (tuple(jnp.asarray(c, space.middle[0].dtype) for c in end) for end in box)
+        distances = np.array([float(distance) for distance in _least_distances(space, *ends)])
         with np.errstate(divide="ignore"):
             more = np.maximum(nodes, np.minimum(np.ceil(length / distances), shape))
         if np.array_equal(more, nodes):
@@ -202,12 +204,6 @@ def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, l
 
 
 _least_distances = compiled(lambda space, low, high: space.least_distances(low, high))
-
-
-def _distances(space: Space, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Least distances between neighbouring nodes along each axis in a box."""
-    ends = (tuple(jnp.asarray(c, space.middle[0].dtype) for c in end.tolist()) for end in (low, high))
-    return np.asarray([float(distance) for distance in _least_distances(space, *ends)])
 
 
 def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:

@@ -40,9 +40,7 @@ Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
 BEAMS = 32  # of curved rays, searched at a time on a GPU: it takes as long as the longest of these
-BATCH = (
-    72  # groups at a time on a CPU: few rays meet a brick, and the last batch lasts as long as its longest
-)
+BATCH = 72  # groups at a time on a CPU: few rays meet a brick, and a batch lasts as long as its longest
 KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
 
 

@@ -209,10 +209,8 @@ def _followed(level: _Level, starts: Arrayable, max_steps: int) -> Float[Array, 
 
 @eqx.filter_jit
 def _similarities(level: _Level, motions: Arrayable) -> Float[Array, "n m"]:
-    def of_motion(motion: Float[Array, "6"]) -> Float[Array, ""]:
-        return 1 - jnp.sum(level(motion, "replay") ** 2) / 2
-
-    return jax.lax.map(of_motion, motions.reshape(-1, 6)).reshape(motions.shape[:2])
+    found = jax.lax.map(lambda motion: 1 - jnp.sum(level(motion, "replay") ** 2) / 2, motions.reshape(-1, 6))
+    return found.reshape(motions.shape[:2])
 
 
 def _averaged(camera: Camera, image: Array, weight: np.ndarray, factor: int) -> tuple[Camera, Any, Any]:

@@ -184,10 +184,8 @@ def enter(
     fault = ~jnp.isfinite(toward)
     if until is not None:
         left = until - base - start
-        length, fault = (
-            jnp.where(left < length, jnp.where(left > 0, left, 0), length),
-            fault | jnp.isnan(until),
-        )
+        length = jnp.where(left < length, jnp.where(left > 0, left, 0), length)
+        fault |= jnp.isnan(until)
     ray = Ray(entry, direction, base + start, length, path, pixel, gaps, spans)
     return invalid(ray, fault)
 

@@ -48,7 +48,10 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     if _folder() != str(path):
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-        _forget_that_none_was_set()
+        # JAX decides once, at the first program, whether there is a cache; in a notebook that may be long ago
+        from jax.experimental.compilation_cache import compilation_cache
+
+        compilation_cache.reset_cache()
     _CHOSEN.add(str(path))
     return path
 
@@ -69,10 +72,3 @@ def kept_folder() -> str | None:
 
 def _folder() -> str | None:
     return getattr(jax.config, "jax_compilation_cache_dir", None)
-
-
-def _forget_that_none_was_set() -> None:
-    # JAX decides once, at the first program, whether there is a cache; in a notebook that may be long ago
-    from jax.experimental.compilation_cache import compilation_cache
-
-    compilation_cache.reset_cache()

@@ -38,10 +38,8 @@ def _bound(model: Model, kind: str, label: str, name: str, **more: Any) -> Contr
 
 def _view_controls(model: Model) -> list[Control]:
     """From where the volume is looked at, and how cells become pixels."""
-    data, modes = (
-        np.asarray(model.scene.volume.data),
-        [*model.scene.modes, *([] if model.scene.others else [ISOSURFACE])],
-    )
+    data = np.asarray(model.scene.volume.data)
+    modes = [*model.scene.modes, *([] if model.scene.others else [ISOSURFACE])]
     low, high = float(data.min()), float(data.max())
     span = high - low or max(abs(low), 1.0)
 

@@ -85,11 +85,10 @@ def _items(path: Path) -> dict[str, bytes]:
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
-            cut = (
-                f"is cut short: item {TOLD.get(tag, tag)} is to end at byte {end}, and it ends at {n_bytes}."
-            )
+            told = TOLD.get(tag, tag)
+            cut = f"is cut short: item {told} is to end at byte {end}, and it ends at {n_bytes}."
             check(end <= n_bytes, cut)
-            check(tag not in found, f"holds item {TOLD.get(tag, tag)} twice.")
+            check(tag not in found, f"holds item {told} twice.")
             if tag in MEANING:
                 found[tag] = stream.read(length)
             stream.seek(end)
