@@ -56,15 +56,10 @@ def printable(text: str) -> str:
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """Check that `holds(value, *others)` is true everywhere, and return `value`.
-
-    `holds` gets NumPy arrays if the values are concrete, else traced ones. `{got}` in `message` becomes the
-    value. Use what is returned: without it, the check on a traced value vanishes. Inside `jax.shard_map`,
-    where Equinox's errors do not work, a traced value becomes NaN instead.
-
-    Raises:
-        ValueError: at once for a concrete value; for a traced one, an Equinox runtime error.
-    """
+    """Check that `holds(value, *others)` is true everywhere, and return `value`: **raises** `ValueError`, or,
+    of traced values, an Equinox runtime error, if what is returned is used. Inside `jax.shard_map`, where
+    these do not work, a traced value becomes NaN. `holds` gets NumPy arrays if all are concrete; `{got}` is
+    the value."""
     if is_traced(value, *others):
         if any(map(varies_over, jax.tree.leaves((value, others)))):
             return jax.tree.map(lambda leaf: jnp.where(jnp.all(holds(value, *others)), leaf, jnp.nan), value)

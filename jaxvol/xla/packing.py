@@ -14,13 +14,8 @@ from .trees import PyTree
 
 
 class Row(NamedTuple):
-    """Where a leaf lies in a packed tree: rows from `first` on of the array of `kind`, a type. Integers of 32
-    bits, and truth values as such, lie there as floats with the same bits, so that one array holds them all.
-
-    Attributes:
-        dtype: of the leaf.
-        shape: of the leaf, for each ray.
-    """
+    """Where a leaf, of a dtype and a shape for each ray, lies in a packed tree: rows from `first` on of the
+    array of `kind`. Integers of 32 bits and truth values lie in float32, with the same bits."""
 
     kind: str
     first: int

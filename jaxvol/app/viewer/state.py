@@ -49,15 +49,8 @@ Vector = Float[np.ndarray, "3"]
 
 @dataclass(frozen=True)
 class Orbit:
-    """A camera that looks at a point.
-
-    Attributes:
-        focal_point: world point.
-        toward: unit direction from there to the camera.
-        distance: between them, world length.
-        view_up: unit direction about which it turns.
-        view_angle: degrees, over the height of the image.
-    """
+    """A camera that looks at a point: `toward`, the unit direction from there, and `distance` place it; it
+    turns about `view_up`, and sees `view_angle` degrees over the height of the image."""
 
     focal_point: Vector
     toward: Vector
@@ -118,9 +111,8 @@ class Orbit:
     def withdrawn(self, least: float) -> "Orbit":
         """From at least so far, by an angle that shows as much at the focal point."""
         distance = max(self.distance, least)
-        return replace(
-            self, distance=distance, view_angle=math.degrees(2 * math.atan(self.half_height / distance))
-        )
+        angle = math.degrees(2 * math.atan(self.half_height / distance))
+        return replace(self, distance=distance, view_angle=angle)
 
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """Unit vectors to the right and up in the image, and forward."""

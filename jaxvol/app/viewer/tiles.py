@@ -29,14 +29,7 @@ Pixels = UInt8[np.ndarray, "height width 3"]  # sRGB
 
 @dataclass(frozen=True)
 class Grid:
-    """Tiles that cover a view.
-
-    Attributes:
-        columns: how many, from left to right.
-        rows: how many, from top to bottom.
-        size: (width, height), pixels of the image that they make together; those at the right and at the
-            lower edge may reach past it.
-    """
+    """Tiles that cover a view, of a `size` in pixels, which those at the right and lower edge may exceed."""
 
     columns: int
     rows: int
