@@ -1,5 +1,4 @@
-"""Piecewise linear functions of one variable: tables of a row for each control point, look-ups, and
-bounds."""
+"""Piecewise linear functions of one variable: tables of a row for each point, look-ups, and bounds."""
 
 from typing import Any, TypeAlias, cast
 

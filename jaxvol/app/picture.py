@@ -74,8 +74,8 @@ IN_MEMORY = 9
 
 
 class Scene(NamedTuple):
-    """What is looked at. `volume` is a coarser copy of `source`, if that is read in bricks of `memory`
-    bytes."""
+    """What is looked at. `volume` is a coarser copy of `source`, if that is read in bricks of `memory` bytes.
+    `others`: further volumes, with their transfer functions. `march`: once it is known."""
 
     volume: Volume
     transfer: Transfer

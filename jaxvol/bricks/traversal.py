@@ -111,7 +111,7 @@ class Traversal:
         self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
-        """Each needed brick and its cells, while the next is read; drop it and set `at` before that."""
+        """Yields the needed bricks and their cells. Before the next, the caller drops it and sets `at`."""
         self.rays, self.start, self.at, given_back = rays, at, at, self.bytes_read
         method = self.request.method
         if not callable(method):

@@ -21,8 +21,7 @@ def save(path: Path, state: Any, about: dict[str, Any]) -> None:
 
 def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]] | None:
     """The saved state, a tree like `like`, with its description; None if none was saved. **Raises**
-    `ValueError` for a damaged file, and one of another fit than `about` describes (it may have more
-    entries)."""
+    `ValueError` for a damaged file, and one of another fit than `about` describes, at least."""
     if not path.exists():
         return None
     remedy = "Choose another file, or delete this one."

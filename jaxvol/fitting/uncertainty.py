@@ -82,9 +82,8 @@ class Spreads(NamedTuple):
 
 
 def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
-    """From the triangles, the number of entries, and the norm `scale` of the data. A direction is
-    undetermined within rounding: its singular value is below n ε times the largest one, or times that
-    norm."""
+    """Spreads, where `scale` is the norm of the data. A direction is undetermined within rounding: its
+    singular value is below n ε times the largest one, or times that norm."""
     factor, scores = (np.asarray(triangle, np.float64) for triangle in triangles)
     n = scores.shape[1]
     _, singular, directions = np.linalg.svd(factor[:n, :n])

@@ -11,8 +11,7 @@ from .shading import Surroundings
 
 
 FADE = 0.02
-"""Materials fade over this part of the narrowest value range, for derivatives; at an outer edge, half
-counts."""
+"""Materials fade over this part of the narrowest value range, so that their edges have derivatives."""
 
 
 class Scattering(NamedTuple):

@@ -1,5 +1,4 @@
-"""Path regeneration: walks of a queue begin in idle lanes, once a quarter is, and are compacted at its
-end."""
+"""Path regeneration: walks of a queue begin in idle lanes; at its end, the remaining ones are compacted."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias

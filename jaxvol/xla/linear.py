@@ -1,7 +1,6 @@
-"""Gives a function derivatives in both modes: a push-forward of tangents, a primitive that JAX transposes as
-a whole, and its transpose, a pull-back. JAX transposes the rule of a `custom_jvp` operation by operation,
-which fails for a loop of unknown length; a `custom_vjp` has no forward mode. So forward mode over reverse
-works."""
+"""Gives a function derivatives in both modes: a push-forward of tangents, and its transpose, a pull-back. A
+`custom_jvp` is transposed operation by operation, which fails for a loop of unknown length; a `custom_vjp`
+has no forward mode. Here, JAX transposes a primitive as a whole, also under forward mode."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -100,8 +99,8 @@ def differentiable(
 
 
 def recomputed(function: Callable[..., PyTree], message: str) -> Callable[..., PyTree]:
-    """The function and its derivative in reverse mode as programs, of which the second recomputes the
-    first."""
+    """The function and its derivative in reverse mode as programs, of which the second recomputes the first.
+    `message`: as for `differentiable`."""
 
     def floats_of(args: tuple[Any, ...], moving: PyTree) -> PyTree:
         return floats(function(*eqx.combine(moving, args)))

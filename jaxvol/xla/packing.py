@@ -1,5 +1,4 @@
-"""Holds the arrays of rays as rows of a few, gathered and scattered at once: XLA compiles a kernel for
-each."""
+"""Holds the arrays of rays as rows of a few: XLA compiles a kernel for each array that is gathered."""
 
 import math
 from collections.abc import Callable

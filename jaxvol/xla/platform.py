@@ -1,5 +1,5 @@
 """The platform of a program, and its loops. On a GPU, the host waits for the device at each branch, and at
-each turn of a loop of unknown length."""
+each turn of a loop of unknown length, as XLA copies the predicate to it."""
 
 from collections.abc import Callable
 from functools import cache, partial
