@@ -20,8 +20,7 @@ Image: TypeAlias = Float64[np.ndarray, "height width channels"]
 Plane: TypeAlias = Float64[np.ndarray, "height width"]
 
 BLOCK = 32
-"""Side, in pixels, of the blocks that are searched for wood grain of unknown frequency: rings on a curved
-surface are straight within one, and frequencies are still apart."""
+"""Side of blocks searched for wood grain: rings are straight in one, and frequencies still apart."""
 
 SLOWEST = 3
 """Cycles per block below which an error counts as shading, not wood grain: a period of 10.7 pixels."""

@@ -124,8 +124,7 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
 
 
 def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:
-    """The rendering of a ray whose pixel is computed after the march. A transparent ray has no depth at which
-    anything could be computed."""
+    """Rendering of a ray whose pixel is computed after the march; a transparent ray has no depth."""
     visible, details = rendering.rgba[3] != 0, rendering.details
     found = rendering.depth, details.selected
     found = jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), found)

@@ -4,9 +4,8 @@ import numpy as np
 
 
 ROUNDED, SHEARED = 1e-3, 1e-4
-"""Greatest difference of a direction's length from 1, and greatest cosine between two that counts as a right
-angle: files hold directions of a few decimal places. A smaller shear misplaces no voxel of 1000 by more than
-a tenth; a greater one is kept, whether it was meant or not."""
+"""Greatest difference of a length from 1, and greatest cosine of a right angle: files round directions. A
+smaller shear misplaces no voxel of 1000 by more than a tenth; a greater one is kept."""
 
 FLAT = 1e-3
 """Three directions of length 1 whose determinant is not above this lie in a plane: no grid, but a mistake."""

@@ -1,8 +1,5 @@
-"""Piecewise bilinear functions of two variables, constant beyond a grid of lines: look-ups, and bounds over
-rectangles.
-
-Lines increase along each axis, but for two equal ones, between which the function has a step.
-"""
+"""Piecewise bilinear functions of two variables, constant beyond a grid of lines (two equal ones make a
+step): look-ups, and bounds over rectangles."""
 
 import jax
 import jax.numpy as jnp

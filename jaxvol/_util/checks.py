@@ -1,8 +1,5 @@
-"""Checks arguments. An error names the argument, what came, and what was expected.
-
-A fault in shapes or Python values raises `ValueError` at once, one in traced values an error of
-`equinox.error_if` when the compiled program runs.
-"""
+"""Checks arguments. Errors name the argument, what came and what was expected: a `ValueError` at once for
+shapes and Python values, one of `equinox.error_if` in the program for traced values."""
 
 import contextlib
 import operator
@@ -27,8 +24,7 @@ from ..xla.trees import PyTree
 T = TypeVar("T")
 
 Arrayable: TypeAlias = Any
-"""What a caller may pass for an array: an array of any library, nested sequences, a number. It is `Any`
-because the value is checked at run time, with an error that names the argument."""
+"""What a caller may pass for an array. `Any`: checked at run time, by errors that name the argument."""
 
 
 def described(value: Any) -> str:
@@ -60,15 +56,10 @@ def printable(text: str) -> str:
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """Check that `holds(value, *others)` is true everywhere, and return `value`.
-
-    `holds` gets NumPy arrays if the values are concrete, else traced ones. `{got}` in `message` becomes the
-    value. Use what is returned: without it, the check on a traced value vanishes. Inside `jax.shard_map`,
-    where Equinox's errors do not work, a traced value becomes NaN instead.
-
-    Raises:
-        ValueError: at once for a concrete value; for a traced one, an Equinox runtime error.
-    """
+    """Check that `holds(value, *others)` is true everywhere, and return `value`: **raises** `ValueError`, or,
+    of traced values, an Equinox runtime error, if what is returned is used. Inside `jax.shard_map`, where
+    these do not work, a traced value becomes NaN. `holds` gets NumPy arrays if all are concrete; `{got}` is
+    the value."""
     if is_traced(value, *others):
         if any(map(varies_over, jax.tree.leaves((value, others)))):
             return jax.tree.map(lambda leaf: jnp.where(jnp.all(holds(value, *others)), leaf, jnp.nan), value)
@@ -87,8 +78,7 @@ def finite(values: Any) -> Any:
 
 
 def all_finite(tree: Any) -> Any:
-    """Whether all floats in a tree's arrays are finite; evaluated when the program runs, or at once, if all
-    are NumPy arrays."""
+    """Whether all floats of a tree are finite; evaluated at once if all are NumPy arrays."""
     arrays = (leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray))
     leaves = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     if all(isinstance(leaf, np.ndarray) for leaf in leaves):

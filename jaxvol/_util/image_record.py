@@ -19,8 +19,7 @@ from .voxels import WHOLE, check_shape, is_flat, within
 
 
 ALONG_AXES = 1e-5
-"""Greatest entry by which directions may differ from the world's axes to count as these: it misplaces no
-voxel of 1000 by more than a hundredth. NIfTI's own rounding is smaller."""
+"""Greatest deviation of directions from the world's axes that is ignored: 0.01 voxels in 1000."""
 
 INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a caller and the reader of a file
 
@@ -65,8 +64,7 @@ class ImageRecord:
         return self.units if isinstance(self.units, str | None) else self.units.get(letter)
 
     def millimetres(self) -> np.ndarray:
-        """Lengths of the units along x, y, z in mm. An unknown one is taken as those of the others are, or as
-        1, and `assumed` says so."""
+        """Lengths in mm of the units along x, y, z; unknown ones as of another axis, or 1 (see `assumed`)."""
         told = [self.unit(letter) for letter in "xyz"]
         known = [length_of(unit) for unit in told]
         usual = next(filter(None, known), None)
@@ -101,9 +99,8 @@ class ImageRecord:
 
     def oriented(self, sizes: list[int], turned: bool = True) -> tuple[list[int], list[int], dict[str, Any]]:
         """How axes of `sizes` voxels are brought along the world's: which of x, y, z becomes each, its sign,
-        and spacing (mm), origin and direction of `Volume`, missing where the file says nothing. Not `turned`:
-        axes stay in order, and only those along which steps are negative are reversed. No voxel is
-        interpolated."""
+        and the known of spacing (mm), origin and direction. Not `turned`: in order, reversed where steps are
+        negative."""
         lengths, given = self.millimetres(), np.array([self.steps.get(a, 1.0) for a in "xyz"], float)
         if self.steps and (unknown := [letter for letter in "xyz" if letter not in self.steps]):
             self.note(f"the distance along {', '.join(unknown)}: taken as 1, in the unit of the others")

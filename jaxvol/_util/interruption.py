@@ -1,9 +1,5 @@
-"""Ctrl-C ends the command `jaxvol` also while its modules load, and while Python shuts down.
-
-Imported first by `jaxvol`. Python raises `KeyboardInterrupt` in whatever runs; where that is a callback of
-the garbage collector (JAX has one) or of a weak reference, it is reported, lost, and the command goes on. So
-before and after `main`, the signal ends the process as it ends programs that do not handle it.
-"""
+"""Ctrl-C ends `jaxvol` also while its modules load and Python shuts down, when a `KeyboardInterrupt` in a
+callback of the garbage collector or of a weak reference would be lost: the signal then ends the process."""
 
 import signal
 import sys

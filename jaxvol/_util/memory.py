@@ -15,8 +15,7 @@ def require_room(wanted: int, of: str) -> None:
 
 
 def memory_of_device() -> int:
-    """Bytes that the default device may use: the limit it reports, or else that of the machine or of a
-    container on it."""
+    """Bytes that the default device may use: its own limit, or that of the machine or container."""
     device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
     reported = (device.memory_stats() or {}).get("bytes_limit") if isinstance(device, jax.Device) else None
     if reported:

@@ -29,8 +29,7 @@ def record_of(value: Any) -> ImageRecord | None:
 
 
 def object_arguments(value: Any) -> dict[str, Any] | None:
-    """Arguments of `Volume` for an image of these libraries; None for anything else. An axis of channels
-    becomes the volume's."""
+    """Arguments of `Volume` for an image of these libraries, channels included; None for anything else."""
     if (record := record_of(value)) is None:
         return None
     if "s" not in (letters := record.letters):
@@ -49,9 +48,8 @@ def grid_of(affine: Any) -> dict[str, Any]:
 
 
 def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
-    """The record of an image whose world is right, front, head; of a NIfTI without sform and qform, axes as
-    they are in the file, from 0 on, as by SimpleITK: nibabel itself reverses one of them and centres all.
-    `stored`: its numbers, if they were read before. Without, a fourth axis is the volume's channels."""
+    """Record of a nibabel image, whose world is RAS. A NIfTI without sform and qform keeps the file's axes
+    from 0 on, as by SimpleITK. `stored`: numbers read before; without, a fourth axis is channels."""
     header, proxy = image.header, image.dataobj
     data = proxy.get_unscaled() if stored is None and hasattr(proxy, "get_unscaled") else stored
     data = np.asanyarray(proxy if data is None else data)

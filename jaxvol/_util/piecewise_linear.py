@@ -1,8 +1,4 @@
-"""Piecewise linear functions of one variable: tables, look-ups, and bounds over ranges.
-
-Transfer functions are such functions of a volume's value. A table has one row for each control point, with
-all that values from this point up to the next one need: see `TransferFunction.rows`.
-"""
+"""Piecewise linear functions of one variable: tables of a row for each point, look-ups, and bounds."""
 
 from typing import Any, TypeAlias, cast
 
@@ -17,8 +13,7 @@ from .vec3 import Scalar, Vec3
 
 
 FEW = 8
-"""Up to so many control points, a row is chosen by comparing with each. Of more, it is searched for once, and
-looked up: in colours, to choose among sixteen takes ten times as long as among eight."""
+"""Most control points among which a row is chosen by comparisons; of more, it is looked up."""
 
 COMPARED = 16
 """Up to so many control points, comparing a value with each costs less than a search."""
@@ -28,8 +23,7 @@ ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
 
 
 def few() -> int:
-    """Up to how many control points a row is chosen by comparing with each: where gathers are fast, up to
-    COMPARED. (Padded to 16, a frame of 9 points takes 2.6 times as long: programs are not shared there.)"""
+    """Most points that are compared one by one: `COMPARED` where gathers are fast, else `FEW`."""
     return COMPARED if gathers_are_fast() and not on_gpu() else FEW
 
 
@@ -46,8 +40,7 @@ def clip_below(value: Scalar, least: Scalar) -> Scalar:
 
 
 def not_negative(extinction: Array) -> Array:
-    """The extinction, or 0 below 0, where an optimiser's step may end; it has no derivative there. NaN stays
-    NaN."""
+    """The extinction, or 0 below 0 (after an optimiser's step), without derivative there. NaN stays NaN."""
     return jnp.where(extinction < 0, 0, extinction)
 
 
@@ -111,8 +104,7 @@ def interpolate_row(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:
 
 
 def positive_between(values: Any, extinction: Any, low: Any, high: Any) -> Any:
-    """Whether the piecewise linear extinction is positive anywhere from `low` to `high`; in NumPy, of NumPy
-    arrays."""
+    """Whether the extinction is positive anywhere from `low` to `high`; of NumPy arrays, in NumPy."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     positive, n, xp = extinction > 0, values.shape[0], np if isinstance(values, np.ndarray) else jnp
     if n > COMPARED:  # counting by look-up costs less than comparing with each point
@@ -138,8 +130,7 @@ def upper_bound_between(
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
 ) -> Float[Array, "*blocks"]:
-    """Upper bound of the piecewise linear extinction from `low` to `high`, rounding included: it is greatest
-    at an end of the range, or at a control point inside it."""
+    """Upper bound of the extinction from `low` to `high`: at the ends or a point between, plus rounding."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     ends = jnp.maximum(jnp.interp(low, values, extinction), jnp.interp(high, values, extinction))
     first, end = points_below(values, low, strictly=True), points_below(values, high)

@@ -1,9 +1,5 @@
-"""Means of piecewise linear functions over all values between two.
-
-Colour and extinction are piecewise linear in the value. The mean colour is weighted by the extinction: it is
-the mean of their product, the emission, divided by the mean extinction. n control points divide all values
-into n + 1 spans: below the first, between two, and beyond the last.
-"""
+"""Means of piecewise linear functions over all values between two: of the extinction, and of the colour,
+weighted by it. n control points divide all values into n + 1 spans."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -17,9 +13,8 @@ from .vec3 import Scalar, Vec3
 
 
 class Span(NamedTuple):
-    """One row of `span_rows`: the values between which it lies; colour (r, g, b) and extinction at its start,
-    and how they grow with the value; integrals of emission and extinction from the first point on, and the
-    part of each that is lost in rounding, so that differences are exact."""
+    """One row of `span_rows`: start and end value; colour (r, g, b) and extinction at the start, and their
+    slopes; integrals of emission and extinction from the first point on, with what rounding lost."""
 
     start: Scalar
     end: Scalar
@@ -111,8 +106,7 @@ def mean_by_rows(
 
 @jax.custom_jvp
 def mean_by_spans(rows: Float[Array, "spans 26"], front: Scalar, back: Scalar) -> tuple[Vec3, Scalar]:
-    """The same, by a sum over all spans: faster while there are few. Its derivatives are those of
-    `mean_by_rows`, which do not divide by a small difference of values."""
+    """The same by a sum over all spans, faster for few; derivatives are those of `mean_by_rows`."""
     spans = [Span.of(tuple(row)) for row in rows]
     up = back > front
     low, high = jnp.where(up, front, back), jnp.where(up, back, front)
@@ -146,8 +140,7 @@ def _(primals: tuple[Array, Scalar, Scalar], tangents: tuple[Any, Any, Any]) -> 
 
 
 def _linear_means(middle: Sequence[Array], rise: Sequence[Array]) -> tuple[Array, ...]:
-    """Mean emission and extinction where colour and extinction are linear, from those in the middle, and from
-    how much they grow."""
+    """Mean emission and extinction of linear colour and extinction, by their middle and rise."""
     *colors, extinction = middle
     *of_colors, of_extinction = rise
     emission = (extinction * c + of_extinction * d / 12 for c, d in zip(colors, of_colors, strict=True))

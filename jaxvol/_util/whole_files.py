@@ -14,9 +14,8 @@ _UNFINISHED: set[Path] = set()
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A path of the same name, in a temporary folder, to write a file to. When the context ends, the file
-    replaces `path`, whose folder is made; after an error nothing has changed. What a link points to is
-    replaced; a pipe or a device is written to."""
+    """A temporary path of the same name, to write to. At the end the file replaces `path`, or what it links
+    to (a pipe or device is written to), and its folder is made; after an error nothing has changed."""
     name, path = path.name, path.resolve()
     special = path.exists() and not (path.is_file() or path.is_dir())
     nearest = next(folder for folder in path.parents if folder.exists())  # on the same disk

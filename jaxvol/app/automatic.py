@@ -26,20 +26,17 @@ SAMPLED = 2**21  # voxels that are looked at, at most
 CUT = 0.25  # fraction of the voxels at the volume's faces from which on the faces cut through the object
 
 BODY = 0.15
-"""Least fraction of the voxels between the thresholds whose six neighbours lie between them, too, if they are
-a body: 0.25 to 0.92 in scans and simulations, 0.09 at most in angiograms, where only rims of vessels do."""
+"""Least part of a body's voxels with all neighbours in it, too: 0.25 in scans, 0.09 in angiograms."""
 
 IN_FRONT, THROUGH, THIN = 0.3, 1.2, 0.15
 """Optical depth of the object in front of what is dense, and all through it, at most, in the median of rays
 along the axes; and opacity from which on it is thin."""
 
 ROUGH, NOISY = 0.7, 0.1
-"""Grain has second differences above this fraction of first differences over two steps (0.6 at most in scans,
-0.8 in ultrasound, 1.7 in white noise), and above this fraction of the distance of the thresholds."""
+"""Second differences of grain, at least, over first ones (scans 0.6), and over the thresholds' distance."""
 
 MOST_LABELS = 256
-"""Whole numbers are labels if most equal their neighbour, and no more than so many differ, the lowest among
-them: a `LabelTransferFunction` has no more."""
+"""Most labels, and most different whole numbers that count as such: as in a `LabelTransferFunction`."""
 
 SPARSE = 0.06  # fraction of voxels that are no background, at most, of angiograms
 MANY = 16  # different values that the others have at least, for one to be far from them
@@ -58,8 +55,7 @@ these, at least, which is also that of a fill value below the others; and the sa
 
 
 class Spread(NamedTuple):
-    """Range of values without strays and fill values. `usual`: their first percentile. `fill`: the value
-    above the range that means background, or infinity. `told`: words on what was left out, or ""."""
+    """Values without strays: first percentile `usual`, background `fill` above or inf, words on the rest."""
 
     low: float
     high: float
@@ -76,12 +72,9 @@ class Spread(NamedTuple):
 
 
 def spread_of(values: Shaped[np.ndarray, "..."]) -> Spread:
-    """Find the range of values but for those that lie far from all others: single voxels, hot or dead, and
-    one value of any number of voxels, such as the padding of CT outside of the circle, or a fill value.
-
-    A value above all others counts as background only if it is farther away than six times their range: a
-    saturated object is no fill value.
-    """
+    """Find the range of values but for those far from all others: hot or dead voxels, and one value of any
+    number, such as padding of CT. Above all others, it counts as background only beyond six times their
+    range: a saturated object is no fill value."""
     kinds, counts = np.unique(values, return_counts=True)
     kinds, most, left, fill, more = kinds.astype(np.float64), RARE * counts.sum(), [], math.inf, True
     while more:
@@ -122,18 +115,19 @@ def sampled(volume: Volume, data: Any = None) -> Shaped[np.ndarray, "nx ny nz *c
 
 
 def unit_of(volume: Volume) -> float:
-    """The length to which opacities refer, so that they do not depend on the volume's units: a hundredth of
-    its diagonal."""
+    """Length to which opacities refer, whatever the volume's units: a hundredth of its diagonal."""
     across = (np.array(volume.shape) - 1) * np.asarray(volume.spacing)
-    return (
-        float(np.linalg.norm(across if volume.direction is None else np.asarray(volume.direction) @ across))
-        / 100
-    )
+    across = across if volume.direction is None else np.asarray(volume.direction) @ across
+    return float(np.linalg.norm(across)) / 100
+
+
+def faces_of(data: Shaped[np.ndarray, "nx ny nz"]) -> Shaped[np.ndarray, " n"]:
+    """The values on a volume's six faces."""
+    return np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
 
 
 def preset_unit(volume: Any) -> float:
-    """Length to which a preset's opacities refer: a millimetre; for voxels that are smaller by far, of
-    phantoms or micro-CT, as long as these."""
+    """Length to which a preset's opacities refer: 1 mm, or the voxels' size if these are far smaller."""
     size = float(voxel_size(volume))
     return size if size < SMALL else 1.0
 
@@ -209,9 +203,7 @@ def _of_histogram(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> tuple[T
         first, second = thresholds(values)
         d = (second - first) / 4
         points = [(second, DENSE, 0.45), (max((second + high) / 2, second + d / 2), BRIGHT, 0.9)]
-        data = np.asarray(copy.data)
-        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
-        if np.mean(outer > first) < CUT and is_body(part, first, second):
+        if np.mean(faces_of(np.asarray(copy.data)) > first) < CUT and is_body(part, first, second):
             depth, usual = depth_of_object(copy, first, second)
             w = min(first - low, second - first) / 3
             border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, max(0.07, depth))]
@@ -219,7 +211,7 @@ def _of_histogram(copy: Volume, part: Shaped[np.ndarray, "nx ny nz"]) -> tuple[T
                 border = [(first, EDGE, 0.0), (min(usual, second - 2 * d), SKIN, depth)]
             points = [*border, (second - d, TISSUE, depth), *points]
         else:
-            foot, opacity = (second - 2 * d, 0.02)
+            foot, opacity = second - 2 * d, 0.02
             if np.mean(values > first) < SPARSE:  # vessels, of which the thin ones are darker
                 foot, opacity = first, 0.2
             points = [(foot, EDGE, 0.0), (second - d, TISSUE, opacity), *points]
@@ -242,8 +234,7 @@ def side_of_distance(volume: Volume) -> int:
     slope = np.sqrt(sum(np.square(each) for each in np.gradient(data, *step.tolist())))
     if np.mean(np.abs(slope[slope > 0] - 1) < 0.1) < 0.7:
         return 0
-    outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
-    return 1 if np.mean(outer > 0) > 0.5 else -1
+    return 1 if np.mean(faces_of(data) > 0) > 0.5 else -1
 
 
 def depth_of_object(volume: Volume, first: float, second: float) -> tuple[float, float]:
@@ -300,8 +291,7 @@ def range_of_object(volume: Volume) -> tuple[float, float]:
 
 
 def xray_transfer(volume: Volume, cmap: Any, clim: tuple[float, float]) -> TransferFunction:
-    """Of an extinction that grows with the values of a range, so that a pixel's brightest channel is 1 where
-    it is the greatest along an axis, but for a thousandth of the rays."""
+    """Extinction that grows over a range, so that the brightest pixel of a view along an axis is 1."""
     colors = colormap(cmap, clim)
     slope, brightest = np.linspace(0, 1, len(colors.values)), np.max(colors.colors, axis=1)
     emitted = np.interp(sampled(volume), colors.values, slope * brightest)
@@ -318,8 +308,7 @@ def brightest_mean(volume: Volume, low: float) -> float:
 
 
 def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -> bool:
-    """Whether values between two thresholds fill a body, and are not only grain, or the borders of what is
-    dense. Of a large volume, every n-th voxel is compared with its neighbours."""
+    """Whether values between the thresholds fill a body, rather than grain or borders."""
     if min(data.shape) < 3:
         return True
     stride = stride_of(data.shape)

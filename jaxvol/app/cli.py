@@ -19,31 +19,16 @@ from .commands.options import Parser, parsed
 
 
 COMMANDS = {
-    "demo": (
-        "pages",
-        "render a shaded head, wood grain before and after, and a fit by gradients, and a page of them",
-    ),
+    "demo": ("pages", "make a page of a shaded head, wood grain before and after, and a fit by gradients"),
     "render": ("render", "render a volume file to an image"),
     "animate": ("animate", "render a volume file from a camera that turns about it"),
     "plan": ("render", "show the cheapest way to render a volume file within a tolerance, and why"),
     "fit": ("fit", "fit a transfer function to images of a volume"),
-    "figures": (
-        "pages",
-        "make the figures and tables of the source papers, and a page of them, from recorded results",
-    ),
+    "figures": ("pages", "make a page of the figures and tables of the source papers, from recorded results"),
     "warm": ("warm", "compile the programs of usual pictures, and keep them, so that these take less time"),
-    "info": (
-        "volumes",
-        "print shape, type, place in the world and values of a volume file, as jaxvol loads it",
-    ),
-    "datasets": (
-        "volumes",
-        "list the public Open SciVis volumes; or print the path of one, downloaded if need be",
-    ),
-    "view": (
-        "volumes",
-        "look at a volume file in the browser of this machine; Ctrl-C ends it",
-    ),
+    "info": ("volumes", "print shape, type, place and values of a volume file, as jaxvol loads it"),
+    "datasets": ("volumes", "list the Open SciVis volumes; or print the path of one, downloaded if need be"),
+    "view": ("volumes", "look at a volume file in the browser of this machine; Ctrl-C ends it"),
 }
 """By name, the module in `commands/` whose `add_NAME` adds a command's options, and what it does."""
 
@@ -61,16 +46,10 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Args:
-        arguments: the words after `jaxvol`; by default those of the process.
-
-    Returns:
-        The exit code: 0; 2 for bad input, reported in one line; 1, with nothing said, where what reads stdout
-        has ended. Ctrl-C is reported in one line and ends the process at once with code 130, as in shells, by
-        `os._exit`: XLA does not stop for a signal. Unfinished files are removed.
-    """
+    """Run the command line, by default with the words of the process. Returns the exit code: 0; 2 for bad
+    input, reported in one line; 1 where what reads stdout has ended. Ctrl-C is reported in one line and ends
+    the process at once with code 130, as in shells, since XLA does not stop for a signal. Unfinished files
+    are removed."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     program = " ".join(["jaxvol", *words[:1]])
     options = argparse.Namespace()

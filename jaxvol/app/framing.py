@@ -99,9 +99,8 @@ def upright(
     front = np.roll(FRONT, axis + 1)  # so that what is above lies along this axis
     front[axis] *= sign
     extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
-    if (thin := int(np.argmin(extent))) >= 0 and extent[thin] < SLAB * np.median(
-        extent
-    ):  # seen from its side
+    thin = int(np.argmin(extent))
+    if extent[thin] < SLAB * np.median(extent):  # seen from its broad side
         front = 0.3 * front
         front[thin] = 1.0 if front[thin] >= 0 else -1.0
         axis, sign = (axis, sign) if axis != thin else (1, 1.0)
@@ -136,8 +135,7 @@ def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
 
 
 def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Float[np.ndarray, "n 3"]:
-    """Points in the world around what a transfer function shows, specks left out; the corners of the volume
-    where nothing is visible, or that is not known."""
+    """World points around what is shown, without specks; else the volume's corners."""
     from scipy.ndimage import label, maximum_filter
     from scipy.spatial import ConvexHull, QhullError
 
@@ -163,14 +161,11 @@ def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -
 def clipped_points(
     points: Float[np.ndarray, "n 3"], planes: Sequence[tuple[Any, Any]]
 ) -> Float[np.ndarray, "m 3"]:
-    """Points whose hull is that of the given ones on the sides of all planes (point, normal): those that lie
-    there, and where lines to the others cross. None where nothing is left."""
+    """Points whose hull is what planes (point, normal) leave of the given hull, if anything."""
     for at, normal in planes:
         height = (points - np.asarray(at, float)) @ np.asarray(normal, float)
-        kept, cut = points[height >= 0], points[height < 0]
-        share = height[height >= 0][:, None] / np.maximum(
-            height[height >= 0][:, None] - height[height < 0], 1e-30
-        )
+        kept, cut, above = points[height >= 0], points[height < 0], height[height >= 0][:, None]
+        share = above / np.maximum(above - height[height < 0], 1e-30)
         crossing = kept[:, None] + share[..., None] * (cut[None] - kept[:, None])
         points = np.concatenate([kept, crossing.reshape(-1, 3)])
     return points

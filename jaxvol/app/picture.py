@@ -35,6 +35,7 @@ from .automatic import (
     SAMPLED,
     automatic_transfer,
     brightest_mean,
+    faces_of,
     labels_if_any,
     labels_shown,
     preset_unit,
@@ -69,14 +70,12 @@ PIXEL = 160
 """Bytes that an image takes for each pixel, while it is rendered and written."""
 
 IN_MEMORY = 9
-"""Most bytes that `render` takes for each byte of voxels: these as read and in the device, a packed copy of
-8-bit ones, the extremes of blocks, and slopes."""
+"""Most bytes of `render` for each byte of voxels: on host and device, packed, and the blocks' ranges."""
 
 
 class Scene(NamedTuple):
-    """What is looked at, and how. If `source` is read in bricks, since it does not fit into `memory` bytes,
-    `volume` is a copy of every n-th voxel in the same place. `others`: volumes in the same image, with their
-    transfer functions. `transforms`: those that belong to the scene. `march`: a `March`, once it is known."""
+    """What is looked at. `volume` is a coarser copy of `source`, if that is read in bricks of `memory` bytes.
+    `others`: further volumes, with their transfer functions. `march`: once it is known."""
 
     volume: Volume
     transfer: Transfer
@@ -123,13 +122,9 @@ class Scene(NamedTuple):
 
 
 def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
-    """The scene that the options describe, without a march.
-
-    Args:
-        options: those of `DEFAULTS`, `recorded_transfer`, and `file`, a path or a `Volume`. `transfer` may be
-            a `Transfer`, and entries of `others` what `other_of` takes.
-        orbit: the views of a camera that turns, in which the automatic camera shows all that is visible.
-    """
+    """The scene of the options (`DEFAULTS`, `recorded_transfer`, and `file`, a path or `Volume`) without a
+    march. `orbit`: the views of a camera that turns, in which the automatic camera shows all that is
+    visible."""
     width, height = np.broadcast_to(getattr(options.camera, "size", options.size), 2).tolist()
     if width * height < 2**31:  # more are refused otherwise
         require_room(width * height * PIXEL, f"size {width} x {height}")
@@ -172,7 +167,8 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
 
     warn_of_distance(volume, others)
     lighting = _lighting(options, mode, alone=not others)
-    camera = _camera(options, volume, transfer, others, orbit).zoom(options.zoom)
+    seen = () if options.clip_inside_out else planes
+    camera = _camera(options, volume, transfer, others, orbit, seen).zoom(options.zoom)
     how = mode, lighting, background, transforms, source, options.memory
     return Scene(volume, transfer, camera, *how, others=others)
 
@@ -201,8 +197,9 @@ def _camera(
     transfer: Transfer,
     others: Sequence[tuple[Volume, Transfer]],
     orbit: Callable[[Camera], Sequence[Camera]] | None,
+    planes: Sequence[Any],
 ) -> Camera:
-    """That of the options; or else one as near as what is visible allows."""
+    """That of the options; or else one as near as what is visible on one side of `planes` allows."""
     given = {"view_angle": options.view_angle, "size": options.size}
     if isinstance(options.camera, Camera):
         return options.camera
@@ -213,8 +210,7 @@ def _camera(
         scale = height if options.parallel else None  # as high at the focal point
         return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
     if options.compositing == "isosurface":  # seen is what lies within, which most of the faces do not
-        step, data = np.full(2, options.isovalue), np.asarray(volume.data)
-        outer = np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
+        step, outer = np.full(2, options.isovalue), faces_of(np.asarray(volume.data))
         opacity = np.array([0.0, 1e6 / unit_of(volume)])[:: -1 if np.mean(outer > step[0]) > 0.5 else 1]
         transfer = TransferFunction(step, np.ones((2, 3)), opacity)
     given["parallel"] = options.parallel
@@ -222,11 +218,6 @@ def _camera(
     what = with_others(volume, transfer, others)
     camera = automatic_camera(*what, options.direction, options.view_up, **given)
     clipped = options.clip_box is not None and not options.clip_inside_out
-    planes = (
-        []
-        if options.clip_inside_out
-        else [(each[:3], each[3:]) for each in np.reshape(options.clip_plane, (-1, 6))]
-    )
     if orbit is None and not clipped and not planes:
         return camera
     points = []
@@ -238,8 +229,7 @@ def _camera(
 
 
 def other_of(each: Any) -> tuple[Volume, Transfer]:
-    """One more volume, a file or a `Volume`, and its transfer function: given, or a colormap ("hot") over LOW
-    and HIGH, or over what stands out of the background."""
+    """A further volume, and the given transfer function, or a colormap over LOW to HIGH."""
     file, *look = each if isinstance(each, Sequence) and not isinstance(each, str) else (each,)
     volume = file if isinstance(file, Volume) else load(file)
     if look and isinstance(look[0], Transfer):
@@ -256,8 +246,7 @@ def other_of(each: Any) -> tuple[Volume, Transfer]:
 
 
 def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> Scene:
-    """The scene with the given step; without one, with the shortest of those planned for the cameras (of
-    several volumes, with half of their shortest spacing)."""
+    """The scene with the given step, or the shortest one planned for the cameras."""
     step = options.step
     if step is None and scene.others:
         if options.tolerance is not None:
@@ -314,8 +303,7 @@ def background_of(options: Namespace) -> tuple[float, float, float]:
 
 
 def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
-    """The transfer function that the options ask for. `source`: of which `volume` is a copy with fewer
-    voxels."""
+    """The transfer function of the options. `source`: what `volume` is a coarser copy of."""
     if options.recorded_transfer is not None:
         return options.recorded_transfer
     if options.transfer is not None:
@@ -367,8 +355,7 @@ def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lig
 
 
 def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel, stretched to the bounds of the whole: of those by which colours are chosen
-    for the whole, if they fit into so many bytes, and of fewer if not."""
+    """A copy of every n-th voxel that fits into memory, stretched to the whole's bounds."""
     most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
     copy = source.subsampled(min(stride_of(source.shape, most), min(source.shape) // 2))
     whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, source.spacing, copy.shape, strict=True)]

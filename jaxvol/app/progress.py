@@ -57,17 +57,9 @@ def _compiled_now() -> list[str]:
 
 @contextmanager
 def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Iterator[Callable[[], object]]:
-    """Show a task while it takes longer than a second, and which of its programs is being compiled.
-
-    Args:
-        task: what is done, such as "reading engine.raw".
-        total: steps of the task. With it, a bar shows how many are done, and the time that is left.
-        quiet: whether nothing is shown. Nothing is shown either where standard error is no terminal, but in
-            notebooks.
-
-    Returns:
-        A context, which gives a function to be called after each step.
-    """
+    """Show a task, and the program that it compiles, while it takes longer than a second; nothing if
+    `quiet`, or where stderr is no terminal, but in notebooks. Of a `total` of steps, a bar shows how many are
+    done; the context gives the function to call after each."""
     from tqdm import tqdm
 
     kernel = "ipykernel" in sys.modules

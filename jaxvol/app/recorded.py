@@ -1,5 +1,5 @@
-"""The options that made a picture: written into a PNG, and read again as data that anyone may have made. Of
-files it names the volume's, for people; none is read because a picture names it."""
+"""The options that made a picture, written into a PNG, and read as data that anyone may have made. No file is
+read because a picture names it."""
 
 import argparse
 import json
@@ -29,8 +29,7 @@ def words_of(name: str, value: Any) -> list[str]:
 def text_of(
     settings: Mapping[str, Any], file: Any, transfer: Any = None, further: Sequence[str] = ()
 ) -> dict[str, str]:
-    """The text that a PNG carries, by its keyword: options, as words of a command line; the volume's file;
-    and a transfer function of points, if it holds one."""
+    """Text of a PNG: options as command-line words, the volume's file, a `TransferFunction`."""
     words = [word for name, value in settings.items() for word in words_of(name, value)]
     content: dict[str, Any] = {"options": words, "file": str(file)}
     if further:
@@ -41,8 +40,7 @@ def text_of(
 
 
 def text_of_options(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
-    """That of the options that are not at their defaults, with a transfer function that a file or a picture
-    held; and which options held other files, which a picture may not name."""
+    """Text of changed options, with a transfer function that was read; other files are only named."""
     further = [name for name in ("labels", "others") if getattr(options, name)]
     given = {name: getattr(options, name) for name in options.defaults.keys() - {"quiet"}}
     changed = {name: value for name, value in given.items() if value != options.defaults[name]}

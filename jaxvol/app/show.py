@@ -108,8 +108,7 @@ show.__signature__ = inspect.Signature([*_positional, *_known])  # pyright: igno
 
 
 def why_empty(scene: Scene, rendering: Rendering) -> str | None:
-    """Why an image shows nothing, and what to change; None where a pixel's opacity is above `FAINT`, and the
-    values differ."""
+    """Why an image shows nothing, and what to change; None if a pixel is more opaque than `FAINT`."""
     volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
     alone = scene.volume.field is None and scene.volume.labels is None and not scene.others
     if alone and (data := np.asarray(scene.volume.data)).min() == data.max():

@@ -1,8 +1,5 @@
-"""Volumes that need not fit into memory, on disk or in the memory of the host.
-
-`jaxvol.render_bricks` renders them, brick by brick. Here is what it uses: sources, from which boxes of voxels
-are read (`source_of`, `levels_of`), and the overlap of bricks with curved faces (`overlap_of`).
-"""
+"""Volumes that need not fit into memory: `jaxvol.render_bricks`, sources from which boxes of voxels are read
+(`source_of`, `levels_of`), and the overlap of bricks with curved faces (`overlap_of`)."""
 
 from .grid import BrickGrid as BrickGrid, overlap_of as overlap_of
 from .opening import level_for as level_for, levels_of as levels_of, source_of as source_of

@@ -1,9 +1,8 @@
-"""Which cells of each ray lie in a brick?
+"""Finds the cells of each ray in a brick: those that begin there, if samples were not moved.
 
-A cell belongs to the brick in which it begins, if samples were not moved. In a grid with straight rays each
-ray meets a brick once. Where rays are curved, a ray may come back to a brick that it has left. Bricks are
-then visited one after the other, and a ray goes on while it is in this one, or in one that was visited
-before: those cells are read with the brick, which is the overlap of Kim, Kwon and Shin 2008.
+A straight ray meets a brick once. A curved one may come back: bricks are visited one after the other, and a
+ray goes on while it is in this one or an earlier one, whose cells are read with it (the overlap of Kim, Kwon
+and Shin 2008).
 """
 
 from typing import NamedTuple, TypeAlias
@@ -24,8 +23,7 @@ from .grid import SLACK, BrickGrid
 CHUNK = 8  # cells of a ray that are tested at a time
 
 Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " bricks"]]
-"""A brick; through which bricks rays go on from it, itself included; and which are empty, so that rays move
-through them to it. The masks are of all bricks, and of what lies outside of the volume."""
+"""A brick, masks of the bricks through which rays go on from it, itself included, and of empty ones."""
 
 CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
 """Rays, at their entries but for which are finished, and to which cell of each ray bricks have been found."""
@@ -62,8 +60,7 @@ def straight_cells(
 def first_behind(
     grid: BrickGrid, march: March, rays: Ray, order: Int[Array, " bricks"], number: Int[Array, ""]
 ) -> Int[Array, "*rays"]:
-    """Of straight rays, the first cell that begins behind the first `number` bricks of an order in which each
-    ray meets them."""
+    """First cell of straight rays behind the first `number` bricks of an order in which rays meet them."""
 
     def more(i: Int[Array, ""], index: Int[Array, "*rays"]) -> Int[Array, "*rays"]:
         _, far, hit = _within(grid, march, rays, order[i])
@@ -127,8 +124,7 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
         return (front < (rays.length + march.step)[None]) & (index < march.most_samples)
 
     def while_in(allowed: Bool[Array, " bricks"], index: Array, active: Array) -> tuple[Array, Array]:
-        """Moves rays on while they are in these bricks; and the index behind the last cell on the way that
-        is not empty."""
+        """Moves rays on while in these bricks; also the index behind the last non-empty cell."""
 
         def more(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             index, last, active = state

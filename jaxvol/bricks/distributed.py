@@ -1,9 +1,6 @@
-"""Distributes bricks over devices: each device reads and renders its own bricks, for all rays.
-
-Devices get consecutive bricks of the order front to back, which straight rays meet in this order. Each device
-marches its cells as if nothing lay in front, and the operator "over", which is associative, joins the partial
-images. All devices render one brick each at a time, in one program.
-"""
+"""Distributes bricks over devices: each gets consecutive ones of the order front to back, reads them, and
+marches all rays as if nothing lay in front. "Over", which is associative, joins the partial images. All
+devices render one brick at a time, in one program."""
 
 from collections.abc import Callable, Iterator
 from itertools import pairwise, zip_longest
@@ -95,8 +92,7 @@ def bounds_of(wanted: Bool[np.ndarray, " bricks"], number: int) -> list[tuple[in
 def _next_loads(
     traversal: Traversal, mesh: Mesh, share: Share, remaining: Iterator[tuple[int, ...]]
 ) -> tuple[np.ndarray, dict[int, Load]] | None:
-    """The next brick of each device, -1 where none of its rays needs one; and those that this process reads,
-    by device. `remaining`: the bricks to come."""
+    """Next brick of each device (-1: none is needed), and this process's loads by device."""
     for each in remaining:
         bricks = np.asarray(each, np.int32)
         given = traversal.grid, traversal.scene
@@ -132,8 +128,7 @@ def _placed(
 
 @compiled
 def _on_each(mesh: Mesh, one: Callable[..., Any], replicated: bool, given: Any, *shares: Any) -> Any:
-    """`one(*given, *shares)` on each device, of its part of each share. `replicated`: it returns the same on
-    all devices."""
+    """`one(*given, *shares)` on each device's shares. `replicated`: the result is the same on all."""
 
     def local(*shares: Any) -> Any:
         found = one(*given, *jax.tree.map(lambda leaf: leaf[0], shares))

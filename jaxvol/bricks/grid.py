@@ -72,12 +72,9 @@ class BrickGrid:
         return number
 
     def order(self, space: Space, camera: Camera) -> list[int]:
-        """All bricks, front to back, by the depth of their centers.
-
-        Where rays are straight in the grid, depth is the sum of the distances along the three axes, counted
-        in bricks: none of the three falls along a ray, so that no ray meets a brick after one behind it.
-        Where rays are curved, it is the distance from the camera, as in the paper, and a ray may meet bricks
-        in another order."""
+        """All bricks, front to back. In straight grids, depth is the sum of distances along the axes in
+        bricks, none of which falls along a ray, so that no ray meets a brick after one behind it. In curved
+        ones it is the distance from the camera, as in the paper, and a ray may."""
         index = np.stack(np.unravel_index(np.arange(self.number), self.counts), axis=-1)
         centers = (index + 0.5) * self.size
         eye, (_, _, forward) = camera.position, axes_of(camera)
@@ -150,8 +147,7 @@ class Margin:
 
     @classmethod
     def of(cls, march: March, space: Space, shape: Node, segment: int, shown: Scene) -> "Margin":
-        """That of a march in a grid of this shape, which takes `segment` cells of a ray at a time. `shown`:
-        what is measured and lit there."""
+        """Margin of a march that takes `segment` cells at a time. `shown`: what is measured and lit."""
         transfer, lighting, straight = shown.transfer, shown.lighting, is_straight(space)
         steps = SLACK + segment
         # where rays are curved, a brick's own cells are found by points that may lie four steps apart
@@ -196,7 +192,9 @@ def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, l
     least distances between nodes in both, also beyond the grid, where a ray may return to it."""
     nodes = np.zeros(3)
     while length > 0:
-        distances = _distances(space, low - nodes, high + nodes)
+        box = (low - nodes).tolist(), (high + nodes).tolist()
+        ends = (tuple(jnp.asarray(c, space.middle[0].dtype) for c in end) for end in box)
+        distances = np.array([float(distance) for distance in _least_distances(space, *ends)])
         with np.errstate(divide="ignore"):
             more = np.maximum(nodes, np.minimum(np.ceil(length / distances), shape))
         if np.array_equal(more, nodes):
@@ -206,12 +204,6 @@ def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, l
 
 
 _least_distances = compiled(lambda space, low, high: space.least_distances(low, high))
-
-
-def _distances(space: Space, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Least distances between neighbouring nodes along each axis in a box."""
-    ends = (tuple(jnp.asarray(c, space.middle[0].dtype) for c in end.tolist()) for end in (low, high))
-    return np.asarray([float(distance) for distance in _least_distances(space, *ends)])
 
 
 def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
@@ -236,9 +228,8 @@ def divided(shape: Node, counts: Any) -> BrickGrid:
 
 
 def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
-    """The fewest bricks of about cubic shape, and at least as many as `devices` if these are not too small,
-    that fit into so many bytes: there is one more along the axis where they are longest, until they do. Axes
-    along which even the smallest bricks would be read whole are split last."""
+    """The fewest about cubic bricks, `devices` if not too small, that fit into memory: one more along the
+    longest side until they do; axes along which the smallest would be read whole are split last."""
     cells = [n - 1 for n in shape]
     x, y, z = (min(EDGE, c) for c in cells)
     short = np.less(margin.stored(BrickGrid(shape, (x, y, z))), shape).tolist()

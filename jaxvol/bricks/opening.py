@@ -1,9 +1,6 @@
-"""Opens arrays, files and folders as sources, and chooses the level of detail for a view.
-
-tensorstore reads Zarr arrays. yaozarrs checks the `multiscales` of OME-Zarr 0.4 (Zarr 2, in .zattrs) and 0.5
-(Zarr 3, in zarr.json), which say where levels of detail lie in the world: https://ngff.openmicroscopy.org/0.5/.
-A voxel's position is that of its centre; `orientation` (RFC 4) is as ngff-zarr writes it.
-"""
+"""Opens arrays, files and folders as sources (Zarr by tensorstore), and chooses the level of detail. yaozarrs
+checks OME-Zarr 0.4 and 0.5 (https://ngff.openmicroscopy.org/0.5/), whose positions are of centres;
+`orientation` (RFC 4) is as ngff-zarr writes it."""
 
 import json
 import math
@@ -129,8 +126,7 @@ def _source(
     channel: int | None = None,
     nan: float | None = None,
 ) -> VoxelSource:
-    """The source of a record's array: its axes along the world's, lengths in mm, values scaled. `place`: as
-    the caller has it."""
+    """Source of a record: axes along the world's, lengths in mm. `place`: given by the caller."""
     name, array = record.what.removeprefix("path: "), record.data
     if not record.axes:
         raise ValueError(
@@ -185,8 +181,7 @@ def _is_zarr_array(path: Path) -> bool:
 
 
 def _zarr_record(path: Path) -> ImageRecord:
-    """The record of an array. Its axes, values and lengths are as xarray keeps them; of a Zarr without names
-    of axes, `axes` is empty unless there are three."""
+    """Record of an array, as xarray keeps it; without names, `axes` is empty, or x, y, z of three."""
     try:
         import tensorstore
     except ImportError as fault:

@@ -54,7 +54,6 @@ def render_bricks(
     level: int | Literal["auto"] | Any = "auto",
     progress: Callable[[int, int], Any] | Any | None = None,
     devices: Devices | Any | None = None,
-    own: Literal["bricks"] | Any = "bricks",
     **options: Any,
 ) -> Rendering:
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
@@ -98,7 +97,6 @@ def render_bricks(
             front but by its transmittance (no `EmptySpaceJitter`; compositing by `"over"`). An
             `EarlyTermination` sees only what is in front on the same device: up to `opacity_left` of the
             colours behind are added, and depth changes with them; without it, depth agrees to 1e-5 of itself.
-        own: `"bricks"`: what devices own.
         **options: for the source (`shape`, `dtype`, `time`, `channel`, `nan`), see `bricks.levels_of`.
 
     Returns:
@@ -122,7 +120,7 @@ def render_bricks(
         )
     order = "render_bricks(source, transfer, camera, march)"
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    words = [("outputs", outputs, get_args(RenderOutputs)), ("own", own, ("bricks",))]
+    words = [("outputs", outputs, get_args(RenderOutputs))]
     words += [] if callable(method) else [("method", method, tuple(METHODS))]
     for name, given, known in words:
         if not isinstance(given, str) or given not in known:

@@ -18,6 +18,7 @@ from .._util.axes import XYZ, Axes, inverse, permuted
 from .._util.checks import Arrayable, described, finite_array
 from .._util.voxels import DTYPES, WHOLE, check_shape, check_type
 from ..scene.volume import Volume
+from ..xla.memory import zeros_in_reserve
 from ..xla.platform import is_traced
 
 
@@ -26,7 +27,6 @@ Box: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]  # the first voxel, and
 
 SPACE = ("x", "y", "z")
 AT_ONCE = 2**23  # bytes of voxels that are read at a time: a larger box is read in several steps
-ALIGNED = 64  # JAX uses an array of NumPy in place if its address is a multiple of so many bytes
 READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
 
@@ -127,8 +127,7 @@ class VoxelSource:
         return None
 
     def check_unchanged(self) -> None:
-        """Raises if the file under a memory map was written to since the source was made. To read one that
-        became shorter would end the process."""
+        """Raises if the mapped file changed: to read a shorter one would end the process."""
         now = self._file_state()
         if now is not None and now != self._file:
             raise ValueError(f"{self.name} changed after it was opened as a source. Open it again.")
@@ -164,10 +163,7 @@ class VoxelSource:
             return self._read_at_once(box, axes)
         self.check_unchanged()
         shape = permuted([b - a for a, b in zip(*box, strict=True)], axes)
-        size = math.prod(shape) * self.dtype.itemsize
-        memory = np.empty(size + ALIGNED, np.uint8)
-        start = -memory.ctypes.data % ALIGNED
-        voxels = memory[start : start + size].view(self.dtype).reshape(shape)
+        voxels = zeros_in_reserve(math.prod(shape), self.dtype).reshape(shape)
         for low, high in self.boxes(box, AT_ONCE):
             place = [slice(a - x, b - x) for a, b, x in zip(low, high, box[0], strict=True)]
             voxels[permuted(place, axes)] = self._read_at_once((low, high), axes)
@@ -185,8 +181,7 @@ class VoxelSource:
         return Volume(found, [stride * s for s in self.spacing], self.origin)
 
     def boxes(self, box: Box, most: int) -> Iterator[Box]:
-        """Cuts a box between chunks, into boxes of at most `most` bytes or of one chunk, in the order of
-        storage."""
+        """Cuts a box between chunks, into boxes of one chunk or `most` bytes, in the order of storage."""
         extent, item = list(self.chunks), self.dtype.itemsize
         for axis in reversed(self.order):  # rows first
             while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= most:
@@ -251,8 +246,7 @@ def voxel_type(stored: np.dtype) -> np.dtype:
 
 
 def _layout_of(array: Any, shape: tuple[int, ...]) -> tuple[Any, list[int]]:
-    """Voxels of a chunk along each axis, None where there are no chunks; and the axes in the order of
-    storage, the slowest first."""
+    """Voxels of a chunk along each axis, or None; and the axes in the order of storage, slowest first."""
     axes, layout = list(range(len(shape))), getattr(array, "chunk_layout", None)
     if layout is not None:  # tensorstore
         chunks = [c or n for c, n in zip(layout.read_chunk.shape, shape, strict=True)]

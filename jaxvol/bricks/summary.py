@@ -1,5 +1,4 @@
-"""Ranges of the values in blocks of a source, found in one pass over all voxels. They tell which bricks are
-empty without reading them, as `occupancy.Blocks` does of a volume in memory."""
+"""Ranges of the values in blocks of a source, from one pass, by which empty bricks are not read."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,8 +31,7 @@ class Summary:
     high: np.ndarray
 
     def bricks_where(self, holds: Callable[[Blocks], Any], grid: BrickGrid) -> Bool[np.ndarray, " bricks"]:
-        """For each brick, whether something such as `transfer.visible` holds of any of its blocks. `holds` is
-        a tree (`eqx.Partial`), so that it is compiled once."""
+        """For each brick, whether `holds`, an `eqx.Partial` that is compiled once, is true of any block."""
         layers = max(1, AT_ONCE // self.low[0].size)  # a transfer function may need 100 times their memory
         some = [slice(begin, begin + layers) for begin in range(0, len(self.low), layers)]
         blocks = np.concatenate([_holding(holds, self.low[each], self.high[each]) for each in some])
@@ -46,8 +44,7 @@ class Summary:
 
 
 def summary_of(source: VoxelSource, *, memory: int = 2**28) -> Summary:
-    """The summary of a source, from one pass over its voxels, which the source keeps. `memory`: bytes for the
-    pass, which one chunk may exceed."""
+    """Summary of a source, found once. `memory`: bytes of the pass, which a chunk may exceed."""
     if source._summary is not None:
         source.check_unchanged()
         return source._summary

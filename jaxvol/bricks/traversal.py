@@ -40,9 +40,7 @@ Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
 BEAMS = 32  # of curved rays, searched at a time on a GPU: it takes as long as the longest of these
-BATCH = (
-    72  # groups at a time on a CPU: few rays meet a brick, and the last batch lasts as long as its longest
-)
+BATCH = 72  # groups at a time on a CPU: few rays meet a brick, and a batch lasts as long as its longest
 KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
 
 
@@ -69,8 +67,7 @@ class Request:
 
 
 class Traversal:
-    """An image's rays on their way through all bricks. Its `scene` is as rays are marched, and its volume is
-    without voxels."""
+    """An image's rays through all bricks. `scene`: as rays are marched, without voxels."""
 
     rays: Ray
     start: Progress  # at their entries
@@ -114,8 +111,7 @@ class Traversal:
         self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
-        """Each brick that rays need, and their cells there, while the next one is read. Before this one is
-        asked for, `at` is set to where rays have come, and the brick dropped."""
+        """Yields the needed bricks and their cells. Before the next, the caller drops it and sets `at`."""
         self.rays, self.start, self.at, given_back = rays, at, at, self.bytes_read
         method = self.request.method
         if not callable(method):
@@ -165,8 +161,7 @@ class Traversal:
         return found if bool(found.any) else None
 
     def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
-        """The box that is read for these cells, for which `stored` is enlarged; None if it, or then any
-        single brick, does not fit into memory."""
+        """Box to read for these cells, which enlarges `stored`; None if memory does not suffice."""
         shape = self.grid.shape
         low, high = np.asarray(found.low, float), np.asarray(found.high, float)
         around = self.margin.of_points(self.space, shape, low, high)
@@ -182,8 +177,7 @@ class Traversal:
     def load(
         self, brick: int, cells: CellRange | None, box: tuple[np.ndarray, np.ndarray] | None = None
     ) -> Load:
-        """Starts to read a brick, from a multiple of BLOCK on. `box`: nodes that it holds, by default what
-        all of its cells need."""
+        """Starts to read a brick, from a multiple of BLOCK on: `box`, or the nodes of all its cells."""
         if box is None:
             low, high = (np.asarray(end) for end in self.grid.cells(brick))
             box = low - self.margin.cells, high + self.margin.cells

@@ -103,8 +103,7 @@ class Compositing(eqx.Module, Generic[State]):
 
 
 class Composite(eqx.Module):
-    """Sums over the cells of a ray so far, of weights w: Σ w, Σ w × colour and Σ w × depth past the entry.
-    What is not computed is None."""
+    """Sums of the weights w of a ray's cells so far, of w × colour and of w × depth, if computed."""
 
     opacity: Scalar
     color: Vec3 | None = None
@@ -236,6 +235,5 @@ class OpticalDepths(Weighting):
 
 
 def joined(front: Composite, back: Composite) -> Composite:
-    """A front and a back part of a ray, each marched independently under "over", which is associative: what
-    is behind is weighted by the transmittance in front."""
+    """Joins a front and a back part of a ray, marched independently under "over", which is associative."""
     return jax.tree.map(lambda a, b: a + (1 - front.opacity) * b, front, back)

@@ -19,8 +19,7 @@ from .selection import RaySampler, Selection
 
 
 class Crossing(NamedTuple):
-    """Depths of both ends of the first cell in which the value is crossed, infinite if there is none, and
-    whether values rise there."""
+    """Ends of the first cell that crosses the value, infinite without one, and whether values rise."""
 
     front: Scalar
     back: Scalar

@@ -15,8 +15,7 @@ from .blending import OpticalDepths
 
 
 SCALE = 2.0**-20
-"""Cells are marched so much thinner, since in float32 an opacity near 1 does not tell how deep a cell is. A
-power of two changes no other digit."""
+"""Factor of the extinction: an opacity near 1 hides the depth in float32; a power of 2 is exact."""
 
 
 class LineIntegral(OpticalDepths):

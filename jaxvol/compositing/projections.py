@@ -1,9 +1,5 @@
-"""Which single value of a ray does a pixel show? Its greatest, its least, or its mean.
-
-A projection turns all values along a ray into one number, and looks that up in the transfer function. The
-opacity is that of a layer of a `thickness`. VTK and PyVista show the opacity of a layer of the unit distance;
-so do these modes by default, since both lengths are 1.
-"""
+"""Shows one value of a ray, its greatest, least or mean, looked up in the transfer function, as opaque as a
+layer of a `thickness`: by default 1, as by VTK and PyVista."""
 
 from abc import abstractmethod
 from typing import Any, TypeAlias
@@ -34,6 +30,9 @@ class Extreme(Selection[Chosen]):
     """A mode that shows the sample of the highest score. `Maximum` says what holds for all of them."""
 
     thickness: Float[Array, ""]
+
+    def __init__(self, thickness: Any = 1.0):
+        self.thickness = number("thickness", thickness, above=0)
 
     @abstractmethod
     def score(self, value: Scalar) -> Scalar:
@@ -87,9 +86,6 @@ class Maximum(Extreme):
         ValueError: for a thickness that is not a positive finite number.
     """
 
-    def __init__(self, thickness: Any = 1.0):
-        self.thickness = number("thickness", thickness, above=0)
-
     def score(self, value: Scalar) -> Scalar:
         return value
 
@@ -109,9 +105,6 @@ class Minimum(Extreme):
     Raises:
         ValueError: for a thickness that is not a positive finite number.
     """
-
-    def __init__(self, thickness: Any = 1.0):
-        self.thickness = number("thickness", thickness, above=0)
 
     def score(self, value: Scalar) -> Scalar:
         return -value

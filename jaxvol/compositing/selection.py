@@ -52,8 +52,7 @@ class RaySampler(NamedTuple):
         return self.space.world(self.place(depth))
 
     def differentiable_depth(self, depth: Scalar) -> Scalar:
-        """The same depth, which moves with the step, and if it is that of the chosen sample, with the faces
-        that cut its cell: to compute with, as in a fog."""
+        """The depth, moving with the step and, if the chosen sample's, with the faces of its cell."""
         if self.chosen is None:
             return depth * self.depth_scale
         number, moving = self.chosen
@@ -62,8 +61,7 @@ class RaySampler(NamedTuple):
     def color(
         self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
     ) -> Vec3:
-        """The colour of what was measured and classified at this depth, behind this transmittance; shaded if
-        there is a lighting."""
+        """Colour of what was classified at this depth, behind this transmittance; lit if there is light."""
         color, extinction = classified
         if self.classification.light is None:
             return color

@@ -1,8 +1,5 @@
-"""Smooth bijections from unconstrained real numbers onto the values that a parameter may take.
-
-A solver moves the free variables, `free`; what is rendered is `forward(free)`, so no step can leave the
-allowed range. Free variables are of order 1 whatever the parameter's units, which suits a damped step.
-"""
+"""Smooth bijections from free variables, real numbers of order 1 that a solver moves, onto allowed values:
+what is rendered is `forward(free)`, so no step can leave the allowed range."""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple
@@ -20,8 +17,7 @@ from ..scene.camera import Camera, axes_of
 
 
 MARGIN = 1e-3
-"""Least distance of a start from an open end of the range, relative to the scale: at the end itself the map
-is flat, and a fit could never leave it."""
+"""Least distance of a start from an open end, relative to the scale: the map is flat at the end."""
 
 
 class RigidMotion(NamedTuple):
@@ -186,9 +182,8 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """`vector` rotated about the axis `turn` by its length in radians (Rodrigues' formula).
-
-    Written out because the slope of JAX's own `Rotation` is NaN at 0, where every fit of a pose starts."""
+    """`vector` rotated about `turn` by its length in radians (Rodrigues' formula); the slope of JAX's own
+    `Rotation` is NaN at 0, where every fit of a pose starts."""
     square = jnp.sum(turn**2)
     small = square < 1e-6
     angle = jnp.sqrt(jnp.where(small, 1, square))  # never at 0, where the slope of sqrt is infinite

@@ -20,12 +20,8 @@ def save(path: Path, state: Any, about: dict[str, Any]) -> None:
 
 
 def load(path: Path, like: T, about: dict[str, Any]) -> tuple[T, dict[str, Any]] | None:
-    """The saved state, a tree like `like`, with its description; or None if none was saved.
-
-    Raises:
-        ValueError: for a damaged file, and for a checkpoint of another fit than `about` describes (the saved
-            description may have more entries).
-    """
+    """The saved state, a tree like `like`, with its description; None if none was saved. **Raises**
+    `ValueError` for a damaged file, and one of another fit than `about` describes, at least."""
     if not path.exists():
         return None
     remedy = "Choose another file, or delete this one."

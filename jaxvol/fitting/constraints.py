@@ -40,12 +40,8 @@ class Free(eqx.Module):
 
     @classmethod
     def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", FreeVariables]:
-        """The mapping from free variables to parameters, and the free variables for `parameters`.
-
-        Raises:
-            ValueError: for constraints or a `where` that do not match the parameters, parameters outside
-                their bounds or not finite, and if nothing is free.
-        """
+        """The mapping from free variables to parameters, and those for `parameters`. **Raises** `ValueError`
+        for constraints or a `where` that do not match, parameters out of bounds, and if nothing is free."""
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
         tree = _select(_resolve(parameters, constraints), where)
         found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)

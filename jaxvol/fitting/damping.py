@@ -1,9 +1,6 @@
-"""Levenberg–Marquardt steps that are damped in each parameter in proportion to its column of the Jacobian.
-
-Optimistix damps by λ |d|², which depends on the units of the residual and of every parameter: where
-residuals are small, as for images, steps are damped to a standstill. Marquardt (1963) damps by
-λ Σ Dᵢ² dᵢ² with Dᵢ² = (JᵀJ)ᵢᵢ, which does not depend on units. It is Optimistix's step in the parameters D d.
-"""
+"""Levenberg–Marquardt steps damped by λ Σ Dᵢ² dᵢ² with Dᵢ² = (JᵀJ)ᵢᵢ (Marquardt 1963), whatever the units:
+Optimistix's step, damped by λ |d|², in the parameters D d. By itself, that comes to a standstill where
+residuals are small, as for images."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,9 +16,7 @@ from ..xla.trees import PyTree
 
 
 FLOOR = 0.1
-"""Smallest Dᵢ relative to the largest, so that a parameter with almost no effect on the residual cannot run
-away. (From two images of a head, a transfer function is recovered to rounding at 0.1; at 0.001, the fit ends
-in a wrong minimum.)"""
+"""Smallest Dᵢ relative to the largest, or a parameter with almost no effect would run away."""
 
 
 class ScaledDescent(optx.DampedNewtonDescent[Any]):

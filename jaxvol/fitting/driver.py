@@ -1,8 +1,5 @@
-"""Fits parameters by minimising a residual, step by step, with a solver of Optimistix.
-
-Steps are taken one by one from here, not by `optimistix.least_squares`, whose loop is a single program: so a
-fit calls back, writes checkpoints, can be interrupted, and gives back the best point that it has seen.
-"""
+"""Fits parameters by minimising a residual with a solver of Optimistix, step by step rather than by
+`least_squares`: for callbacks, checkpoints, interruption, and the best point seen."""
 
 import math
 import time

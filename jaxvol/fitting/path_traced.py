@@ -42,8 +42,7 @@ LONGEST = 1.0, 0.5
 """A step moves no free variable by more than the first, or than this part of itself, whichever is more."""
 
 FLOOR = 0.3
-"""Smallest curvature in any direction by a single sample, relative to that with noise, which is larger: the
-unbiased one may be 0 or negative. With the number of samples, it falls as their noise."""
+"""Least curvature by one sample, over that with noise, as the unbiased one may be 0 or negative."""
 
 FORGET = 2.0
 """How many times as long as the one before an epoch is."""
@@ -52,8 +51,7 @@ LEAST = 12
 """Steps that a fit takes at least: standard errors are known from 9 samples then."""
 
 ENOUGH = 0.5
-"""A fit has converged when the noise of its own paths is at most this fraction of the standard error that the
-references leave, and no step of those that are averaged was shortened, since the minimum lay too far away."""
+"""A fit converges when its paths' noise is at most this part of the references' standard error."""
 
 
 class PathTracedResidual(eqx.Module):
@@ -213,8 +211,7 @@ class Averages(eqx.Module):
 
     @property
     def minimum(self) -> tuple[Float[Array, " free"], Float[Array, "free free"], Float[Array, ""]]:
-        """The minimum by a quadratic model of the loss: the point, its covariance due to the noise of the
-        paths, and the loss there."""
+        """Minimum of a quadratic model of the loss: the point, its covariance by the paths, the loss."""
         flat, halves = self.rows.reshape(-1, self.rows.shape[-1]), 2 * self.steps
         squares = flat.T @ flat
         # over all pairs of different halves of all steps
@@ -305,8 +302,7 @@ class SampledRun(eqx.Module):
         return not (bool(self.cut) or self.window.cut > 0)
 
     def ratio(self, problem: SampledProblem, limits: Limits) -> float:
-        """Largest ratio of the standard error that is due to the paths to that which the references leave, of
-        all free variables for which the first one is larger than the tolerances."""
+        """Largest ratio of standard errors, by paths over by references, beyond the tolerances."""
         flat = np.asarray(ravel_pytree(self.best)[0], np.float64)
         own = np.sqrt(np.maximum(np.diag(np.asarray(self.own, np.float64)), 0))
         each = spreads(self.triangles, problem.count, problem.scale).each

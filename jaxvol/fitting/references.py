@@ -33,12 +33,8 @@ class References(eqx.Module):
     def of(
         cls, views: Iterable[Any] | Any, background: Arrayable, noise: Any, weights: Any = None
     ) -> "References":
-        """From pairs (camera, image).
-
-        Raises:
-            ValueError: for no views, an image that differs in size from its camera or holds integers, NaN or
-                infinite pixels, and noise or weights that do not belong to them.
-        """
+        """From pairs (camera, image). **Raises** `ValueError` for no views, images that differ in size from
+        their camera, integers, NaN or infinity, and noise or weights that do not belong to them."""
         color = finite_array("background", background, (3,))
         views = list(views) if isinstance(views, Iterable) else []
         if not views:

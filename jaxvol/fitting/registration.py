@@ -1,10 +1,6 @@
-"""Where does a volume lie, by X-ray images of it? 2D/3D registration from many starts, coarse to fine.
-
-The similarity c of rendered and given images is a correlation. Of images of mean 0 and length 1, half the
-squared length of their difference is 1 - c, so a least-squares solver maximises c: Levenberg–Marquardt,
-whose few steps of six tangents each cost less than the hundreds that gradients take. Coarse images come
-first, since a derivative describes only features that move by less than their own size.
-"""
+"""2D/3D registration by X-ray images, from many starts, coarse to fine: a derivative describes only features
+that move by less than their size. Of images of mean 0 and length 1 with the correlation c, half the squared
+difference is 1 - c, so that Levenberg–Marquardt, of few steps, maximises c."""
 
 import math
 from collections.abc import Sequence
@@ -172,8 +168,7 @@ def register(
 
 
 class _Level(eqx.Module):
-    """The images of a level, as the residual of a motion: six numbers, a rotation vector, and a translation
-    in units of the volume's radius, so that both move voxels as far."""
+    """Residual of a level by a motion: a rotation vector, and a translation in the volume's radii."""
 
     scene: tuple[Volume, Transfer, March]
     views: tuple[Camera, Float[Array, "views height width"], Float[Array, "views height width"]]
@@ -214,10 +209,8 @@ def _followed(level: _Level, starts: Arrayable, max_steps: int) -> Float[Array, 
 
 @eqx.filter_jit
 def _similarities(level: _Level, motions: Arrayable) -> Float[Array, "n m"]:
-    def of_motion(motion: Float[Array, "6"]) -> Float[Array, ""]:
-        return 1 - jnp.sum(level(motion, "replay") ** 2) / 2
-
-    return jax.lax.map(of_motion, motions.reshape(-1, 6)).reshape(motions.shape[:2])
+    found = jax.lax.map(lambda motion: 1 - jnp.sum(level(motion, "replay") ** 2) / 2, motions.reshape(-1, 6))
+    return found.reshape(motions.shape[:2])
 
 
 def _averaged(camera: Camera, image: Array, weight: np.ndarray, factor: int) -> tuple[Camera, Any, Any]:

@@ -1,14 +1,10 @@
-"""Residuals of a fit, in tiles that fit into memory, and the QR factor that a least-squares solver needs.
+"""Residuals of a fit, in tiles, and the QR factor that a least-squares solver needs of r (m,) and J (m, n):
 
-A least-squares solver uses the residual r (m,) and its Jacobian J (m, n). With millions of pixels J is too
-large to hold, but a Gauss–Newton or Levenberg–Marquardt step needs only the triangle of
+    [J r] = Q [R c; 0 ρ]      with      |J d + r|² = |R d + c|² + ρ²   for every step d.
 
-    [J r] = Q [R c; 0 ρ]      with      |J d + r|² = |R d + c|² + ρ²   for every step d,
-
-which is (n + 1, n + 1) and is computed tile by tile, by QR of the triangle so far and the tile's rows (TSQR,
-Demmel et al. 2012). A residual of n + 1 numbers with the Jacobian [R; 0] thus replaces that of all pixels
-exactly, for any solver; unlike JᵀJ, it does not square the condition number. The scores Jᵢ rᵢ, whose outer
-products tell how much the estimate varies, are reduced in the same pass.
+The triangle is computed by QR of that so far and the next rows (TSQR, Demmel et al. 2012). The residual of n
++ 1 numbers with the Jacobian [R; 0] replaces that of all pixels exactly; unlike JᵀJ, it does not square the
+condition number. The scores Jᵢ rᵢ are reduced in the same pass.
 """
 
 import inspect
@@ -31,7 +27,7 @@ from ..render import Adjoint, render
 from ..scene.camera import Camera
 from ..scene.several import together
 from ..scene.transfer import Transfer
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, is_none
 from .constraints import Free, FreeVariables, size
 from .noise import Noise
 from .references import References
@@ -42,8 +38,7 @@ TANGENTS = 64
 
 
 Tiles = tuple[Callable[[PyTree, Any, Adjoint], Float[Array, "pixels channels"]], PyTree]
-"""Pieces of a residual, of equal shape: `function(parameters, item, adjoint)`, and the stacked items. Noise
-may be correlated between the entries of a pixel."""
+"""Equal pieces of a residual: `function(parameters, item, adjoint)`, and the stacked items."""
 
 
 def check_residual(residual: Any) -> None:
@@ -132,7 +127,7 @@ class ImageResidual(eqx.Module):
     def blurred(self, blur: Arrayable | None) -> "ImageResidual":
         """The same residual, of images blurred otherwise."""
         sigma = None if blur is None else not_negative("blur", blur)
-        return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(lambda residual: residual.blur, self, sigma, is_leaf=is_none)
 
     def tiles(self, most: int) -> list[Tiles]:
         """The residual in pieces of at most `most` entries."""
@@ -203,8 +198,7 @@ def _blurred(image: Array, weight: Array | None, sigma: Float[Array, ""]) -> Arr
 
 
 def _blurring(n: int, sigma: Float[Array, ""]) -> Float[Array, "n n"]:
-    """Matrix that blurs a line of `n` pixels by a Gaussian, `sigma` in pixels; the identity for 0. Weights of
-    the pixels that exist sum to 1."""
+    """Gaussian blur of a line of `n` pixels, `sigma` in pixels; weights inside sum to 1."""
     at = jnp.arange(n, dtype=sigma.dtype)
     away = (at[:, None] - at[None, :]) / jnp.maximum(sigma, 1e-3)
     return jax.nn.softmax(-(away**2) / 2, axis=1)
@@ -303,8 +297,7 @@ class Problem(eqx.Module):
         return loss(free)
 
     def condensed(self, free: FreeVariables) -> Triangles:
-        """The triangle [R c; 0 ρ], whose last column of n + 1 numbers replaces the residual, in value and
-        derivative, and that of the scores, without derivative. Forward mode."""
+        """[R c; 0 ρ], whose last column replaces the residual, and the scores' triangle, a constant."""
 
         @jax.custom_jvp
         def condensed(free: FreeVariables) -> Triangles:

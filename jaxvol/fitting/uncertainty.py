@@ -82,10 +82,8 @@ class Spreads(NamedTuple):
 
 
 def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
-    """From the triangles, the number of entries of the residual, and the norm `scale` of the compared data.
-
-    A direction is undetermined if its singular value is below n ε times the largest one, or times that norm,
-    with ε of the float type: within rounding, the residual does not depend on it."""
+    """Spreads, where `scale` is the norm of the data. A direction is undetermined within rounding: its
+    singular value is below n ε times the largest one, or times that norm."""
     factor, scores = (np.asarray(triangle, np.float64) for triangle in triangles)
     n = scores.shape[1]
     _, singular, directions = np.linalg.svd(factor[:n, :n])
@@ -106,8 +104,7 @@ def uncertainty(
     chi_squared: float | None,
     own: Float[Array, "free free"] | None = None,
 ) -> Uncertainty:
-    """Uncertainty of the parameters `free.forward(at)`, from what `spreads` takes there, the reduced χ², and
-    the fit's `own` covariance, if it is random."""
+    """Uncertainty of `free.forward(at)`. `own`: the fit's covariance, if it is random."""
     flat, unravel = ravel_pytree(at)
     jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
     each, equal, undetermined = spreads(triangles, count, scale)

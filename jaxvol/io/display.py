@@ -96,8 +96,7 @@ GAP, TITLE = 6, 20
 """Pixels between images that `show_images` draws, and of the line above each that names it."""
 
 INSET = 1e-3
-"""Pixels by which an image is drawn smaller on each side: versions of matplotlib before 3.11 may draw one row
-more or less where an edge lies exactly between two pixels."""
+"""Inset of an image, pixels: on an edge between two, matplotlib below 3.11 may draw a row more or less."""
 
 
 def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -> None:
@@ -154,8 +153,7 @@ def _numbers(name: str, image: Any, channels: tuple[int, ...]) -> Float[np.ndarr
 
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
-    """Check that an image with this many channels (0: no axis of channels) can be written to `path`, before
-    it is rendered."""
+    """Check, before rendering, that an image of these channels (0: no such axis) can be written to `path`."""
     path, what = Path(path), {0: "one channel", 3: "colours", 4: "colours and opacity"}[channels]
     allowed = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
     allowed = {0: allowed[3:], 3: allowed, 4: (".png", *allowed[3:])}[channels]

@@ -134,6 +134,17 @@ class ConstantLight(Light):
         return Arriving(None, jnp.full_like(point[0], jnp.inf), (r, g, b))
 
 
+def located(lights: tuple[Light, ...]) -> list[Light]:
+    """The lights that reach a point from a single direction."""
+    return [light for light in lights if not isinstance(light, ConstantLight)]
+
+
+def sky_of(lights: tuple[Light, ...], dtype: Any) -> Vec3:
+    """Radiance of all constant lights."""
+    constant = [light.radiance for light in lights if isinstance(light, ConstantLight)]
+    return apart(sum(constant, jnp.zeros(3, dtype)))
+
+
 def lights_of(lights: Any, excluded: type[Light] = HeadLight) -> tuple[Light, ...]:
     """One or several lights of any but the `excluded` kind, as a tuple; `ValueError` for anything else."""
     several = (lights,) if isinstance(lights, Light) else lights

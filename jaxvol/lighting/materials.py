@@ -109,9 +109,9 @@ def shares(
     edge: float = 0.0,
     labels: Literal["nearest", "linear"] = "nearest",
 ) -> tuple[Scalar, ...]:
-    """Share of each material at a grid coordinate with this value: 1 for the first that is present, 0 for all
-    others. `edge`: over which fraction of the narrowest value range materials fade; where it is
-    above 0, shares by values are continuous; with `"linear"`, those by labels. They sum to at most 1."""
+    """Shares of materials at a grid coordinate with this value: 1 for the first present; sum at most 1.
+    `edge`: part of the narrowest range over which they fade; above 0, shares by values are continuous (by
+    labels if `"linear"`)."""
     remaining, each = jnp.ones_like(value), []
     ranges = [one.values[1] - one.values[0] for one in materials if one.values is not None]
     width = edge * jax.lax.stop_gradient(jnp.min(jnp.stack(ranges))) if ranges else jnp.zeros_like(value)

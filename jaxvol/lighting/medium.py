@@ -11,9 +11,7 @@ from .shading import Surroundings
 
 
 FADE = 0.02
-"""Materials fade in and out over this fraction of the narrowest value range, so that their edges have
-derivatives. It is small: at an outer edge, only half of what is visible counts as the material, and absorbs
-so."""
+"""Materials fade over this part of the narrowest value range, so that their edges have derivatives."""
 
 
 class Scattering(NamedTuple):

@@ -1,8 +1,5 @@
-"""Templates as published: packets of light that are refracted and reflected at each scatterer.
-
-Packets start from the origin. Each travels to its next scatterer, leaves a photon there, and goes on as two
-packets, one refracted and one reflected. This binary tree is simulated level by level in arrays of static
-shape, so that many templates of many materials are simulated at once.
+"""Templates as published: packets of light from the origin leave a photon at each scatterer and go on as two,
+refracted and reflected, a binary tree that is simulated level by level in arrays of static shape.
 
 Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
 volume rendering (2016), section 3.
@@ -18,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from .._util.checks import integer, number
-from .._util.vec3 import Scalar, golden_spiral, turned
+from .._util.vec3 import Scalar, golden_spiral, root, turned
 from ..xla.platform import is_traced
 from .materials import Material, Optics, smoothstep
 from .template import ScattererTemplate
@@ -72,16 +69,14 @@ class PacketTree:
         return math.inf if self.whole_levels else math.floor(1 / self.faintest + 1e-9)
 
     def levels(self, opacity: float) -> int:
-        """Number of levels that may hold a photon above the threshold. The brightest possible photon of level
-        k has `α (1 - α)^k / packets`."""
+        """Levels with photons above the threshold: the brightest of level k has `α (1 - α)^k / packets`."""
         if opacity == 1:
             return 1
         return 1 + math.floor(math.log(self.faintest * self.packets / opacity) / math.log(1 - opacity) + 1e-9)
 
     def levels_of(self, materials: Sequence[Material], levels: int | Sequence[int] | None) -> tuple[int, ...]:
-        """The number of levels of each material, by default as many as its opacity allows. **Raises**
-        `ValueError` for an opacity that leaves no photon, for one that is traced, if no number is given, and
-        for too many photons."""
+        """Levels of each material, by default as its opacity allows. **Raises** `ValueError` for no photon,
+        too many, or a traced opacity without a number."""
         found = []
         for material in materials:
             if is_traced(material.opacity):
@@ -112,8 +107,7 @@ class PacketTree:
         return tuple(found)
 
     def capacity(self, levels: int, opacity: float | None = None) -> int:
-        """Upper bound of a template's photons: in each level at most twice as many as in the one before, and,
-        for a given opacity, no more than its energy allows."""
+        """Upper bound of a template's photons: levels at most double, and, by opacity, energy limits them."""
         total = 0
         for k in range(levels):
             most = self.max_width
@@ -130,8 +124,7 @@ class PacketTree:
         merge: float = MERGE,
         own_levels: Int[Array, ""] | None = None,
     ) -> ScattererTemplate:
-        """The photons of a tree of so many levels, merged and sorted; NaN if a traced opacity leaves none.
-        `own_levels`: of this material, if it has fewer than others."""
+        """Photons of a tree, merged and sorted; NaN if a traced opacity leaves none."""
         origin, draws = jax.random.split(key)
         # evenly spread over the sphere and rotated at random, so that each alone is uniformly distributed
         q, r = jnp.linalg.qr(jax.random.normal(origin, (3, 3)))
@@ -139,7 +132,7 @@ class PacketTree:
         directions = jnp.asarray(spread, q.dtype) @ (q * jnp.sign(jnp.diagonal(r))[None]).T
         packets = jnp.zeros((self.packets, 3)), directions, jnp.full(self.packets, 1 / self.packets)
         sine_of_critical_angle = jnp.minimum(optics.refractive_index, 1 / optics.refractive_index)
-        cone = 1 - _root(1 - sine_of_critical_angle**2)
+        cone = 1 - root(1 - sine_of_critical_angle**2)
 
         def advance(packets: Packets, level: Any) -> tuple[Packets, ScattererTemplate]:
             """The packets that go on from a level, and the photons that they leave (lengths in λ)."""
@@ -192,15 +185,9 @@ class PacketTree:
         return light * smoothstep((opacity * light / self.threshold - FADES) / (1 - FADES))
 
 
-def _root(squared: Scalar) -> Scalar:
-    """Square root; 0 with derivative 0 for arguments up to 0. NaN stays NaN."""
-    clamped = squared <= 0
-    return jnp.where(clamped, 0, jnp.sqrt(jnp.where(clamped, 1, squared)))
-
-
 def _turned(direction: Float[Array, "n 3"], cosine: Scalar, u: Scalar) -> Float[Array, "n 3"]:
     """Directions at an angle to `direction` given by its cosine; `u` in [0, 1) selects the azimuth."""
     x, y, z = direction.T
-    sine = _root(1 - cosine**2)
+    sine = root(1 - cosine**2)
     around = 2 * jnp.pi * u
     return jnp.stack(turned((sine * jnp.cos(around), sine * jnp.sin(around), cosine), (x, y, z)), axis=-1)

@@ -31,8 +31,7 @@ light around it: half of the photons of a sample on its face are inside, so that
 
 
 class PhotonsOfSample(NamedTuple):
-    """What all photons of a sample have in common. `mixture`: the materials' shares, scaled to sum to 1.
-    `template`: the one in use, if there are several."""
+    """What a sample's photons share. `mixture`: shares of sum 1. `template`: the one in use, of several."""
 
     shares: tuple[Scalar, ...]
     mixture: tuple[Scalar, ...]
@@ -42,8 +41,7 @@ class PhotonsOfSample(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """What is at a photon's place: the materials' total share, the ratio of the opacity there to that at the
-    sample, mean free path and refractive index; of no material, those at the sample."""
+    """Medium at a photon: share of all materials, opacity over the sample's, and optics."""
 
     share: Scalar
     ratio: Scalar
@@ -52,8 +50,7 @@ class Medium(NamedTuple):
 
 
 class PhotonShading(Shading):
-    """Templates prepared for one image: (materials, templates, photons). `blended`: how many were blended
-    into each, whose photons are skipped as they would be in their own templates."""
+    """Templates of one image; each has `blended` ones, whose photons are skipped as in their own."""
 
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
@@ -184,8 +181,7 @@ class PhotonShading(Shading):
     def refracted(
         self, around: Surroundings, sample: Sample, shared: PhotonsOfSample, offset: Vec3
     ) -> tuple[Vec3, "Medium"]:
-        """The offset of a photon that is moved by refraction into the material at its place, and the medium
-        there."""
+        """Offset of a photon, refracted into the material at its place, and the medium there."""
         read = around.stored(lambda: around.measured(_displaced(sample, offset)))
 
         def moved() -> tuple[Vec3, Medium]:

@@ -26,11 +26,9 @@ from .phase import sample_phase
 def unit_walks(
     key: PRNGKeyArray, count: int, walks: int, levels: int
 ) -> tuple[Float[Array, "count walks levels 3"], Float[Array, "count walks levels"]]:
-    """Directions and lengths, in mean free paths, of the flights of random walks, in sets of `walks`.
-
-    The first directions of a set are spread evenly over the sphere. Lengths and turns of each level are
-    stratified over all walks: as few are kept, drawn one by one their mean length would be off by
-    1/√number."""
+    """Directions and lengths, in mean free paths, of flights of random walks, in sets of `walks`, whose first
+    directions are evenly spread. Lengths and turns are stratified, or the mean of the few that are kept would
+    be off by 1/√number."""
     number = count * walks
     rotate, shuffle, within = jax.random.split(key, 3)
     q, r = jnp.linalg.qr(jax.random.normal(rotate, (count, 3, 3)))
@@ -60,9 +58,8 @@ def unit_walks(
 
 
 def scatterings(materials: Sequence[Material], threshold: float, levels: Any) -> int:
-    """Number of scatterings of a random walk: as given, or after which less than `threshold` of the light is
-    left in any of the materials. **Raises** `ValueError` where that depends on a traced opacity, or is
-    never."""
+    """Scatterings of a walk: as given, or until less than `threshold` of the light is left in any material.
+    **Raises** `ValueError` where that depends on a traced opacity, or is never."""
     if levels is not None:
         return integer("levels", levels, 1)
     if is_traced([material.opacity for material in materials]):

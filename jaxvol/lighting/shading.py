@@ -1,8 +1,5 @@
-"""How is a classified sample shaded? The interface of lightings.
-
-`render` takes a `Lighting`, which makes a `Shading` for each image; engines call the `Shader`, which adds up
-a sample's terms.
-"""
+"""The interface of lightings: `render` takes a `Lighting`, which makes a `Shading` for each image; engines
+call the `Shader`, which adds up a sample's terms."""
 
 import math
 from abc import abstractmethod

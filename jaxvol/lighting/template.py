@@ -49,8 +49,7 @@ class ScattererTemplate(eqx.Module):
         return ScattererTemplate(offset, intensity).sorted()
 
     def clustered(self, distance: float) -> "ScattererTemplate":
-        """One sorted template, in which the brightest photon within this distance gets the intensity of each
-        fainter one, which stays with intensity 0."""
+        """Sorted template in which the brightest photon within the distance gets the others' intensity."""
         offset = jax.lax.stop_gradient(self.offset)
         near = sum((offset[:, None, i] - offset[None, :, i]) ** 2 for i in range(3)) <= distance**2
         # Photons are sorted, so argmax finds the brightest. A host may have a host in turn; doubling follows

@@ -247,8 +247,7 @@ class ScattererTemplates(Lighting):
         )
 
     def simulated(self) -> ScattererTemplate:
-        """The templates that are used, of shape (materials, templates, photons); if they are blended, one for
-        each material."""
+        """Templates in use, (materials, templates, photons); blended ones, one for each material."""
         templates = self.given
         if templates is None:
             how: Any = {"packets": self.packets, "threshold": self.threshold, "levels": self.levels}

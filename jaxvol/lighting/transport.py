@@ -1,9 +1,6 @@
-"""Lighting by templates of random walks: light that is scattered any number of times, as by `path_trace`.
-
-Light that has been scattered at least once before it reaches a sample changes slowly from place to place. It
-is computed on a grid of nodes, by random walks from each: the flights of a template, turned at random. What a
-sample gets from a light directly changes fast at surfaces, and is computed for each sample.
-"""
+"""Lighting by random walks: light scattered any number of times, as by `path_trace`. Radiance, which changes
+slowly, is computed on a grid of nodes, by a template's flights from each, turned at random; direct light,
+which changes fast at surfaces, at each sample."""
 
 import dataclasses
 import itertools
@@ -25,7 +22,7 @@ from ..scene.space import Space, enter
 from ..scene.volume import without_voxels
 from ..scene.voxel_fetch import corners
 from ..xla.memory import gather
-from .lights import ConstantLight, Light
+from .lights import Light, located, sky_of
 from .materials import Material, shares
 from .medium import FADE, Scattering, clipped, scattering_at
 from .random_walks import unit_walks
@@ -33,8 +30,7 @@ from .shading import Sample, Shading, Surroundings
 
 
 NEAR, FAR = 2, 3
-"""Nodes around visible ones up to which radiance is computed, since samples lie between nodes; and optical
-depths, which are read farther towards lights (`LOCAL`)."""
+"""Nodes around visible ones with a radiance, and with optical depths, read farther towards lights."""
 
 STEPS = 2
 """Steps from a node towards a light, per node of the grid's longest side. They grow with the distance."""
@@ -61,12 +57,10 @@ NODES = 2**9, 2**12
 """Nodes at a time for walks, and for what is simpler."""
 
 EVEN = 3.0
-"""Mean free paths of a step above which places in it are distributed as if it had so many: else none would
-lie in the far part of wide steps."""
+"""Most mean free paths by which places in a step are distributed, or none would lie in far parts."""
 
 LEAST = 1e-6
-"""Least optical depth by which anything is divided, and share of flights that end in matter or not even where
-they meet none."""
+"""Least optical depth of a divisor, and share of flights that end anywhere though they meet no matter."""
 
 
 _Way: TypeAlias = tuple[Vec3, Scalar, Bool[Array, ""]]
@@ -94,10 +88,8 @@ class ScatteredLight(Shading):
         return 1 if self.depths.shape[-1] else 0
 
     def begin(self, around: Surroundings, sample: Sample) -> _Begun:
-        """Radiance from the grid, scattered towards the camera; the share that is not absorbed; the way to
-        each light; and the optical depth towards it, beyond the steps near the sample. (Between a node
-        outside of matter and one inside, depths do not grow linearly, so that they are not interpolated at
-        the sample.)"""
+        """Radiance from the grid; the share not absorbed; the way to each light; and the optical depth
+        towards it beyond the near steps (depths at surfaces are not linear between nodes)."""
         coordinate = around.space.coordinate(sample.point)
         r, g, b = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
         fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=FADE)
@@ -114,8 +106,7 @@ class ScatteredLight(Shading):
     def term(
         self, around: Surroundings, sample: Sample, shared: _Begun, number: Int[Array, ""]
     ) -> tuple[Scalar, ...]:
-        """The optical depth towards each light, near the sample: all of it, since places that are read
-        together take less time."""
+        """Optical depth near the sample towards all lights, read together, which takes less time."""
         _, _, ways, _ = shared
         steps = _growing(LOCAL_STEPS)
         places = [along(sample.point, to, middle * reach) for to, reach, _ in ways for _, middle in steps]
@@ -150,11 +141,6 @@ def _exit(space: Space, point: Vec3, direction: Vec3) -> Scalar:
     return enter(space.whole, point, direction, (pixel, pixel)).length
 
 
-def located(lights: tuple[Light, ...]) -> list[Light]:
-    """The lights that reach a point from a single direction."""
-    return [light for light in lights if not isinstance(light, ConstantLight)]
-
-
 def _way(light: Light, point: Vec3, direction: Vec3) -> tuple[Vec3, Scalar]:
     """Direction and distance of a light."""
     arriving = light.at(point, direction)
@@ -184,8 +170,7 @@ def _on_grid(around: Surroundings, shape: tuple[int, ...], point: Vec3) -> tuple
 
 
 def refined(values: Float[Array, "nx ny nz channels"]) -> Float[Array, "fx fy fz channels"]:
-    """On a grid twice as fine, by cubic interpolation. (Between nodes a mean free path apart, light that
-    falls steeply behind a surface is far from linear.)"""
+    """Values on a grid twice as fine, by cubic interpolation: light falls steeply behind surfaces."""
     for axis in range(3):
         n = values.shape[axis]
         ends = [(1, 1) if i == axis else (0, 0) for i in range(4)]
@@ -256,12 +241,6 @@ class Transport(NamedTuple):
     def dtype(self) -> Any:
         return self.around.volume.spacing.dtype
 
-    @property
-    def sky(self) -> Vec3:
-        """Radiance of all constant lights."""
-        constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
-        return apart(sum(constant, jnp.zeros(3, self.dtype)))
-
     def flights(self) -> Float[Array, "flights 4"]:
         """Direction and length, in mean free paths, of each flight: by level, walk and set."""
         key = jax.random.key(self.seed)
@@ -273,8 +252,7 @@ class Transport(NamedTuple):
 
 
 class _State(NamedTuple):
-    """Of a walk: where it is, the rate of collisions there, the fraction of the light there that arrives
-    where the walk began, and the radiance gathered so far."""
+    """A walk: place, rate of collisions, share of its light that arrives at the begin, radiance gathered."""
 
     point: Vec3
     rate: Scalar
@@ -324,8 +302,7 @@ class _Grid(NamedTuple):
         return whole.at[chunks.reshape(-1)].set(found, mode="drop")
 
     def matter(self) -> tuple[Float[Array, " nodes"], Int[Array, " nodes"], Int[Array, " nodes"]]:
-        """The rate of collisions around all nodes; and the numbers of the nodes near visible ones, and of
-        those farther off, too, followed by numbers past the last."""
+        """Rates of collisions around all nodes; padded indices of nodes near visible ones, and farther."""
         offsets = np.array([(0.5, 0.5, 0.5), *np.ndindex(2, 2, 2)]) / 2 - 0.25
 
         def one(number: Int[Array, ""]) -> Array:
@@ -416,7 +393,7 @@ class _Grid(NamedTuple):
         end = along(point, direction, distance)
         there = transport.at(end)
         # the mean of 1 - weight is the fraction of flights that leave
-        light = plus(light, scaled(times(throughput, transport.sky), 1 - weight))
+        light = plus(light, scaled(times(throughput, sky_of(transport.lights, transport.dtype)), 1 - weight))
         throughput = times(scaled(throughput, weight), there.albedo)
         row = interpolated(depths, _on_grid(transport.around, self.shape, end))
         for i, source in enumerate(located(transport.lights)):
@@ -426,11 +403,8 @@ class _Grid(NamedTuple):
 
 
 class _Looks(NamedTuple):
-    """Where a flight looks for matter: a place in each of its steps, and the steps' widths. `density` is 1,
-    with the derivative of the places' density, by the rate at which they are distributed.
-
-    Walks stay where they are under the derivative, which is that of their weights: as they moved, it would
-    lack what they gain or lose where the extinction jumps, at every surface."""
+    """Where a flight looks for matter: places and widths of its steps. `density` is 1, with the derivative of
+    the places' density: walks stay where they are, and their weights change, or jumps would be lacking."""
 
     places: Float[Array, "looks"]
     widths: Float[Array, "looks"]
@@ -438,8 +412,7 @@ class _Looks(NamedTuple):
 
 
 def _looks(rate: Scalar, length: Scalar, u: Scalar) -> _Looks:
-    """Steps grow in proportion to the distance from a mean free path on. In each, places are distributed as
-    collisions at this rate."""
+    """Steps grow with the distance beyond a mean free path; places in them are distributed as collisions."""
     fixed = jax.lax.stop_gradient(rate), jax.lax.stop_gradient(length)
     number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(fixed[0] * fixed[1], LEAST)
     ends = jnp.expm1(number / LOOKS * jnp.log1p(depth)) / depth
@@ -454,8 +427,7 @@ def _looks(rate: Scalar, length: Scalar, u: Scalar) -> _Looks:
 
 
 def _ending(extinction: Float[Array, "looks"], looks: _Looks, u: Scalar) -> tuple[Scalar, Scalar]:
-    """How far a flight goes for a uniform number, and its weight: the probability of a collision in the step
-    where it ends over that by which the step is drawn."""
+    """Distance of a flight, and its weight: probability of a collision in its last step over that drawn."""
     depths = extinction * looks.widths
     each = -jnp.expm1(-depths) * jnp.exp(depths - jnp.cumsum(depths))
     drawn = jax.lax.stop_gradient(each + (SPREAD * jnp.sum(each) + LEAST) / LOOKS)
@@ -467,9 +439,7 @@ def _ending(extinction: Float[Array, "looks"], looks: _Looks, u: Scalar) -> tupl
 
 
 def _rotation(u: Scalar, v: Scalar, w: Scalar) -> tuple[Vec3, Vec3, Vec3]:
-    """The rows of a rotation, uniformly distributed for uniform numbers in [0, 1).
-
-    Source: Shoemake, "Uniform Random Rotations", Graphics Gems III, 1992."""
+    """Rows of a uniformly distributed rotation. Source: Shoemake, "Uniform Random Rotations", 1992."""
     a, b = jnp.sqrt(1 - u), jnp.sqrt(u)
     x, y = a * jnp.sin(2 * jnp.pi * v), a * jnp.cos(2 * jnp.pi * v)
     z, s = b * jnp.sin(2 * jnp.pi * w), b * jnp.cos(2 * jnp.pi * w)

@@ -1,8 +1,5 @@
-"""Where is nothing visible? What marches ask, and which stretches of a beam of neighbouring rays are empty.
-
-A beam is a group of rays that share one query: at each distance from their origins, they lie in a bounding
-box whose faces move linearly with the distance.
-"""
+"""Finds what is empty: the questions of marches, and empty stretches of a beam, neighbouring rays that lie in
+a bounding box whose faces move linearly with the distance."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -77,9 +74,8 @@ class View(NamedTuple):
 
 
 class Box(eqx.Module):
-    """Bounding box of a beam's rays at the distance `near + u` from their origins: from `low + u low_rate` to
-    `high + u high_rate`, in cells of the occupancy. Components are stacked, so that XLA compiles a third of
-    the kernels."""
+    """Bounding box of a beam's rays at the distance `near + u`: `low + u low_rate` to `high + u high_rate`,
+    in cells of the occupancy, stacked for a third of the kernels."""
 
     near: Float[Array, "*beams"]
     far: Float[Array, "*beams"]
@@ -103,8 +99,7 @@ class Box(eqx.Module):
 
     @classmethod
     def within(cls, occupancy: Occupancy, rays: Ray) -> "Box":
-        """The box of all camera rays between a beam's corner rays, `rays` by beam and corner, whether these
-        meet the volume or not."""
+        """Box of all camera rays between a beam's corner rays, whether they meet the volume or not."""
         rays = jax.lax.stop_gradient(rays)
         frame, t_in = occupancy.frame, rays.t_in
         x, y, z = (

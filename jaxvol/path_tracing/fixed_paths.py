@@ -1,5 +1,6 @@
 """Which inputs have no derivative, since they move paths, or the places where the medium jumps?"""
 
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from ..scene.transfer import Transfer, TransferFunction
 from ..scene.transfer2d import TransferFunction2D
 from ..scene.volume import Volume, with_voxels, without_voxels
 from ..xla.platform import is_traced
+from ..xla.trees import is_none
 
 
 T = TypeVar("T")
@@ -35,15 +37,15 @@ def with_constant_paths(
 ) -> tuple[Volume, Transfer, Camera, tuple[Material, ...]]:
     """The same. Raises `RuntimeError` where what moves paths or jumps of the medium is differentiated."""
     place = "the volume's spacing, origin and direction"
-    data, field = volume.data, volume.field
-    volume = constant(place, without_voxels(eqx.tree_at(_field_of, volume, None, is_leaf=_is_none)))
-    volume = eqx.tree_at(_field_of, with_voxels(volume, [data]), field, is_leaf=_is_none)
+    data, field, field_of = volume.data, volume.field, attrgetter("field")
+    volume = constant(place, without_voxels(eqx.tree_at(field_of, volume, None, is_leaf=is_none)))
+    volume = eqx.tree_at(field_of, with_voxels(volume, [data]), field, is_leaf=is_none)
 
     lines = constant("the control points' values of transfer", _lines_of(transfer), "they are constants")
     transfer = eqx.tree_at(_lines_of, transfer, lines) if lines else transfer
     edges = constant("the values of materials", [m.values for m in materials], "the medium jumps there")
     materials = tuple(
-        eqx.tree_at(lambda m: m.values, material, edge, is_leaf=_is_none)
+        eqx.tree_at(lambda m: m.values, material, edge, is_leaf=is_none)
         for material, edge in zip(materials, edges, strict=True)
     )
     return volume, transfer, constant("camera", camera), materials
@@ -71,11 +73,3 @@ def _lines_of(transfer: Transfer) -> list[Any]:
     parts = jax.tree.leaves(transfer, is_leaf=lambda part: isinstance(part, tables))
     found: list[Any] = [part.values for part in parts if isinstance(part, tables)]
     return found + [part.magnitudes for part in parts if isinstance(part, TransferFunction2D)]
-
-
-def _field_of(volume: Volume) -> Any:
-    return volume.field
-
-
-def _is_none(leaf: Any) -> bool:
-    return leaf is None

@@ -1,5 +1,4 @@
-"""Path regeneration: walks run side by side in lanes; once a quarter of the lanes is idle, the next walks of
-a queue begin there. When the queue is empty, the remaining walks are compacted into fewer lanes."""
+"""Path regeneration: walks of a queue begin in idle lanes; at its end, the remaining ones are compacted."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -33,8 +32,7 @@ class _Lanes(NamedTuple):
 def walk_all(
     begin: Callable[[Index], Walk], step: Callable[[Walk], Walk], count: int, lanes: int
 ) -> WalkResult:
-    """The results of all walks of a queue. `begin`: the walks with these indices, from 0 to `count`; those
-    past the last must not be alive. `step`: advances all lanes' walks by one step."""
+    """Results of a queue. `begin`: walks by indices, not alive from `count` on. `step`: of all lanes."""
     lanes = min(lanes, count)
     fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)

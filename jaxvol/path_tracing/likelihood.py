@@ -1,12 +1,9 @@
-"""How does the probability of what was drawn depend on the parameters?
+"""Derivatives of detached sampling: paths are drawn as if the parameters were constants, and each probability
+p of what was drawn enters as the weight p / q, q its constant. The mean over paths is then the image as a
+function of the parameters.
 
-Derivatives are those of detached sampling: paths are drawn as if the parameters were constants, and each
-probability p of what was drawn enters as the weight p / q, where q is the constant it was drawn with. The
-mean over paths is then the image as a function of the parameters, and so are its derivatives.
-
-Where the extinction is 0, nothing collides, although the derivative there is not 0; and near 0, or near a
-majorant, p / q has a derivative of unbounded variance. So the paths of a derivative are drawn with a
-`Sampling` of their own. (A weight of 0 may have a derivative that is not.)
+Where the extinction is 0, nothing collides, although the derivative is not 0; near 0 or a majorant, p / q has
+a derivative of unbounded variance. So derivatives have paths by a `Sampling` of their own.
 
 Sources: Vicini, Speierer and Jakob, "Path Replay Backpropagation", 2021; Nimier-David et al., "Unbiased
 Inverse Volume Rendering with Differential Trackers", 2022.

@@ -1,5 +1,4 @@
-"""The medium that a volume is: extinction and albedo at a point, and proven bounds of the extinction, without
-which Woodcock tracking would be biased."""
+"""A volume as a medium: extinction, albedo, and proven bounds of the extinction, for unbiased tracking."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias

@@ -24,7 +24,7 @@ from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_only
 from ..xla.platform import is_traced
-from ..xla.trees import constant
+from ..xla.trees import constant, is_none
 from .fixed_paths import check_voxels, has_step, with_constant_paths
 from .lanes import walk_all
 from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
@@ -312,7 +312,7 @@ def _(primals: tuple[Inputs, Constants, How], tangents: tuple[Any, Any, Any]) ->
         check_voxels(inputs.transfer, inputs.materials)
     how = replace(how, sampling=OF_DERIVATIVES)
     found = _derivative(inputs, moving, constants, how)
-    return traced, eqx.tree_at(_estimates, constant, found, is_leaf=lambda leaf: leaf is None)
+    return traced, eqx.tree_at(_estimates, constant, found, is_leaf=is_none)
 
 
 def _estimates(traced: PathTraced) -> tuple[Any, ...]:

@@ -51,8 +51,7 @@ class Flight(NamedTuple):
     def to(
         cls, majorants: Majorants, start: Vec3, direction: Vec3, spacing: Vec3, distance: Scalar
     ) -> "Flight":
-        """Flight from a grid coordinate over `distance`, or to the grid's border. `direction`: its components
-        along the grid's axes, of a unit vector."""
+        """Flight over `distance` or to the grid's border. `direction`: unit, along the grid's axes."""
         x, y, z = (d / step for d, step in zip(direction, spacing, strict=True))
         x, y, z = (jnp.where(jnp.abs(rate) < TINY, TINY, rate) for rate in (x, y, z))
         end = distance
@@ -63,8 +62,7 @@ class Flight(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Where a flight has stopped: at a collision candidate if `found`, at its end if `over`; if neither
-    holds, it is still on its way. `coordinate`: in the grid."""
+    """Where a flight stopped: at a collision candidate (`found`), its end (`over`), or on its way."""
 
     found: Bool[Array, "..."]
     over: Bool[Array, "..."]
@@ -143,8 +141,7 @@ def _wall(start: Scalar, rate: Scalar, index: Array, reach: Array, count: int) -
 
 
 def _next(coordinate: Scalar, rate: Scalar, index: Array, reach: Array, count: int, leaves: Array) -> Array:
-    """Index, along one axis, of the flight's next block. It never turns back along the flight, so that
-    rounding cannot hold a flight where it is."""
+    """Index of the next block along an axis; never back along the flight, so rounding cannot stall it."""
     ahead = rate > 0
     first, last = index - jnp.where(ahead, 0, reach), index + jnp.where(ahead, reach, 0)
     arrived = jnp.floor(coordinate / BLOCK).astype(jnp.int32)

@@ -1,8 +1,6 @@
-"""Random walks of light, traced backwards from the camera: flights, scatterings and next-event estimation.
-
-A walk is always on one flight: its own, or one from its last scattering towards a light. Both query the
-volume in the same way, so that walks at different stages run side by side, a step at a time.
-"""
+"""Random walks of light, from the camera: flights, scatterings, next-event estimation. A walk is on its own
+flight or on one towards a light; both query the volume alike, so that walks run side by side, a step at a
+time."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from .._util.noise import hashed_uniforms_4
-from .._util.vec3 import Scalar, Vec3, apart, dot, greatest, plus, scaled, select, times
-from ..lighting.lights import Arriving, ConstantLight, Light
+from .._util.vec3 import Scalar, Vec3, dot, greatest, plus, scaled, select, times
+from ..lighting.lights import Arriving, Light, located, sky_of
 from ..lighting.phase import phase, sample_phase, scattered
 from ..scene.space import Affine
 from ..scene.volume import Volume
@@ -37,8 +35,7 @@ Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Arra
 
 
 class WalkResult(NamedTuple):
-    """Of a path: its radiance, the opacity (1 if the camera's ray met anything, else 0), its scatterings,
-    whether it was cut."""
+    """A path's radiance, opacity (0 or 1), number of scatterings, and whether it was cut."""
 
     radiance: Vec3
     opacity: Scalar
@@ -92,17 +89,6 @@ class WalkScene(NamedTuple):
     sampling: Sampling
 
     @property
-    def located(self) -> tuple[Light, ...]:
-        """The lights that reach each point from a single direction."""
-        return tuple(light for light in self.lights if not isinstance(light, ConstantLight))
-
-    @property
-    def surroundings(self) -> Vec3:
-        """Radiance of all constant lights."""
-        constant = [light.radiance for light in self.lights if isinstance(light, ConstantLight)]
-        return apart(sum(constant, jnp.zeros(3, jnp.float32)))
-
-    @property
     def space(self) -> Affine:
         return Affine(self.volume)
 
@@ -112,12 +98,11 @@ class WalkScene(NamedTuple):
         return Flight.to(self.medium.majorants, start, space.frame.components(direction), space.spacing, end)
 
     def light(self, coordinate: Vec3, direction: Vec3, uniform: Scalar) -> Arriving:
-        """Light at a grid coordinate of a walk in this direction, from one located light, chosen at random,
-        weighted by their number."""
+        """Light at a grid coordinate from a random located light, weighted by their number."""
         x, y, z = self.space.point(coordinate)
-        count = len(self.located)
+        count = len(lights := located(self.lights))
         chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
-        each = [light.at((x, y, z), direction) for light in self.located]
+        each = [light.at((x, y, z), direction) for light in lights]
         one = jax.tree.map(lambda *parts: jnp.select([chosen == i for i in range(count)], parts), *each)
         r, g, b = one.irradiance
         toward, distance = constant(LIGHTS, (one.toward, one.distance))
@@ -137,8 +122,7 @@ class Scattering(NamedTuple):
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
-    """Advance many walks (arrays of one length) by one step: a part of a flight, and its outcome. Whatever is
-    expensive is put in memory, since XLA would recompute it for each of its uses."""
+    """Advance many walks by a part of a flight. Expensive values are stored, or XLA recomputes them."""
     live = jnp.any(walks.alive)
 
     def uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -164,7 +148,7 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
         walk: Walk, candidate: Candidate, decision: Decision, scattering: Scattering, u: Scalar
     ) -> Walk:
         advanced = _delta_tracking(scene, walk, candidate, decision, scattering, u)
-        if not scene.located:
+        if not located(scene.lights):
             return advanced
         return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, decision, u), advanced)
 
@@ -181,8 +165,7 @@ def _scatter(
     choose: Scalar,
     survive: Scalar,
 ) -> Scattering:
-    """The outcome for a walk that is scattered at `coordinate`. `collided`: the weight of this collision;
-    `turn`: the direction around the z axis."""
+    """Outcome of a scattering. `collided`: the collision's weight; `turn`: direction around z."""
     kept = scaled(albedo, collided)
     before_roulette = times(walk.throughput, kept)
     least = scene.sampling.importance
@@ -195,7 +178,7 @@ def _scatter(
     throughput = scaled(before_roulette, weight)
     direction = scattered(turn, walk.direction)
     endless = jnp.full_like(survive, jnp.inf)
-    if not scene.located:
+    if not located(scene.lights):
         no = jnp.zeros(survive.shape, bool)
         return Scattering(direction, throughput, importance, walk.unoccluded, no, direction, endless)
     light = scene.light(coordinate, walk.direction, choose)
@@ -220,7 +203,7 @@ def _delta_tracking(
     collides = candidate.found & (decide < decision.chance)
     capped = collides & (before.scatterings >= scene.max_scatterings)
     scatters, met = collides & ~capped, before.scatterings > 0
-    gathered = times(walk.throughput, scene.surroundings)
+    gathered = times(walk.throughput, sky_of(scene.lights, jnp.float32))
     gathered = scaled(gathered, (candidate.over & met).astype(decision.share.dtype))
     passed = jnp.where(candidate.found & ~collides, decision.passed, 1)
     opacity = jnp.where(candidate.over & ~met, 1 - walk.throughput[0], before.opacity)
@@ -268,8 +251,7 @@ def _where(condition: Bool[Array, ""], a: T, b: T) -> T:
 
 
 def _roulette(importance: Scalar, uniform: Scalar) -> tuple[Scalar, Scalar]:
-    """Russian roulette: what is of small importance ends, or is divided by the probability of survival.
-    Returns its weight, a constant for derivatives, and the importance then."""
+    """Russian roulette: weight by the importance, a constant for derivatives; and importance then."""
     importance = jax.lax.stop_gradient(importance)
     small = importance < ROULETTE
     survives = uniform * ROULETTE < importance

@@ -433,8 +433,7 @@ def _points(camera: Camera, columns: Array, rows: Array, depths: Array) -> Float
 
 @jax.jit
 def _calibrated(k: Array, r: Array, t: Array, size: Array) -> tuple[list[Array], Array]:
-    """Position, focal point and up direction of a calibrated camera; and its window, for a view angle of
-    90°."""
+    """Position, focal point and up of a calibrated camera, and its window for a view angle of 90°."""
     position = -jnp.sum(r * t[:, None], axis=0)
     # as far away as the world's origin, since a near point would be rounded
     away = 1 + jax.lax.stop_gradient(jnp.linalg.norm(t))
@@ -448,8 +447,7 @@ def _calibrated(k: Array, r: Array, t: Array, size: Array) -> tuple[list[Array],
 def _facing(
     source: Array, center: Array, right: Array, down: Array, pitch: Array, size: Array, parallel: bool
 ) -> tuple[list[Array], Array]:
-    """Position, focal point and up direction of a camera that faces a detector; and its window, for a view
-    angle of 90° or a parallel scale of 1."""
+    """Position, focal point and up, and the window for a view angle of 90° or a parallel scale of 1."""
     right, down = (axis / jnp.linalg.norm(axis) for axis in (right, down))
     to_center, normal = center - source, jnp.cross(right, down)
     distance = jnp.sum(normal * to_center)
@@ -491,8 +489,7 @@ def _is_rotation(r: Any) -> Any:
 
 
 def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A point to which, from the origin, squares of lengths do not overflow. If it is traced, what overflows
-    makes the image NaN."""
+    """A point whose squared lengths do not overflow; a traced one that does makes the image NaN."""
     if is_traced(point):
         return point
     most = float(jnp.finfo(point.dtype).max) ** 0.5 / 16

@@ -1,9 +1,5 @@
-"""Where may anything be visible? Ranges of values of a volume's blocks, and grids of occupied cells.
-
-Ranges depend only on the voxels, and are kept as long as their array. Which blocks are visible depends on
-the transfer function, too, and is computed in each image. What is called empty is proven to be. There are no
-gradients.
-"""
+"""Finds where anything may be visible: ranges of values of blocks, kept as long as the voxels, and grids of
+occupied cells, computed for each image. What is called empty is proven to be. No gradients."""
 
 import itertools
 import math
@@ -196,8 +192,7 @@ class Occupancy(eqx.Module):
 
 
 def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Array]:
-    """Distances in a plane, if those of the plane before it are known, from which one step leads here, also
-    a diagonal one along the axes `across`."""
+    """Distances in a plane from those of the plane before, one step away, also diagonally along `across`."""
     for axis in across:
         before = _with_both_sides(before, axis)
     plane = jnp.minimum(plane, jnp.minimum(before, FARTHEST - 2) + jnp.uint8(1))
@@ -263,9 +258,8 @@ def _widened(low: Any, high: Any, xp: Any) -> tuple[Any, Any]:
 
 
 def _slope_ranges(data: Shaped[Array, "nx ny nz"], side: int) -> tuple[Array, Array, Array]:
-    """Least and greatest slopes along the array's axes in each block, in value units per node, and the
-    greatest length of a node's three; layer by layer, since all would take several times the volume's memory.
-    """
+    """Least and greatest slopes along the array's axes in each block, per node, and the greatest length of
+    the three; layer by layer, to save memory."""
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:

@@ -30,9 +30,9 @@ SLICER = "3D Slicer"
 
 
 def _add_presets(file: str) -> None:
-    """Add the presets of a file: ours, or those of 3D Slicer, from its
-    Modules/Loadable/VolumeRendering/Resources/presets.xml, with points at the values of both its curves, and
-    colours made linear. Its opacity by the gradient, 1 above 0 in all of them, is left out."""
+    """Add the presets of a file: ours, or 3D Slicer's
+    (Modules/Loadable/VolumeRendering/Resources/presets.xml) at the points of both curves, with linear
+    colours, without its opacity by gradient, which is 1."""
     for name, entry in json.loads(Path(__file__).with_name(file).read_text("utf-8")).items():
         points = [(value, (r, g, b), opacity) for value, r, g, b, opacity in entry["points"]]
         low, high = entry.get("range") or (points[0][0], points[-1][0])
@@ -72,8 +72,7 @@ def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1
 
 
 def preset_name(name: str | Any) -> str:
-    """The key of `PRESETS` that is meant: case and what separates words do not count. **Raises** `ValueError`
-    for an unknown name."""
+    """Key of `PRESETS`, whatever case and separators. **Raises** `ValueError` for an unknown name."""
 
     def plain(text: str) -> str:
         return re.sub("[^a-z0-9]", "", text.lower())

@@ -1,8 +1,5 @@
-"""What do several volumes show together? `render([ct, pet], [of_ct, of_pet], camera, march)`.
-
-They become one volume, a grid that just holds them all, whose field (`Several`) reads each at its place,
-and one transfer function (`Together`): extinctions add, and colours are means, weighted by extinction.
-"""
+"""Several volumes in one image, `render([ct, pet], [of_ct, of_pet], …)`: a grid that just holds them, whose
+field (`Several`) reads each at its place, and one transfer function (`Together`), of added extinctions."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -16,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._util.checks import described
 from .._util.vec3 import Scalar, Vec3, apart
+from ..xla.trees import is_none
 from .occupancy import BLOCK, Blocks, Sums
 from .transfer import Classify, Measured, Transfer, sized
 from .volume import Field, Volume
@@ -27,12 +25,8 @@ ROUNDING = 1e-3
 
 
 def together(volume: Any, transfer: Any) -> tuple[Any, Any]:
-    """One volume and transfer function for lists of them; anything else as it is. Transfer functions whose
-    lengths are counted in voxels are those of their volumes.
-
-    Raises:
-        ValueError: for lists of other things, or of different lengths.
-    """
+    """One volume and transfer function for lists of them; anything else as it is. Lengths counted in voxels
+    are those of each volume. **Raises** `ValueError` for lists of other things, or of different lengths."""
     if (pairs := pairs_of(volume, transfer)) is None:
         return volume, sized(transfer, volume)
     volume, transfer = zip(*pairs, strict=True)
@@ -79,9 +73,7 @@ def _holding(largest: Volume, volumes: Sequence[Volume]) -> Volume:
     """A grid along the axes of the largest volume, with as many nodes, that just holds all of them."""
     grid = _empty(largest)
     parts = *_around(grid, list(map(_empty, volumes))), Several(tuple(volumes))
-    return eqx.tree_at(
-        lambda v: (v.origin, v.spacing, v.field), grid, parts, is_leaf=lambda leaf: leaf is None
-    )
+    return eqx.tree_at(lambda v: (v.origin, v.spacing, v.field), grid, parts, is_leaf=is_none)
 
 
 def _empty(volume: Volume) -> Volume:
@@ -104,8 +96,7 @@ class Several(Field):
         return tuple(value for each, at in read for value in each.values(at))
 
     def coordinates(self, volume: Volume, coordinate: Vec3) -> list[Vec3]:
-        """A grid coordinate of `volume`, in the grid of each; outside of that, the nearest one, since a cell
-        which a face divides is sampled in its middle."""
+        """A coordinate of `volume` in each grid, clamped: a divided cell is sampled in its middle."""
         at = [GridMap.between(volume, each)(coordinate) for each in self.volumes]
         return [_within(place, each.shape) for place, each in zip(at, self.volumes, strict=True)]
 
@@ -270,8 +261,7 @@ class Together(Transfer):
     def emission_vjp(
         self, measured: Measured, emission: Vec3, extinction: Scalar
     ) -> tuple["Together", Measured]:
-        """As `vjp`, from the cotangents of the emission, extinction × colour, and of the extinction: where
-        that is 0, the cotangents of colours, which it weights, say nothing."""
+        """As `vjp`, by cotangents of emission and extinction, which suffice where the extinction is 0."""
         own, shares = self._own(measured)
         of_transfers, of_values, of_attributes, of_shares = [], [], [], []
         for transfer, count, part, share in zip(self.transfers, self.counts, own, shares, strict=True):

@@ -1,8 +1,5 @@
-"""Where does a world point lie in the grid, and where does a ray enter and leave the grid?
-
-A `Space` answers both for one volume; this is the seam `locate`. The default, `Affine`, applies spacing,
-origin and direction, so that rays are straight in the grid. A space with curved rays has another `Path`.
-"""
+"""Where a world point lies in the grid, and where a ray enters and leaves it: a `Space`, the seam `locate`.
+In the default, `Affine`, rays are straight in the grid; others have another `Path`."""
 
 from abc import abstractmethod
 from functools import reduce
@@ -83,8 +80,7 @@ class Space(eqx.Module):
         return ()
 
     def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
-        """Of several volumes (`several.Several`), the depths between which a line is in each; none for one.
-        What it is not in ends before it begins."""
+        """Entry and exit depth in each of several volumes, () for one. On a miss, exit < entry."""
         return ()
 
     @abstractmethod
@@ -113,9 +109,8 @@ class Space(eqx.Module):
 
 
 class Line(NamedTuple):
-    """A ray before it is cut to the volume: world origin, unit direction, (column, row) of its pixel, the
-    distance from the origin at which it ends, if not at the volume's exit, and how far beside the origin it
-    begins: added where places count from near the volume, since world coordinates are coarse far from 0."""
+    """A ray before it is cut to the volume: origin, unit direction, (column, row), the distance at which it
+    ends, and `beside`, added to the origin once that counts from near the volume, where float32 is fine."""
 
     origin: Vec3
     direction: Vec3
@@ -125,8 +120,7 @@ class Line(NamedTuple):
 
 
 class Ray(eqx.Module):
-    """One ray, clipped to the volume. Depths along it are measured from the entry, so that float32 resolves
-    them for far cameras, too."""
+    """One ray, clipped to the volume. Depths count from the entry, for float32 and far cameras."""
 
     entry: Vec3
     """Where the ray enters the volume, from the `anchor` of its space on."""
@@ -170,8 +164,7 @@ def enter(
     until: Scalar | None = None,
     beside: Vec3 | None = None,
 ) -> Ray:
-    """Clip a ray to the volume, to what lies ahead of its origin (and `beside` it), and to its first part, up
-    to the distance `until`; `invalid` if a number is not finite (or `until` NaN)."""
+    """Clip a ray to the volume, ahead of its origin (+ `beside`) and to `until`; `invalid` if not finite."""
     origin, space = space.place(origin), space.local
     if beside is not None:
         origin = plus(origin, beside)
@@ -191,10 +184,8 @@ def enter(
     fault = ~jnp.isfinite(toward)
     if until is not None:
         left = until - base - start
-        length, fault = (
-            jnp.where(left < length, jnp.where(left > 0, left, 0), length),
-            fault | jnp.isnan(until),
-        )
+        length = jnp.where(left < length, jnp.where(left > 0, left, 0), length)
+        fault |= jnp.isnan(until)
     ray = Ray(entry, direction, base + start, length, path, pixel, gaps, spans)
     return invalid(ray, fault)
 
@@ -314,8 +305,7 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
 
 
 def median_node_distance(space: Space, *middles: Array) -> Scalar:
-    """The size of a voxel: the median, over places at these grid coordinates along each axis, of the least
-    world distance between neighbouring nodes."""
+    """Size of a voxel: median over grid coordinates of the least world distance between nodes."""
 
     def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
         along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
@@ -326,8 +316,7 @@ def median_node_distance(space: Space, *middles: Array) -> Scalar:
 
 
 def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:
-    """Gradient of the value with respect to a world point: that of `Volume.gradient` times the transposed
-    Jacobian of `space.coordinate`."""
+    """World gradient of the value: `Volume.gradient` times the transposed Jacobian of `coordinate`."""
     coordinate, transpose = jax.vjp(space.coordinate, point)
     slopes = volume.gradient(coordinate)
     per_node = tuple(slope * volume.spacing[i] for i, slope in enumerate(slopes))

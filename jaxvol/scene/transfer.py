@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util import piecewise_linear as linear
-from .._util.checks import Arrayable, finite_array, flag, increasing, number, require, unit_interval
+from .._util.checks import Arrayable, finite_array, flag, increasing, not_negative, number, unit_interval
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.srgb import warn_of_8_bits
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
-from ..xla.platform import is_traced
+from ..xla.platform import in_numpy, is_traced
 from ..xla.trees import unchecked
 from .occupancy import Blocks
 from .volume import Volume
@@ -40,8 +40,7 @@ Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
 
 
 class Classification(NamedTuple):
-    """A transfer function applied to one volume: `measure` at a grid coordinate fetches from memory; what it
-    found, `classify` turns into colour and extinction."""
+    """A transfer function of one volume: `measure` fetches at a grid coordinate, `classify` the rest."""
 
     measure: Callable[[Vec3], Measured]
     attributes: Callable[[Vec3], Measured]
@@ -50,11 +49,9 @@ class Classification(NamedTuple):
     search: Callable[[Measured], Measured] | None = None
     """`Transfer.search`; what it finds is appended to the measured values."""
     integrate: Classify | None = None
-    """From what is measured of a cell (`spanned`) to its mean colour and extinction, if the value is linear
-    along it. None: a cell is as its sample."""
+    """From a cell (`spanned`) to mean colour and extinction, values linear; None: as its sample."""
     light: Callable[[Any], Vec3] | None = None
-    """From a `lighting.shading.Sample`, or many along one axis, to the shaded colours. None: colours are as
-    classified."""
+    """From a `lighting.shading.Sample`, or many, to shaded colours; None: as classified."""
 
     def at(self, coordinate: Vec3) -> Measured:
         """What `classify` needs at a grid coordinate."""
@@ -209,8 +206,7 @@ class TransferFunction(Transfer):
         n = self.values.shape[0]
         self.colors = finite_array("colors", colors, (n, 3))
         warn_of_8_bits("colors", self.colors)
-        extinction = finite_array("extinction", extinction, (n,))
-        self.extinction = require(extinction, lambda e: e >= 0, "extinction must not be negative; got {got}.")
+        self.extinction = not_negative("extinction", extinction, (n,))
 
     @classmethod
     def from_points(
@@ -430,19 +426,11 @@ def voxel_size(volume: Any) -> Any:
 
 
 def extinction_of(opacity: Arrayable, unit_distance: Arrayable | Volume = 1.0) -> Float[Array, " n"]:
-    """The extinction (1/length) under which a layer of thickness `unit_distance` (of a volume, its
-    `voxel_size`) has this opacity, of which more than 1 - 2⁻²⁴, the largest float32 below 1, counts as that.
-    """
+    """Extinction (1/length) of a layer of thickness `unit_distance` (or a volume's `voxel_size`) with this
+    opacity, which counts as 1 - 2⁻²⁴ at most."""
     if hasattr(unit_distance, "spacing"):
         unit_distance = voxel_size(unit_distance)
     unit_distance = number("unit_distance", unit_distance, above=0)
     opacity = unit_interval("opacity", opacity, (None,))
-    if not is_traced(opacity, unit_distance):  # without a program for each number of points
-        opacity, unit_distance = np.asarray(opacity), np.asarray(unit_distance)
-        return jnp.asarray(-np.log1p(-np.minimum(opacity, 1 - 2.0**-24)) / unit_distance, opacity.dtype)
-    return _extinction(opacity, unit_distance)
-
-
-@jax.jit  # one program, rather than one for each operation
-def _extinction(opacity: Float[Array, " n"], unit_distance: Float[Array, ""]) -> Float[Array, " n"]:
-    return -jnp.log1p(-jnp.minimum(opacity, 1 - 2.0**-24)) / unit_distance
+    xp, (opacity, unit_distance) = in_numpy(opacity, unit_distance)
+    return jnp.asarray(-xp.log1p(-xp.minimum(opacity, 1 - 2.0**-24)) / unit_distance, opacity.dtype)

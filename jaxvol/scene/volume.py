@@ -24,6 +24,7 @@ from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
+from ..xla.trees import is_none
 from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index
 
 
@@ -247,7 +248,10 @@ class Volume(eqx.Module):
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """World positions of the first and the last node."""
-        return corners_of(self.origin, self.spacing, self.direction, self._steps)
+        along = self._steps * self.spacing
+        # not by a matrix product, which some GPUs round to 10 bits
+        turned = along if self.direction is None else jnp.sum(self.direction * along[None, :], axis=1)
+        return self.origin, self.origin + turned
 
     @property
     def _steps(self) -> Float[np.ndarray, "3"]:
@@ -318,17 +322,6 @@ def check_one_channel(volume: Volume, use: str) -> None:
         raise ValueError(f"volume must have one channel for {use}; got one of {channels}.")
 
 
-def corners_of(
-    origin: Float[Array, "3"], spacing: Float[Array, "3"], direction: Float[Array, "3 3"] | None, cells: Any
-) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """World positions of the first and the last node of a grid of so many `cells` along x, y, z."""
-    along = cells.astype(spacing.dtype) * spacing
-    if direction is not None:
-        # not by a matrix product, which some GPUs round to 10 bits
-        along = jnp.sum(direction * along[None, :], axis=1)
-    return origin, origin + along
-
-
 def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
     """None for a direction that is known to be the identity."""
     turn = require(
@@ -366,9 +359,7 @@ def without_voxels(volume: Volume) -> Volume:
 
 def with_voxels(volume: Volume, data: Sequence[Any]) -> Volume:
     """The volume with these arrays as voxels of its `grids`."""
-    return eqx.tree_at(
-        lambda v: [grid.data for grid in grids(v)], volume, list(data), is_leaf=lambda leaf: leaf is None
-    )
+    return eqx.tree_at(lambda v: [grid.data for grid in grids(v)], volume, list(data), is_leaf=is_none)
 
 
 def _is_volume(node: Any) -> bool:
@@ -378,22 +369,20 @@ def _is_volume(node: Any) -> bool:
 def part_of(
     volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
-    """The volume as a part of a grid of `whole` nodes that begins at the node `first`; beyond it, its faces
-    are read. Spacing, origin and direction are those of the whole. `axes`: as in `Window`; by default those
-    of `volume`."""
+    """The volume as a part of a grid of `whole` nodes, from the node `first` on, with the grid's place;
+    beyond, its faces are read. `axes`: as in `Window`; by default unchanged."""
     window = Window(first, whole, volume.fetch.axes if axes is None else axes)
-    return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=lambda leaf: leaf is None)
+    return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=is_none)
 
 
 def read_as(volume: Volume, *fetches: Fetch | None) -> Volume:
-    """The volume with other ways to read the voxels of its `grids`, which are the same, and the same windows;
-    None: as before."""
+    """The volume with other fetches of its `grids`, in the same windows; None: as before."""
 
     def in_window(grid: Volume, fetch: Fetch | None) -> Fetch:
         if fetch is None:
             return grid.fetch
         window = grid.fetch.window
-        return eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=lambda leaf: leaf is None)
+        return eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=is_none)
 
     return with_fetches(volume, [in_window(*each) for each in zip(grids(volume), fetches, strict=True)])
 

@@ -27,21 +27,14 @@ OPTIONS = {
 def compiled(
     function: Callable[..., Any], *, has_jvp: bool = False, by_jvp: bool = False, in_turn: bool = True
 ) -> Callable[..., Any]:
-    """The function under jit, compiled with `OPTIONS` where it is not part of a larger program.
+    """The function under jit, compiled with `OPTIONS` where it is not part of a larger program. `jax.vmap`
+    runs it for one element after the other, in one program: batched, both sides of branches would run, and
+    loops until the last element is finished, 3 to 18 times slower.
 
-    `jax.vmap` runs it for each element of the batch in turn, as a Python loop would, but in one program.
-    Batching its operations instead would execute both sides of each branch, and run each loop until the last
-    element is finished: 3 to 18 times slower.
-
-    `has_jvp`: JAX itself is to differentiate the function. It cannot linearize a function with a batching
-    rule, so the rule is used only where `jax.vmap` is the innermost transformation of the arguments. Where
-    they are also differentiated, or a `jax.jit` lies between, operations are batched.
-
-    `by_jvp`: JAX is to differentiate it in forward mode alone, which goes through that rule, so that it is
-    used under a `jax.jit` within the `jax.vmap`, or around it, too.
-
-    `in_turn`: False if operations are always to be batched, as for a batch of tangents, on which no branch
-    and no loop depends.
+    `has_jvp`: JAX differentiates it, and cannot linearize a batching rule: operations are batched unless
+    `jax.vmap` is the innermost transformation. `by_jvp`: JAX differentiates it in forward mode alone, through
+    the rule, also under another `jax.jit`. `in_turn`: False to batch always, as for tangents, on which no
+    branch and no loop depends.
     """
     nested, outermost = eqx.filter_jit(function), kept(function, compiler_options=OPTIONS)
     looped = _in_turn(function, nested)
@@ -115,8 +108,7 @@ def _in_turn(function: Callable[..., Any], nested: Callable[..., Any]) -> Callab
 
 
 def _each(function: Callable[..., Any], batched: tuple[bool, ...], args: tuple[Any, ...]) -> Any:
-    """`function` of each element of the batch. `batched`: which arrays among the arguments have a batch
-    axis."""
+    """`function` of each element of the batch. `batched`: which arrays have a batch axis."""
     arrays, rest = eqx.partition(args, _is_array)
     leaves, tree = jax.tree.flatten(arrays)
 

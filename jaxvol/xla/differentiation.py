@@ -50,8 +50,7 @@ def forward_only(tree: PyTree, message: str) -> PyTree:
 
 
 def nan_derivatives(tree: PyTree, fault: Array) -> PyTree:
-    """The tree, unchanged; where `fault` is true, its derivatives in either mode are NaN, even if they would
-    be 0."""
+    """The tree; where `fault` is true, its derivatives are NaN in either mode, even if they would be 0."""
 
     @jax.custom_jvp
     def same(leaf: Array, factor: Array) -> Array:

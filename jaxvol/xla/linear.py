@@ -1,10 +1,6 @@
-"""Gives a function derivatives in both modes: a push-forward of tangents, and its transpose, a pull-back.
-
-JAX has one or the other: it transposes the rule of a `custom_jvp` operation by operation, which is impossible
-for a loop of unknown length, and a `custom_vjp` has no forward mode. Here tangents are pushed by a primitive,
-which JAX transposes as a whole. So `jax.jvp`, `jax.linearize`, `jax.grad`, and forward mode over these, work,
-also of a function under `jax.jit`.
-"""
+"""Gives a function derivatives in both modes: a push-forward of tangents, and its transpose, a pull-back. A
+`custom_jvp` is transposed operation by operation, which fails for a loop of unknown length; a `custom_vjp`
+has no forward mode. Here, JAX transposes a primitive as a whole, also under forward mode."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -21,7 +17,7 @@ from jaxtyping import Array
 from .compiling import compiled
 from .differentiation import forward_only, not_transposed
 from .platform import is_traced
-from .trees import PyTree, floats
+from .trees import PyTree, floats, is_none
 
 
 def differentiable(
@@ -103,8 +99,8 @@ def differentiable(
 
 
 def recomputed(function: Callable[..., PyTree], message: str) -> Callable[..., PyTree]:
-    """The function, from trees to arrays, as one program, and its derivative in reverse mode as another,
-    which recomputes the function instead of keeping residuals. `message`: as for `differentiable`."""
+    """The function and its derivative in reverse mode as programs, of which the second recomputes the first.
+    `message`: as for `differentiable`."""
 
     def floats_of(args: tuple[Any, ...], moving: PyTree) -> PyTree:
         return floats(function(*eqx.combine(moving, args)))
@@ -130,12 +126,7 @@ def recomputed(function: Callable[..., PyTree], message: str) -> Callable[..., P
 
 def moving_leaves(tree: PyTree, tangents: PyTree) -> PyTree:
     """The leaves of a tree that have a tangent; None in place of the others."""
-    return jax.tree.map(
-        lambda leaf, tangent: None if tangent is None else leaf,
-        tree,
-        tangents,
-        is_leaf=lambda leaf: leaf is None,
-    )
+    return jax.tree.map(lambda leaf, of: None if of is None else leaf, tree, tangents, is_leaf=is_none)
 
 
 # From constants, of which there are `count`, and tangents to tangents, in which it is linear.

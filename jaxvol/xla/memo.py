@@ -1,8 +1,4 @@
-"""Memoizes results computed from arrays, for as long as these live.
-
-Arrays are immutable: an update of a volume replaces its array, and results for the old one are never
-requested again. So nothing stored here goes stale, and nothing outlives what it was computed from.
-"""
+"""Memoizes results computed from arrays, which are immutable, as long as these live: nothing goes stale."""
 
 import weakref
 from collections.abc import Callable, Hashable, Sequence
@@ -24,9 +20,8 @@ T = TypeVar("T")
 def memoized(
     array: Array | np.ndarray, compute: Callable[[Any], T], in_numpy: Callable[[Any], Any] | None = None
 ) -> T:
-    """`compute(array)`, computed once in the lifetime of a concrete array; it carries no gradient. Under
-    `jax.vmap`, it is computed once in the lifetime of the batch. `in_numpy`: the same function of a NumPy
-    array, which needs no program; it is used on CPU, unless the array was put on a device."""
+    """`compute(array)`, once in the lifetime of a concrete array (under `jax.vmap`, of the batch), without a
+    gradient. `in_numpy`: the same in NumPy, without a program, unless the array was put on a device."""
     if not isinstance(array, jax.Array):  # NumPy arrays are mutable
         return compute(array)
     if is_traced(array):

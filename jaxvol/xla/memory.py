@@ -1,9 +1,5 @@
-"""How are values fetched from arrays, kept in memory, and added up again?
-
-On a GPU, rows of one index are added by atomic operations, one after the other. (On an H200, 1.5 ms for a
-million rows of one index.) So zeros, which most samples of a march that has ended give, are left out there,
-and a table that many samples share is summed in copies.
-"""
+"""Fetches values, keeps them in memory, and adds them up. GPUs add rows of one index one after the other: so
+zeros, which most samples of an ended march give, are left out there, and shared tables summed in copies."""
 
 from collections.abc import Callable
 from typing import Any
@@ -52,8 +48,7 @@ def gather(array: Array, index: Array) -> Array:
 
 
 def zeros_in_reserve(length: int, dtype: Any) -> np.ndarray:
-    """NumPy zeros that `jax.device_put` does not copy to the CPU. So what is never written takes addresses,
-    but no memory: a few lengths can serve arrays of any, which then share programs."""
+    """NumPy zeros that `jax.device_put` does not copy, so that unwritten ones take no memory."""
     size = length * np.dtype(dtype).itemsize
     reserved = np.zeros(size + ALIGNED, np.uint8)
     first = -reserved.ctypes.data % ALIGNED
@@ -61,8 +56,7 @@ def zeros_in_reserve(length: int, dtype: Any) -> np.ndarray:
 
 
 def packed_pair(a: Array, b: Array, factor: Array) -> Array:
-    """The pair (a · factor, b · factor) in one array, so that one kernel computes both: of two arrays, XLA
-    would compute all that they share twice."""
+    """(a · factor, b · factor) in one array and kernel: of two arrays, XLA computes what they share twice."""
     return jax.lax.complex(a, b) * jax.lax.complex(factor, jnp.zeros_like(factor))
 
 
@@ -72,13 +66,9 @@ def unpacked_pair(pair: Array) -> tuple[Array, Array]:
 
 
 def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, computed once and stored in memory.
-
-    XLA recomputes what it fuses for each use, fetches too, but the results of a branch lie in memory. `live`
-    must always be true, in a way that XLA cannot see. If it is not, floats come out as NaN.
-
-    On a GPU, a branch would wait for the host; but there XLA fuses nothing across an `optimization_barrier`,
-    which on CPU it removes before it fuses."""
+    """`f(*arguments)`, stored in memory as the result of a branch: XLA recomputes what it fuses for each use.
+    `live` must be true, unknown to XLA; if not, floats are NaN. On a GPU, where a branch waits for the host,
+    by an `optimization_barrier`, which has no such effect on CPU."""
     if on_gpu():
         return jax.lax.optimization_barrier(f(*arguments))
     f = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch

@@ -1,7 +1,4 @@
-"""Holds the arrays of many rays as the rows of a few, so that each is gathered and scattered at once.
-
-XLA compiles a kernel for each array that is gathered: of a ray with twenty numbers, twenty.
-"""
+"""Holds the arrays of rays as rows of a few: XLA compiles a kernel for each array that is gathered."""
 
 import math
 from collections.abc import Callable
@@ -16,13 +13,8 @@ from .trees import PyTree
 
 
 class Row(NamedTuple):
-    """Where a leaf lies in a packed tree: rows from `first` on of the array of `kind`, a type. Integers of 32
-    bits, and truth values as such, lie there as floats with the same bits, so that one array holds them all.
-
-    Attributes:
-        dtype: of the leaf.
-        shape: of the leaf, for each ray.
-    """
+    """Where a leaf, of a dtype and a shape for each ray, lies in a packed tree: rows from `first` on of the
+    array of `kind`. Integers of 32 bits and truth values lie in float32, with the same bits."""
 
     kind: str
     first: int
@@ -68,8 +60,7 @@ class Layout(NamedTuple):
 
 
 class Packed(eqx.Module):
-    """A tree of arrays as rows of a few arrays, by kind. Where a branch is given this rather than the tree,
-    XLA need not store each leaf for it."""
+    """A tree of arrays as rows of a few arrays, by kind: a branch then need not store each leaf."""
 
     rows: dict[str, Array]
     layout: Layout = eqx.field(static=True)

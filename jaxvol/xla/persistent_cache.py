@@ -16,8 +16,7 @@ _CHOSEN: set[str] = set()
 
 
 def default_programs() -> Path:
-    """The folder of kept programs: JAX's own if `JAX_COMPILATION_CACHE_DIR` is set, else one in the user's
-    cache."""
+    """Folder of kept programs: `JAX_COMPILATION_CACHE_DIR`, or one in the user's cache."""
     chosen = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(chosen) if chosen else caches / "jaxvol" / "programs"
@@ -49,7 +48,10 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
     if _folder() != str(path):
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-        _forget_that_none_was_set()
+        # JAX decides once, at the first program, whether there is a cache; in a notebook that may be long ago
+        from jax.experimental.compilation_cache import compilation_cache
+
+        compilation_cache.reset_cache()
     _CHOSEN.add(str(path))
     return path
 
@@ -70,10 +72,3 @@ def kept_folder() -> str | None:
 
 def _folder() -> str | None:
     return getattr(jax.config, "jax_compilation_cache_dir", None)
-
-
-def _forget_that_none_was_set() -> None:
-    # JAX decides once, at the first program, whether there is a cache; in a notebook that may be long ago
-    from jax.experimental.compilation_cache import compilation_cache
-
-    compilation_cache.reset_cache()

@@ -1,9 +1,5 @@
-"""For which platform is a program traced, and how does it loop there?
-
-On a GPU, the host launches one kernel after the other. It waits for the device at each branch, and at each
-turn of a loop whose number of turns is not known when it is compiled; a number that is known costs nothing.
-(XLA's `ConditionalThunk` and `WhileThunk` copy the predicate to the host.)
-"""
+"""The platform of a program, and its loops. On a GPU, the host waits for the device at each branch, and at
+each turn of a loop of unknown length, as XLA copies the predicate to it."""
 
 from collections.abc import Callable
 from functools import cache, partial
@@ -24,8 +20,8 @@ TURNS = 16
 
 
 def platform() -> str:
-    """The platform of a program that is traced now: that of `jax.default_device`, or else of JAX's default
-    backend. Arrays that were put on another device make it as right, but not as fast."""
+    """Platform of the program that is traced: of `jax.default_device`, or the default backend. Arrays on
+    another device make it slower, not wrong."""
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     return jax.default_backend() if device is None else getattr(device, "platform", str(device))
 
@@ -37,9 +33,8 @@ def on_gpu() -> bool:
 
 @cache
 def gathers_are_fast() -> bool:
-    """Whether LLVM gathers many values at once on this processor: one of Intel's with AVX-512. On others, it
-    computes a whole kernel with gathers for one sample after the other, so that what surrounds them is a
-    kernel of its own."""
+    """Whether LLVM gathers many values at once: on Intel with AVX-512. Elsewhere, a kernel with gathers runs
+    sample by sample, and what surrounds them is another kernel."""
     try:
         features = Path("/proc/cpuinfo").read_text()
     except OSError:  # not Linux
@@ -50,8 +45,7 @@ def gathers_are_fast() -> bool:
 def while_loop(
     cond: Callable[[State], Bool[Array, ""]], body: Callable[[State], State], start: State
 ) -> State:
-    """`jax.lax.while_loop`. On a GPU, it looks at the condition once in `TURNS`; surplus turns change
-    nothing."""
+    """`jax.lax.while_loop`; on a GPU, the condition is tested once in `TURNS`, and surplus turns idle."""
 
     def turn(_: object, state: State) -> State:
         return jax.tree.map(partial(jnp.where, cond(state)), body(state), state)
@@ -68,6 +62,5 @@ def is_traced(*values: Any) -> bool:
 
 
 def in_numpy(*values: Any) -> tuple[Any, Any]:
-    """`numpy`, which compiles nothing, and the values as its arrays, where they are known; else `jax.numpy`
-    and the values themselves."""
+    """`numpy` and the values as its arrays, where they are known; else `jax.numpy` and the values."""
     return (jnp, values) if is_traced(*values) else (np, jax.tree.map(np.asarray, values))

@@ -12,8 +12,7 @@ from .trees import PyTree
 
 
 def varies_over(leaf: Any) -> frozenset[Any]:
-    """The mesh axes over which an array varies inside `jax.shard_map`; none under `check_vma=False`, where
-    JAX does not track them."""
+    """Mesh axes over which an array varies inside `jax.shard_map`; none under `check_vma=False`."""
     if not isinstance(leaf, jax.core.Tracer):
         return frozenset()
     kind = jax.typeof(leaf)
@@ -23,11 +22,8 @@ def varies_over(leaf: Any) -> frozenset[Any]:
 
 
 def varying(tree: PyTree, *like: PyTree) -> PyTree:
-    """The tree, with arrays that vary over all mesh axes over which any array of `like`, or of itself,
-    varies.
-
-    These axes are part of an array's type in JAX. A loop must start with arrays of the types that it ends
-    with, and zeros do not vary. Outside of `jax.shard_map` this changes nothing."""
+    """The tree, with arrays that vary over all mesh axes of `like` or itself, which are part of their types:
+    loops must keep these, and zeros do not vary. Nothing changes outside of `jax.shard_map`."""
     axes = frozenset().union(*(varies_over(leaf) for leaf in jax.tree.leaves((tree, like))))
     if not axes:
         return tree
@@ -44,8 +40,7 @@ def varying(tree: PyTree, *like: PyTree) -> PyTree:
 
 
 def shard_number(*arrays: Any) -> Int[Array, ""]:
-    """Index of this shard, of arrays that are sharded along their first axis; 0 outside of
-    `jax.shard_map`."""
+    """Index of this shard of arrays sharded along their first axis; 0 outside of `jax.shard_map`."""
     axes = frozenset().union(*map(varies_over, arrays))
     if not axes:
         return jnp.zeros((), jnp.int32)

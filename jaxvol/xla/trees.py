@@ -11,9 +11,13 @@ PyTree: TypeAlias = Any
 """A tree of arrays. The type of this name in jaxtyping is one that type checkers cannot know, on purpose."""
 
 
+def is_none(leaf: Any) -> bool:
+    """For `is_leaf`, where None is to be replaced or kept."""
+    return leaf is None
+
+
 def unchecked(module: Any, **changes: Any) -> Any:
-    """The module with other values for these fields, static ones too, without its constructor's checks; or
-    one of a class, from all of its fields."""
+    """A module (or a class's) with these fields, also static ones, without its constructor's checks."""
     new = isinstance(module, type)
     copy = object.__new__(module if new else type(module))
     for name, value in {**({} if new else vars(module)), **changes}.items():
@@ -22,15 +26,10 @@ def unchecked(module: Any, **changes: Any) -> Any:
 
 
 def with_fields(tree: Any, **changes: Any) -> Any:
-    """A module with other values for these fields, of many rays (`dataclasses.replace` would check the shapes
-    of one)."""
+    """A module with other fields, of many rays, whose shapes `dataclasses.replace` would check."""
     names = list(changes)
-    return eqx.tree_at(
-        lambda tree: [getattr(tree, name) for name in names],
-        tree,
-        [changes[name] for name in names],
-        is_leaf=lambda leaf: leaf is None,
-    )
+    parts = [changes[name] for name in names]
+    return eqx.tree_at(lambda tree: [getattr(tree, name) for name in names], tree, parts, is_leaf=is_none)
 
 
 def floats(tree: PyTree) -> PyTree:
@@ -49,8 +48,7 @@ def constant(tree: PyTree) -> PyTree:
 
 
 def strong(tree: PyTree) -> PyTree:
-    """The tree with leaves of weak type, which come from Python numbers, as plain arrays: `jax.custom_vjp`
-    loses the gradients of weak ones."""
+    """The tree without weak types (of Python numbers), whose gradients `jax.custom_vjp` loses."""
 
     def plain(leaf: Any) -> Any:
         return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf

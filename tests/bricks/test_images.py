@@ -164,7 +164,6 @@ BAD: list[tuple[dict[str, Any], str]] = [
         {"devices": jax.devices(), "march": jv.March(1.0, (jv.EmptySpaceJitter(0),))},
         "devices, which own bricks, do not go with EmptySpaceJitter",
     ),
-    ({"own": "voxels"}, "own must be one of bricks; got 'voxels'"),
 ]
 
 

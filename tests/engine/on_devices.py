@@ -85,7 +85,7 @@ def image_and_gradient(known: dict[str, np.ndarray]):
 
 def owned_bricks(known: dict[str, np.ndarray]):
     """Bricks of four devices, some in front of others on every ray."""
-    how: Any = {"bricks": (2, 2, 3), "devices": all_devices()[:4], "own": "bricks"}
+    how: Any = {"bricks": (2, 2, 3), "devices": all_devices()[:4]}
     found = jv.render_bricks(scenes.balls(), TRANSFER, CAMERA, LEAPING, **PLACE, **how)
     assert 6 < found.bricks.loads <= found.bricks.needed
     np.testing.assert_allclose(found.rgba, known["rgba by bricks"], atol=2e-5, rtol=0)

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
 from ..._util.checks import integer, output_file
 from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
+from ...fitting.bijections import RigidMotion
 from ...scene.camera import Camera
 from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import scene_of, with_march
@@ -68,16 +68,11 @@ def _animate(options: argparse.Namespace) -> None:
 
 def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
     """The camera, turned about an axis through its focal point."""
-    from scipy.spatial.transform import Rotation
-
     axis = np.asarray(axis, float)
     if not np.isfinite(axis).all() or not axis.any():
         raise ValueError(f"--axis must not be 0; got {' '.join(map(str, axis))}.")
-    turn = Rotation.from_rotvec(np.deg2rad(degrees) * axis / np.linalg.norm(axis))
-    focal = np.asarray(camera.focal_point, float)
-    position = jnp.asarray(focal + turn.apply(np.asarray(camera.position, float) - focal))
-    up = jnp.asarray(turn.apply(np.asarray(camera.view_up, float)))
-    return eqx.tree_at(lambda c: (c.position, c.view_up), camera, (position, up))
+    turn = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
+    return eqx.filter_jit(RigidMotion.camera)(RigidMotion(turn, np.zeros(3), camera.focal_point), camera)
 
 
 def angles_of(degrees: float, frames: int) -> list[float]:

@@ -1,7 +1,4 @@
-"""Options of the subcommands of `jaxvol`, of the command line or of the picture that `--like` names.
-
-What takes long to import is imported where it is used.
-"""
+"""Options of the subcommands, of the command line or of `--like`; slow imports are where they are used."""
 
 import argparse
 import re
@@ -79,8 +76,7 @@ def parsed(parser: Parser, words: Sequence[str]) -> argparse.Namespace:
 
 
 def in_full(words: Sequence[str]) -> list[str]:
-    """Words in which `--size 512` is that of a square, `--size 640x480` is two words, and
-    `--background white` is in linear RGB."""
+    """Words with both numbers of `--size 512` and `640x480`, and the linear RGB of `--background white`."""
     joined = "--size=", "--background="
     words = [part for word in words for part in (word.split("=", 1) if word.startswith(joined) else [word])]
     found = [*words]
@@ -125,8 +121,7 @@ def _of_picture(command: Parser, path: Path) -> dict[str, Any]:
 
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
-    """Refuse to write a file (an option of these names) that is read, such as a slice of the volume, or
-    another one."""
+    """Refuse to write a file that is read, such as a slice of the volume, or two options to one file."""
     from ...io.formats import files_of
 
     read = [getattr(options, name, None) for name in ("file", "labels", "transfer")]

@@ -48,10 +48,8 @@ def _render(options: argparse.Namespace) -> None:
 
 def legend(volume: Volume, transfer: LabelTransferFunction) -> str:
     """The labels that a volume has, each with its colour."""
-    kinds, colors = (
-        np.unique(np.asarray(volume.labels)),
-        displayed(np.asarray(transfer.stacked.colors, np.float32)[None, :, -1])[0],
-    )
+    kinds = np.unique(np.asarray(volume.labels))
+    colors = displayed(np.asarray(transfer.stacked.colors, np.float32)[None, :, -1])[0]
     ids = volume.label_ids or range(256)
     told = [f"{ids[kind]} #{bytes(colors[kind]).hex()}" for kind in kinds.tolist() if 0 < kind < len(colors)]
     return f"labels {', '.join(told[:24])}{', …' * (len(told) > 24)}"

@@ -2,7 +2,6 @@
 
 import argparse
 from argparse import Namespace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -55,7 +54,8 @@ def _warm(options: argparse.Namespace) -> None:
         jax.block_until_ready(jax.grad(lambda transfer: _mean(scene, transfer))(scene.transfer))
         print("gradient of the transfer function", flush=True)
         done()
-    _print_size(folder)
+    files = [file for file in folder.iterdir() if file.is_file()]
+    print(f"{folder}: {len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.1f} MB")
 
 
 def _drawn(volume: Volume, size: tuple[int, ...], **how: Any) -> Scene:
@@ -70,11 +70,6 @@ def _drawn(volume: Volume, size: tuple[int, ...], **how: Any) -> Scene:
 
 def _mean(scene: Scene, transfer: Any) -> Any:
     return render(scene.volume, transfer, scene.camera, scene.march).image(scene.background).mean()
-
-
-def _print_size(folder: Path) -> None:
-    files = [file for file in folder.iterdir() if file.is_file()]
-    print(f"{folder}: {len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.1f} MB")
 
 
 def add_warm(parser: Parser) -> None:

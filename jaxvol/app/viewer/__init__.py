@@ -1,8 +1,5 @@
-"""Looks at volumes: `view` in a notebook, and `serve` as a page of its own, which `jaxvol view FILE` shows.
-
-One `model`, whose `state` a thread draws in `tiles`, and one list of its `controls` have two faces,
-`notebook` and `page`.
-"""
+"""Looks at volumes: `view` in a notebook, `serve` as a page, which `jaxvol view FILE` shows. One `model`,
+drawn in `tiles` by a thread, and one list of `controls` have two faces, `notebook` and `page`."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any

@@ -23,8 +23,7 @@ SIDES = {f"{'+-'[sign < 0]}{name}": (axis, sign) for axis, name in enumerate("xy
 
 
 def controls_of(model: Model) -> dict[str, list[Control]]:
-    """A viewer's controls, by the heading of their group. When one has changed the model, others may have
-    something else to show."""
+    """Controls by the heading of their group. A change of one may change what others show."""
     groups = {"view": _view_controls, "transfer function": transfer_controls, "slices": slice_controls}
     groups |= {"clip": _clip_controls, "save": _save_controls, "march": _march_controls}
     made = {heading: controls(model) for heading, controls in groups.items()}
@@ -39,10 +38,8 @@ def _bound(model: Model, kind: str, label: str, name: str, **more: Any) -> Contr
 
 def _view_controls(model: Model) -> list[Control]:
     """From where the volume is looked at, and how cells become pixels."""
-    data, modes = (
-        np.asarray(model.scene.volume.data),
-        [*model.scene.modes, *([] if model.scene.others else [ISOSURFACE])],
-    )
+    data = np.asarray(model.scene.volume.data)
+    modes = [*model.scene.modes, *([] if model.scene.others else [ISOSURFACE])]
     low, high = float(data.min()), float(data.max())
     span = high - low or max(abs(low), 1.0)
 

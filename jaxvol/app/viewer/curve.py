@@ -3,6 +3,8 @@
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from string import Template
 from typing import Any, cast
 
 import numpy as np
@@ -22,6 +24,7 @@ from .model import Model
 MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
 BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
 GIVEN = "as given"
+PLOT = Template(Path(__file__).with_name("curve.html").read_text("utf-8"))
 
 
 def transfer_controls(model: Model) -> list[Control]:
@@ -49,8 +52,7 @@ def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]
 
 
 def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel: float, chosen: int) -> str:
-    """A pad with the histogram, and as a line the square root of the opacity, which shows thin materials; its
-    points, in their colours, are parts of the pad."""
+    """A pad: histogram, square root of the opacity (which shows thin materials), and the points as parts."""
     at, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction)
     across = WIDTH * np.clip((at - low) / (high - low), 0, 1)
     colors = [editing.display_color(color) for color in np.asarray(transfer.colors)]
@@ -70,22 +72,13 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
         for i, (x, y, color) in enumerate(dots)
     )
     line = height(np.interp(np.linspace(low, high, 4 * BINS), at, extinction))
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" data-pad="curve" viewBox="0 0 {WIDTH} {HEIGHT}"'
-        f' style="overflow: visible; touch-action: none; cursor: crosshair; width: 100%; display: block">'
-        f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#8882" />'
-        f'<polygon points="0,{HEIGHT} {points(HEIGHT * (1 - bars))} {WIDTH},{HEIGHT}" fill="#8888" />'
-        f'<polyline points="{points(line)}" fill="none" stroke="currentColor" />'
-        f"{circles if len(at) <= editing.MAX_POINTS else ''}</svg>"
-        f'<div style="height: 8px; background: linear-gradient(to right, {stops})"></div>'
-        f'<div style="display: flex; justify-content: space-between; font-size: 10px">'
-        f"<span>{low:.4g}</span><span>{high:.4g}</span></div>"
-    )
+    shown = {"width": WIDTH, "height": HEIGHT, "low": f"{low:.4g}", "high": f"{high:.4g}", "stops": stops}
+    shown |= {"bars": points(HEIGHT * (1 - bars)), "line": points(line)}
+    return PLOT.substitute(shown, circles=circles if len(at) <= editing.MAX_POINTS else "")
 
 
 def _point_controls(model: Model) -> list[Control]:
-    """Presets, the curve, window and level; and value, colour and opacity of the point that was pressed last,
-    the opacity that of a layer as thick as a voxel."""
+    """Presets, curve, window and level; value, colour and opacity (in a voxel) of the chosen point."""
     low, high, bars = histogram(model.scene.volume)
     voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
     shown = GIVEN
@@ -160,8 +153,7 @@ def _point_controls(model: Model) -> list[Control]:
 
 
 def _label_controls(model: Model) -> list[Control]:
-    """A label that can be seen, by name or densest colour, whether it is shown, and the factor of its
-    extinction."""
+    """A visible label, by name or densest colour, whether it is shown, and its extinction's factor."""
     stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()

@@ -29,13 +29,11 @@ INTERVAL = 0.25  # seconds after which an unfinished fine image is shown again
 BUDGET = 0.06  # seconds that a coarse image may take, of the 150 ms in which it is to follow the pointer
 
 LEVELS = ((1, 4.0), (1, 2.0), (1, 1.0), (2, 1.0), (4, 1.0), (6, 1.0), (9, 1.0), (16, 1.0))
-"""Coarse images, from the coarsest on: tiles, and how many times as long their steps are. One takes up to
-some two times as long as the one before."""
+"""Coarse images: tiles, and factors of the step. Each takes some two times as long as the one before."""
 
 
 def adapted(level: int, seconds: float, fine_tiles: int) -> int:
-    """The index of `LEVELS` of the next coarse image, after one that took so long. A coarse image has at most
-    half as many tiles as the fine one."""
+    """Index of the next coarse image's level by the last one's time; at most half of all tiles."""
     if seconds > BUDGET:
         level -= 2 if seconds > 2 * BUDGET else 1
     elif seconds < BUDGET / 2.5:
@@ -110,8 +108,7 @@ class Model:
         self.apply(lambda state: replace(state, **changes))
 
     def apply(self, change: Callable[[State], State]) -> None:
-        """Change the state by a function of it, and draw it. Bad input, such as points that make no transfer
-        function, changes nothing but the status."""
+        """Change the state by a function of it, and draw it; bad input changes nothing but the status."""
         try:
             self.state = change(self.state)
         except ValueError as fault:
@@ -120,8 +117,7 @@ class Model:
             self.ask(self.state)
 
     def resize(self, width: float, height: float, **changes: Any) -> None:
-        """Change the view to this many pixels, or to fewer if it is wider or higher than `MAX_SIDE`; and
-        replace other fields of the state."""
+        """Change the view to this many pixels, `MAX_SIDE` at most, and replace other fields of the state."""
         if math.isfinite(width) and math.isfinite(height) and min(width, height) >= 1:
             scale = min(1.0, MAX_SIDE / max(width, height))
             size = max(1, round(width * scale)), max(1, round(height * scale))
@@ -146,8 +142,7 @@ class Model:
             self._changed.notify_all()
 
     def save(self, width: float) -> None:
-        """Render an image that is so many pixels wide, by a thread of its own, and deliver it as a PNG, which
-        holds its settings as those that `jaxvol render` writes."""
+        """Render an image of this width in another thread, and deliver it as a PNG with its settings."""
         across, down = self.state.size
         scale = min(max(width, 1), MAX_SAVED, MAX_SAVED * across / down) / across
         state = replace(self.state, size=(round(across * scale), max(1, round(down * scale))))
@@ -241,8 +236,7 @@ class Model:
             self._changed.notify_all()
 
     def _stand_in(self, request: State, last: State) -> State | None:
-        """What is drawn until the program of a request is compiled, by that of the last one; None if that
-        would be the image that is there. Has the program compiled, unless another is being compiled."""
+        """Starts to compile a request's program. Returns what the last one draws until then, or None."""
         if not self._compiling and TileRenderer(self.scene, request).program_key not in self._failed:
             names = [told for name, told in PROGRAM.items() if getattr(request, name) != getattr(last, name)]
             names = [*sorted(request.enabled ^ last.enabled), *filter(None, names)]

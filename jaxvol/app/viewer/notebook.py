@@ -206,26 +206,14 @@ def _widget_of_value(control: Control) -> Any:
 class Pad(anywidget.AnyWidget):
     """HTML whose boxes tell where they are pressed."""
 
-    _esm = f"""
-    const pressed = {PRESSED};
-    export default {{ render({{ model, el }}) {{
-      const show = () => {{ el.innerHTML = model.get('value'); }};
-      const send = text => {{ model.set('sent', text); model.save_changes(); }};
-      show();
-      model.on('change:value', show);
-      el.onpointerdown = event => pressed(event, send);
-    }} }};
-    """
+    _esm = Path(__file__).with_name("pad.js").read_text("utf-8").replace("$pressed", PRESSED)
     value = traitlets.Unicode().tag(sync=True)
     sent = traitlets.Unicode().tag(sync=True)
 
 
 class PromptCanvas(RenderCanvas):
-    """Calls handlers of events at once, and sends an image as soon as fewer than two wait for the browser.
-
-    rendercanvas does both at ticks of a scheduler, sends each image once more without loss, and its browser's
-    part keeps moves of the pointer back for 20 ms: too long for a coarse image that is to follow within
-    150 ms."""
+    """Calls event handlers at once, and sends an image as soon as fewer than two wait for the browser: not at
+    ticks of rendercanvas's scheduler, not once more without loss, and with moves not held back for 20 ms."""
 
     _esm = RenderCanvas._esm.replace("setThrottle(20)", "setThrottle(0)")
     pixels: Pixels | None = None
@@ -236,8 +224,7 @@ class PromptCanvas(RenderCanvas):
         self.request_draw(self._set_bitmap)
 
     def show(self, pixels: Pixels, quality: int) -> None:
-        """Send an image, in place of those that have not been sent, as JPEG of a quality below 100. In the
-        thread of the event loop."""
+        """Send an image as JPEG of this quality, in place of unsent ones; in the event loop's thread."""
         self.pixels, self._quality = pixels, quality
         self.request_draw()
 

@@ -9,6 +9,8 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from string import Template
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -27,13 +29,8 @@ from .tiles import Pixels
 
 HOST = "127.0.0.1"
 OWN_NAMES = {HOST, "localhost"}
-PAD = """<style>.mantine-Flex-root:has(> div label[for="{field}"]) {{ position: absolute; height: 0; width: 0;
-opacity: 0; overflow: hidden }}</style><div onpointerdown="({pressed})(event, text => {{
-const label = [...document.querySelectorAll('label')].find(each => each.htmlFor === '{field}');
-const input = label.closest('.mantine-Flex-root').querySelector('input');
-Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, text);
-input.dispatchEvent(new Event('input', {{bubbles: true}})) }})">{content}</div>"""
-"""Of viser's widgets, only a field of text sends what a script tells: each pad has one, which is hidden."""
+# of viser's widgets, only a text field sends what a script tells: each pad has a hidden one
+PAD = Template(Path(__file__).with_name("pad.html").read_text("utf-8"))
 
 
 class _Server(viser.ViserServer):
@@ -59,14 +56,7 @@ class Page:
         port: as for `serve`, as is `title`.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        state: State,
-        *,
-        port: int = 8080,
-        title: str = "jaxvol",
-    ):
+    def __init__(self, scene: Scene, state: State, *, port: int, title: str):
         self.shown = scene, state
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
         # viser's cameras have limits that suit scenes of about this size
@@ -98,8 +88,7 @@ class Page:
         self._server.stop()
 
     async def _only_own_pages(self, connection: Any) -> None:
-        """Any page that a browser shows may connect to a port of this machine; viser takes them all. It reads
-        messages only after this call, so that those of others are read here, and dropped."""
+        """Refuse pages of others; viser reads messages only after this, so theirs are dropped here."""
         client = self._server._websock_server._live_connections[connection.client_id]
         origin = urlsplit(client.request.headers.get("Origin", "") if client.request else "")
         if origin.hostname not in OWN_NAMES or origin.port != self.port:
@@ -146,8 +135,7 @@ class Page:
 
 
 def _in_one_line(record: logging.LogRecord) -> bool:
-    """Whether to log something; what a client's message did to viser, if that knows none such, without the
-    place in viser's code."""
+    """Whether to log a record; a client's unknown message is told in one line."""
     told = record.getMessage()
     if told == "connection handler failed" and record.exc_info:
         fault = shortened(record.exc_info[1])
@@ -198,7 +186,7 @@ class _Panel:
             return
         if control.kind == "pad":
             told, field = control.get, {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
-            control = replace(control, get=lambda: PAD.format(**field, content=told()))
+            control = replace(control, get=lambda: PAD.substitute(**field, content=told()))
             _update(widget, control)
         self._widgets.append((widget, control))
         source.on_update(changed)

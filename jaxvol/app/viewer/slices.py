@@ -19,8 +19,7 @@ SIDE = 256  # pixels of the longest axis
 
 
 def slice_controls(model: Model) -> list[Control]:
-    """A pad with a slice across each axis of the voxels, to the right and upwards as the world or the camera
-    has it. A press moves the point."""
+    """A pad of slices across the voxels' axes, oriented as world or camera. A press moves the point."""
     volume = model.scene.volume
     if np.ndim(volume.data) != 3 or volume.field is not None:
         return []

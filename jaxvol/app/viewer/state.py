@@ -1,8 +1,5 @@
-"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace.
-
-The camera turns about its focal point as on a turntable: `view_up` stays up. Drags are given in units of the
-view's height, to the right and down, as the pointer moved.
-"""
+"""What does a viewer show? `Scene`, which stays, and `State`, which its controls replace. The camera turns as
+on a turntable. Drags are in units of the view's height, to the right and down."""
 
 import math
 from collections.abc import Sequence
@@ -52,15 +49,8 @@ Vector = Float[np.ndarray, "3"]
 
 @dataclass(frozen=True)
 class Orbit:
-    """A camera that looks at a point.
-
-    Attributes:
-        focal_point: world point.
-        toward: unit direction from there to the camera.
-        distance: between them, world length.
-        view_up: unit direction about which it turns.
-        view_angle: degrees, over the height of the image.
-    """
+    """A camera that looks at a point: `toward`, the unit direction from there, and `distance` place it; it
+    turns about `view_up`, and sees `view_angle` degrees over the height of the image."""
 
     focal_point: Vector
     toward: Vector
@@ -86,8 +76,7 @@ class Orbit:
         return orbit.zoomed(orbit.half_height / float(camera.parallel_scale))
 
     def turned(self, right: float, down: float) -> "Orbit":
-        """After a drag that turns what is seen, as if the pointer held its front: by half a turn for a drag
-        over the height of the view."""
+        """Turned by a drag, as if the pointer held the front: half a turn over the view's height."""
         up = self.view_up
         height = math.asin(float(np.clip(self.toward @ up, -1, 1)))
         level = self.toward - (self.toward @ up) * up
@@ -122,9 +111,8 @@ class Orbit:
     def withdrawn(self, least: float) -> "Orbit":
         """From at least so far, by an angle that shows as much at the focal point."""
         distance = max(self.distance, least)
-        return replace(
-            self, distance=distance, view_angle=math.degrees(2 * math.atan(self.half_height / distance))
-        )
+        angle = math.degrees(2 * math.atan(self.half_height / distance))
+        return replace(self, distance=distance, view_angle=angle)
 
     def axes(self) -> tuple[Vector, Vector, Vector]:
         """Unit vectors to the right and up in the image, and forward."""
@@ -163,8 +151,7 @@ class State:
 
 
 PROGRAM = {"enabled": "", "lit": "light", "mode": "mode", "parallel": "orthographic", "clip": "clip"}
-"""Fields of a state of whose values each has a program of its own, and their controls. So has each form of
-transfer function."""
+"""Fields of which each value has a program of its own, as each form of transfer function has."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,5 @@
-"""How is a view of any size drawn by one compiled program?
-
-It is drawn in tiles of `SIDE` x `SIDE` rays. A coarse image is a few of them, stretched over the view, whose
-pixels need not be square; a fine one has a tile's pixel for each of the view's.
-"""
+"""Draws a view of any size by one program, in tiles of `SIDE` x `SIDE` rays: a coarse image is a few of them,
+stretched; a fine one has a tile's pixel for each of the view's."""
 
 import math
 from dataclasses import dataclass
@@ -25,22 +22,14 @@ from .state import PROGRAM, Scene, State
 
 
 SIDE = 128
-"""Rays along a side of a tile. Each tile searches for empty space again, which takes less time than its rays
-at this size, and a drag waits for one tile at most: of 192 rays, for up to 0.3 s on two cores."""
+"""Rays along a side of a tile: finding empty space takes less time than these, and a drag waits for few."""
 
 Pixels = UInt8[np.ndarray, "height width 3"]  # sRGB
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Tiles that cover a view.
-
-    Attributes:
-        columns: how many, from left to right.
-        rows: how many, from top to bottom.
-        size: (width, height), pixels of the image that they make together; those at the right and at the
-            lower edge may reach past it.
-    """
+    """Tiles that cover a view, of a `size` in pixels, which those at the right and lower edge may exceed."""
 
     columns: int
     rows: int
@@ -71,8 +60,7 @@ class Grid:
         return np.empty((self.rows * SIDE, self.columns * SIDE, 3), np.uint8)
 
     def canvas(self, pixels: Pixels) -> Pixels:
-        """An image that holds all tiles whole: another one, stretched smoothly, so that it has no
-        blocks beside finished tiles."""
+        """An image of whole tiles, filled with another one, stretched smoothly."""
         width, height = self.size
         stretched = np.asarray(Image.fromarray(pixels).resize(self.size, Image.Resampling.BILINEAR))
         beyond = (0, self.rows * SIDE - height), (0, self.columns * SIDE - width), (0, 0)
@@ -135,8 +123,7 @@ class TileRenderer:
         return rgba[..., :3] + (1 - rgba[..., 3:]) * self.background
 
     def picked(self, across: float, down: float) -> Float[np.ndarray, "3"] | None:
-        """The world point that is seen at a fraction of the view's width and height, at the mean depth; None
-        where nothing is."""
+        """World point seen at a fraction of width and height, at the mean depth; None where nothing is."""
         (width, height), least = self.state.size, 1e-3
         x, y = (2 * across - 1) * width / height, 1 - 2 * down
         camera = self.camera((x - least, x + least, y - least, y + least))
@@ -149,8 +136,7 @@ class TileRenderer:
 def estimated_error(
     image: Float[np.ndarray, "side side 3"], doubled: Float[np.ndarray, "side side 3"], quadrature: str
 ) -> float:
-    """RMSE of linear colours because of the step, from an image and one with steps twice as long: the error
-    is taken to fall with the square of the step, or with the step under "left"."""
+    """RMSE due to the step, by an image of twice the step: of order 2, or 1 under "left"."""
     return float(rmse(image, doubled)) / (1 if quadrature == "left" else 3)
 
 

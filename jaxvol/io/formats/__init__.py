@@ -1,8 +1,5 @@
-"""Loads volumes from files, with a reader chosen by the ending of the file's name, and saves them.
-
-A reader returns an `ImageRecord`: the array as it is stored, and what the file says of it. Nothing is
-unpickled, and the content of a file is checked against its header before memory is allocated for it.
-"""
+"""Loads volumes from files, by readers chosen by the name's ending, which return an `ImageRecord`. Nothing is
+unpickled, and content is checked against the header before memory is allocated."""
 
 import os
 from collections.abc import Callable, Sequence

@@ -54,8 +54,7 @@ def read_voxels(source: Path, shape: Any, dtype: Any, begin: int, packed: str = 
 
 
 def read_raw(path: Path, shape: Any = None, dtype: Any = None, offset: int = 0) -> ImageRecord:
-    """Reader for voxels without a header, x fastest. `shape`, `dtype`: as passed to `load`, unchecked, or by
-    the JSON file, or by the name. `offset`: bytes before the voxels."""
+    """Reader for voxels without a header, x fastest. Shape and type: given, by JSON or by name."""
     match = SCIVIS_NAME.search(path.name)
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
     given = {"shape": shape, "dtype": dtype}

@@ -73,10 +73,8 @@ def folders_below(folder: Path) -> list[Path]:
 
 
 def read_dicom(path: Path, spacing: Any = None, time: int | None = None) -> ImageRecord:
-    """Reader for a folder that holds one series, for one file of a series, whose others are in its folder,
-    for a file of several frames, and for the DICOMDIR of a disc with one series. `spacing`: of the volume, if
-    the caller knows it; for slices that do not say theirs. `time`: which one of several images at each place.
-    """
+    """Reader for a folder of one series, a file of a series, a file of several frames, and a DICOMDIR of one
+    series. `spacing`: for slices that do not say theirs. `time`: which of several images at each place."""
     if path.name.upper() == "DICOMDIR":
         folders = folders_below(path.parent)
         told = ", ".join(str(each.relative_to(path.parent)) for each in folders[:8]) or "no folder"
@@ -251,8 +249,7 @@ def _numbers(elements: Any, count: int, *names: str) -> np.ndarray:
 
 
 def _values(slices: list[Slice]) -> np.ndarray:
-    """Values [z, y, x], of a type that holds those of all slices: each may have a scale or a table of its
-    own."""
+    """Values [z, y, x] in a common type: each slice may have its own scale or table."""
     planes, pixels, last = [], np.empty(0), None
     for each in slices:
         with refusing(each.file):

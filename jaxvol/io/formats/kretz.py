@@ -1,11 +1,7 @@
-"""Reads Kretz ultrasound files (`.vol`, of GE Voluson scanners): voxels as acquired, and where they lie.
-
-A file is 16 bytes of magic and then items: group (u16), element (u16), length (u32), and `length` bytes, all
-little-endian. The format is not published; the items that are read (`MEANING`) are those of
-`vtkSlicerKretzFileReaderLogic` (SlicerHeart) and plooney/kretz, who found them out from files. `ToroidalMap`
-has the readers' place for every voxel but for a shift along z by a and, against SlicerHeart's RAS axes, the
-sign of y.
-"""
+"""Reads Kretz ultrasound files (`.vol`, of GE Voluson scanners): 16 bytes of magic, then items of group
+(u16), element (u16), length (u32) and bytes, little-endian. The format is not published; the items of
+`MEANING` are those of SlicerHeart's `vtkSlicerKretzFileReaderLogic` and plooney/kretz, and so are places but
+for a shift along z by a and, in SlicerHeart's RAS axes, the sign of y."""
 
 import math
 import struct
@@ -89,11 +85,10 @@ def _items(path: Path) -> dict[str, bytes]:
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
-            cut = (
-                f"is cut short: item {TOLD.get(tag, tag)} is to end at byte {end}, and it ends at {n_bytes}."
-            )
+            told = TOLD.get(tag, tag)
+            cut = f"is cut short: item {told} is to end at byte {end}, and it ends at {n_bytes}."
             check(end <= n_bytes, cut)
-            check(tag not in found, f"holds item {TOLD.get(tag, tag)} twice.")
+            check(tag not in found, f"holds item {told} twice.")
             if tag in MEANING:
                 found[tag] = stream.read(length)
             stream.seek(end)

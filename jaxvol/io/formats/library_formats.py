@@ -23,9 +23,8 @@ LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many tim
 
 
 def read_nifti(path: Path) -> ImageRecord:
-    """Reader by nibabel. The sform of a NIfTI places voxels if its code is positive, with its scales and
-    shears; else the qform, if its is; else `pixdim` is their spacing, along axes as in the file. Voxels are
-    read here: nibabel takes memory as headers say."""
+    """Reader by nibabel: placed by a NIfTI's sform, if its code is positive, else its qform, else `pixdim`
+    along the file's axes. Voxels are read here, since nibabel takes memory as headers say."""
     nibabel = library("nibabel", path)
     with nibabel.imageglobals.ErrorLevel(31):  # what it would mend
         image: Any = nibabel.load(path)
@@ -58,8 +57,7 @@ def read_nifti(path: Path) -> ImageRecord:
 
 
 def read_mrc(path: Path) -> ImageRecord:
-    """Reader, in ångström. Axes are those of MAPC, MAPR, MAPS; the place is `origin`, or else that of the
-    numbers of the first column, row and section."""
+    """Reader, in ångström; placed by `origin`, or by the first column, row and section."""
     with path.open("rb") as stream:
         size, extended = file_size(path), stream.read(96)[92:]
     longest = min(int.from_bytes(extended, order) for order in ("little", "big"))

@@ -1,8 +1,5 @@
-"""Reads formats of a header in text before voxels: NRRD (`.nrrd`, `.nhdr`) and MetaImage (`.mha`, `.mhd`).
-
-ITK, which also reads them, hangs on some headers, ends the process on others, and leaves voxels unset where a
-header understates the number of compressed bytes.
-"""
+"""Reads NRRD (`.nrrd`, `.nhdr`) and MetaImage (`.mha`, `.mhd`). On some headers, ITK hangs, ends the process,
+or leaves voxels unset."""
 
 import re
 from pathlib import Path
@@ -30,8 +27,7 @@ DOMAIN = "domain", "space", "???", "none"  # kinds of axes of space in NRRD
 
 
 def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> tuple[dict[str, str], int]:
-    """The fields of a header in text, and where in the file it ends: at an empty line, or behind the field
-    `last`. Refuses more than `MOST_FIELDS`, and fields of more than `longest` letters."""
+    """Fields of a header in text, and where it ends: at an empty line or behind the field `last`."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
         while last not in fields and (line := stream.readline(2**20).decode("utf-8", "replace").strip()):

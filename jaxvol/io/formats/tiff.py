@@ -75,8 +75,7 @@ def _series(path: Path, file: Any, tifffile: Any) -> ImageRecord:
 
 
 def _calibrate(record: ImageRecord, file: Any, first: Any, pixels: dict[str, Any]) -> None:
-    """Set the scale of a record as GDAL or ImageJ wrote it, and steps as ImageJ or OME did: ImageJ leaves out
-    a step of 1 along z."""
+    """Set scale (GDAL, ImageJ) and steps (ImageJ, which omits a step of 1 along z; OME) of a record."""
     if "GDAL_NODATA" in first.tags:
         record.missing = (float(first.nodata),)
     gdal = str(first.tags["GDAL_METADATA"].value) if "GDAL_METADATA" in first.tags else ""
@@ -137,9 +136,8 @@ def _words(file: Path) -> list[Any]:
 
 
 def read_slices(folder: Path) -> ImageRecord:
-    """Reader for a folder of files of one image each, in the order of the numbers in their names; where two
-    of these count, one is that of channels or times. Refuses images of different sizes or types, a number
-    that is missing, and names that count in another way."""
+    """Reader for a folder of one image each, in the order of numbers in their names, of which one may count
+    channels or times. Refuses images that differ, missing numbers, and names that count otherwise."""
     axes, counts, files = _counted(folder, slice_files(folder))
     record, planes = ImageRecord(None, axes), list[np.ndarray]()
     for file in files:

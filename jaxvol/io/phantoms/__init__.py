@@ -1,9 +1,5 @@
-"""Synthetic scenes that need no data files.
-
-Every phantom is the same scene at every resolution: shapes are signed distances and textures are waves, both
-in world units, and a shape's coverage falls off over a ramp of a fixed number of voxels. Drawn scenes have a
-file each; `canvas.py` and `shapes.py` are what they are drawn with.
-"""
+"""Synthetic scenes, the same at every resolution: shapes are signed distances and textures waves, in world
+units, and edges ramps of a fixed number of voxels. Drawn ones have a file each."""
 
 from collections.abc import Callable
 from typing import Any

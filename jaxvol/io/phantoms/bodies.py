@@ -1,10 +1,5 @@
-"""The `head`, `labels` and `engine` phantoms: a CT-like head, a frog with the organ that each node belongs
-to, and three cylinders in a row along x, with the crankshaft below them, cut open towards -y.
-
-`parts.json` has their shapes. Head and frog face -y; the head's crown points to +z, and so does the frog's
-back. Of the head, skin and bone are fields; everything else is painted over them. 1 world unit is about 14 cm
-there.
-"""
+"""The `head`, `labels` (a frog with organs) and `engine` phantoms, whose shapes `parts.json` has. Head and
+frog face -y; the head's crown and the frog's back point to +z. 1 world unit of the head is about 14 cm."""
 
 import json
 from functools import cache

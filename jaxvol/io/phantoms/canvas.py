@@ -1,9 +1,6 @@
-"""Rasterises shapes at the nodes of the cube [-1, 1]³, as values or as signed distances; and textures.
-
-A *field* is a canvas of signed distances, `FAR` where there is nothing, that shapes are joined to and carved
-from; a canvas of values is painted, later layers over earlier ones. A shape is evaluated only near its
-bounding box, in slabs small enough for the cache.
-"""
+"""Rasterises shapes at the nodes of the cube [-1, 1]³, near their boxes, in slabs for the cache; and
+textures. A *field* holds signed distances, `FAR` where nothing is; a canvas of values is painted, later
+layers over earlier ones."""
 
 from collections.abc import Callable, Iterable, Iterator
 
@@ -48,11 +45,8 @@ class Canvas:
             yield where, (self.axis[start:stop, None, None], y[None, :, None], z[None, None, :])
 
     def join(self, shapes: Shape | Iterable[Shape], blend: float = 0.0, sign: int = 1) -> None:
-        """Union with a field of distances; seams are rounded over a distance `blend`.
-
-        A shape's distance is evaluated up to 2 `blend` outside its box. Shapes that blend into it later need
-        it equally far out, so the first shape of a field is given the widest blend that follows.
-        """
+        """Union with a field of distances, seams rounded over `blend`, evaluated up to 2 `blend` outside the
+        box: give the first shape the widest blend that follows."""
         for shape in [shapes] if isinstance(shapes, Shape) else shapes:
             for where, at in self.slabs(shape.low, shape.high, 2 * blend + 2 * self.spacing):
                 self.values[where] = sign * smooth_min(sign * self.values[where], shape.distance(*at), blend)
@@ -68,8 +62,7 @@ class Canvas:
         width: float | None = None,
         grown: float = 0.0,
     ) -> None:
-        """Paint a number, or a function of (x, y, z, distance), over the present values, within a shape or
-        field that is `grown` by a distance. `width`: of the ramp at the boundary."""
+        """Paint a number or function of (x, y, z, distance) within a `grown` shape; `width`: of its ramp."""
         width = RAMP * self.spacing if width is None else width
         field = isinstance(shape, Canvas)
         for where, at in self.slabs() if field else self.slabs(shape.low, shape.high, width + grown):
@@ -91,8 +84,7 @@ def smooth_min(a: Block, b: Block, blend: float) -> Block:
 
 
 def plane_waves(rng: np.random.Generator, shortest: float, longest: float) -> Callable[..., Block]:
-    """A smooth random texture, the same at every resolution: a sum of 32 plane waves with wavelengths of a
-    given range, variance 1."""
+    """A random texture, the same at every resolution: 32 plane waves between two wavelengths, variance 1."""
     direction = rng.normal(size=(32, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     wave_vector = 2 * np.pi * direction / rng.uniform(shortest, longest, (32, 1))

@@ -1,8 +1,4 @@
-"""Shapes, as signed distances with bounding boxes.
-
-Distances are negative inside and in world units: exact for round shapes, and to first order at the surface
-for the others.
-"""
+"""Shapes, as signed distances (negative inside, exact if round, else to first order) with bounding boxes."""
 
 from collections.abc import Callable, Sequence
 from functools import reduce

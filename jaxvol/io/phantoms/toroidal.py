@@ -1,8 +1,5 @@
-"""Synthetic ultrasound volumes of known scenes, as acquired by a swept probe.
-
-The scene lies in the world, in mm, in front of a probe whose motor axis is the x axis and whose middle beam
-points along z. It is sampled at the nodes of the probe's beams, and speckle is applied.
-"""
+"""Synthetic ultrasound volumes of scenes in mm, sampled with speckle at the nodes of a swept probe, whose
+motor axis is the x axis and whose middle beam points along z."""
 
 from collections.abc import Iterable
 from functools import reduce
@@ -143,8 +140,7 @@ def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
 
 
 def _joined(part: str, at: tuple[Block, Block, Block], blend: float) -> Block:
-    """Distance to the union of the shapes of a part of the fetus, with rounded seams. Of paired parts, those
-    at y > 0 are listed."""
+    """Distance to a part of the fetus, its shapes blended; of pairs, those at y > 0 are listed."""
     distances = (shape.distance(*at) for shape in shapes_of(parts()[f"fetus {part}"]))
     return reduce(lambda a, b: smooth_min(a, b, blend), distances)
 

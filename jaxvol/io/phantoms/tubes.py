@@ -1,8 +1,5 @@
-"""The `colon` and `vessels` phantoms: a winding tube with folds and polyps, and a branching tree.
-
-The tree's branches feed points scattered in a crown above the root. A branch covers part of the way to the
-points it feeds and splits them between two children, whose radii follow Murray's law.
-"""
+"""The `colon`, a winding tube with folds and polyps, and `vessels`, a tree that feeds points in a crown:
+branches cover part of the way, and split the points between two children of radii by Murray's law."""
 
 from itertools import pairwise
 from typing import Any

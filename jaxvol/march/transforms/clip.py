@@ -105,8 +105,7 @@ class HalfSpace(NamedTuple):
         return dot(self.normal, (x - px, y - py, z - pz))
 
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which a line enters and leaves, infinite where it does not; of a line that is outside,
-        the first exceeds the second."""
+        """Distances at which a line enters and leaves, or ±infinity; outside, the first is greater."""
         height, rate = self.height(origin), dot(self.normal, direction)
         # Smaller rates count as parallel. Not 0: the derivative of 1/x, 1/x², must be finite.
         parallel = jnp.abs(rate) < float(jnp.finfo(rate.dtype).tiny) ** 0.25
@@ -117,8 +116,7 @@ class HalfSpace(NamedTuple):
         return near, far
 
     def over(self, grid: Occupancy) -> tuple[Float[Array, "cx cy cz"], Scalar]:
-        """Heights of the middles of a grid's cells, and how far cells reach from there along the normal, with
-        a margin for rounding."""
+        """Heights of cells' middles, and how far cells reach along the normal, with a rounding margin."""
         shape = grid.occupied.shape
         x, y, z = (
             low + size * (jnp.arange(n, dtype=size.dtype) + 0.5)
@@ -181,8 +179,7 @@ class _Clipped(Space):
         return self.inner.path(entry, direction)
 
     def _inside(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
-        """Distances at which a line enters and leaves what is inside all sides; the first is at least the
-        second if it does not."""
+        """Distances at which a line enters and leaves all sides; if not, the first is at least the second."""
         nears, fars = zip(*(side.interval(origin, direction) for side in self.sides), strict=True)
         return reduce(_later, nears), reduce(_earlier, fars)
 

@@ -23,9 +23,8 @@ Pattern = Literal["white", "blue"]
 
 
 class Noise(eqx.Module):
-    """One random number in [0, 1) per pixel, which depends only on seed, stream and pixel: `"white"`,
-    independent of its neighbours, or `"blue"`, from a repeated tile of 128 x 128 without low frequencies.
-    Numbers of different streams are independent."""
+    """One random number in [0, 1) by seed, stream and pixel: `"white"`, or `"blue"`, from a repeated tile of
+    128 x 128 without low frequencies. Streams are independent."""
 
     seed: UInt32[Array, ""]
     tile: Float[Array, "side side"] | None

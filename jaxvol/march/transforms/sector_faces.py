@@ -1,8 +1,5 @@
-"""Where does a line enter a swept sector, where does it leave it, and where in between is it outside?
-
-Its faces are two tori, two cones and two planes. The distance to each of them has a closed form, so that each
-crossing is approached by steps that cannot pass it (sphere tracing), which become Newton's steps.
-"""
+"""Where a line enters and leaves a swept sector, and its gaps: faces are two tori, cones and planes, of known
+distance, approached by safe steps (sphere tracing), which become Newton's."""
 
 import math
 from functools import partial, reduce
@@ -13,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..._util.vec3 import Scalar, Vec3, along
+from ..._util.vec3 import Scalar, Vec3, along, root
 from ...scene.space import Gap, slab_interval
 from ...xla.platform import while_loop
 
@@ -90,8 +87,7 @@ class SectorFaces(eqx.Module):
     def _crossing(
         self, origin: Vec3, direction: Vec3, begin: Scalar, reach: Scalar, sign: int, *, inside: bool
     ) -> tuple[Scalar, Bool[Array, ""]]:
-        """Where a line ceases to be `inside`, or outside, from `begin` over `reach` along `sign` × its
-        direction, and whether it does; without a gradient."""
+        """Where a line stops being `inside`, or outside, along `sign` × direction, and whether."""
         faces, origin, direction = jax.lax.stop_gradient((self, origin, direction))
         begin, reach, tolerance = jax.lax.stop_gradient((begin, reach, self._tolerance))
 
@@ -184,6 +180,4 @@ def _farthest(to_faces: list[ToFace]) -> ToFace:
 
 def hypot(a: Scalar, b: Scalar) -> Scalar:
     """sqrt(a² + b²), with gradient 0 at the origin."""
-    square = a * a + b * b
-    away = square > 0
-    return jnp.where(away, jnp.sqrt(jnp.where(away, square, 1)), 0)
+    return root(a * a + b * b)

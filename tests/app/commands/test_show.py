@@ -78,7 +78,7 @@ def test_labels_are_shown_in_what_is_around_them(volume_file, tmp_path, drawn):
     assert data[8, 12, 12] == data[16, 12, 12] == np.max(given.data)
     assert kinds[[8, 16], 12, 12].tolist() == [1, 2]
     np.testing.assert_array_equal(data[kinds == 0], np.asarray(given.data)[kinds == 0])
-    like = ["render", "--like", str(tmp_path / "x.png"), "-o", str(tmp_path / "y.png")]
+    like = ["render", str(volume_file), "--like", str(tmp_path / "x.png"), "-o", str(tmp_path / "y.png")]
     assert main(like) == 2  # it may name no other file
     assert main([*like, "--labels", str(tmp_path / "labels.npy")]) == 0
     np.testing.assert_array_equal(imread(tmp_path / "x.png"), imread(tmp_path / "y.png"))
