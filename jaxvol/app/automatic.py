@@ -12,7 +12,7 @@ from jaxtyping import Float, Shaped
 from .._util.checks import described
 from .._util.image_record import warn_caller
 from .._util.srgb import from_srgb
-from .._util.voxels import is_flat
+from .._util.voxels import faces_of, is_flat
 from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
 from ..scene.presets import colormap
@@ -119,11 +119,6 @@ def unit_of(volume: Volume) -> float:
     across = (np.array(volume.shape) - 1) * np.asarray(volume.spacing)
     across = across if volume.direction is None else np.asarray(volume.direction) @ across
     return float(np.linalg.norm(across)) / 100
-
-
-def faces_of(data: Shaped[np.ndarray, "nx ny nz"]) -> Shaped[np.ndarray, " n"]:
-    """The values on a volume's six faces."""
-    return np.concatenate([data.take(end, axis).ravel() for axis in range(3) for end in (0, -1)])
 
 
 def preset_unit(volume: Any) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from .._util.checks import described, finite_array, flag, integer, number
 from .._util.memory import require_room
 from .._util.srgb import linear_color
+from .._util.voxels import faces_of
 from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
 from ..compositing.isosurface import Isosurface
@@ -25,7 +26,7 @@ from ..march.march import March, Transform
 from ..march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
 from ..planning import Plan, plan
 from ..render import PLANNED, render
-from ..scene.camera import Camera
+from ..scene.camera import Camera, image_size
 from ..scene.presets import SHADED, colormap, fitted_range, preset, preset_name
 from ..scene.rendering import Rendering
 from ..scene.several import with_others
@@ -35,7 +36,6 @@ from .automatic import (
     SAMPLED,
     automatic_transfer,
     brightest_mean,
-    faces_of,
     labels_if_any,
     labels_shown,
     preset_unit,
@@ -125,9 +125,8 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
     """The scene of the options (`DEFAULTS`, `recorded_transfer`, and `file`, a path or `Volume`) without a
     march. `orbit`: the views of a camera that turns, in which the automatic camera shows all that is
     visible."""
-    width, height = np.broadcast_to(getattr(options.camera, "size", options.size), 2).tolist()
-    if width * height < 2**31:  # more are refused otherwise
-        require_room(width * height * PIXEL, f"size {width} x {height}")
+    width, height = image_size(getattr(options.camera, "size", options.size))
+    require_room(width * height * PIXEL, f"size {width} x {height}")
     is_surface, background = options.compositing == "isosurface", background_of(options)
     if is_surface == (options.isovalue is None):
         raise ValueError("compositing isosurface and isovalue go together; one is missing.")

@@ -78,7 +78,7 @@ class Camera(eqx.Module):
         window: Arrayable | None = None,
         corner: Arrayable | None = None,
     ):
-        self.size = width, height = _image_size(size)
+        self.size = width, height = image_size(size)
         self.focal_point = _moderate("focal_point", finite_array("focal_point", focal_point, (3,)))
         self.position = require(
             _moderate("position", finite_array("position", position, (3,))),
@@ -144,7 +144,7 @@ class Camera(eqx.Module):
             for name, vector in (("direction", direction), ("view_up", view_up))
         )
         view_angle = number("view_angle", view_angle, above=0, below=180, unit="degrees")
-        width, height = _image_size(size)
+        width, height = image_size(size)
         cells = np.array(volume.shape, volume.spacing.dtype) - 1
         place, aspect = (volume.origin, volume.spacing, volume.direction, cells), min(1.0, width / height)
         with np.errstate(over="ignore"):  # refused below
@@ -185,7 +185,7 @@ class Camera(eqx.Module):
         )
         message = "R must be a rotation, whose rows are orthonormal and right-handed; got {got}."
         R, t = require(finite_array("R", R, (3, 3)), _is_rotation, message), finite_array("t", t, (3,))
-        size = _image_size(size)
+        size = image_size(size)
         place, window = _calibrated(K, R, t, np.array(size, K.dtype))
         return cls(*place, view_angle=90, size=size, window=window)
 
@@ -226,7 +226,7 @@ class Camera(eqx.Module):
         )
         pitch = finite_array("pixel_pitch", pixel_pitch, (2,) if np.shape(pixel_pitch) else ())
         pitch = require(pitch, lambda p: p > 0, "pixel_pitch must be greater than 0; got {got}.")
-        size, parallel = _image_size(size), flag("parallel", parallel)
+        size, parallel = image_size(size), flag("parallel", parallel)
         place, window = _facing(source, center, right, down, pitch, np.array(size, source.dtype), parallel)
         scale = 1 if parallel else None
         return cls(*place, view_angle=90, size=size, window=window, parallel_scale=scale)
@@ -497,7 +497,7 @@ def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
     return require(point, lambda p: abs(p) < most, f"{message}greater unit of length. Got {{got}}.")
 
 
-def _image_size(size: Any) -> tuple[int, int]:
+def image_size(size: Any) -> tuple[int, int]:
     size = (size, size) if isinstance(size, int) and not is_flag(size) else size
     try:
         width, height = (int(n) for n in size)

@@ -253,6 +253,19 @@ def test_other_volumes_are_not_taken_for_labels():
         jv.labels_shown(jv.Volume(floats))
 
 
+def test_grey_values_in_a_fill_value_that_is_not_the_lowest_are_no_labels():
+    places = np.meshgrid(*(np.linspace(-1, 1, n) for n in (18, 15, 8)), indexing="ij")
+    ball = np.clip(
+        1.3 - np.sqrt(sum((x / s) ** 2 for x, s in zip(places, (0.7, 0.55, 0.4), strict=True))), 0, 1
+    )
+    data = np.full((18, 15, 24), 3, np.uint8)
+    data[:, :, 8:16] = (250 * ball).astype(np.uint8)
+    assert labels_if_any(jv.Volume(data)) is None
+    segments = np.full((18, 15, 24), 3, np.uint8)
+    segments[2:16, 2:13, 8:16], segments[2:8, 2:13, 9:15] = 0, 7
+    assert labels_if_any(jv.Volume(segments)) is not None
+
+
 def test_the_automatic_camera_is_upright_and_as_near_as_what_is_visible_allows():
     data = np.asarray(ball(0.5, 0.2).data)
     transfer, stand = jv.automatic_transfer(jv.Volume(data)), data

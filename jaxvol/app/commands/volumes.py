@@ -86,7 +86,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _numbers(values: Any, between: str = " ") -> str:
-    return between.join(f"{value:.6g}" for value in np.asarray(values))
+    return between.join(f"{value + 0:.6g}" for value in np.asarray(values))  # 0 in place of -0
 
 
 def add_info(parser: Parser) -> None:

@@ -135,7 +135,7 @@ def read_record(
     with nullcontext() if folder else refusing(path):  # what others know tells its own faults
         record = reader(path)
     record.what = f"path: {path}" if record.what == "data" else record.what
-    record.format = record.format or lower.rpartition(".")[2] or "folder"
+    record.format = record.format or lower.removesuffix(".gz").rpartition(".")[2] or "folder"
     return record
 
 

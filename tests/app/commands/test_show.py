@@ -115,6 +115,7 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn, monkeypatc
         (5, {}, "volume must be a jaxvol Volume; got 5"),
         (volume, {"transfer": "hot"}, "transfer must be .*; got 'hot'"),
         (volume, {"camera": (1, 2, 3)}, r"camera must have shape \(6,\)"),
+        (volume, {"size": "big"}, r"size must be \(width, height\) in whole pixels"),
         (volume, {"camera": camera, "size": 9}, "camera is a Camera, which has its own size; leave size out"),
         (volume, {"shade": "no"}, "shade must be True or False; got 'no'"),
         (volume, {"memory": "512M"}, "memory is of files; volume is a Volume"),
