@@ -71,11 +71,11 @@ def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
 def _itk(image: Any) -> ImageRecord:
     """The record of an image of SimpleITK, or of the package `itk`."""
     simple = hasattr(image, "GetDimension")
-    n = image.GetDimension() if simple else image.GetImageDimension()
-    ensure(n == 3, f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
     library = sys.modules.get("SimpleITK" if simple else "itk")
     if library is None:  # a class that only looks like theirs
         raise ValueError(f"data must be an image of SimpleITK or itk; got {type(image).__name__}.")
+    n = image.GetDimension() if simple else image.GetImageDimension()
+    ensure(n == 3, f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
     data = (library.GetArrayFromImage if simple else library.array_from_image)(image)
     turn = np.asarray(image.GetDirection() if simple else library.array_from_matrix(image.GetDirection()))
     steps, axes = dict(zip("xyz", map(float, image.GetSpacing()), strict=True)), "zyxs"[: data.ndim]

@@ -1,5 +1,7 @@
 """Are images of xarray, nibabel, SimpleITK and VTK taken with their axes and their place?"""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -86,3 +88,11 @@ def test_images_of_other_libraries_are_taken_with_their_place(made):
         np.testing.assert_allclose(volume.origin, PLACE[1], rtol=1e-5)
         np.testing.assert_allclose(np.asarray(volume.direction), PLACE[2], atol=1e-6)
     np.testing.assert_array_equal(jv.Volume(made(DATA), (3, 3, 3), direction=np.eye(3)).spacing, (3, 3, 3))
+
+
+def test_what_only_looks_like_an_image_of_itk_is_refused(monkeypatch):
+    monkeypatch.delitem(sys.modules, "itk", raising=False)
+    names = "GetSpacing", "GetOrigin", "GetDirection", "GetNumberOfComponentsPerPixel"
+    image = type("itkImageF3", (), dict.fromkeys(names, lambda self: None))()
+    with pytest.raises(ValueError, match="data must be an image of SimpleITK or itk; got itkImageF3"):
+        jv.Volume(image)
