@@ -47,13 +47,18 @@ def grid_of(affine: Any) -> dict[str, Any]:
     return {"steps": steps, "origin": origin[:, 0], "direction": turn}
 
 
+def fields_of(header: Any) -> Any:
+    """The names in a header of nibabel; that of MINC tells none."""
+    return header.keys() if hasattr(header, "keys") else ()
+
+
 def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
     """Record of a nibabel image, whose world is RAS. A NIfTI without sform and qform keeps the file's axes
     from 0 on, as by SimpleITK. `stored`: numbers read before; without, a fourth axis is channels."""
     header, proxy = image.header, image.dataobj
     data = proxy.get_unscaled() if stored is None and hasattr(proxy, "get_unscaled") else stored
     data = np.asanyarray(proxy if data is None else data)
-    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in header]
+    codes = [int(header[name]) for name in ("sform_code", "qform_code") if name in fields_of(header)]
     place: dict[str, Any] = {"convention": "RAS"} | grid_of(image.affine)
     if codes and not any(codes):
         place = {"steps": dict(zip("xyz", map(float, header["pixdim"][1:4]), strict=True))}

@@ -11,7 +11,7 @@ import numpy as np
 from ..._util.checks import shortened
 from ..._util.files import MOST_COMPRESSED, Refused, check, check_size, file_size, library
 from ..._util.image_record import ImageRecord
-from ..._util.named_axes import nibabel_record, record_of
+from ..._util.named_axes import fields_of, nibabel_record, record_of
 from .arrays import check_volume, read_voxels
 
 
@@ -28,15 +28,16 @@ def read_nifti(path: Path) -> ImageRecord:
     nibabel = library("nibabel", path)
     with nibabel.imageglobals.ErrorLevel(31):  # what it would mend
         image: Any = nibabel.load(path)
-    proxy, header, stored, shape = image.dataobj, image.header, image.get_data_dtype(), image.shape
-    files, raw = image.file_map, header
-    if "pixdim" in header:  # as it is in the file
+    proxy, header, stored = image.dataobj, image.header, image.get_data_dtype()
+    shape = tuple(map(int, image.shape))
+    files, raw, fields = image.file_map, header, fields_of(header)
+    if "pixdim" in fields:  # as it is in the file
         with nibabel.openers.ImageOpener(files.get("header", files["image"]).filename) as stream:
             raw = type(header).from_fileobj(stream, check=False)
-    in_sform = "sform_code" in header and header["sform_code"] > 0
-    pixdim = np.ones(3) if in_sform or "pixdim" not in header else raw["pixdim"][1:4]
-    offset = raw["vox_offset"] if "vox_offset" in header else 0
-    whole = "header" in files or "magic" not in header or raw["magic"].tolist()[:2] == b"n+"
+    in_sform = "sform_code" in fields and header["sform_code"] > 0
+    pixdim = np.ones(3) if in_sform or "pixdim" not in fields else raw["pixdim"][1:4]
+    offset = raw["vox_offset"] if "vox_offset" in fields else 0
+    whole = "header" in files or "magic" not in fields or raw["magic"].tolist()[:2] == b"n+"
     for name, holds, expected in (
         ("pixdim", np.all(pixdim > 0) and np.all(np.isfinite(pixdim)), "positive lengths"),
         ("vox_offset", 0 <= offset < 2**31, "the byte at which voxels begin"),

@@ -146,3 +146,41 @@ def test_nibabel_reads_what_is_saved(tmp_path):
             np.testing.assert_allclose(image.get_qform()[:3], expected, atol=1e-4)
         np.testing.assert_array_equal(image.dataobj, volume.data)
     assert image.header["qform_code"] == 0  # which cannot hold a shear
+
+
+def minc(path, data, affine):
+    """A file of MINC 2 as its own tools write it: axes z, y, x, and a range of values."""
+    h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install jaxvol[test]")
+    with h5py.File(path, "w") as file:
+        axes, image = (file.create_group(f"minc-2.0/{name}") for name in ("dimensions", "image/0"))
+        for i in (2, 1, 0):
+            step = np.linalg.norm(affine[:3, i])
+            axis = axes.create_dataset(f"{'xyz'[i]}space", data=np.int32(0))
+            start = float(affine[:3, i] @ affine[:3, 3] / step)
+            told = {"length": np.int32(data.shape[i]), "start": start, "step": step}
+            axis.attrs.update(told | {"direction_cosines": affine[:3, i] / step})
+        voxels = image.create_dataset("image", data=data.T)
+        voxels.attrs["dimorder"] = np.bytes_("zspace,yspace,xspace")
+        voxels.attrs["valid_range"] = np.array([data.min(), data.max()], float)
+        for name, value in (("image-min", data.min()), ("image-max", data.max())):
+            image.create_dataset(name, data=float(value)).attrs["dimorder"] = np.bytes_("")
+
+
+@pytest.mark.parametrize("ending", [".mnc", ".mgz", ".mgh", ".img"])
+def test_other_formats_of_nibabel_are_read_where_it_reads_them(tmp_path, ending):
+    data = np.random.default_rng(0).integers(-100, 1000, (5, 4, 3)).astype(np.int16)
+    data[3, 1, 2] = 2000
+    affine = np.array([[0.5, 0, 0, 1], [0, 1.5, 0, -5], [0, 0, 2, 10], [0, 0, 0, 1]])
+    path = tmp_path / f"a{ending}"
+    if ending == ".mnc":
+        minc(path, data, affine)
+    else:
+        kind = nibabel.Spm99AnalyzeImage if ending == ".img" else nibabel.MGHImage
+        nibabel.save(kind(data, affine), path)
+    known, volume = nibabel.load(path), load(path)
+    np.testing.assert_allclose(np.sort(np.ravel(volume.data)), np.sort(np.ravel(known.dataobj)), atol=1e-3)
+    place = known.affine @ (*np.unravel_index(np.argmax(known.dataobj), known.shape), 1)
+    turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
+    found = np.unravel_index(np.argmax(volume.data), volume.shape)
+    found = np.asarray(volume.origin) + turn @ (np.asarray(volume.spacing) * found)
+    np.testing.assert_allclose(found, (-place[0], -place[1], place[2]), atol=1e-4)
