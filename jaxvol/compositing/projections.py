@@ -31,9 +31,6 @@ class Extreme(Selection[Chosen]):
 
     thickness: Float[Array, ""]
 
-    def __init__(self, thickness: Any = 1.0):
-        self.thickness = number("thickness", thickness, above=0)
-
     @abstractmethod
     def score(self, value: Scalar) -> Scalar:
         """Score; the maximum wins."""
@@ -86,6 +83,9 @@ class Maximum(Extreme):
         ValueError: for a thickness that is not a positive finite number.
     """
 
+    def __init__(self, thickness: Any = 1.0):
+        self.thickness = number("thickness", thickness, above=0)
+
     def score(self, value: Scalar) -> Scalar:
         return value
 
@@ -105,6 +105,9 @@ class Minimum(Extreme):
     Raises:
         ValueError: for a thickness that is not a positive finite number.
     """
+
+    def __init__(self, thickness: Any = 1.0):
+        self.thickness = number("thickness", thickness, above=0)
 
     def score(self, value: Scalar) -> Scalar:
         return -value
