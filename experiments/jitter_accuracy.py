@@ -1,10 +1,11 @@
-"""What do jitter and alignment do to the error, at different step lengths?
+"""What do jitter and alignment do to the error, at different step lengths, lit and pre-integrated?
 
 *By step*: five marches on two scenes, a block whose left half is cut by the box's faces and whose right half
 is an inclined plane (its comb of rings has a known frequency), and the head phantom, its crown cut off, in
 perspective. Measured against a converged image are wood grain, noise on cut faces and the whole error (RMSE);
-also, the time of a frame over that of ray casting. The head's wood grain is measured off its cut face, where
-empty-space jitter must not act, and again off where rays leave it, too, which alone alignment changes.
+also, the samples that are taken, over those of ray casting (`overhead` has times). The head's wood grain is
+measured off its cut face, where empty-space jitter must not act, and again off where rays leave it, too,
+which alone alignment changes.
 
 *Conditions*: the same on skin, of the phantom and of CT as in the pictures of Kye's Fig. 9, unlit, by Phong's
 shading (the paper's base method shades), pre-integrated, and lit with leaps and early ends.
@@ -22,7 +23,6 @@ plain jitter can be nearer to the truth in the mean, or farther; it is noisier i
 import textwrap
 from argparse import Namespace
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,7 +30,7 @@ import numpy as np
 import jaxvol as jv
 from jaxvol.metrics import boundary_noise, comb_frequency, wood_grain_energy
 
-from . import charts, harness, marches, timing
+from . import charts, harness, marches
 from .harness import entered, experiment, frame, grain_off, left
 from .pictures import kye
 from .scenes import Scene, cropped
@@ -53,13 +53,14 @@ ENDS = jv.SpaceLeaping(), jv.EarlyTermination(kye.ENDED)
 CONDITIONS: dict[str, tuple[Any, ...]] = {name: (*how, ()) for name, how in kye.CONDITIONS.items()}
 CONDITIONS["lit, leaps and early ends"] = (*kye.CONDITIONS["lit"], ENDS)
 """Lighting, quadrature, and transforms of all marches."""
+ROUNDING = 1e-12
 LEAST = 1e-7
 """Energy at which the chart of conditions begins."""
 PANELS = {
     "wood grain": "wood grain off the cut face (where above 0)",
     "boundary noise": "noise on the cut face (where above 0)",
     "rmse off the face": "RMSE off the cut face",
-    "time": "time / ray casting",
+    "samples / ray casting": "samples / ray casting",
 }
 
 
@@ -94,45 +95,52 @@ def head(resolution: int, size: int) -> Faced:
     volume = cropped(jv.phantom("head", resolution), (0, 0, 0), (1, 1, 0.62))
     camera = jv.Camera.looking_at(volume, (0.5, -1, 0.75), size=(size, size)).zoom(1.7, (0.52, 0.46))
     scene = Scene(volume, jv.preset("head", unit_distance=0.01), camera, float(volume.spacing[0]))
+    return skin(scene)
+
+
+def skin(scene: Scene) -> Faced:
+    """A scene whose wood grain is that off where rays enter, and off where they leave, within material."""
     face, exits = entered(scene), left(scene)
-    return Faced(scene, lambda error, step: grains(error, face, exits), face)
+
+    def grain(error: np.ndarray, _: float) -> dict[str, float]:
+        both = grain_off(error, face | exits)
+        return {"wood grain": grain_off(error, face), "wood grain off both faces": both}
+
+    return Faced(scene, grain, face)
 
 
-def grains(error: np.ndarray, face: np.ndarray, exits: np.ndarray) -> dict[str, float]:
-    """Wood grain off where rays enter, and off where they leave, within material."""
-    return {
-        "wood grain": grain_off(error, face),
-        "wood grain off both faces": grain_off(error, face | exits),
-    }
+def by_march(
+    of: Faced, step: float, truth: np.ndarray, how: tuple[Any, ...], seed: int
+) -> dict[str, dict[str, Any]]:
+    """Measures of the image of every march, at a step in voxels."""
+    (scene, grain, face), (lighting, quadrature, more) = of, how
+    length, rows, plain = step * scene.step, {}, 0
+    for name in METHODS:
+        march = jv.March(length, (*marches.transforms(name, seed), *more), quadrature)
+        rendering = frame(scene, march, lighting)
+        error = colors(rendering) - truth
+        samples = int(np.sum(np.asarray(rendering.samples), dtype=np.int64))
+        plain = plain or samples
+        rows[name] = {
+            **grain(error, length),
+            "boundary noise": boundary_noise(error, face),
+            "rmse": float(np.sqrt(np.mean(error**2))),
+            "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
+            "samples / ray casting": samples / plain,
+        }
+    return rows
 
 
-def measure(of: Faced, chosen: Namespace) -> list[dict[str, Any]]:
+def colors(rendering: jv.Rendering) -> np.ndarray:
+    return np.asarray(rendering.rgba[..., :3], np.float64)
+
+
+def by_step(of: Faced, chosen: Namespace) -> list[dict[str, Any]]:
     """A row for each step and march."""
-    scene, grain, face = of
-
-    def image(march: jv.March) -> np.ndarray:
-        return np.asarray(frame(scene, march).rgba[..., :3], np.float64)
-
-    truth, rows = image(marches.converged(min(chosen.steps) * scene.step)), []
+    truth, rows = colors(frame(of.scene, marches.converged(min(chosen.steps) * of.scene.step))), []
     for step in chosen.steps:
-        length = step * scene.step
-        under = {name: jv.March(length, marches.transforms(name, chosen.seed)) for name in METHODS}
-        drawn = {name: partial(frame, scene, march) for name, march in under.items()}
-        seconds = timing.interleaved(drawn, chosen.repetitions)
-        for name, march in under.items():
-            error = image(march) - truth
-            rows.append(
-                {
-                    "step": step,
-                    "march": name,
-                    **grain(error, length),
-                    "boundary noise": boundary_noise(error, face),
-                    "rmse": float(np.sqrt(np.mean(error**2))),
-                    "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
-                    "seconds": timing.median(seconds[name]),
-                    "time": timing.ratio(seconds[name], seconds[marches.PLAIN]),
-                }
-            )
+        found = by_march(of, step, truth, CONDITIONS["unlit"], chosen.seed)
+        rows += [{"step": step, "march": name, **row} for name, row in found.items()]
     return rows
 
 
@@ -147,36 +155,11 @@ def under_conditions(chosen: Namespace) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for said, view in kye.views("head", pictured(chosen)).items():
         scene = view.scenes(pictured(chosen))["zoomed"]
-        rows = found[said.rstrip(", ") or "phantom head"] = {}
-        face, exits = entered(scene), left(scene)
+        of, rows = skin(scene), found.setdefault(said.rstrip(", ") or "phantom head", {})
         for condition, how in CONDITIONS.items():
-            rows[condition] = conditioned(scene, how, face, exits, chosen)
+            truth = colors(frame(scene, marches.converged(scene.step), how[0]))
+            rows[condition] = by_march(of, 1.0, truth, how, chosen.seed)
     return found
-
-
-def conditioned(
-    scene: Scene, how: tuple[Any, ...], face: np.ndarray, exits: np.ndarray, chosen: Namespace
-) -> dict[str, Any]:
-    """Measures of all marches, against a converged image in the same light."""
-    lighting, quadrature, more = how
-
-    def image(march: jv.March) -> np.ndarray:
-        return np.asarray(frame(scene, march, lighting).rgba[..., :3], np.float64)
-
-    of = {n: jv.March(scene.step, (*marches.transforms(n, chosen.seed), *more), quadrature) for n in METHODS}
-    draws = {n: partial(jv.render, *scene[:3], m, lighting=lighting, outputs="rgba") for n, m in of.items()}
-    seconds = timing.interleaved({n: lambda d=d: d().rgba for n, d in draws.items()}, chosen.repetitions)
-    truth = image(marches.converged(scene.step))
-    rows: dict[str, Any] = {}
-    for name, march in of.items():
-        error = image(march) - truth
-        rows[name] = {
-            **grains(error, face, exits),
-            "boundary noise": boundary_noise(error, face),
-            "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
-            "time": timing.ratio(seconds[name], seconds[marches.PLAIN]),
-        }
-    return rows
 
 
 def aligned_shares(chosen: Namespace) -> dict[str, Any]:
@@ -198,12 +181,12 @@ def alignment_by_quadrature(of: Faced, chosen: Namespace) -> dict[str, Any]:
     """At the shortest step: wood grain, and the mean error of the pixels that alignment changes."""
     scene, grain, _ = of
     step = min(chosen.steps) * scene.step
-    truth, exits = frame(scene, marches.converged(step)).rgba[..., :3], left(scene)
+    truth, exits = colors(frame(scene, marches.converged(step))), left(scene)
     found: dict[str, Any] = {}
     for quadrature in ("left", "midpoint"):
         for name in (marches.PLAIN, marches.ALIGNED):
-            image = frame(scene, jv.March(step, marches.transforms(name), quadrature)).rgba[..., :3]
-            error = np.asarray(image, np.float64) - np.asarray(truth, np.float64)
+            march = jv.March(step, marches.transforms(name), quadrature)
+            error = colors(frame(scene, march)) - truth
             mean = {"mean error where rays leave through material": float(error[exits].mean())}
             found.setdefault(quadrature, {})[name] = grain(error, step) | mean
     return found
@@ -215,11 +198,12 @@ def draw(result: dict[str, Any]) -> Any:
     for line, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for panel, (key, label) in zip(line, PANELS.items(), strict=True):
             for name, style in METHODS.items():
-                by_step = {row["step"]: row[key] for row in rows if row["march"] == name}
-                found = [each["median"] if key == "time" else each for each in by_step.values()]
-                panel.plot(list(by_step), found, style, marker=".", markersize=6, label=name)
+                found = {row["step"]: row[key] for row in rows if row["march"] == name}
+                # what is below is rounding
+                shown = [value if value > ROUNDING else np.nan for value in found.values()]
+                panel.plot(list(found), shown, style, marker=".", markersize=6, label=name)
             panel.set(title=label, xlabel="step, voxels", xscale="log")
-            if key != "time":
+            if key != "samples / ray casting":
                 panel.set_yscale("log", nonpositive="mask")
                 charts.plain_numbers(panel)
             charts.numbered(panel, STEPS, [f"{step:g}" for step in STEPS])
@@ -250,11 +234,10 @@ more = {"jitter_conditions": draw_conditions}
 
 
 @experiment(
-    repetitions=7,
     size=256,
     resolution=160,
     steps=STEPS,
-    quick={"size": 96, "resolution": 48, "repetitions": 1, "steps": (2.3, 1.9)},
+    quick={"size": 96, "resolution": 48, "steps": (2.3, 1.9)},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     faced = {
@@ -263,7 +246,7 @@ def main(chosen: Namespace) -> dict[str, Any]:
     }
     return {
         "note": NOTE,
-        "by step": {name: measure(of, chosen) for name, of in faced.items()},
+        "by step": {name: by_step(of, chosen) for name, of in faced.items()},
         "conditions": under_conditions(chosen),
         "aligned pixels": aligned_shares(chosen),
         "alignment by quadrature": alignment_by_quadrature(faced["head, perspective"], chosen),
