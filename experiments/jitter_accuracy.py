@@ -57,8 +57,8 @@ ROUNDING = 1e-12
 LEAST = 1e-7
 """Energy at which the chart of conditions begins."""
 PANELS = {
-    "wood grain": "wood grain off the cut face (where above 0)",
-    "boundary noise": "noise on the cut face (where above 0)",
+    "wood grain": "wood grain off the face (above 0)",
+    "boundary noise": "noise on the cut face (above 0)",
     "rmse off the face": "RMSE off the cut face",
     "samples / ray casting": "samples / ray casting",
 }

@@ -112,7 +112,9 @@ def draw(result: dict[str, Any]) -> Any:
         rows = [scene[name] for scene in result["scenes"].values()]
         plain = [scene[PLAIN] for scene in result["scenes"].values()]
         grains = [row["wood grain"] / base["wood grain"] for row, base in zip(rows, plain, strict=True)]
-        panel.plot(grains, [row["samples / ray casting"] for row in rows], "o", color=color, label=name)
+        samples = [row["samples / ray casting"] for row in rows]
+        ring = {"markersize": 9, "fillstyle": "none"} if name == ONCE else {}  # others lie on it
+        panel.plot(grains, samples, "o", color=color, label=name, **ring)
     panel.set(xlabel="wood grain / ray casting", ylabel="samples / ray casting")
     panel.legend()
     return figure
