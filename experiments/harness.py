@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 import jaxvol as jv
-from jaxvol.metrics import rmse
+from jaxvol.metrics import BLOCK, rmse, wood_grain_energy
 
 from . import charts, marches, record, timing
 from .scenes import Scene
@@ -165,9 +165,9 @@ def chosen_scenes(
         yield name, makers[name](folder, size, chosen.resolution)
 
 
-def frame(scene: Scene, march: jv.March) -> jv.Rendering:
+def frame(scene: Scene, march: jv.March, lighting: Any = None) -> jv.Rendering:
     """The image with all its outputs."""
-    return jv.render(*scene[:3], march)
+    return jv.render(*scene[:3], march, lighting=lighting)
 
 
 def image(scene: Scene, march: jv.March) -> jv.Rendering:
@@ -178,6 +178,25 @@ def image(scene: Scene, march: jv.March) -> jv.Rendering:
 def entered(scene: Scene) -> np.ndarray:
     """Pixels whose rays enter the volume within visible material: cut faces, seen from the front."""
     return np.asarray(frame(scene, jv.March(scene.step, max_samples=1)).rgba[..., 3] > 0)
+
+
+def left(scene: Scene, *more: jv.Transform) -> np.ndarray:
+    """Pixels that alignment changes: their rays leave the volume within visible material."""
+    march = jv.March(scene.step, (*marches.transforms(marches.BOTH), *more))
+    return np.asarray(frame(scene, march).aligned)
+
+
+def grain_off(error: np.ndarray, faces: np.ndarray) -> float:
+    """Energy of wood grain in the blocks without a pixel of `faces`; NaN if all have one."""
+    height, width = faces.shape
+    corners = [
+        (y, x)
+        for y in range(0, height - BLOCK + 1, BLOCK // 2)
+        for x in range(0, width - BLOCK + 1, BLOCK // 2)
+    ]
+    blocks = [np.s_[y : y + BLOCK, x : x + BLOCK] for y, x in corners]
+    energies = [wood_grain_energy(error[block]) for block in blocks if not faces[block].any()]
+    return float(np.mean(energies)) if energies else math.nan
 
 
 def compare(scene: Scene, under: dict[str, jv.March], repetitions: int) -> dict[str, dict[str, Any]]:

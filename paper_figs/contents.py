@@ -69,6 +69,18 @@ ENTRIES = (
         data=True,
     ),
     Entry(
+        "kye_conditions",
+        "kye",
+        "Lit, and pre-integrated: the paper's own conditions",
+        "The base method shades its samples (Levoy 1988). The methods serve pre-integrated rendering, too,"
+        " says the text; it shows no picture of it.",
+        "The zoomed head of Fig. 9 by Phong's shading, above, and pre-integrated, below. Lit, the rings go"
+        " as they do unlit: from 2.0e-3 (phantom) and 2.4e-3 (CT) to less than 4e-6. Pre-integrated images"
+        " have 1/29 and 1/52 of the unlit grain before any jitter; of that, 13 % are left on the phantom "
+        "and 54 % in CT.",
+        data=True,
+    ),
+    Entry(
         "fig10",
         "kye",
         "Fig. 10: the heart",
@@ -102,8 +114,11 @@ ENTRIES = (
         "fig13",
         "kye",
         "Fig. 13: the pixels that alignment changes",
-        "A mask: only rays that reach a back face that is not transparent are changed.",
-        "The same mask, in green, of the phantom and of the CT of Fig. 12.",
+        "A mask: only rays that reach a back face that is not transparent are changed. These are not many,"
+        " says the text, since rays end early and leap.",
+        "The same mask, in green, of the phantom and of the CT of Fig. 12. In the CT they are 37.4 % of "
+        "the pixels, with early ends and leaps as without: its transfer function is translucent. Under the"
+        " nearly opaque ones of Figs. 9 to 11 they are at most 9.4 %, and 2.1 % with early ends.",
         data=True,
     ),
     Entry(

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from experiments import charts
-from experiments.harness import QUICK, Main, command
+from experiments.harness import QUICK, Main, command, left
 from experiments.marches import JITTER, PLAIN
 from experiments.pictures import chae, kisti, kye, lee, lee_steps, lee_wave
 from experiments.pictures.kim import kim_fig8, order_of_bricks
@@ -17,6 +17,7 @@ from .common import OUTPUT, pictures
 CHAE = "Chae and Shin, Fig. 6: part of an image of twice the size; wrong pixels are green"
 FIG01 = "Fig. 1: wood grain, and noise on the cut face; phantom, and CT of a head"
 FIG09 = "Fig. 9: the head, phantom and CT; boundary noise is that of the cut face"
+LIT_GRAIN = "The head by Phong's shading, and pre-integrated; wood grain is that off the cut face"
 FIG10 = "Fig. 10: a cut engine in place of the heart, and CT of a heart; boundary noise: of the cut faces"
 FIG11 = "Fig. 11: a colon, and CT of a liver, in place of the kidney; boundary noise: of the cut faces"
 FIG12 = "Fig. 12: vessels, phantom and CT of a lung; boundary noise: of the pixels that alignment changes"
@@ -88,9 +89,10 @@ def lee_fig5(chosen: Namespace) -> None:
 PICTURES: dict[str, Main] = {
     "fig01": pictures("fig01", FIG01, partial(kye.comparison, "head", methods=(PLAIN, JITTER)), data=True),
     "fig09": pictures("fig09", FIG09, partial(kye.comparison, "head"), data=True),
+    "kye_conditions": pictures("kye_conditions", LIT_GRAIN, partial(kye.conditions, "head"), data=True),
     "fig10": pictures("fig10", FIG10, partial(kye.comparison, "heart"), data=True),
     "fig11": pictures("fig11", FIG11, partial(kye.comparison, "kidney"), data=True),
-    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=kye.left), data=True),
+    "fig12": pictures("fig12", FIG12, partial(kye.comparison, "vessels", region=left), data=True),
     "fig13": pictures("fig13", "Fig. 13: pixels that alignment changes", kye.fig13, data=True),
     "chae_fig6": pictures("chae_fig6", CHAE, chae.chae_fig6, resolution=256, data=True),
     "kim_fig6": kim_fig6,

@@ -22,6 +22,7 @@ PANELS = {
     "paper_figs/output/gallery.webp": (4, 7),
     "paper_figs/output/kim_fig8.webp": (3, 2),
     "paper_figs/output/kisti_fig.webp": (4, 2),
+    "paper_figs/output/kye_conditions.webp": (4, 4),
     "paper_figs/output/lee_fig4.webp": (3, 2),
     "paper_figs/output/lee_fig6.webp": (3, 4),
     "paper_figs/output/lee_fig_steps.webp": (3, 4),

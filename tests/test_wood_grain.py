@@ -1,31 +1,57 @@
 """Does jitter break wood grain, keep cut faces smooth and leave the error unchanged? Kye 2013, measured."""
 
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import nibabel
 import numpy as np
 import pytest
 from jaxtyping import Array, Bool
 
 import jaxvol as jv
+from jaxvol.lighting import Phong
 from jaxvol.march.transforms.jitter import Noise
 from jaxvol.metrics import boundary_noise, comb_frequency, rmse, wood_grain_energy
 
+from . import scenes
 from .switch import switch
 
 
 KINDS = {"jitter": jv.Jitter, "empty space": jv.EmptySpaceJitter}
+NO_SHIFT = {"jitter": 0.0, "empty space": 1.0}
+"""Numbers by which these move no sample."""
+NEVER = 1e-7
+"""Transmittance at which rays end whose colour lacks nothing by it."""
 
 
-def rendered(scene, kind="", seed=0, refined=1):
-    """Colour over black, with alpha correction, so that exits make no difference. Jitters are switched on and
-    off, so that all images of a scene share a program."""
+class SwitchedNoise(eqx.Module):
+    """A transform's random numbers where `on` is true, elsewhere the number by which it moves no sample. The
+    transform stays the library's own, which the engine turns into numbers of its fast path."""
+
+    noise: Noise
+    on: Bool[Array, ""]
+    otherwise: float = eqx.field(static=True)
+
+    def __call__(self, pixel, dtype):
+        return jnp.where(self.on, self.noise(pixel, dtype), jnp.asarray(self.otherwise, dtype))
+
+
+def rendered(scene, kind="", seed=0, refined=1, *, leaps=False, left=NEVER, quadrature="left", lighting=None):
+    """Colour over black, with alpha correction, so that exits make no difference. Jitters and leaps are
+    switched on and off, so that all images of a scene share a program."""
     volume, transfer, camera, step = scene
-    jitters = (switch(made(seed), name == kind) for name, made in KINDS.items())
-    march = jv.March(step / refined, (*jitters, jv.AlphaCorrection()))
-    rgba = jv.render(volume, transfer, camera, march, adjoint="forward").rgba  # compiles fastest
+    transforms = []
+    for name, made in KINDS.items():
+        jitter = made(seed)
+        noise = SwitchedNoise(jitter.noise, jax.device_put(np.asarray(name == kind)), NO_SHIFT[name])
+        transforms.append(eqx.tree_at(lambda transform: transform.noise, jitter, noise))
+    transforms += [jv.AlphaCorrection(), switch(jv.SpaceLeaping(), leaps), jv.EarlyTermination(left)]
+    march = jv.March(step / refined, tuple(transforms), quadrature)
+    rgba = scenes.rendered(volume, transfer, camera, march, lighting=lighting, outputs="rgba").rgba
     return np.asarray(rgba, np.float64)[..., :3]
 
 
@@ -149,6 +175,129 @@ def test_the_blue_pattern_holds_a_fifth_of_the_slow_energy_of_the_white():
     for seed in (0, 1):
         white, blue = (slow_energy(drawn(Noise(seed, p, stream=0))) for p in ("white", "blue"))
         assert blue <= white / 5, seed
+
+
+# -- the random number of each ray -----------------------------------------------------------------------
+# Values are 0, 5, 10, … at the layers of voxels along z, so that a colour tells the depth of a sample.
+# Volumes, transfer functions and images have the shapes of the scenes below, and so share their programs.
+
+LAYERS, SMALL = 48, (64, 64)
+SPACING = 2 / (LAYERS - 1)
+OPAQUE = 1e5  # per length: one sample hides all behind it
+
+
+def ramp_scene(points, extinction, level):
+    """A view along z into the values' ramp, by steps of 20 values."""
+    data = np.broadcast_to(5 * np.arange(LAYERS, dtype=np.uint8), (LAYERS,) * 3)
+    volume = jv.Volume(data, [SPACING] * 3, [-1.0] * 3)
+    colors = np.tile(np.array(level, np.float32)[:, None] / 255, 3)
+    camera = jv.Camera((0.1, 0.2, -9), (0.1, 0.2, 0), (0, 1, 0), 4.0, size=SMALL)
+    return volume, jv.TransferFunction(points, colors, extinction), camera, 4 * SPACING
+
+
+def steps_to_first_sample(scene, kind, seed=0, before=1.0):
+    """How many steps past the entry of each ray its first opaque sample lies, behind a transmittance."""
+    directions = np.asarray(scene[2].rays()[1], np.float64)
+    value = rendered(scene, kind, seed)[..., 0] * 255 / before
+    return value / 20 / directions[..., 2]  # the front face is perpendicular to z
+
+
+def assert_uniform(numbers):
+    """Numbers are uniform in [0, 1): with their mean and variance, within four standard deviations, and
+    hardly two alike."""
+    n = numbers.size
+    assert numbers.min() > -1e-3
+    assert numbers.max() < 1 + 1e-3
+    assert numbers.mean() == pytest.approx(1 / 2, abs=4 * (1 / 12 / n) ** 0.5)
+    assert numbers.var() == pytest.approx(1 / 12, abs=4 * (1 / 180 / n) ** 0.5)
+    thousandths = np.unique(np.floor(1000 * numbers)).size
+    assert thousandths > 0.95 * 1000 * (1 - np.exp(-n / 1000))
+
+
+def test_each_ray_begins_by_its_own_uniform_part_of_a_step():
+    solid = ramp_scene([0, 1, 2, 3, 4, 255], [OPAQUE] * 6, [0, 1, 2, 3, 4, 255])
+    for seed in (0, 1):
+        assert_uniform(steps_to_first_sample(solid, "jitter", seed))
+    # empty-space jitter moves no sample where none is transparent
+    np.testing.assert_allclose(steps_to_first_sample(solid, "empty space"), 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("front", [0, 30])
+def test_each_ray_shifts_once_at_its_first_transparent_sample(front):
+    """Be that its first sample, or one behind material that it begins in (Kye 2013, Fig. 6)."""
+    dense = 5.0 if front else 0.0
+    points, level = [0, 30, 30.01, 69.99, 70, 255], [0, 0, 0, 70, 70, 255]
+    scene = ramp_scene(points, [dense, dense, 0, 0, OPAQUE, OPAQUE], level)
+    directions = np.asarray(scene[2].rays()[1], np.float64)
+    seen_through = 2 if front else 0  # samples of 0 and 20
+    before = np.exp(-dense * seen_through * scene[3])
+    plain = steps_to_first_sample(scene, "", before=before)
+    np.testing.assert_allclose(plain, np.ceil(3.5 / directions[..., 2]), atol=1e-4)
+    numbers = []
+    for seed in (0, 1):
+        steps = steps_to_first_sample(scene, "empty space", seed, before)
+        assert steps.min() > 3.49
+        assert steps.max() < 4.51
+        numbers.append(steps % 1)
+        assert_uniform(numbers[-1])
+    assert abs(np.corrcoef(numbers[0].ravel(), numbers[1].ravel())[0, 1]) < 4 / 64
+
+
+# -- voxels, without files of data ------------------------------------------------------------------------
+
+SKIN_COLORS = [(0.1, 0.04, 0.03), (0.85, 0.5, 0.35), (0.75, 0.3, 0.22), (0.9, 0.75, 0.6), (1, 0.95, 0.85)]
+SKIN_COLORS.append((1, 1, 1))
+
+
+def skin(values, unit_distance):
+    """Air is transparent, all else nearly opaque."""
+    opacities = [0, 0.9, 0.9, 0.9, 0.95, 0.95]
+    points = list(zip(values, SKIN_COLORS, opacities, strict=True))
+    return jv.TransferFunction.from_points(points, unit_distance)
+
+
+def phantom_head():
+    volume = jv.phantom("head", LAYERS)
+    camera = jv.Camera.looking_at(volume, (0.5, -1, 0.3), size=SMALL).zoom(3, (0.46, 0.5))
+    return volume, skin((40, 78, 100, 130, 185, 255), 0.03), camera, 2 * SPACING
+
+
+def mr_head():
+    """Slices of a head by magnetic resonance, from the tests of nibabel: every second voxel of a slice, and
+    each slice twice, which gives the shape of the phantom."""
+    path = Path(nibabel.__file__).parent / "tests" / "data" / "example4d.nii.gz"
+    if not path.is_file():
+        pytest.skip("this nibabel was installed without the data of its tests")
+    image: Any = nibabel.load(path)
+    data = np.asarray(image.dataobj)[16:112:2, ::2, :, 0].repeat(2, axis=2)
+    volume = jv.Volume(np.clip(data // 4, 0, 255).astype(np.uint8), (4.0, 4.0, 1.1))
+    camera = jv.Camera.looking_at(volume, (-1, 0.6, 0.1), size=SMALL).zoom(3.6, (0.5, 0.55))
+    return volume, skin((30, 60, 90, 120, 150, 255), 1.0), camera, 4.0
+
+
+MARCHES = {
+    "plain": {},
+    "lit": {"lighting": Phong()},
+    "integrated": {"quadrature": "preintegrated"},
+    "leaps and early ends": {"leaps": True, "left": 1 / 255},
+}
+
+
+@pytest.mark.parametrize(("make", "less", "rel"), [(phantom_head, 8, 0.05), (mr_head, 3, 0.25)])
+@pytest.mark.parametrize("march", MARCHES)
+def test_jitter_breaks_wood_grain_of_voxels_and_leaves_the_error(march, make, less, rel):
+    """The slices' surface is bumpy: edges, which count as structure, remain, and the samples of its few rings
+    do not lie as evenly as jittered ones."""
+    scene, how = make(), MARCHES[march]
+    reference = rendered(scene, refined=FINE, **how | {"leaps": False, "left": NEVER})
+    before = rendered(scene, **how) - reference
+    structure = wood_grain_energy(before)
+    assert structure > 0.1 * np.sum(np.var(before, axis=(0, 1)))
+    for kind in KINDS:
+        for seed in (0, 1):
+            error = rendered(scene, kind, seed, **how) - reference
+            assert abs(wood_grain_energy(error)) <= structure / less, (kind, seed)
+            assert rmse(error, 0 * error) == pytest.approx(rmse(before, 0 * before), rel=rel), (kind, seed)
 
 
 # -- any scene --------------------------------------------------------------------------------------------

@@ -2,21 +2,24 @@
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 import jaxvol as jv
+from jaxvol.lighting import Phong
 from jaxvol.metrics import boundary_noise, rmse, wood_grain_energy
 
-from ..harness import entered, frame
+from ..harness import entered, frame, grain_off, left
 from ..marches import BOTH, EMPTY, JITTER, PLAIN, converged, transforms
 from ..scenes import AIRWAY, CT_HEAD, OF_AIRWAY, SKIN, Scene, cropped
-from . import BLACK, Panels, panel
+from . import BLACK, Panel, Panels, panel
 
 
 METHODS = (PLAIN, JITTER, EMPTY, BOTH)
 GREEN = (0.0, 0.8, 0.05)
+ENDED = 1 / 255
+"""Transmittance at which rays end early."""
 METAL = [
     (50, (0.02, 0.03, 0.05), 0.0),
     (90, (0.15, 0.25, 0.40), 0.6),
@@ -116,44 +119,69 @@ CT = {"head": "CT head", "heart": "CT heart", "kidney": "CT liver", "vessels": "
 """In titles."""
 
 
-def left(scene: Scene) -> np.ndarray:
-    """Pixels that alignment changes: their rays leave the volume within visible material."""
-    return np.asarray(frame(scene, jv.March(scene.step, transforms(BOTH))).aligned)
+CONDITIONS: dict[str, tuple[Any, Any]] = {
+    "unlit": (None, "left"),
+    "lit": (Phong(), "left"),
+    "pre-integrated": (None, "preintegrated"),
+}
+"""Lighting and quadrature. The paper shades its samples, and says that its methods serve pre-integration."""
 
 
-def rendered(scene: Scene, march: jv.March) -> np.ndarray:
-    return np.asarray(frame(scene, march).image(BLACK))
+def rendered(scene: Scene, march: jv.March, lighting: Any = None) -> np.ndarray:
+    return np.asarray(frame(scene, march, lighting).image(BLACK), np.float64)
+
+
+Region: TypeAlias = Callable[[Scene], np.ndarray]
+"""The pixels of a scene whose boundary noise is measured."""
 
 
 def comparison(
-    view: str,
-    chosen: Namespace,
-    methods: Sequence[str] = METHODS,
-    region: Callable[[Scene], np.ndarray] = entered,
+    view: str, chosen: Namespace, methods: Sequence[str] = METHODS, region: Region = entered
 ) -> Panels:
-    """The view under every method, whole above and zoomed below, with its measures. `region`: the pixels
-    whose boundary noise is measured."""
+    """The view under every method, whole above and zoomed below, with its measures."""
     rows: Panels = []
-    of = {"": VIEWS[view], **({f"{CT[view]}, ": REAL[view]} if chosen.data else {})}
-    for said, each in of.items():
-        for name, scene in each.scenes(chosen).items():
-            truth, mask, row = rendered(scene, converged(scene.step)), region(scene), []
-            for method in methods:
-                image = rendered(scene, jv.March(scene.step, transforms(method)))
-                title = said + method if name == "whole" else ""
-                row.append(panel(image, measured(image, truth, mask), title))
-            rows.append(row)
+    for said, seen in views(view, chosen).items():
+        whole, zoomed = seen.scenes(chosen).values()
+        rows += [compared(whole, methods, region, said), compared(zoomed, methods, region)]
     return rows
 
 
-def measured(image: np.ndarray, truth: np.ndarray, region: np.ndarray) -> str:
-    """Three measures of an image's error, as text."""
+def conditions(view: str, chosen: Namespace) -> Panels:
+    """The zoomed view lit, and pre-integrated, under every method."""
+    return [
+        compared(seen.scenes(chosen)["zoomed"], METHODS, entered, f"{said}{condition}, ", condition)
+        for condition in list(CONDITIONS)[1:]
+        for said, seen in views(view, chosen).items()
+    ]
+
+
+def views(name: str, chosen: Namespace) -> dict[str, View]:
+    """The phantom and, where there are real volumes, the CT, by how titles call them."""
+    return {"": VIEWS[name], **({f"{CT[name]}, ": REAL[name]} if chosen.data else {})}
+
+
+def compared(
+    scene: Scene, methods: Sequence[str], region: Region, above: str | None = None, condition: str = "unlit"
+) -> list[Panel]:
+    """A row of panels, a method each, with measures below and, if `above` is given, titles."""
+    lighting, quadrature = CONDITIONS[condition]
+    truth, mask, row = rendered(scene, converged(scene.step), lighting), region(scene), []
+    for method in methods:
+        image = rendered(scene, jv.March(scene.step, transforms(method), quadrature), lighting)
+        title = "" if above is None else above + method
+        row.append(panel(image, measured(image, truth, mask, off=region is entered), title))
+    return row
+
+
+def measured(image: np.ndarray, truth: np.ndarray, region: np.ndarray, off: bool) -> str:
+    """Three measures of an image's error, as text. `off`: wood grain is that of blocks without a pixel of the
+    region."""
     error = image - truth
     try:
         noise = f"{boundary_noise(error, region):.2g}"
     except ValueError:  # no 3 x 3 pixels of such a face in this image
         noise = "none"
-    grain = wood_grain_energy(error)
+    grain = grain_off(error, region) if off else wood_grain_energy(error)
     return f"wood grain {grain:.2g}\nboundary noise {noise}\nRMSE {rmse(image, truth):.2g}"
 
 
@@ -164,10 +192,11 @@ def fig13(chosen: Namespace) -> Panels:
         side = chosen.size / view.factor
         x, y = (middle * chosen.size - side / 2 for middle in view.middle)
         for name, scene in view.scenes(chosen).items():
-            aligned = left(scene)
+            aligned, ended = left(scene), left(scene, jv.EarlyTermination(ENDED), jv.SpaceLeaping())
             march = jv.March(scene.step, transforms(BOTH))
             image = np.where(aligned[..., None], GREEN, rendered(scene, march))
             title = f"{'CT lung' if view.spacing else 'phantom'}, {name}"
             square = (x, y, side) if name == "whole" else None
-            row.append(panel(image, f"{aligned.mean():.1%} of the pixels", title, square))
+            shares = f"{aligned.mean():.1%} of the pixels\n{ended.mean():.1%} where rays end early and leap"
+            row.append(panel(image, shares, title, square))
     return [row]

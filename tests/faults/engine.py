@@ -1,5 +1,7 @@
 """Faults of the march, its transforms, the fast engine and its gradients."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -46,7 +48,32 @@ def later(widened):
     return found
 
 
-MARCH = "march/test_march.py::"
+def unshifted(front, step):
+    """Where a cell would begin without jitter, that is at a whole number of steps."""
+    return jnp.floor(front / step + 1e-3) * step
+
+
+def normals_of_unshifted(light_terms):
+    def terms(shader, scene, live, ray, cells):
+        step = scene.march.step
+        moved = lambda: tuple(replace(cell, front=unshifted(cell.front, step)) for cell in cells())  # noqa: E731
+        return light_terms(shader, scene, live, ray, moved)
+
+    return terms
+
+
+def behind_leaps_at_whole_steps(to_next_cell):
+    def moved(job, beam, rays, at):
+        after = to_next_cell(job, beam, rays, at)
+        leapt, track = after.index > at.index, after.track
+        kept = lambda leaf: None if leaf is None else jnp.where(leapt, 0, leaf)  # noqa: E731
+        return replace(after, track=replace(track, offset=kept(track.offset), shift=kept(track.shift)))
+
+    return moved
+
+
+MARCH, GRAIN = "march/test_march.py::", "test_wood_grain.py::"
+OF_VOXELS = f"{GRAIN}test_jitter_breaks_wood_grain_of_voxels_and_leaves_the_error"
 FAULTS: list[Fault] = [
     Fault(
         "quadrature: midpoint samples at the front of cells",
@@ -112,6 +139,42 @@ FAULTS: list[Fault] = [
         (
             "march/transforms/test_jitter.py::test_numbers_are_uniform_and_depend_on_seed_stream_and_pixel_alone",
         ),
+    ),
+    Fault(
+        "jitter: numbers have four values",
+        "march.transforms.jitter:Noise.__call__",
+        lambda f: lambda self, pixel, dtype: (jnp.floor(4 * f(self, pixel, dtype)) + 0.5) / 4,
+        (f"{GRAIN}test_each_ray_begins_by_its_own_uniform_part_of_a_step",),
+    ),
+    Fault(
+        "jitter: rays begin up to two steps late",
+        "march.transforms.jitter:Jitter.start",
+        lambda f: lambda self, steps, ray: 2 * f(self, steps, ray) - steps,
+        (f"{GRAIN}test_each_ray_begins_by_its_own_uniform_part_of_a_step",),
+    ),
+    Fault(
+        "empty-space jitter: only rays whose first sample is transparent shift",
+        "engine.shifts:_shifted",
+        lambda f: lambda *given: jnp.where(f(*given) == 1, 1, NEVER),
+        (f"{GRAIN}test_each_ray_shifts_once_at_its_first_transparent_sample",),
+    ),
+    Fault(
+        "jitter: normals are those of samples that are not shifted",
+        "engine.shading:light_terms",
+        normals_of_unshifted,
+        (f"{OF_VOXELS}[lit-phantom_head-8-0.05]",),
+    ),
+    Fault(
+        "jitter: values are integrated over cells that are not shifted",
+        "march.march:CellRules.ends",
+        lambda f: lambda self, cell, ray: f(self, replace(cell, front=unshifted(cell.front, self.step)), ray),
+        (f"{OF_VOXELS}[integrated-phantom_head-8-0.05]",),
+    ),
+    Fault(
+        "jitter: behind a leap samples lie at whole steps",
+        "engine.wavefront:_to_next_cell",
+        behind_leaps_at_whole_steps,
+        (f"{OF_VOXELS}[leaps and early ends-phantom_head-8-0.05]",),
     ),
     Fault(
         "clip: cells whose middle is cut away are taken as empty",
