@@ -467,6 +467,13 @@ def flat_index(node: Node, shape: tuple[Any, ...]) -> Int[Array, "..."]:
     return (i * ny + j) * nz + k
 
 
+def nearest_node(coordinate: Vec3, shape: tuple[Any, ...]) -> Node:
+    """The node nearest to a coordinate; half-way between two, the upper one."""
+    nearest = (jnp.floor(c + 0.5).astype(jnp.int32) for c in coordinate)
+    i, j, k = (jnp.clip(index, 0, n - 1) for index, n in zip(nearest, shape[:3], strict=True))
+    return i, j, k
+
+
 def corners(coordinate: Vec3, shape: tuple[Any, ...]) -> list[tuple[Int[Array, ""], Scalar]]:
     """The eight nodes around a coordinate: the index of each into the flattened array, and its weight."""
     node, fraction = split(coordinate, shape)

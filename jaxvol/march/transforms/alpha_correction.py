@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,17 +11,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from ..._util.checks import flag
-from ..._util.vec3 import Scalar
-from ...scene.space import Ray
+from ..._util.vec3 import Scalar, Vec3, greatest, minus
+from ...scene.space import Path, Ray
 from ...scene.volume import Volume
+from ...scene.voxel_fetch import Node, nearest_node
 from ..march import Cell, CellRules, Transform, cut_at_entry, cut_at_exit
 
 
-PROBES = 4
-"""Depths of a cell, besides its front, at which the region is looked up."""
+SHARED = 1e-3
+"""By how much of a voxel a cell may be longer than one voxel, and be looked through at once."""
 
-BISECTIONS = 14
-"""Bisections of a face, which is found to 2⁻¹⁶ of a step."""
+LIMIT = 2**15
+"""Planes between nodes along a cell, of which any more are passed over."""
 
 
 class AlphaCorrection(Transform):
@@ -77,7 +78,13 @@ class AlphaCorrection(Transform):
 
 
 def _divided_by_labels(cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
-    return _divided(cell, *_label_faces(cell, ray, volume))
+    first, last, changes = _label_faces(cell, ray, volume)
+    if ray.gaps:
+        begin, end, cut = _gap_faces(cell, ray)
+        first = jnp.where(cut & ~(changes & (first < begin)), begin, first)
+        last = jnp.where(cut & ~(changes & (last > end)), end, last)
+        changes |= cut
+    return _divided(cell, first, last, changes)
 
 
 def _divided_by_gaps(cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -110,31 +117,111 @@ def _gap_faces(cell: Cell, ray: Ray) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
 
 
 def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
-    """Where a cell's label first and last changes, and whether it does. Gaps have a label of their own."""
-
-    def region(s: Scalar) -> Int[Array, ""]:
-        return jnp.where(ray.in_gap(s), -1, volume.label(ray.path(s)))
-
+    """Where a cell's label first and last changes, and whether it does. Labels are those of the nearest nodes, so
+    that they change at planes half-way between nodes only."""
     cell = jax.lax.stop_gradient(cut_at_entry(cell))  # in front of the entry lies no face
-    depths = [cell.front + cell.width * (i / PROBES) for i in range(PROBES + 1)]
-    regions = [region(depth) for depth in depths]
+    path = jax.lax.stop_gradient(ray.path)
+    parts = _parts(cell, path)
 
-    def face(depths: list[Scalar], regions: list[Array]) -> tuple[Scalar, Scalar]:
-        """Both sides of the face where the region first differs from that at the first depth."""
-        inner, near, far = regions[0], depths[0], depths[0]
-        for i in reversed(range(PROBES)):
-            changed = regions[i + 1] != inner
-            near, far = jnp.where(changed, depths[i], near), jnp.where(changed, depths[i + 1], far)
+    def search(part: Any, crossed: Int[Array, ""]) -> Int[Array, ""]:
+        first, last = _changes(_crossings(cell, part, parts, path, volume), volume)
+        before, after = crossed // LIMIT, crossed % LIMIT
+        before = jnp.where((before == 0) & (first > 0), 3 * part + first, before)
+        return before * LIMIT + jnp.where(last > 0, 3 * part + last, after)
 
-        def halve(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
-            near, far = bracket
-            middle = (near + far) / 2
-            same = region(middle) == inner
-            return jnp.where(same, middle, near), jnp.where(same, far, middle)
+    # one number for both faces, since XLA repeats the look-ups for each result of a loop
+    crossed = jax.lax.fori_loop(0, parts, search, jnp.zeros(cell.front.shape, jnp.int32))
+    first, last = (
+        _face(cell, number, parts, ray.path, volume) for number in (crossed // LIMIT, crossed % LIMIT)
+    )
+    return first, last, crossed > 0
 
-        return jax.lax.fori_loop(0, BISECTIONS, halve, (near, far))
 
-    # each piece begins on its own side of the face, since it is sampled there
-    _, first = face(depths, regions)
-    last, _ = face(depths[::-1], regions[::-1])
-    return first, last, jnp.any(jnp.stack(regions) != regions[0])
+def _parts(cell: Cell, path: Path) -> Int[Array, ""]:
+    """The number of parts into which a cell is divided, so that each crosses one plane of an axis at most."""
+    x, y, z = minus(path(cell.front + cell.width), path(cell.front))
+    longest = jnp.ceil(greatest((jnp.abs(x), jnp.abs(y), jnp.abs(z))) - SHARED)
+    return jnp.clip(longest, 1, LIMIT // 3 - 1).astype(jnp.int32)
+
+
+class Crossings(NamedTuple):
+    """The planes half-way between nodes that are crossed in a part of a cell.
+
+    Attributes:
+        node: nearest to where it begins.
+        sides: of each axis, to which side the next node lies: -1, 1, or 0 if no plane is crossed.
+        depths: of each axis, where its plane is crossed; inf if it is not.
+    """
+
+    node: Node
+    sides: Node
+    depths: Vec3
+
+
+def _crossings(cell: Cell, part: Any, parts: Any, path: Path, volume: Volume) -> Crossings:
+    """The planes that are crossed in a part of a cell, as if the ray were straight there."""
+    length = cell.width / parts.astype(cell.front.dtype)
+    front = cell.front + part.astype(length.dtype) * length
+    begin, end = path(front), path(front + length)
+    node, other = nearest_node(begin, volume.shape), nearest_node(end, volume.shape)
+    sides, depths = [], []
+    for i, j, low, high in zip(node, other, begin, end, strict=True):
+        side = jnp.sign(j - i)
+        share = (_plane(i, side, low.dtype) - low) / jnp.where(side == 0, 1, high - low)
+        sides.append(side)
+        depths.append(jnp.where(side == 0, jnp.inf, front + length * share))
+    return Crossings(node, tuple(sides), tuple(depths))
+
+
+def _changes(crossings: Crossings, volume: Volume) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The axes, 1 to 3, of the first and the last plane at which the label changes; 0 if none does."""
+    node, sides, depths = crossings
+    front = jnp.full_like(depths[0], -jnp.inf)
+
+    def label(depth: Scalar) -> Int[Array, ""]:
+        """The label just behind a depth."""
+        return volume.label_of(
+            tuple(i + jnp.where(t <= depth, side, 0) for i, side, t in zip(node, sides, depths, strict=True))
+        )
+
+    ahead, labels = label(front), [label(depth) for depth in depths]
+    first = last = jnp.zeros(front.shape, jnp.int32)
+    begins, ends = -front, front
+    for k, depth in enumerate(depths):
+        before, at = ahead, front
+        for j, other in enumerate(depths):
+            if j != k:
+                nearer = (other < depth) & (other >= at)
+                before, at = jnp.where(nearer, labels[j], before), jnp.where(nearer, other, at)
+        changes = (depth < jnp.inf) & (labels[k] != before)
+        first = jnp.where(changes & (depth < begins), k + 1, first)
+        begins = jnp.where(changes & (depth < begins), depth, begins)
+        last = jnp.where(changes & (depth > ends), k + 1, last)
+        ends = jnp.where(changes & (depth > ends), depth, ends)
+    return first, last
+
+
+def _face(cell: Cell, number: Int[Array, ""], parts: Any, path: Path, volume: Volume) -> Scalar:
+    """The depth just behind a plane, given by its part of the cell and its axis, with which it moves."""
+    still = jax.lax.stop_gradient
+    part, axis = jnp.maximum(number - 1, 0) // 3, jnp.maximum(number - 1, 0) % 3
+
+    def chosen(values: Any) -> Array:
+        return jnp.where(axis == 0, values[0], jnp.where(axis == 1, values[1], values[2]))
+
+    crossings = _crossings(cell, part, parts, still(path), volume)
+    depth = jnp.where(number > 0, chosen(crossings.depths), cell.front)
+    plane = _plane(chosen(crossings.node), chosen(crossings.sides), depth.dtype)
+    coordinate = chosen(path(depth))
+    _, slope = jax.jvp(still(path), (depth,), (jnp.ones_like(depth),))
+    rate = chosen(slope)
+    rate = jnp.where(rate == 0, 1, rate)
+    # so far behind it that a sample there reads the label behind
+    nodes = jnp.asarray(chosen(volume.shape), depth.dtype)
+    margin = 4 * float(jnp.finfo(depth.dtype).eps) * nodes / jnp.abs(rate)
+    return depth + jnp.where(number > 0, (plane - coordinate) / rate + margin, 0)
+
+
+def _plane(node: Int[Array, ""], side: Int[Array, ""], dtype: Any) -> Scalar:
+    """The coordinate half-way between a node and the next one on this side."""
+    return node.astype(dtype) + 0.5 * side.astype(dtype)
