@@ -120,14 +120,14 @@ def _slopes(contrast: Array) -> tuple[Array, Array, Array]:
     "extinction behind the face / in front of it",
     (1.0, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 5.0),
     "relative error of the derivative by the angle of a ray",
-    "AlphaCorrection(labels=True)",
+    "AlphaCorrection()",
     limit=0.1,
 )
 def gradients_at_label_faces(contrast: float, size: int) -> dict[str, float]:
     """How much may extinction jump at the face of a label before the gradient of the rays is wrong?
 
-    Gradients take the depth of a label's face along a ray as fixed, and so give all motion to the exit.
-    Finite differences of the same image, whose cells are cut at the face, are right."""
+    Without labels=True, the image jumps where a sample crosses the face, and the gradient gives all motion to
+    the exit. Of cells that are cut at the face, it is right, as finite differences of the same image are."""
     depth = FRONT * (NEAR + contrast * FAR) / np.cos(ANGLE)
     exact = depth * np.tan(ANGLE) * np.exp(-depth)
     found = (float(slope) for slope in _slopes(jnp.asarray(contrast, jnp.float32)))

@@ -24,7 +24,6 @@ from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, stop
 from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
-from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree, unchecked, with_fields
 from .shading import inline_shader, light_terms, lit_colors, shaded_colors
@@ -129,7 +128,7 @@ def march_segment(
     finished. `shifts`: a segment is one cell, behind which rays may shift."""
     classification, number = scene.classification, tiling.cells
     ahead = Ahead.of(rays, at, scene.march.step)
-    samples = _sampled(scene, tiling, ahead)
+    samples = _sampled(scene, number, ahead)
     ray, _ = ahead.place
     colors: list[Vec3] | list[None]
     values = [read[:1] for read in samples.measured]
@@ -168,9 +167,9 @@ def march_segment(
     return jax.vmap(partial(move, scene.march))(ray, after, transparent, steps), samples._replace(ray=ray)
 
 
-def _sampled(scene: Scene, tiling: Tiling, ahead: Ahead) -> Samples:
-    """The samples of a segment of cells ahead of each ray."""
-    march, classification, number = scene.march, scene.classification, tiling.cells
+def _sampled(scene: Scene, number: int, ahead: Ahead) -> Samples:
+    """The samples of so many cells ahead of each ray."""
+    march, classification = scene.march, scene.classification
 
     def pieces_of(ahead: Ahead) -> tuple[Cell, ...]:
         rays = jax.vmap(partial(pieces, scene), in_axes=(0, 0, None))
@@ -182,12 +181,8 @@ def _sampled(scene: Scene, tiling: Tiling, ahead: Ahead) -> Samples:
     # Dividing a cell is expensive, so that its pieces are stored. An undivided cell costs less to recompute
     # than to load.
     given = cut if divided else None
-    # Few cells have more pieces than one. Those are gathered, but if each is integrated, with ends that it shares.
-    few = divided and not march.integrates and march.divide is not None
 
     def cells(ahead: Ahead, given: Any) -> tuple[Cell, ...]:
-        if few:
-            return given[:1]
         return given if divided else pieces_of(ahead)
 
     def measured(ahead: Ahead, given: Any) -> list[Measured]:
@@ -204,34 +199,10 @@ def _sampled(scene: Scene, tiling: Tiling, ahead: Ahead) -> Samples:
     else:
         values = _searched(classification, live, in_memory(live, measured, ahead, given))
     alphas = in_memory(live, opacities, ahead, given, values)
-    ray, _ = ahead.place
-    if few:
-        more, thin = _of_few(scene, tiling.chunk, ray, list(cut[1:]), (values[0], alphas[0]))
-        values, alphas = [*values, *more], [*alphas, *thin]
     shader = inline_shader(scene)
-    whole = cut if divided else pieces_of(ahead)
-    light = None if shader is None else light_terms(shader, scene, live, ray, lambda: whole)
-    return Samples(list(whole), values, alphas, light)
-
-
-def _of_few(
-    scene: Scene, chunk: int, ray: Ray, cells: list[Cell], like: tuple[Measured, Scalar]
-) -> tuple[list[Measured], list[Scalar]]:
-    """What is measured of pieces of which few have a width, and their opacity; 0 for all others."""
-    chosen = Chosen.of([piece.width > 0 for piece in cells], chunk)
-
-    def sample(ray: Ray, piece: Cell) -> tuple[Measured, Scalar]:
-        measured = scene.classification.searched(read(scene, ray, piece))
-        return measured, opacity(scene, ray, piece, measured)
-
-    def one(indices: Int[Array, " chunk"], found: PyTree) -> PyTree:
-        column = indices % chosen.columns
-        rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), ray)
-        return chosen.put(found, indices, jax.vmap(sample)(rays, chosen.take(cells, indices)))
-
-    start = jax.tree.map(lambda leaf: jnp.zeros(len(cells) * leaf.size, leaf.dtype), like)
-    found = chosen.split(chosen.fold(one, start), len(cells))
-    return [measured for measured, _ in found], [alpha for _, alpha in found]
+    ray, _ = ahead.place
+    light = None if shader is None else light_terms(shader, scene, live, ray, partial(cells, ahead, given))
+    return Samples(list(cells(ahead, given)), values, alphas, light)
 
 
 def always(at: Any) -> Bool[Array, ""]:

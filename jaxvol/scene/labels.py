@@ -28,9 +28,9 @@ class LabelTransferFunction(Transfer):
             others, as `jv.load(path, labels=...)` and `np.unique(labels, return_inverse=True)` do.
 
     The label is that of the nearest node, so it jumps along a ray, half-way between nodes, and a pixel jumps
-    where a sample crosses there: gradients with respect to camera and place do not include these jumps;
-    `AlphaCorrection(labels=True)` cuts cells there, where `"preintegrated"` otherwise takes the label in the
-    middle of a cell.
+    where a sample crosses there: gradients with respect to camera and place do not include these jumps.
+    `AlphaCorrection(labels=True)` cuts cells there, so that nothing jumps; otherwise `"preintegrated"` takes
+    the label in the middle of a cell.
 
     What `with_visibility` hides is leapt over. Other factors, or labels hidden and shown, compile nothing
     again.

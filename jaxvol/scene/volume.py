@@ -25,7 +25,7 @@ from .._util.voxels import label_array, voxel_array
 from ..xla.memory import gather
 from ..xla.platform import is_traced
 from ..xla.trees import is_none
-from .voxel_fetch import Fetch, Node, OneByOne, Voxel, Window, corners, flat_index, nearest_node
+from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index, nearest_node
 
 
 PLACE = 1e-4
@@ -289,11 +289,11 @@ class Volume(eqx.Module):
 
     def label(self, coordinate: Vec3) -> Int[Array, ""]:
         """Label of the node nearest to a grid coordinate; half-way between two nodes, the upper one."""
-        return self.label_of(nearest_node(coordinate, self.shape))
+        return self.label_at(flat_index(nearest_node(coordinate, self.shape), self.shape))
 
-    def label_of(self, node: Node) -> Int[Array, ""]:
-        """Label of a node of the grid."""
-        return gather(self._labels().reshape(-1), flat_index(node, self.shape)).astype(jnp.int32)
+    def label_at(self, place: Int[Array, ""]) -> Int[Array, ""]:
+        """Label of a node, by its index into the flattened labels."""
+        return gather(self._labels().reshape(-1), place).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
         """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""

@@ -34,8 +34,7 @@ class Clip(Transform):
 
     `box`, `origins` and `normals` are differentiable; where a face of the box coincides with one of the
     volume, the derivative is that of moving it inwards. Without `AlphaCorrection`, gradients miss the jumps
-    of the image when a sample crosses a cut; `AlphaCorrection(labels=True)` takes the ends of gaps as fixed.
-    A ray that lies in a plane counts as inside. Inside out, a film of less than 2e-6 of the volume's diagonal
+    of the image when a sample crosses a cut. A ray that lies in a plane counts as inside. Inside out, a film of less than 2e-6 of the volume's diagonal
     between a face of the volume and the cut is taken for rounding, and not seen.
 
     Where it fails: `experiments/stability.py`, "jitter behind cuts".

@@ -72,6 +72,57 @@ def test_a_cell_is_divided_where_the_label_changes():
     assert [width for _, width, _ in pieces(-0.5, 1, labels=True, line=oblique)] == [1, 0, 0]
 
 
+def depth_by_planes(labels, extinctions, origin, direction):
+    """The optical depth of a line through unit voxels. Between planes half-way between nodes, and between
+    those and faces of the grid, the label does not change."""
+    planes = [
+        (np.concatenate([[0, n - 1], np.arange(n - 1) + 0.5]) - start) / rate
+        for n, start, rate in zip(labels.shape, origin, direction, strict=True)
+    ]
+    near, far = max(min(axis[:2]) for axis in planes), min(max(axis[:2]) for axis in planes)
+    depths = np.sort(np.clip(np.concatenate(planes), near, far))
+    middle = origin + direction * (depths[1:] + depths[:-1])[:, None] / 2
+    nodes = np.clip(np.floor(middle + 0.5).astype(int), 0, np.array(labels.shape) - 1)
+    return np.sum(extinctions[labels[tuple(nodes.T)]] * np.diff(depths))
+
+
+def test_faces_of_labels_are_exact_and_move():
+    """Rays through blobs of two labels: opacity, and its gradient by origins, against sums over planes."""
+    random, shape, number = np.random.default_rng(0), (9, 10, 8), 64
+    x, y, z = np.indices(shape)
+    labels = (np.sin(0.9 * x + 0.4 * y) + np.cos(0.7 * z - 0.5 * y) > 0.4).astype(np.uint8)
+    extinctions = np.array([0.05, 0.3])
+    directions = random.normal(size=(number, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = random.uniform(2, 6, (number, 3)) - 20 * directions
+
+    @jax.jit
+    def opacity_and_gradient(step, origins):
+        volume = jv.Volume(np.ones(shape, np.float32), labels=labels)
+        transfer = jv.LabelTransferFunction([uniform_transfer(extinction) for extinction in extinctions])
+        march = jv.March(step, (jv.AlphaCorrection(labels=True),), max_samples=64)
+
+        def opacity(origins):
+            rays = origins, jnp.asarray(directions, jnp.float32)
+            return jv.render_rays(volume, transfer, *rays, march, outputs="rgba").rgba[:, 3]
+
+        found, pull = jax.vjp(opacity, origins)
+        return found, pull(jnp.ones(number))[0]
+
+    def exact(origins):
+        lines = zip(origins, directions, strict=True)
+        return -np.expm1([-depth_by_planes(labels, extinctions, *line) for line in lines])
+
+    h = 1e-6
+    slopes = [(exact(origins + h * axis) - exact(origins - h * axis)) / (2 * h) for axis in np.eye(3)]
+    # a cell of 2.1 voxels may pass more than two faces
+    for step, share in ((0.3, 1), (2.1, 0.75)):
+        found, gradient = jax.device_get(opacity_and_gradient(np.float32(step), origins.astype(np.float32)))
+        right = np.abs(found - exact(origins)) < 1e-5
+        assert right.mean() >= share
+        np.testing.assert_allclose(gradient[right], np.stack(slopes, 1)[right], atol=2e-3, rtol=2e-3)
+
+
 @pytest.mark.parametrize("fast", [True, False])
 def test_the_gradient_by_an_exit_at_the_end_of_a_cell(fast):
     """A ray of eight whole steps, or of a little more or less, through a constant cube."""
