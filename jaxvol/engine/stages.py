@@ -319,7 +319,7 @@ def _start(
     box = box_of_corners if corners else box_of_rays
     skips = None
     if index is not None:
-        skips = index.along(place).skips(partial(box, tiling, rays), tiling.cells * seams.step)
+        skips = index.on_axes_of(place).skips(partial(box, tiling, rays), tiling.cells * seams.step)
     track = unchecked(track, offset=offset, shifted=None, until=None)
     return Started(rays, track, skips, seams.locate(place))
 
@@ -329,7 +329,7 @@ def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, 
     """What is told of rays that neither begin nor shift anywhere in particular: no steps, the first cell, no
     cell; and where they see nothing, as far as is known."""
     none, beams = np.zeros((groups, group), dtype), groups // GROUPS_OF_BEAM
-    stretches = Stretches.nowhere(beams, none.dtype)
+    stretches = Stretches.unknown(beams, none.dtype)
     zero, never = (np.full(none.shape, number, np.int32) for number in (0, NEVER))
     return jax.device_put((none, zero, never, stretches))
 

@@ -1,1 +1,1 @@
-"""Where the samples of a ray are: marches, transforms, and the beams that leap over empty space."""
+"""Marches and their transforms, which place the samples of rays, and tables of empty space."""

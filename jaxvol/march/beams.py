@@ -1,5 +1,5 @@
-"""Finds what is empty: the questions of marches, and empty stretches of a beam, neighbouring rays that lie in
-a bounding box whose faces move linearly with the distance."""
+"""Finds empty space: the interface that marches use, and empty stretches of a beam of neighbouring rays, whose
+bounding box has faces that move linearly with the distance."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.vec3 import Scalar, Vec3, along
@@ -28,35 +29,35 @@ ROUNDING = 64 * float(jnp.finfo(jnp.float32).eps)
 
 
 class Skips(eqx.Module):
-    """Where nothing is visible along the rays of some beams."""
+    """Empty space along the rays of beams."""
 
     @abstractmethod
     def any_visible(self) -> Bool[Array, "*beams"]:
-        """Whether anything may be visible along each beam."""
+        """Tell for each beam whether anything may be visible along it."""
 
     @abstractmethod
     def skip_to(self, beam: Int[Array, " rays"], rays: Ray, depth: Scalar) -> Scalar:
-        """For rays of these beams, a depth of at least `depth` before which nothing is visible."""
+        """Return a depth of at least `depth`, before which nothing is visible, for each ray and its beam."""
 
 
 class EmptySpaceIndex(eqx.Module):
-    """Where nothing is visible, for beams of rays."""
+    """Empty space of a scene, which becomes that of beams."""
 
     @abstractmethod
     def skips(self, box: Callable[[Occupancy], "Box"], stretch: Scalar) -> Skips:
-        """That along beams, from the boxes around them. `stretch`: the shortest useful leap."""
+        """Find empty space along beams from the boxes around them. `stretch`: the shortest useful leap."""
 
     @property
     def unshaped(self) -> "EmptySpaceIndex":
         """The same index, so that its kernel knows no numbers of cells, if that is possible."""
         return self
 
-    def along(self, volume: Volume) -> "EmptySpaceIndex":
+    def on_axes_of(self, volume: Volume) -> "EmptySpaceIndex":
         """The same index along the axes of a volume, if it does not know them."""
         return self
 
     def within_ranges(self) -> "EmptySpaceIndex":
-        """What is of use where each ray's first and last visible cell are known."""
+        """Return the part that is of use where the first and last visible cell of each ray are known."""
         return self
 
 
@@ -110,8 +111,8 @@ class Box(eqx.Module):
         center, radius = jnp.stack(frame.vector((x, y, z))), frame.diagonal(spans) / 2
         entry, direction = jnp.stack(rays.entry), jnp.stack(rays.direction)
         origin = entry - direction * t_in[None]
-        away = center.reshape(3, *(1,) * t_in.ndim) - origin
-        middle = jnp.sqrt(jnp.sum(away * away, axis=0))
+        offset = center.reshape(3, *(1,) * t_in.ndim) - origin
+        middle = jnp.sqrt(jnp.sum(offset * offset, axis=0))
         # A direction between the corners is their normalized average: normalizing lengthens it by at most 1
         # minus the cosine of the widest angle to the mean direction.
         axis = jnp.mean(direction, axis=-1)
@@ -135,11 +136,11 @@ class Box(eqx.Module):
         """`start`, `direction`: along the axes of the occupancy."""
 
         def bounds(values: Array) -> tuple[Array, Array]:
-            least, most = jnp.where(counts, values, jnp.inf), jnp.where(counts, values, -jnp.inf)
-            return jnp.min(least, axis=-1), jnp.max(most, axis=-1)
+            lowest = jnp.min(jnp.where(counts, values, jnp.inf), axis=-1)
+            return lowest, jnp.max(jnp.where(counts, values, -jnp.inf), axis=-1)
 
         size, corner = (
-            jnp.stack(each).reshape(3, *(1,) * near.ndim) for each in (occupancy.size, occupancy.origin)
+            jnp.stack(vector).reshape(3, *(1,) * near.ndim) for vector in (occupancy.size, occupancy.origin)
         )
         # allows for rounding a ray's start to float32 when the camera is far away
         far_off = near[None] * occupancy.frame.stretch + abs(corner) + size
@@ -168,8 +169,8 @@ class Stretches(Skips):
     """For each stretch, the first one from there on that is not empty, or their number."""
 
     @classmethod
-    def nowhere(cls, beams: int, dtype: Any) -> Any:
-        """Those of beams in which nothing is known to be empty, as NumPy arrays. `dtype`: that of depths."""
+    def unknown(cls, beams: int, dtype: DTypeLike) -> Any:
+        """NumPy stretches of beams of which nothing is known to be empty. `dtype`: that of depths."""
         near, length = np.zeros(beams, dtype), np.full((), np.inf, dtype)
         return unchecked(cls, near=near, length=length, following=np.zeros((STRETCHES, beams), np.int32))
 
@@ -203,15 +204,15 @@ def stretches(occupancy: Occupancy, sums: Sums, box: Box, stretch: Scalar) -> St
             inside &= (high >= 0) & (low <= count)
         for ends, count in zip(sides, counts, strict=True):
             # arbitrary for boxes outside the grid
-            cells = (jnp.clip(jnp.floor(jnp.where(inside, each, 0)), 0, count - 1) for each in ends)
-            corners.append([each.astype(jnp.int32) for each in cells])
+            cells = (jnp.clip(jnp.floor(jnp.where(inside, end, 0)), 0, count - 1) for end in ends)
+            corners.append([cell.astype(jnp.int32) for cell in cells])
         (x, right), (y, back), (z, top) = corners
         return inside & sums.any_between((x, y, z), (right, back, top))
 
     if on_gpu():  # all at once: a loop would take longer to launch than to run
         at = jnp.arange(STRETCHES, dtype=jnp.int32)
-        own = jnp.where(jax.vmap(occupied)(at), at[:, None], STRETCHES)
-        return Stretches(box.near, length, jax.lax.cummin(own, axis=0, reverse=True))
+        filled = jnp.where(jax.vmap(occupied)(at), at[:, None], STRETCHES)
+        return Stretches(box.near, length, jax.lax.cummin(filled, axis=0, reverse=True))
 
     def visit(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         at, next_one, table = state

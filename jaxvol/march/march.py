@@ -1,4 +1,4 @@
-"""Where is the next sample, and which part of the ray does it stand for?
+"""Places the samples of a ray, and the part of the ray that each of them represents.
 
 A march is a step length d and a tuple of transforms. Without transforms it is Levoy's ray casting: samples at
 depths 0, d, 2d, … from the entry to the exit, each of which stands for the cell of width d that begins there;
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import check_answer, described, integer, number
+from .._util.checks import Arrayable, check_answer, described, integer, number
 from .._util.texts import pasted
 from .._util.vec3 import Scalar
 from ..scene.occupancy import BLOCK, Occupancy
@@ -29,7 +29,7 @@ Quadrature: TypeAlias = Literal["left", "midpoint", "preintegrated"]
 
 
 class Cell(eqx.Module):
-    """What one sample of a ray stands for: a cell, or a piece of one. `cut`: whether the volume's exit
+    """Part of a ray that one sample represents, a cell or a piece of one. `cut`: whether the volume's exit
     shortened it."""
 
     front: Scalar
@@ -54,17 +54,17 @@ class Transform(eqx.Module):
         return steps
 
     def shift(self, ray: Ray) -> Scalar:
-        """By how many steps all samples behind the ray's first cell of opacity 0 move, in [-1, 0]; those of
-        all transforms are summed and clipped. Otherwise rays advance by whole steps."""
+        """Steps by which all samples behind the ray's first cell of opacity 0 move, in [-1, 0]. The answers
+        of all transforms are summed and clipped. Otherwise rays advance by whole steps."""
         return jnp.zeros_like(ray.length)
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex | None:
-        """Where nothing is visible, asked once an image; None: unknown. `view`: None for `render_rays`."""
+        """Index of empty space, made once for an image; None: unknown. `view`: None for `render_rays`."""
         return None
 
     @property
     def block_side(self) -> int:
-        """Cells of the voxel grid along the side of the blocks of which `empty_space` is told."""
+        """Cells of the voxel grid along the side of the blocks of `empty_space`'s occupancy."""
         return BLOCK
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -74,8 +74,8 @@ class Transform(eqx.Module):
 
     @property
     def valid(self) -> Bool[Array, ""] | bool:
-        """Whether its parameters, which may be traced, are such as its constructor accepts; else the image is
-        NaN. (Whether they are finite is checked of all.)"""
+        """True where its parameters, which may be traced, are such as its constructor accepts; else the image
+        is NaN. (All parameters are checked to be finite besides.)"""
         return True
 
     joins: ClassVar[bool] = False
@@ -86,7 +86,7 @@ class Transform(eqx.Module):
     """Whether `cut` shortens what reaches past the exit."""
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
-        """Whether the ray is finished, given the answer of the transforms before."""
+        """Decide whether the ray is finished. `stopped`: the answer of the transforms before."""
         return stopped
 
     def rules(self, rules: "CellRules") -> "CellRules | None":
@@ -98,13 +98,13 @@ class Transform(eqx.Module):
 
     @property
     def leaves_gaps(self) -> bool:
-        """Whether rays may leave the volume and come back, by its `locate` or `clip`."""
+        """True if rays may leave the volume and come back, by its `locate` or `clip`."""
         seams = "locate", "clip"
         return any(getattr(type(self), seam) is not getattr(Transform, seam) for seam in seams)
 
     @property
     def reads_labels(self) -> bool:
-        """Whether `cut` reads the volume's labels."""
+        """True if `cut` reads the volume's labels."""
         return False
 
     @property
@@ -114,7 +114,7 @@ class Transform(eqx.Module):
 
 
 class CellRules(eqx.Module):
-    """How the kernel of a march cuts rays into cells, and ends them. What the library's transforms do is
+    """Rules by which the kernel of a march cuts rays into cells, and ends them. The library's transforms are
     numbers here, so that all subsets of them, and both quadratures that sample, share a program.
 
     Attributes:
@@ -141,7 +141,7 @@ class CellRules(eqx.Module):
 
     @property
     def joins(self) -> bool:
-        """Whether pieces touch: see `Transform`."""
+        """True if pieces touch: see `Transform`."""
         return all(transform.joins for transform in self.custom)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -152,7 +152,7 @@ class CellRules(eqx.Module):
         return (cell,) if self.divide is None else self.divide(cell, ray, volume)
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
-        """Whether a ray with this much transmittance left ends before its exit."""
+        """Decide whether a ray of this transmittance ends before its exit."""
         return stop_by(self.custom, transmittance) if self.custom else transmittance <= self.opacity_left
 
     def sample(self, cell: Cell) -> Scalar:
@@ -165,12 +165,12 @@ class CellRules(eqx.Module):
 
     @property
     def moving(self) -> "CellRules":
-        """What has a gradient; None in place of all else."""
+        """The rules with None in place of all that has no gradient."""
         return eqx.filter(self, self._moves)
 
     @property
     def constant(self) -> "CellRules":
-        """What has none; None in place of all else."""
+        """The rules with None in place of all that has a gradient."""
         return eqx.filter(self, self._moves, inverse=True)
 
     @property
@@ -181,7 +181,7 @@ class CellRules(eqx.Module):
 
 
 class March(eqx.Module):
-    """How rays step through a volume. Its methods combine the answers of all transforms at a seam.
+    """Steps of rays through a volume. Its methods combine the answers of all transforms at a seam.
 
     Args:
         step: distance d between samples, world length, > 0.
@@ -215,11 +215,11 @@ class March(eqx.Module):
 
     def __init__(
         self,
-        step: Any,
-        transforms: tuple[Transform, ...] | Any = (),
-        quadrature: Quadrature | Any = "left",
+        step: Arrayable,
+        transforms: tuple[Transform, ...] | list[Transform] = (),
+        quadrature: Quadrature = "left",
         *,
-        max_samples: int | Any | None = None,
+        max_samples: int | None = None,
     ):
         self.step = number("step", step, above=0)
         if not isinstance(transforms, tuple | list):
@@ -239,13 +239,11 @@ class March(eqx.Module):
         self.max_samples = None if max_samples is None else integer("max_samples", max_samples, 1, 2**24)
 
     def __repr__(self) -> str:
-        told = [
-            f"step={pasted(self.step)}",
-            f"transforms={self.transforms}",
-            f"quadrature={self.quadrature!r}",
-        ]
-        told += [] if self.max_samples is None else [f"max_samples={self.max_samples}"]
-        return f"March({', '.join(told)})"
+        limit = "" if self.max_samples is None else f", max_samples={self.max_samples}"
+        return (
+            f"March(step={pasted(self.step)}, transforms={self.transforms}, "
+            f"quadrature={self.quadrature!r}{limit})"
+        )
 
     @property
     def most_samples(self) -> int:
@@ -264,7 +262,7 @@ class March(eqx.Module):
     def overriding(self, seam: str) -> list[Transform]:
         """The transforms that override a seam."""
         default = getattr(Transform, seam)
-        return [each for each in self.transforms if getattr(type(each), seam) is not default]
+        return [t for t in self.transforms if getattr(type(t), seam) is not default]
 
     @property
     def leaps(self) -> bool:
@@ -272,14 +270,14 @@ class March(eqx.Module):
 
     @property
     def block_side(self) -> int:
-        """The least that a transform asks for."""
-        return min((each.block_side for each in self.transforms), default=BLOCK)
+        """The smallest side that a transform asks for."""
+        return min((transform.block_side for transform in self.transforms), default=BLOCK)
 
     @property
     def tested_every(self) -> int | None:
-        """The least number of samples that a transform asks for."""
-        given = [number for each in self.transforms if (number := each.tested_every) is not None]
-        return min(given, default=None)
+        """The smallest number of samples that a transform asks for."""
+        numbers = [t.tested_every for t in self.transforms if t.tested_every is not None]
+        return min(numbers, default=None)
 
     @property
     def may_shift(self) -> bool:
@@ -312,33 +310,33 @@ class March(eqx.Module):
         return cut_by(self.transforms, cell, ray, volume)
 
     def stop(self, transmittance: Scalar) -> Bool[Array, ""]:
-        """Whether a ray with this much transmittance left ends before its exit."""
+        """Decide whether a ray of this transmittance ends before its exit."""
         return stop_by(self.transforms, transmittance)
 
     @property
     def rules(self) -> CellRules:
-        """How the kernel cuts and ends rays."""
+        """Rules by which the kernel cuts and ends rays."""
         dtype = self.step.dtype
         middle = 0.0 if self.quadrature == "left" else 0.5
-        place, left = np.asarray(middle, dtype), np.asarray(-1, dtype)
-        most = np.asarray(self.most_samples, np.int32)
-        plain = found = CellRules(self.step, place, np.asarray(False), left, most, self.integrates)
+        place, never = np.asarray(middle, dtype), np.asarray(-1, dtype)
+        limit = np.asarray(self.most_samples, np.int32)
+        plain = rules = CellRules(self.step, place, np.asarray(False), never, limit, self.integrates)
         for transform in self.transforms:
-            answer = transform.rules(found)
+            answer = transform.rules(rules)
             if answer is None:
                 return replace(plain, custom=self.transforms)
-            found = answer
+            rules = answer
         divided = self.reads_labels or any(transform.leaves_gaps for transform in self.transforms)
-        return found if divided else replace(found, divide=None)
+        return rules if divided else replace(rules, divide=None)
 
     @property
     def reads_labels(self) -> bool:
-        """Whether cells are cut at the faces of labels."""
+        """True if cells are cut at the faces of labels."""
         return any(transform.reads_labels for transform in self.transforms)
 
     @property
     def integrates(self) -> bool:
-        """Whether cells are integrated between their ends, rather than sampled."""
+        """True if cells are integrated between their ends, rather than sampled."""
         return self.quadrature == "preintegrated"
 
     @property
@@ -367,14 +365,14 @@ def cut_by(transforms: tuple[Transform, ...], cell: Cell, ray: Ray, volume: Volu
             _check_kind(transform, "cut", cells, tuple)
             if not cells:
                 raise ValueError(f"{type(transform).__name__}.cut must return at least one Cell; got ().")
-            for each in cells:
-                _check_kind(transform, "cut", each, Cell)
-        pieces = tuple(each for cells in divided for each in cells)
+            for piece in cells:
+                _check_kind(transform, "cut", piece, Cell)
+        pieces = tuple(piece for cells in divided for piece in cells)
     return pieces
 
 
 def stop_by(transforms: tuple[Transform, ...], transmittance: Scalar) -> Bool[Array, ""]:
-    """Whether transforms end a ray with this much transmittance left."""
+    """Decide whether transforms end a ray of this transmittance."""
     stopped = jnp.zeros(jnp.shape(transmittance), bool)
     for transform in transforms:
         stopped = _checked(transform, "stop", transform.stop(stopped, transmittance), stopped)
@@ -382,20 +380,20 @@ def stop_by(transforms: tuple[Transform, ...], transmittance: Scalar) -> Bool[Ar
 
 
 def cut_at_entry(cell: Cell) -> Cell:
-    """The cell without what lies before the entry; a cell may end there, and has width 0 then."""
+    """The cell without its part before the entry; one that ends there has width 0."""
     # not jnp.maximum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10)
     front = jnp.where(cell.front > 0, cell.front, 0)
-    left = cell.width - (front - cell.front)
-    return Cell(front, jnp.where(left > 0, left, 0), cell.cut)
+    width = cell.width - (front - cell.front)
+    return Cell(front, jnp.where(width > 0, width, 0), cell.cut)
 
 
-def cut_at_exit(cell: Cell, ray: Ray, cuts: Any = True) -> Cell:
-    """The cell without what lies past the ray's exit, if it `cuts`."""
-    left = jnp.where(cuts, ray.length, jnp.inf) - cell.front
+def cut_at_exit(cell: Cell, ray: Ray, cuts: Bool[Array, ""] | np.ndarray | bool = True) -> Cell:
+    """The cell without its part past the ray's exit, if `cuts`."""
+    until_exit = jnp.where(cuts, ray.length, jnp.inf) - cell.front
     # Not by jnp.minimum: inside loops on CPU, XLA loses its derivative (jaxlib 0.10). A cell that ends just
     # at the exit counts as cut there: its width, and the gradient of that, then depend on the exit.
-    width = jnp.where(left <= cell.width, left, cell.width)
-    return Cell(cell.front, jnp.where(width > 0, width, 0), cell.cut | (left < cell.width))
+    width = jnp.where(until_exit <= cell.width, until_exit, cell.width)
+    return Cell(cell.front, jnp.where(width > 0, width, 0), cell.cut | (until_exit < cell.width))
 
 
 def within(ray: Ray, depth: Scalar) -> Scalar:

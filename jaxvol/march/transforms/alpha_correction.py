@@ -1,4 +1,4 @@
-"""How wide is a cell that crosses a face? Sampling alignment, also called alpha correction (Kye 2013)."""
+"""Sampling alignment, also called alpha correction: the width of a cell that crosses a face (Kye 2013)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,7 +29,7 @@ LIMIT = 2**15
 class AlphaCorrection(Transform):
     """Cut the cells of a ray at the faces that they cross.
 
-    A ray's last sample then stands only for the width e up to the exit, and back faces are smooth: its
+    A ray's last sample then represents only the width e up to the exit, and back faces are smooth: its
     opacity is `1 - exp(-extinction e)`, the paper's `1 - (1 - α)^(e/d)`. A volume of constant extinction is
     rendered exactly at any step. Cells are also cut at the ends of a ray's gaps, as under `ToroidalMap` or
     `Clip`; of several gaps in one cell, at the first and the last end.
@@ -60,7 +60,7 @@ class AlphaCorrection(Transform):
 
     labels: bool = eqx.field(static=True)
 
-    def __init__(self, labels: bool | Any = False):
+    def __init__(self, labels: bool = False):
         self.labels = flag("labels", labels)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:
@@ -108,18 +108,18 @@ def _divided(cell: Cell, first: Scalar, last: Scalar, changes: Bool[Array, ""]) 
 def _gap_faces(cell: Cell, ray: Ray) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
     """The first and the last end of a gap within a cell, and whether there is any."""
     first = last = cell.front
-    found = jnp.zeros_like(cell.cut)
+    cuts = jnp.zeros_like(cell.cut)
     for depth in (end for gap in ray.gaps for end in gap):
-        here = (depth > cell.front) & (depth < cell.front + cell.width)
-        first = jnp.where(here & ~(found & (first < depth)), depth, first)
-        last = jnp.where(here & (last < depth), depth, last)
-        found |= here
-    return first, last, found
+        within = (depth > cell.front) & (depth < cell.front + cell.width)
+        first = jnp.where(within & ~(cuts & (first < depth)), depth, first)
+        last = jnp.where(within & (last < depth), depth, last)
+        cuts |= within
+    return first, last, cuts
 
 
 def _label_faces(cell: Cell, ray: Ray, volume: Volume) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
-    """Where a cell's label first and last changes, and whether it does. The label is that of the nearest node,
-    so that it changes at planes half-way between nodes only."""
+    """The first and the last face of labels within a cell, and whether there is any. A label is that of the
+    nearest node, so that faces are planes half-way between nodes."""
     cell = jax.lax.stop_gradient(cut_at_entry(cell))  # in front of the entry lies no face
     path = jax.lax.stop_gradient(ray.path)
     parts = _parts(cell, path)
@@ -164,9 +164,9 @@ def _crossings(cell: Cell, part: Any, parts: Any, path: Path, volume: Volume) ->
     length = cell.width / parts.astype(cell.front.dtype)
     front = cell.front + part.astype(length.dtype) * length
     begin, end = path(front), path(front + length)
-    node, other = nearest_node(begin, volume.shape), nearest_node(end, volume.shape)
+    node, next_node = nearest_node(begin, volume.shape), nearest_node(end, volume.shape)
     sides, depths = [], []
-    for i, j, low, high in zip(node, other, begin, end, strict=True):
+    for i, j, low, high in zip(node, next_node, begin, end, strict=True):
         side = jnp.sign(j - i)
         share = (_plane(i, side, low.dtype) - low) / jnp.where(side == 0, 1, high - low)
         sides.append(side)
@@ -183,9 +183,9 @@ def _changes(crossings: Crossings, volume: Volume) -> tuple[Int[Array, ""], Int[
     begins, ends = -front, front
     for axis, depth in enumerate(depths):
         before, at = ahead, front
-        for label, other in zip(labels, depths, strict=True):
-            nearer = (other < depth) & (other >= at)
-            before, at = jnp.where(nearer, label, before), jnp.where(nearer, other, at)
+        for label, crossed in zip(labels, depths, strict=True):
+            nearer = (crossed < depth) & (crossed >= at)
+            before, at = jnp.where(nearer, label, before), jnp.where(nearer, crossed, at)
         changes = (depth < jnp.inf) & (labels[axis] != before)
         first = jnp.where(changes & (depth < begins), axis + 1, first)
         begins = jnp.where(changes & (depth < begins), depth, begins)

@@ -1,4 +1,4 @@
-"""Which part of the volume is seen? What lies inside a box and planes, or outside of them."""
+"""Clipping: shows the part of a volume inside a box and planes, or outside of them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -34,8 +34,9 @@ class Clip(Transform):
 
     `box`, `origins` and `normals` are differentiable; where a face of the box coincides with one of the
     volume, the derivative is that of moving it inwards. Without `AlphaCorrection`, gradients miss the jumps
-    of the image when a sample crosses a cut. A ray that lies in a plane counts as inside. Inside out, a film of less than 2e-6 of the volume's diagonal
-    between a face of the volume and the cut is taken for rounding, and not seen.
+    of the image when a sample crosses a cut. A ray that lies in a plane counts as inside. Inside out, a film
+    of less than 2e-6 of the volume's diagonal between a face of the volume and the cut counts as rounding,
+    and is not shown.
 
     Where it fails: `experiments/stability.py`, "jitter behind cuts".
 
@@ -52,9 +53,9 @@ class Clip(Transform):
     def __init__(
         self,
         box: Arrayable | None = None,
-        planes: Sequence[tuple[Arrayable, Arrayable]] | Any = (),
+        planes: Sequence[tuple[Arrayable, Arrayable]] = (),
         *,
-        inside_out: bool | Any = False,
+        inside_out: bool = False,
     ):
         self.box = None
         if box is not None:
@@ -87,7 +88,7 @@ class Clip(Transform):
 
 
 class HalfSpace(NamedTuple):
-    """What lies on the side of a plane through `point` to which its unit `normal` points."""
+    """Points on the side of a plane through `point` to which its unit `normal` points."""
 
     point: Vec3
     normal: Vec3
@@ -132,7 +133,7 @@ class HalfSpace(NamedTuple):
 
 
 class _Clipped(Space):
-    """A space of which only what is inside all `sides` is seen, or only what is not."""
+    """A space that shows what is inside all `sides`, or only the rest."""
 
     inner: Space
     sides: tuple[HalfSpace, ...]
@@ -213,10 +214,10 @@ class _Clipped(Space):
         grid = self.inner.occupancy(visible, first, side)
         over = [side.over(grid) for side in self.local.sides]
         if self.inside_out:
-            seen = reduce(jnp.logical_or, [height <= reach for height, reach in over])
+            visible = reduce(jnp.logical_or, [height <= reach for height, reach in over])
         else:
-            seen = reduce(jnp.logical_and, [height >= -reach for height, reach in over])
-        return replace(grid, occupied=grid.occupied & seen)
+            visible = reduce(jnp.logical_and, [height >= -reach for height, reach in over])
+        return replace(grid, occupied=grid.occupied & visible)
 
 
 def _later(a: Scalar, b: Scalar) -> Scalar:

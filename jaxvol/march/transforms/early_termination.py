@@ -1,12 +1,11 @@
-"""When can a ray stop before its exit? Early ray termination (KISTI report 2005)."""
+"""Early ray termination: ends rays that are nearly opaque (KISTI report 2005)."""
 
 from dataclasses import replace
-from typing import Any
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
 
-from ..._util.checks import integer, number
+from ..._util.checks import Arrayable, integer, number
 from ..._util.vec3 import Scalar
 from ..march import CellRules, Transform
 
@@ -38,7 +37,7 @@ class EarlyTermination(Transform):
     opacity_left: Float[Array, ""]
     interval: int | None = eqx.field(static=True)
 
-    def __init__(self, opacity_left: Any = 1 / 255, interval: int | Any | None = None):
+    def __init__(self, opacity_left: Arrayable = 1 / 255, interval: int | None = None):
         self.opacity_left = number("opacity_left", opacity_left, above=0, below=1)
         self.interval = None if interval is None else integer("interval", interval, 1, 64)
 

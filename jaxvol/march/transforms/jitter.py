@@ -1,14 +1,15 @@
-"""Jittered sampling, and empty-space jittering: how are steps kept from showing as rings?
+"""Jittered sampling and empty-space jittering, which keep steps from showing as rings.
 
 Samples at the same depths in all pixels show rings around surfaces: wood grain. Both transforms shift the
 samples of each pixel by a random fraction ξ of a step, which turns the rings into noise of the same energy.
 """
 
 from dataclasses import replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from ..._util.checks import flag
@@ -19,7 +20,9 @@ from ...scene.volume import Volume
 from ..march import Cell, CellRules, Transform, cut_at_entry
 
 
-Pattern = Literal["white", "blue"]
+Pattern: TypeAlias = Literal["white", "blue"]
+Seed: TypeAlias = int | np.integer | Array
+"""An integer in [0, 2³²), or a key of `jax.random`."""
 
 
 class Noise(eqx.Module):
@@ -30,7 +33,7 @@ class Noise(eqx.Module):
     tile: Float[Array, "side side"] | None
     stream: int = eqx.field(static=True)
 
-    def __init__(self, seed: int | Any, pattern: Pattern | Any, stream: int):
+    def __init__(self, seed: Seed, pattern: Pattern, stream: int):
         self.seed = seed_word(seed)
         if pattern not in ("white", "blue"):
             raise ValueError(f'pattern must be "white" or "blue"; got {pattern!r}.')
@@ -42,8 +45,8 @@ class Noise(eqx.Module):
         if self.tile is None:
             return hashed_uniforms(column, row, self.seed, dtype)[self.stream]
         side = self.tile.shape[0]
-        here = jnp.full_like(column, self.stream)
-        shift_x, shift_y, _ = hashed_uniforms(here, here, self.seed, jnp.float32)
+        stream = jnp.full_like(column, self.stream)
+        shift_x, shift_y, _ = hashed_uniforms(stream, stream, self.seed, jnp.float32)
         x = (column + (shift_x * side).astype(column.dtype)) % side
         y = (row + (shift_y * side).astype(row.dtype)) % side
         return self.tile[y, x].astype(dtype)
@@ -72,9 +75,7 @@ class Jitter(Transform):
     noise: Noise
     front_residual: bool = eqx.field(static=True)
 
-    def __init__(
-        self, seed: Any = 0, pattern: Pattern | Any = "white", *, front_residual: bool | Any = False
-    ):
+    def __init__(self, seed: Seed = 0, pattern: Pattern = "white", *, front_residual: bool = False):
         self.noise = Noise(seed, pattern, stream=0)
         self.front_residual = flag("front_residual", front_residual)
 
@@ -92,7 +93,7 @@ class Jitter(Transform):
 
 
 class EmptySpaceJitter(Transform):
-    """At a ray's first transparent sample, of extinction 0, advance by a random fraction ξ of a step.
+    """Advance by a random fraction ξ of a step at a ray's first transparent sample, of extinction 0.
 
     So wood grain turns into noise, while faces where the volume's bounds cut material stay smooth. The image
     jumps where a ray's first transparent sample changes; gradients do not include these jumps.
@@ -111,7 +112,7 @@ class EmptySpaceJitter(Transform):
 
     noise: Noise
 
-    def __init__(self, seed: int | Any = 0, pattern: Pattern | Any = "white"):
+    def __init__(self, seed: Seed = 0, pattern: Pattern = "white"):
         self.noise = Noise(seed, pattern, stream=1)
 
     def shift(self, ray: Ray) -> Scalar:

@@ -1,4 +1,4 @@
-"""Where a line enters and leaves a swept sector, and its gaps: faces are two tori, cones and planes, of known
+"""Entry, exit and gaps of a line through a swept sector. Its faces are two tori, cones and planes, of known
 distance, approached by safe steps (sphere tracing), which become Newton's."""
 
 import math
@@ -68,26 +68,26 @@ class SectorFaces(eqx.Module):
         faces, start, rate, length = jax.lax.stop_gradient((self, entry, direction, length))
 
         def next_gap(depth: Scalar, _: None) -> tuple[Scalar, Gap]:
-            left, leaves = faces._crossing(start, rate, depth, length - depth, 1, inside=True)
-            back = faces._crossing(start, rate, left, length - left, 1, inside=False)[0]
-            back = jnp.minimum(back, length)  # also where no entry was found
-            found = leaves & (back > left)
-            gap = jnp.where(found, left, jnp.inf), jnp.where(found, back, jnp.inf)
-            return jnp.where(found, back, length), gap
+            begin, leaves = faces._crossing(start, rate, depth, length - depth, 1, inside=True)
+            end = faces._crossing(start, rate, begin, length - begin, 1, inside=False)[0]
+            end = jnp.minimum(end, length)  # also where no entry was found
+            exists = leaves & (end > begin)
+            gap = jnp.where(exists, begin, jnp.inf), jnp.where(exists, end, jnp.inf)
+            return jnp.where(exists, end, length), gap
 
         _, ends = jax.lax.scan(next_gap, 0 * length, None, GAPS)
 
         def exact(depth: Scalar) -> Scalar:
-            found = jnp.isfinite(depth)
-            at = self._exact(entry, direction, jnp.where(found, depth, 0))
-            return jnp.where(found, at, jnp.inf)
+            exists = jnp.isfinite(depth)
+            crossing = self._exact(entry, direction, jnp.where(exists, depth, 0))
+            return jnp.where(exists, crossing, jnp.inf)
 
-        return tuple((exact(left), exact(back)) for left, back in zip(*ends, strict=True))
+        return tuple((exact(begin), exact(end)) for begin, end in zip(*ends, strict=True))
 
     def _crossing(
         self, origin: Vec3, direction: Vec3, begin: Scalar, reach: Scalar, sign: int, *, inside: bool
     ) -> tuple[Scalar, Bool[Array, ""]]:
-        """Where a line stops being `inside`, or outside, along `sign` × direction, and whether."""
+        """Find where a line stops being `inside`, or outside, along `sign` × direction, and if it does."""
         faces, origin, direction = jax.lax.stop_gradient((self, origin, direction))
         begin, reach, tolerance = jax.lax.stop_gradient((begin, reach, self._tolerance))
 
@@ -101,9 +101,9 @@ class SectorFaces(eqx.Module):
 
         def body(state: Any) -> Any:
             gone, to_faces, steps = state
-            here = along(origin, direction, begin + sign * gone)
+            point = along(origin, direction, begin + sign * gone)
             ahead = [ToFace(distance, sign * slope) for distance, slope in to_faces]
-            gone = gone + faces._clear(here, ahead, inside=inside)
+            gone = gone + faces._clear(point, ahead, inside=inside)
             return gone, faces._at(origin, direction, begin + sign * gone), steps + 1
 
         to_faces = faces._at(origin, direction, begin)
@@ -125,18 +125,18 @@ class SectorFaces(eqx.Module):
 
         def clear(face: ToFace, near: Scalar | None) -> Scalar:
             # past the tolerance, which a step to the face itself might not pass
-            away = jnp.maximum(2 * self._tolerance - face.distance if inside else face.distance, 0)
+            distance = jnp.maximum(2 * self._tolerance - face.distance if inside else face.distance, 0)
             fall = face.slope if inside else -face.slope
             falls = fall > 0
             if near is None:
                 far = 4 * self.size
-                safe = jnp.where(falls, jnp.minimum(away / jnp.where(falls, fall, 1), far), far)
+                safe = jnp.where(falls, jnp.minimum(distance / jnp.where(falls, fall, 1), far), far)
             else:
-                bend = 8 * away / jnp.maximum(near, jnp.maximum(away, self._tolerance))
+                bend = 8 * distance / jnp.maximum(near, jnp.maximum(distance, self._tolerance))
                 root = jnp.sqrt(fall * fall + bend)
-                quotient = 2 * away / jnp.where(falls, root + fall, 1)  # without differences
+                quotient = 2 * distance / jnp.where(falls, root + fall, 1)  # without differences
                 newton = jnp.where(falls, quotient, (root - fall) * near / 4)
-                safe = jnp.maximum(away, jnp.minimum(newton, near / 2))
+                safe = jnp.maximum(distance, jnp.minimum(newton, near / 2))
             return safe if inside else jnp.where(face.distance > 0, safe, 0)
 
         # it leaves at the first face that it passes, and has entered when it has passed all
@@ -169,11 +169,11 @@ class SectorFaces(eqx.Module):
 
 
 def _farthest(to_faces: list[ToFace]) -> ToFace:
-    """Of the face that a point is farthest outside of."""
+    """The distance of the face that a point is farthest outside of."""
 
-    def farther(one: ToFace, other: ToFace) -> ToFace:
-        keep = one.distance >= other.distance
-        return ToFace(*(jnp.where(keep, a, b) for a, b in zip(one, other, strict=True)))
+    def farther(a: ToFace, b: ToFace) -> ToFace:
+        keep = a.distance >= b.distance
+        return ToFace(jnp.where(keep, a.distance, b.distance), jnp.where(keep, a.slope, b.slope))
 
     return reduce(farther, to_faces)
 

@@ -1,4 +1,4 @@
-"""How far ahead is nothing visible? Space leaping (Chae and Shin; KISTI report 2005)."""
+"""Space leaping: passes over regions that show nothing (Chae and Shin; KISTI report 2005)."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -74,7 +74,7 @@ class SpaceLeaping(Transform):
     cell: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
 
-    def __init__(self, method: Method | Any = "hierarchy", cell: int | Any = 8, *, block: int | Any = BLOCK):
+    def __init__(self, method: Method = "hierarchy", cell: int = 8, *, block: int = BLOCK):
         if method not in get_args(Method):
             raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
         self.method = method
@@ -83,7 +83,9 @@ class SpaceLeaping(Transform):
         if block not in (1, 2, BLOCK):
             raise ValueError(f"block must be 1, 2 or {BLOCK}; got {block}.")
         if block != BLOCK and method not in ("distance", "min_distance"):
-            raise ValueError(f'block is of the map of "distance" and "min_distance"; got method {method!r}.')
+            raise ValueError(
+                f'block={block} needs method="distance" or "min_distance"; got method="{method}".'
+            )
 
     @property
     def block_side(self) -> int:
@@ -109,11 +111,11 @@ class SpaceLeaping(Transform):
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
     def index_of(self, occupancy: Occupancy, sums: Sums) -> EmptySpaceIndex:
-        """That of `"hierarchy"`, from sums of occupied cells."""
+        """The index of `"hierarchy"`, from sums of occupied cells."""
         return _Beams(occupancy, sums)
 
     def _beam_starts(self, occupancy: Occupancy, view: View, column: Array, row: Array) -> Array:
-        """For each square of pixels, from its first one, up to where its rays meet nothing visible."""
+        """Distances up to which the rays of each square of pixels meet nothing visible."""
         last = self.cell - 1
         column = jnp.stack([column, column + last, column, column + last], axis=-1)
         row = jnp.stack([row, row, row + last, row + last], axis=-1)
@@ -138,7 +140,7 @@ class _Beams(EmptySpaceIndex):
     def unshaped(self) -> "_Beams":
         return _Beams(self.occupancy.unshaped, self.sums)
 
-    def along(self, volume: Volume) -> "_Beams":
+    def on_axes_of(self, volume: Volume) -> "_Beams":
         frame: Any = self.occupancy.frame
         if frame is not None:
             return self
@@ -191,11 +193,11 @@ class _Distances(EmptySpaceIndex, Skips):
         x, y, z = (jnp.clip(jnp.floor(p), 0, n - 1) for p, n in zip(point, shape, strict=True))
         i, j, k = (corner.astype(jnp.int32) for corner in (x, y, z))
         flat = (i * ny + j) * nz + k
-        away = gather(self.distance, flat).astype(depth.dtype)
-        # all cells nearer than `away` are empty: advance to where the ray leaves their cube
+        distance = gather(self.distance, flat).astype(depth.dtype)
+        # all cells nearer than `distance` are empty: advance to where the ray leaves their cube
         ahead = jnp.inf
         for p, r, corner in zip(point, rate, (x, y, z), strict=True):
-            face = jnp.where(r > 0, corner + away, corner + 1 - away)
+            face = jnp.where(r > 0, corner + distance, corner + 1 - distance)
             ahead = jnp.minimum(ahead, jnp.where(r == 0, jnp.inf, (face - p) / jnp.where(r == 0, 1, r)))
-        ahead = jnp.where(away >= FARTHEST, jnp.inf, ahead)
-        return jnp.where((away > 0) & (depth < length), depth + jnp.maximum(ahead, 0), depth)
+        ahead = jnp.where(distance >= FARTHEST, jnp.inf, ahead)
+        return jnp.where((distance > 0) & (depth < length), depth + jnp.maximum(ahead, 0), depth)

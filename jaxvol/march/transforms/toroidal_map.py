@@ -1,4 +1,4 @@
-"""Where does a swept ultrasound fan lie in the world? Toroidal coordinates (Kim, Kwon and Shin 2008).
+"""Toroidal coordinates, which place a swept ultrasound fan in the world (Kim, Kwon and Shin 2008).
 
 A mechanical probe turns a fan of beams about a motor axis. Its samples form a box in (β, σ, γ): the motor
 angle, the angle of the beam in the fan, and the depth along the beam. In the world, whose x axis is the motor
@@ -192,8 +192,9 @@ class _Sector(Space):
 
         def angle(axis_distance: Scalar) -> Scalar:
             """Most that an angle about an axis changes within the sphere."""
-            away = axis_distance > radius
-            return jnp.where(away, jnp.arcsin(radius / jnp.where(away, axis_distance, radius)), math.tau)
+            off_axis = axis_distance > radius
+            ratio = radius / jnp.where(off_axis, axis_distance, radius)
+            return jnp.where(off_axis, jnp.arcsin(ratio), math.tau)
 
         changes, ranges = (angle(rho), angle(off), radius), self.probe.ranges
         begin, stop, reached = [], [], jnp.ones(rho.shape, bool)
@@ -202,10 +203,10 @@ class _Sector(Space):
             blocks, c = visible.shape[axis], coordinate[axis] - (0 if first is None else first[axis])
             nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
             reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, side * blocks))
-            for end, found in ((c - nodes, begin), (c + nodes, stop)):
-                found.append(jnp.clip(jnp.floor(end / side).astype(jnp.int32), 0, blocks - 1))
-        seen = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
-        return Occupancy(reached & seen, low, (x, y, z))
+            for end, bounds in ((c - nodes, begin), (c + nodes, stop)):
+                bounds.append(jnp.clip(jnp.floor(end / side).astype(jnp.int32), 0, blocks - 1))
+        shows = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
+        return Occupancy(reached & shows, low, (x, y, z))
 
     @property
     def _faces(self) -> SectorFaces:
@@ -221,8 +222,8 @@ class _Sector(Space):
 def _atan2(a: Scalar, b: Scalar) -> Scalar:
     """atan2, with value and gradient 0 at the origin."""
     # not merely nonzero: the derivative divides by a² + b², which must not underflow
-    away = jnp.maximum(jnp.abs(a), jnp.abs(b)) > float(jnp.finfo(a.dtype).tiny) ** 0.25
-    return jnp.where(away, jnp.arctan2(jnp.where(away, a, 0), jnp.where(away, b, 1)), 0)
+    defined = jnp.maximum(jnp.abs(a), jnp.abs(b)) > float(jnp.finfo(a.dtype).tiny) ** 0.25
+    return jnp.where(defined, jnp.arctan2(jnp.where(defined, a, 0), jnp.where(defined, b, 1)), 0)
 
 
 def _range(name: str, value: Arrayable) -> Float[Array, "2"]:

@@ -269,7 +269,7 @@ def test_bad_arguments_are_named():
             jv.SpaceLeaping(*arguments)
     for method, block, message in (
         ("distance", 3, "block must be 1, 2 or 4; got 3"),
-        ("beam", 1, "block is of"),
+        ("beam", 1, "block=1 needs method"),
     ):
         with pytest.raises(ValueError, match=message):
             jv.SpaceLeaping(method, block=block)
