@@ -1,5 +1,5 @@
-"""Finds empty space: the interface that marches use, and empty stretches of a beam of neighbouring rays, whose
-bounding box has faces that move linearly with the distance."""
+"""Finds empty space: the interface that marches use, and empty stretches of beams, neighbouring rays in a
+bounding box whose faces move linearly with the distance."""
 
 from abc import abstractmethod
 from collections.abc import Callable
