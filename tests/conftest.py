@@ -22,7 +22,7 @@ def import_with_types_checked():
     """Imports the library so that shapes and types are checked at every call, which takes seven seconds."""
     if os.environ.get("NOHOOK"):
         return
-    typechecker.leave_inner_functions()
+    typechecker.adapt_decorator()
     with install_import_hook("jaxvol", "tests.typechecker.check"):
         import jaxvol
 
