@@ -11,7 +11,7 @@ check = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
 def adapt_decorator():
     """Change `jaxtyping.jaxtyped`, the decorator of jaxtyping's import hook, in two ways. Functions inside
-    others stay as they are: they are made anew in each call of the outer one, and to decorate them takes up to
+    others stay as they are: they are made anew in each call of the outer one, and decorating them takes up to
     a third of the time of tests that mostly trace. And where an argument is not of its annotated type, the
     function's own error comes first, if it raises one, since that is what users see."""
     decorate = jaxtyping.jaxtyped
