@@ -8,7 +8,7 @@ the last may reach past the exit. A transform is one idea of one paper: it overr
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, SupportsIndex, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -219,7 +219,7 @@ class March(eqx.Module):
         transforms: tuple[Transform, ...] | list[Transform] = (),
         quadrature: Quadrature = "left",
         *,
-        max_samples: int | None = None,
+        max_samples: SupportsIndex | None = None,
     ):
         self.step = number("step", step, above=0)
         if not isinstance(transforms, tuple | list):

@@ -1,6 +1,7 @@
 """Early ray termination: ends rays that are nearly opaque (KISTI report 2005)."""
 
 from dataclasses import replace
+from typing import SupportsIndex
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float
@@ -37,7 +38,7 @@ class EarlyTermination(Transform):
     opacity_left: Float[Array, ""]
     interval: int | None = eqx.field(static=True)
 
-    def __init__(self, opacity_left: Arrayable = 1 / 255, interval: int | None = None):
+    def __init__(self, opacity_left: Arrayable = 1 / 255, interval: SupportsIndex | None = None):
         self.opacity_left = number("opacity_left", opacity_left, above=0, below=1)
         self.interval = None if interval is None else integer("interval", interval, 1, 64)
 

@@ -5,11 +5,10 @@ samples of each pixel by a random fraction ξ of a step, which turns the rings i
 """
 
 from dataclasses import replace
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, SupportsIndex, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from ..._util.checks import flag
@@ -21,7 +20,7 @@ from ..march import Cell, CellRules, Transform, cut_at_entry
 
 
 Pattern: TypeAlias = Literal["white", "blue"]
-Seed: TypeAlias = int | np.integer | Array
+Seed: TypeAlias = SupportsIndex | Array
 """An integer in [0, 2³²), or a key of `jax.random`."""
 
 

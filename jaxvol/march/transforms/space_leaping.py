@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, TypeAlias, get_args
+from typing import Any, Literal, SupportsIndex, TypeAlias, get_args
 
 import equinox as eqx
 import jax
@@ -74,7 +74,9 @@ class SpaceLeaping(Transform):
     cell: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
 
-    def __init__(self, method: Method = "hierarchy", cell: int = 8, *, block: int = BLOCK):
+    def __init__(
+        self, method: Method = "hierarchy", cell: SupportsIndex = 8, *, block: SupportsIndex = BLOCK
+    ):
         if method not in get_args(Method):
             raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
         self.method = method
