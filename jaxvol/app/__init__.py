@@ -1,1 +1,1 @@
-"""Programs over the library: the command line, the viewer, and what is shown by default."""
+"""Applications of the library: command line, viewer, default transfer functions and cameras."""

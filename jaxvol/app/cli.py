@@ -1,5 +1,4 @@
-"""The command `jaxvol`: puts its subcommands together, reports faults in one line, and ends at once when it
-is interrupted."""
+"""Entry point of the command `jaxvol`: its subcommands, errors in one line, an immediate end on Ctrl-C."""
 
 import argparse
 import os
@@ -30,7 +29,7 @@ COMMANDS = {
     "datasets": ("volumes", "list the Open SciVis volumes; or print the path of one, downloaded if need be"),
     "view": ("volumes", "look at a volume file in the browser of this machine; Ctrl-C ends it"),
 }
-"""By name, the module in `commands/` whose `add_NAME` adds a command's options, and what it does."""
+"""Commands by name: the module in `commands/` with `add_NAME` (options) and `run_NAME`, and the help text."""
 
 EXAMPLES = """\
 examples:
@@ -46,10 +45,9 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line, by default with the words of the process. Returns the exit code: 0; 2 for bad
-    input, reported in one line; 1 where what reads stdout has ended. Ctrl-C is reported in one line and ends
-    the process at once with code 130, as in shells, since XLA does not stop for a signal. Unfinished files
-    are removed."""
+    """Run the command line, by default `sys.argv`, and return the exit code: 0; 2 for bad input, reported in
+    one line; 1 if stdout was closed. Ctrl-C removes unfinished files and ends the process at once with code
+    130, as in shells, since XLA does not stop for a signal."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     program = " ".join(["jaxvol", *words[:1]])
     options = argparse.Namespace()
@@ -59,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = lambda told, *_: print(f"{program}: {told}", file=sys.stderr)
+            warnings.showwarning = lambda message, *_: print(f"{program}: {message}", file=sys.stderr)
             # the main thread gets the signals, and can handle them while it waits, also if XLA is busy
             ThreadPoolExecutor(1).submit(options.execute, options).result()
         sys.stdout.flush()
@@ -68,11 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (ValueError, OSError, ImportError, OverflowError) as fault:
-        return _told(program, str(fault).removeprefix("path: "))  # the argument's name in Python
+        return _report(program, str(fault).removeprefix("path: "))  # the argument's name in Python
     except (MemoryError, RuntimeError) as fault:
         if not isinstance(fault, MemoryError) and "RESOURCE_EXHAUSTED" not in str(fault):
             raise
-        return _told(program, f"there is not enough memory ({fault})")
+        return _report(program, f"there is not enough memory ({fault})")
     except KeyboardInterrupt:
         remove_unfinished()
         checkpoint = getattr(options, "checkpoint", None)
@@ -86,14 +84,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 ARGUMENT = re.compile(r'\b(shape|dtype|spacing|nan|time|channel)=(?:\(([\w, ]+)\)|"?(\w+)"?)')
-"""Of `jv.load`, as messages quote it, such as `shape=(nx, ny, nz)`: an option of the command, too."""
+"""Arguments of `jv.load` in messages, such as `shape=(nx, ny, nz)`, which are options of the command."""
 
 
-def _told(program: str, fault: str) -> int:
-    """Print a fault in one line, which may hold text of files. Returns the exit code."""
+def _report(program: str, fault: str) -> int:
+    """Print an error, which may quote a file, in one line, and return the exit code."""
     from .._util.checks import printable  # here: takes long to import
 
-    fault = ARGUMENT.sub(lambda found: f"--{found[1]} {(found[2] or found[3]).replace(',', '')}", fault)
+    fault = ARGUMENT.sub(lambda match: f"--{match[1]} {(match[2] or match[3]).replace(',', '')}", fault)
     print(f"{program}: error: {printable(' '.join(fault.split()))}", file=sys.stderr)
     return 2
 
@@ -106,16 +104,18 @@ def parser_of_all() -> Parser:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    told = f"%(prog)s {__version__} (jax {version_of('jax')})"
-    parser.add_argument("--version", action="version", version=told)
+    version = f"%(prog)s {__version__} (jax {version_of('jax')})"
+    parser.add_argument("--version", action="version", version=version)
     commands: Any = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, (module, text) in COMMANDS.items():
-        about = {"help": text, "description": f"{text[0].upper()}{text[1:]}."}
-        added = commands.add_parser(name, add_options=partial(_add_options, module, name), **about)
-        added.set_defaults(parser=added)
+        texts = {"help": text, "description": f"{text[0].upper()}{text[1:]}."}
+        command = commands.add_parser(name, add_options=partial(_add_options, module, name), **texts)
+        command.set_defaults(parser=command)
     return parser
 
 
 def _add_options(module: str, name: str, parser: Parser) -> None:
-    """Add the options of a command, and the function that executes it."""
-    getattr(import_module(f"{__package__}.commands.{module}"), f"add_{name}")(parser)
+    """Add the options of a command, and the function to execute."""
+    commands = import_module(f"{__package__}.commands.{module}")
+    getattr(commands, f"add_{name}")(parser)
+    parser.set_defaults(execute=getattr(commands, f"run_{name}"))

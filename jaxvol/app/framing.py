@@ -1,9 +1,9 @@
-"""Where is what a transfer function shows, and from how far does a camera see all of it?"""
+"""Cameras framed on the visible part of a volume."""
 
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -17,60 +17,53 @@ from ..scene.labels import LabelTransferFunction
 from ..scene.several import pairs_of
 from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
-from .automatic import automatic_transfer, check_known, sampled, stride_of, unit_of
+from .automatic import automatic_transfer, check_known, reports_arguments, sampled, stride_of, unit_of
 
 
-VISIBLE = 0.1  # opacity, along a hundredth of the diagonal, from which on a voxel counts as visible
-FAINT = 0.01  # the same of a transfer function that was given, and where it is asked on which face it stands
-SPECK = 0.02  # pieces smaller than this fraction of the largest one need not be in the picture
-REACH = 3  # voxels of the cube around each visible one that connects it to others, as the leaves of a tree
-NEAREST = 0.1  # least distance of the camera from what is visible, as a fraction of the diagonal of that
-MARGIN = 1.06  # by how much more than what is visible the picture shows, in each direction
-
-CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
-"""Of the unit cube."""
-
-FRONT = (0.5, -1.0, 0.4)
-"""From the volume to the camera, where z is up: to the right, in front, and higher."""
-
-
-SLAB = 0.2
-"""Shortest side of a volume, as a fraction of the middle one, below which it is seen from its broad side."""
+VISIBLE = 0.1  # least opacity of a visible voxel, along a hundredth of the volume's diagonal
+FAINT = 0.01  # the same under a user's transfer function, and to find the face that an object stands on
+SPECK = 0.02  # pieces smaller than this fraction of the largest one are left out of the picture
+REACH = 3  # side of the cube, in voxels, that connects visible voxels to a piece, as the leaves of a tree
+NEAREST = 0.1  # least distance of the camera from the visible points, as a fraction of their diagonal
+MARGIN = 1.06  # size of the picture over that of the visible points
+CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # of the unit cube
+FRONT = (0.5, -1.0, 0.4)  # from the volume to the camera, where z is up: to the right, in front, and higher
+SLAB = 0.2  # shortest side over the middle one, below which a volume is seen from its broad side
 
 CUT_FACE, OTHER_FACE = 0.1, 1 / 3
-"""An object stands on a face of the volume that cuts through so much of it, if the opposite one cuts through
-at most that part as much: the neck, or the pot of a plant."""
+"""An object stands on a face of the volume of which it covers more than `CUT_FACE`, if it covers at most
+`OTHER_FACE` times as much of the opposite one: the neck, or the pot of a plant."""
 
 
+@reports_arguments
 def automatic_camera(
-    volume: Volume | Any,
-    transfer: Transfer | Any,
+    volume: Volume | Sequence[Volume],
+    transfer: Transfer | Sequence[Transfer],
     direction: Arrayable | None = None,
     view_up: Arrayable | None = None,
     view_angle: Arrayable = 30.0,
     *,
-    parallel: bool | Any = False,
-    size: tuple[int, int] | int | Any = (512, 512),
+    parallel: bool = False,
+    size: tuple[int, int] | int = (512, 512),
     least: float = VISIBLE,
-    centered: bool | Any = False,
+    centered: bool = False,
 ) -> Camera:
-    """A camera as near as what a transfer function shows allows, specks left out, and upright.
+    """A camera framed on the visible part of a volume, without specks, and upright.
 
     Args:
-        volume: what is seen; or a list of several volumes, as for `render`, the first of which is upright.
-        transfer: a `TransferFunction` or `LabelTransferFunction`; for another, all of the volume counts. Of
-            several volumes, a list of one for each.
+        volume: the volume; or a list of volumes, as for `render`, the first of which is upright.
+        transfer: a `TransferFunction` or `LabelTransferFunction`; under other kinds, the whole volume counts
+            as visible. For a list of volumes, a list with one for each.
         direction: from the volume to the camera; by default to the right, in front, and higher.
-        view_up: by default z, or -y from straight above or below, where a patient's front is; of a volume
-            that does not say where it lies (its origin is 0, its axes are the world's, as of raw files), away
-            from the face that cuts through most of what `automatic_transfer` shows, if the opposite one does
-            not: the neck, or the pot of a plant, is below.
+        view_up: by default z, or from straight above or below -y, where a patient's front is. For a volume
+            with origin 0 and the world's axes, as of raw files: away from the face that the object stands on
+            (the neck, the pot of a plant), if `automatic_transfer` shows much more on it than on the opposite
+            one.
         view_angle: degrees.
         parallel: whether the camera is orthographic.
         size: (width, height) of the image in pixels.
-        least: opacity along a hundredth of the volume's diagonal from which on a voxel counts; 0.01 where
-            what is visible may be fog.
-        centered: whether the focal point is the middle of what is seen, as to turn the camera about it. The
+        least: least opacity of a visible voxel, along a hundredth of the volume's diagonal; 0.01 for fog.
+        centered: whether the focal point is the middle of the visible part, as for an orbit about it. The
             camera is then farther away (by 1.03 to 1.3 in eight scans), since perspective shows the near part
             larger.
 
@@ -78,13 +71,13 @@ def automatic_camera(
         The `Camera`.
 
     Raises:
-        ValueError: as `Camera.looking_at` does, for a `view_up` along `direction`, and for what is traced.
+        ValueError: as `Camera.looking_at` does, for a `view_up` along `direction`, and for traced arguments.
     """
-    pairs = pairs_of(volume, transfer) or [(volume, transfer)]
+    pairs = cast(list[tuple[Volume, Transfer]], pairs_of(volume, transfer) or [(volume, transfer)])
     volume, transfer = pairs[0]
     check_arguments("automatic_camera(volume, transfer)", volume=volume, transfer=transfer)
     check_known("automatic_camera", pairs, direction, view_up, view_angle)
-    with jax.ensure_compile_time_eval():  # also where something else is traced
+    with jax.ensure_compile_time_eval():  # also inside jax.jit
         side = upright(volume, transfer, direction, view_up)
         camera = Camera.looking_at(volume, *side, view_angle, parallel=parallel, size=size)
         points = np.concatenate([visible_points(*pair, least) for pair in pairs])
@@ -94,56 +87,60 @@ def automatic_camera(
 def upright(
     volume: Volume, transfer: Transfer, direction: Arrayable | None, view_up: Arrayable | None
 ) -> tuple[Any, Any]:
-    """Direction and view up, where they are None as `automatic_camera` has them."""
+    """Direction and view up; where they are None, the defaults of `automatic_camera`."""
     axis, sign = (2, 1.0) if view_up is not None else _up(volume, transfer)
-    front = np.roll(FRONT, axis + 1)  # so that what is above lies along this axis
+    front = np.roll(FRONT, axis + 1)  # its height lies along the axis
     front[axis] *= sign
     extent = np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
     thin = int(np.argmin(extent))
-    if extent[thin] < SLAB * np.median(extent):  # seen from its broad side
+    if extent[thin] < SLAB * np.median(extent):
         front = 0.3 * front
         front[thin] = 1.0 if front[thin] >= 0 else -1.0
         axis, sign = (axis, sign) if axis != thin else (1, 1.0)
         front = front if volume.direction is None else np.asarray(volume.direction) @ front
     toward = np.asarray(finite_array("direction", front if direction is None else direction, (3,)))
     up = np.asarray(finite_array("view_up", sign * np.eye(3)[axis] if view_up is None else view_up, (3,)))
-    along = np.linalg.norm(np.cross(toward, up)) <= 1e-3 * np.linalg.norm(toward) * np.linalg.norm(up)
-    if along and view_up is not None and np.any(up) and np.any(toward):
+    is_along = np.linalg.norm(np.cross(toward, up)) <= 1e-3 * np.linalg.norm(toward) * np.linalg.norm(up)
+    if is_along and view_up is not None and np.any(up) and np.any(toward):
         raise ValueError(f"view_up must not point along direction, {pasted(toward)}; got {pasted(up)}.")
-    # a patient's front lies at -y; of others, `Camera.looking_at` knows
-    return toward, -np.eye(3)[1] if along and view_up is None and is_placed(volume) else up
+    # a patient's front lies at -y; `Camera.looking_at` knows the default of other volumes
+    return toward, -np.eye(3)[1] if is_along and view_up is None and is_placed(volume) else up
 
 
 def is_placed(volume: Volume) -> bool:
-    """Whether a volume says where it lies, as those of scanners do."""
+    """True if a volume has a place in the world, as those of scanners do."""
     return volume.direction is not None or bool(np.any(np.asarray(volume.origin)))
 
 
 def _up(volume: Volume, transfer: Transfer) -> tuple[int, float]:
-    """The axis that points up, and whether it does so forward or backward."""
-    known = is_placed(volume)
-    if not known and isinstance(transfer, TransferFunction):  # what is given may be fog
+    """The axis that points up, and its sign."""
+    up = 2, 1.0
+    if is_placed(volume):
+        return up
+    if isinstance(transfer, TransferFunction):  # the given one may show fog
         with warnings.catch_warnings(action="ignore"):  # which were given before
             transfer = automatic_transfer(volume)
-    visible, found, most = _visible(volume, transfer, FAINT), (2, 1.0), CUT_FACE
-    for axis in () if known else (2, 1, 0):
+    visible, threshold = _visible(volume, transfer, FAINT), CUT_FACE
+    for axis in (2, 1, 0):
         low, high = (float(visible.take(end, axis).mean()) for end in (0, -1))
-        cut, other, sign = (low, high, 1.0) if low >= high else (high, low, -1.0)
-        if cut > most and other <= OTHER_FACE * cut:
-            found, most = (axis, sign), cut
-    return found
+        cut, opposite, sign = (low, high, 1.0) if low >= high else (high, low, -1.0)
+        if cut > threshold and opposite <= OTHER_FACE * cut:
+            up, threshold = (axis, sign), cut
+    return up
 
 
-def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -> Float[np.ndarray, "n 3"]:
-    """World points around what is shown, without specks; else the volume's corners."""
+def visible_points(
+    volume: Volume, transfer: Transfer, min_opacity: float = VISIBLE
+) -> Float[np.ndarray, "n 3"]:
+    """World points around the visible voxels, without specks; the volume's corners if there are none."""
     from scipy.ndimage import label, maximum_filter
     from scipy.spatial import ConvexHull, QhullError
 
-    visible, last = _visible(volume, transfer, least), np.array(volume.shape) - 1
+    visible, last = _visible(volume, transfer, min_opacity), np.array(volume.shape) - 1
     grid = CORNERS * last
     if visible.any():
-        found: Any = label(maximum_filter(visible, REACH))  # scipy's types allow a number, too
-        pieces = visible * found[0]
+        labelled: Any = label(maximum_filter(visible, REACH))  # scipy's types allow a number, too
+        pieces = visible * labelled[0]
         sizes = np.bincount(pieces.ravel())
         sizes[0] = 0
         shown = (sizes >= SPECK * sizes.max())[pieces]
@@ -161,9 +158,9 @@ def visible_points(volume: Volume, transfer: Transfer, least: float = VISIBLE) -
 def clipped_points(
     points: Float[np.ndarray, "n 3"], planes: Sequence[tuple[Any, Any]]
 ) -> Float[np.ndarray, "m 3"]:
-    """Points whose hull is what planes (point, normal) leave of the given hull, if anything."""
-    for at, normal in planes:
-        height = (points - np.asarray(at, float)) @ np.asarray(normal, float)
+    """Points of the hull of `points` clipped by planes (origin, normal); none if nothing remains."""
+    for origin, normal in planes:
+        height = (points - np.asarray(origin, float)) @ np.asarray(normal, float)
         kept, cut, above = points[height >= 0], points[height < 0], height[height >= 0][:, None]
         share = above / np.maximum(above - height[height < 0], 1e-30)
         crossing = kept[:, None] + share[..., None] * (cut[None] - kept[:, None])
@@ -171,8 +168,8 @@ def clipped_points(
     return points
 
 
-def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarray, "nx ny nz"]:
-    """Which of the volume's `sampled` voxels a transfer function shows with at least this opacity."""
+def _visible(volume: Volume, transfer: Transfer, min_opacity: float) -> Bool[np.ndarray, "nx ny nz"]:
+    """Mask of the volume's `sampled` voxels that are more opaque than `min_opacity`."""
     data, shown = sampled(volume), sized(transfer, volume)
     if isinstance(shown, TransferFunction):
         extinction = np.interp(data, np.asarray(shown.values), np.asarray(shown.extinction))
@@ -180,34 +177,29 @@ def _visible(volume: Volume, transfer: Transfer, least: float) -> Bool[np.ndarra
         extinction, kinds = np.zeros(data.shape), sampled(volume, volume.labels)
         factors = np.asarray(shown.opacity) * np.asarray(shown.shown)
         functions = map(np.asarray, (shown.stacked.values, shown.stacked.extinction))
-        for kind, (values, own) in enumerate(zip(*functions, strict=True)):
-            extinction[kinds == kind] = factors[kind] * np.interp(data[kinds == kind], values, own)
+        for kind, function in enumerate(zip(*functions, strict=True)):
+            extinction[kinds == kind] = factors[kind] * np.interp(data[kinds == kind], *function)
     else:
         return np.ones(data.shape[:3], bool)
-    return -np.expm1(-extinction * unit_of(volume)) > least
+    return -np.expm1(-extinction * unit_of(volume)) > min_opacity
 
 
-def warn_of_distance(volume: Volume, others: Sequence[tuple[Volume, Transfer]]) -> None:
-    """Say so of a volume that does not meet the first one: mostly a file does not say where it lies."""
-    for number, (other, _) in enumerate(others):
-        low, high = np.asarray(volume.bounds).reshape(3, 2).T
-        first, last = np.asarray(other.bounds).reshape(3, 2).T
+def warn_of_gap(volume: Volume, pairs: Sequence[tuple[Volume, Transfer]]) -> None:
+    """Warn of volumes of `pairs` that do not overlap the first one, mostly since a file has no origin."""
+    low, high = np.asarray(volume.bounds).reshape(3, 2).T
+    for number, (added, _) in enumerate(pairs):
+        first, last = np.asarray(added.bounds).reshape(3, 2).T
         if (last < low).any() or (first > high).any():
-            ends = (f"{pasted(a)} to {pasted(b)}" for a, b in ((first, last), (low, high)))
-            told = f"others[{number}], from {next(ends)}, does not meet the volume, from {next(ends)}"
-            warnings.warn(f"{told}: do spacing and origin suit?", stacklevel=4)
+            place = f"others[{number}], from {pasted(first)} to {pasted(last)},"
+            bounds = f"does not meet the volume, from {pasted(low)} to {pasted(high)}"
+            warnings.warn(f"{place} {bounds}: do spacing and origin suit?", stacklevel=4)
 
 
 def framed(
-    camera: Camera,
-    points: Float[np.ndarray, "n 3"],
-    views: Sequence[Camera] = (),
-    *,
-    centered: bool = False,
+    camera: Camera, points: Float[np.ndarray, "n 3"], views: Sequence[Camera] = (), *, centered: bool = False
 ) -> Camera:
-    """A camera with the directions, the angle and the size of another, placed so that the points just fill
-    its picture, the whole window, their middle in its middle if `centered`; or those of all `views` of it,
-    turned about that.
+    """`camera` moved along its direction and across it so that the points just fill the whole window, with
+    their middle in its middle if `centered`; or so that they fit into all `views` of an orbit about them.
 
     From a distance D, a point that lies x across from the focal point, and z nearer, is in the picture if
     |x| <= t (D - z), where t is the tangent of half the angle. For parallel rays, z does not count, and D is
@@ -215,8 +207,8 @@ def framed(
     from scipy.optimize import brentq
 
     def excess(shift: float, across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) -> float:
-        seen = (across - shift) / depth  # 0 where as much is free on both sides
-        return float(seen.max() + seen.min())
+        position = (across - shift) / depth
+        return float(position.max() + position.min())  # 0 if the margins of both sides are equal
 
     centered, views = centered or len(views) > 1, views or [camera]
     width, height = camera.size
@@ -231,18 +223,18 @@ def framed(
         axes = np.stack([right, up], axis=1)
         across, depth = (points - middle) @ axes / t, -(points - middle) @ forward
         nearer, front = depth * perspective, max(front, float(depth.max()))
-        one, other = ((nearer[:, None] + side * across).max(axis=0) for side in (1, -1))
-        needed = np.maximum(one, other) if centered else (one + other) / 2
+        upper, lower = ((nearer[:, None] + side * across).max(axis=0) for side in (1, -1))
+        needed = np.maximum(upper, lower) if centered else (upper + lower) / 2
         distance = max(distance, float(nearer.max()) + free * perspective, *needed.tolist())
         if not centered:
-            away = distance - nearer if perspective else np.ones(len(points))
-            shifts = [brentq(excess, x.min(), x.max(), (x, away)) for x in across.T]
+            depths = distance - nearer if perspective else np.ones(len(points))
+            shifts = [brentq(excess, x.min(), x.max(), (x, depths)) for x in across.T]
             focal = middle + axes @ (t * np.array(shifts))
-    away = np.asarray(camera.position) - np.asarray(camera.focal_point, np.float64)
-    # an orthographic camera shows what is before it, too
-    length = distance if perspective else max(float(np.linalg.norm(away)), front + free)
+    toward = np.asarray(camera.position) - np.asarray(camera.focal_point, np.float64)
+    # an orthographic camera must stand in front of all points, too
+    length = distance if perspective else max(float(np.linalg.norm(toward)), front + free)
     return Camera(
-        focal + away * (length / np.linalg.norm(away)),
+        focal + toward * (length / np.linalg.norm(toward)),
         focal,
         camera.view_up,
         camera.view_angle,

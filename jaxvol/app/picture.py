@@ -1,4 +1,4 @@
-"""From options, of a command or of `show`, to images: what is looked at, how, from where, by which march."""
+"""Builds the scene that options of a command or of `show` describe, plans its march, and renders it."""
 
 import math
 import warnings
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .._util.checks import described, finite_array, flag, integer, number
+from .._util.checks import Arrayable, described, finite_array, flag, integer, number
 from .._util.memory import require_room
 from .._util.srgb import linear_color
 from .._util.voxels import faces_of
@@ -43,39 +43,27 @@ from .automatic import (
     sampled,
     spread_of,
     stride_of,
-    transfer_by_copy,
+    transfer_of_bricks,
     unit_of,
     xray_transfer,
 )
-from .framing import (
-    FAINT,
-    VISIBLE,
-    automatic_camera,
-    clipped_points,
-    framed,
-    visible_points,
-    warn_of_distance,
-)
+from .framing import FAINT, VISIBLE, automatic_camera, clipped_points, framed, visible_points, warn_of_gap
 from .progress import progress
-from .settings import OF_COLORS, header_of
+from .settings import COLOR_OPTIONS, header_of
 
 
-def quick_march(step: Any, transforms: Sequence[Transform] = ()) -> March:
-    """Of a step that is given."""
-    fast = SpaceLeaping(), AlphaCorrection(), EarlyTermination()
-    return March(step, (*transforms, *fast), "midpoint")
+PIXEL = 160  # bytes per pixel of an image while it is rendered and written
+IN_MEMORY = 9  # most bytes of `render` per byte of voxels: on host and device, packed, and the blocks' ranges
 
 
-PIXEL = 160
-"""Bytes that an image takes for each pixel, while it is rendered and written."""
-
-IN_MEMORY = 9
-"""Most bytes of `render` for each byte of voxels: on host and device, packed, and the blocks' ranges."""
+def quick_march(step: Arrayable, transforms: Sequence[Transform] = ()) -> March:
+    """The march of a step that was not planned."""
+    return March(step, (*transforms, SpaceLeaping(), AlphaCorrection(), EarlyTermination()), "midpoint")
 
 
-class Scene(NamedTuple):
-    """What is looked at. `volume` is a coarser copy of `source`, if that is read in bricks of `memory` bytes.
-    `others`: further volumes, with their transfer functions. `march`: once it is known."""
+class PictureRequest(NamedTuple):
+    """Arguments of `render`. `volume` is a coarser copy of `source`, if that is read in bricks with `memory`
+    bytes. `others`: more volumes, with their transfer functions. `march`: None until it is planned."""
 
     volume: Volume
     transfer: Transfer
@@ -91,51 +79,50 @@ class Scene(NamedTuple):
 
     @property
     def coarser(self) -> float:
-        """How many times as long the voxels of `volume` are as those of `source`; 1 where there is none."""
-        own = np.min(np.asarray(self.volume.spacing))
-        return 1.0 if self.source is None else float(own / np.min(self.source.spacing))
+        """Voxel size of `volume` over that of `source`; 1 without a source."""
+        spacing = np.min(np.asarray(self.volume.spacing))
+        return 1.0 if self.source is None else float(spacing / np.min(self.source.spacing))
 
     def render(self, camera: Camera) -> Rendering:
-        """An image by `march`."""
-        how = {"compositing": self.compositing, "lighting": self.lighting}
+        """Render an image with `march`."""
+        kwargs: dict[str, Any] = {"compositing": self.compositing, "lighting": self.lighting}
         if self.source is None:
-            what = with_others(self.volume, self.transfer, self.others)
-            found = render(*what, camera, self.march, **how)
+            pair = with_others(self.volume, self.transfer, self.others)
+            rendering = render(*pair, camera, self.march, **kwargs)
         else:
-            how["memory"] = self.memory
-            found = render_bricks(self.source, self.transfer, camera, self.march, **how)
-        return jax.block_until_ready(found)
+            kwargs["memory"] = self.memory
+            rendering = render_bricks(self.source, self.transfer, camera, self.march, **kwargs)
+        return jax.block_until_ready(rendering)
 
     def picture(self, quiet: bool) -> Rendering:
-        """The image of `camera`, shown as it is made."""
+        """Render the image of `camera`, with progress on stderr."""
         with progress(f"drawing {self.camera.size[0]} x {self.camera.size[1]} pixels", quiet=quiet):
             return self.render(self.camera)
 
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
-        """The cheapest way to render the scene within a tolerance, for each camera."""
+        """The cheapest march within a tolerance, for each camera."""
         if self.others:
             raise ValueError("others: several volumes are not planned for; render them by a step.")
-        how: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
-        how |= {"compositing": self.compositing, "lighting": self.lighting}
+        kwargs: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
+        kwargs |= {"compositing": self.compositing, "lighting": self.lighting}
         tolerance = PLANNED if tolerance is None else tolerance
-        return [plan(self.volume, self.transfer, camera, tolerance, **how) for camera in cameras]
+        return [plan(self.volume, self.transfer, camera, tolerance, **kwargs) for camera in cameras]
 
 
-def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> Scene:
+def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | None = None) -> PictureRequest:
     """The scene of the options (`DEFAULTS`, `recorded_transfer`, and `file`, a path or `Volume`) without a
-    march. `orbit`: the views of a camera that turns, in which the automatic camera shows all that is
-    visible."""
+    march. `orbit`: views of a camera that turns; the automatic camera fits the visible part into all."""
     width, height = image_size(getattr(options.camera, "size", options.size))
     require_room(width * height * PIXEL, f"size {width} x {height}")
     is_surface, background = options.compositing == "isosurface", background_of(options)
     if is_surface == (options.isovalue is None):
         raise ValueError("compositing isosurface and isovalue go together; one is missing.")
     mode = Isosurface(options.isovalue) if is_surface else compositing_of(options.compositing)
-    # by jitter, which the aligned last cell belongs to, the rings of wood grain become noise
+    # jitter turns the rings of wood grain into noise
     transforms: tuple[Transform, ...] = (EmptySpaceJitter(seed=0),)
-    given = np.atleast_2d(options.clip_plane) if len(options.clip_plane) else np.empty((0, 6))
-    planes = finite_array("clip_plane", given, (None, 6))
-    planes = [(plane[:3], plane[3:]) for plane in np.asarray(planes).tolist()]
+    rows = np.atleast_2d(options.clip_plane) if len(options.clip_plane) else np.empty((0, 6))
+    rows = np.asarray(finite_array("clip_plane", rows, (None, 6))).tolist()
+    planes = [(row[:3], row[3:]) for row in rows]
     if options.clip_box is not None or planes:
         transforms = (Clip(options.clip_box, planes, inside_out=options.clip_inside_out), *transforms)
     elif options.clip_inside_out:
@@ -156,33 +143,32 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         header = {name: value for name, value in header_of(options).items() if value is not None}
         try:
             source = levels_of(options.file, **header)[0]
-        except TypeError as fault:  # such as a shape of what is no raw file
+        except TypeError as fault:  # such as a shape for another kind than raw
             raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
         volume = copy_of(source, options.memory)
         automatic = is_automatic(options)
-        transfer = _transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
+        transfer = transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
         if IN_MEMORY * source.dtype.itemsize * math.prod(source.shape) <= options.memory:
             volume, source = source.subsampled(1), None
 
-    warn_of_distance(volume, others)
+    warn_of_gap(volume, others)
     lighting = _lighting(options, mode, alone=not others)
-    seen = () if options.clip_inside_out else planes
-    camera = _camera(options, volume, transfer, others, orbit, seen).zoom(options.zoom)
-    how = mode, lighting, background, transforms, source, options.memory
-    return Scene(volume, transfer, camera, *how, others=others)
+    camera = _camera(options, [(volume, transfer), *others], orbit, planes).zoom(options.zoom)
+    look = mode, lighting, background, transforms, source, options.memory
+    return PictureRequest(volume, transfer, camera, *look, others=others)
 
 
 def look_of(options: Namespace) -> tuple[Volume, Transfer]:
-    """The volume, which may be another one where labels are shown, and its transfer function."""
+    """The volume, smoothed where labels are shown, and its transfer function."""
     volume, automatic = volume_of(options), is_automatic(options)
     if volume.channels > 1 and not isinstance(options.transfer, Transfer):
-        told = f"0 to {volume.channels - 1}" if volume.channels > 2 else "0 or 1"
+        last = volume.channels - 1
         raise ValueError(
-            f"{volume.channels} values in each voxel: choose one by channel, {told}. (--channel 0)"
+            f"{last + 1} values in each voxel: choose one by channel, 0 to {last}. (--channel 0)"
         )
     transfer = None if automatic else transfer_of(options, volume)
     if volume.labels is not None and not np.any(volume.labels):
-        warnings.warn("labels: all voxels have the label 0, which stands for what is around", stacklevel=4)
+        warnings.warn("labels: all voxels have the label 0, the background", stacklevel=4)
     if options.labels is not None:
         return labels_shown(volume, transfer)
     if automatic:
@@ -192,44 +178,45 @@ def look_of(options: Namespace) -> tuple[Volume, Transfer]:
 
 def _camera(
     options: Namespace,
-    volume: Volume,
-    transfer: Transfer,
-    others: Sequence[tuple[Volume, Transfer]],
+    pairs: Sequence[tuple[Volume, Transfer]],
     orbit: Callable[[Camera], Sequence[Camera]] | None,
     planes: Sequence[Any],
 ) -> Camera:
-    """That of the options; or else one as near as what is visible on one side of `planes` allows."""
-    given = {"view_angle": options.view_angle, "size": options.size}
+    """The camera of the options; by default one framed on the visible part that the clip leaves."""
+    kwargs = {"view_angle": options.view_angle, "size": options.size}
     if isinstance(options.camera, Camera):
         return options.camera
     if options.camera is not None:
         finite_array("camera", options.camera, (6,))
         up, place = options.view_up, (options.camera[:3], options.camera[3:])
         height = np.linalg.norm(np.subtract(*place)) * np.tan(np.deg2rad(options.view_angle) / 2)
-        scale = height if options.parallel else None  # as high at the focal point
-        return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **given)
-    if options.compositing == "isosurface":  # seen is what lies within, which most of the faces do not
+        scale = height if options.parallel else None  # of the same view height at the focal point
+        return Camera(*place, (0.0, 0.0, 1.0) if up is None else up, parallel_scale=scale, **kwargs)
+    if options.compositing == "isosurface":  # visible is the side with fewer of the volume's faces
+        volume = pairs[0][0]
         step, outer = np.full(2, options.isovalue), faces_of(np.asarray(volume.data))
         opacity = np.array([0.0, 1e6 / unit_of(volume)])[:: -1 if np.mean(outer > step[0]) > 0.5 else 1]
-        transfer = TransferFunction(step, np.ones((2, 3)), opacity)
-    given["parallel"] = options.parallel
-    given["least"] = least = VISIBLE if is_automatic(options) else FAINT
-    what = with_others(volume, transfer, others)
-    camera = automatic_camera(*what, options.direction, options.view_up, **given)
-    clipped = options.clip_box is not None and not options.clip_inside_out
-    if orbit is None and not clipped and not planes:
+        pairs = [(volume, TransferFunction(step, np.ones((2, 3)), opacity)), *pairs[1:]]
+    min_opacity = VISIBLE if is_automatic(options) else FAINT
+    kwargs |= {"parallel": options.parallel, "least": min_opacity}
+    scene = with_others(*pairs[0], pairs[1:])
+    camera = automatic_camera(*scene, options.direction, options.view_up, **kwargs)
+    planes = () if options.clip_inside_out else planes
+    has_box = options.clip_box is not None and not options.clip_inside_out
+    if orbit is None and not has_box and not planes:
         return camera
     points = []
-    for each, its in ((volume, transfer), *others):
-        with suppress(ValueError):  # of a box that holds nothing of it
-            points.append(visible_points(each.crop(options.clip_box) if clipped else each, its, least))
-    seen = clipped_points(np.concatenate(points), planes) if points else np.empty((0, 3))
-    return framed(camera, seen, orbit(camera) if orbit else ()) if len(seen) else camera
+    for volume, transfer in pairs:
+        with suppress(ValueError):  # the box holds no part of the volume
+            part = volume.crop(options.clip_box) if has_box else volume
+            points.append(visible_points(part, transfer, min_opacity))
+    points = clipped_points(np.concatenate(points), planes) if points else np.empty((0, 3))
+    return framed(camera, points, orbit(camera) if orbit else ()) if len(points) else camera
 
 
-def other_of(each: Any) -> tuple[Volume, Transfer]:
-    """A further volume, and the given transfer function, or a colormap over LOW to HIGH."""
-    file, *look = each if isinstance(each, Sequence) and not isinstance(each, str) else (each,)
+def other_of(entry: Volume | str | Path | Sequence[Any]) -> tuple[Volume, Transfer]:
+    """Volume and transfer function of an entry of `others`: FILE, or (FILE, transfer or CMAP, LOW, HIGH)."""
+    file, *look = entry if isinstance(entry, Sequence) and not isinstance(entry, str) else (entry,)
     volume = file if isinstance(file, Volume) else load(file)
     if look and isinstance(look[0], Transfer):
         return volume, look[0]
@@ -244,57 +231,59 @@ def other_of(each: Any) -> tuple[Volume, Transfer]:
     return volume, colormap(cmap, (low, high))
 
 
-def with_march(scene: Scene, options: Namespace, cameras: Sequence[Camera]) -> Scene:
-    """The scene with the given step, or the shortest one planned for the cameras."""
+def with_march(scene: PictureRequest, options: Namespace, cameras: Sequence[Camera] = ()) -> PictureRequest:
+    """The scene with the step of the options, or the shortest planned for `cameras`, by default its own."""
     step = options.step
     if step is None and scene.others:
         if options.tolerance is not None:
             raise ValueError("tolerance is for one volume; give a step.")
-        step = min(float(np.min(each.spacing)) for each, _ in ((scene.volume, None), *scene.others)) / 2
+        volumes = scene.volume, *(volume for volume, _ in scene.others)
+        step = min(float(np.min(volume.spacing)) for volume in volumes) / 2
     if step is not None:
         return scene._replace(march=quick_march(step, scene.transforms))
     with progress("planning", quiet=options.quiet):
-        plans = scene.plans(cameras, options.tolerance)
-    found = min(plans, key=lambda plan: float(plan.march.step))
-    # a view in which cells must be integrated needs that at any step
+        plans = scene.plans(cameras or [scene.camera], options.tolerance)
+    shortest = min(plans, key=lambda plan: float(plan.march.step))
+    # a view that needs preintegration needs it at any step
     integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)
-    march, transforms = found.march, found.march.transforms
+    march, transforms = shortest.march, shortest.march.transforms
     if scene.source is not None and not any(isinstance(t, SpaceLeaping) for t in transforms):
         transforms = (*transforms, SpaceLeaping())  # a copy proves no block empty
     if integrated or scene.source is not None:
         quadrature = "preintegrated" if integrated else march.quadrature
         march = March(float(march.step) / scene.coarser, transforms, quadrature)
     if not all(plan.within for plan in plans):
-        told = f"not proven to be within an RMSE of {found.tolerance:.2g}; jaxvol plan tells more"
-        warnings.warn(told, stacklevel=3)
+        bound = f"an RMSE of {shortest.tolerance:.2g}"
+        warnings.warn(f"not proven to be within {bound}; jaxvol plan tells more", stacklevel=3)
     return scene._replace(march=march)
 
 
 def volume_of(options: Namespace) -> Volume:
+    """The volume of `file` and `labels`."""
     header, labels = header_of(options), options.labels
     if not isinstance(labels, str | Path | None):
         raise ValueError(f"labels must be a file; got {described(labels)}. Or jv.Volume(data, labels=...).")
     if not isinstance(options.file, Volume):
         return load(options.file, **header, labels=labels)
-    if told := [name for name, value in header.items() if value is not None]:
-        raise ValueError(f"{told[0]} is of files; volume is a Volume.")
+    if names := [name for name, value in header.items() if value is not None]:
+        raise ValueError(f"{names[0]} is of files; volume is a Volume.")
     return options.file if labels is None else labelled(options.file, labels)
 
 
 def is_automatic(options: Namespace) -> bool:
-    """Whether nothing is said of the transfer function."""
-    given = (getattr(options, name) for name in (*OF_COLORS, "recorded_transfer"))
-    return options.compositing == "over" and all(each is None for each in given)
+    """True if no option sets the transfer function."""
+    names = (*COLOR_OPTIONS, "recorded_transfer")
+    return options.compositing == "over" and all(getattr(options, name) is None for name in names)
 
 
 def background_of(options: Namespace) -> tuple[float, float, float]:
-    """Linear RGB. The greater values of projections are lighter: on white, the greatest would be hidden."""
+    """Linear RGB, by default black for projections, whose greatest values are light, else white."""
     if options.background is None:
         is_dark = options.preset is not None and preset_name(options.preset).endswith("MIP")
         level = 0.0 if is_dark or options.compositing in MODES.keys() - {"over"} else 1.0
         return level, level, level
     red, green, blue = np.asarray(linear_color("background", options.background), np.float64).tolist()
-    if not all(0 <= each <= 1 for each in (red, green, blue)):
+    if not all(0 <= channel <= 1 for channel in (red, green, blue)):
         got = f"{red:g} {green:g} {blue:g}"
         hint = " 8-bit colours are written '#336699'." if max(red, green, blue) > 1 else ""
         raise ValueError(f"background must be three numbers from 0 to 1 (linear RGB); got {got}.{hint}")
@@ -302,12 +291,12 @@ def background_of(options: Namespace) -> tuple[float, float, float]:
 
 
 def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
-    """The transfer function of the options. `source`: what `volume` is a coarser copy of."""
+    """The transfer function of the options. `volume` is a coarser copy of `source`, if there is one."""
     if options.recorded_transfer is not None:
         return options.recorded_transfer
     if options.transfer is not None:
-        given = options.transfer
-        return read_transfer(given) if isinstance(given, str | Path) else given
+        transfer = options.transfer
+        return read_transfer(transfer) if isinstance(transfer, str | Path) else transfer
     unit, clim = options.unit_distance, options.clim
     if (options.window is None) != (options.level is None):
         raise ValueError("window and level go together; one is missing.")
@@ -317,16 +306,17 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
         clim = level - window / 2, level + window / 2
     if options.preset is not None:
         if clim is None:
-            clim, told = fitted_range(options.preset, sampled(volume))
-            if told:
-                warnings.warn(told, stacklevel=5 if source is None else 4)
+            clim, warning = fitted_range(options.preset, sampled(volume))
+            if warning:
+                warnings.warn(warning, stacklevel=5 if source is None else 4)
         return preset(options.preset, clim, preset_unit(source or volume) if unit is None else unit)
     if clim is None:
-        data, over = np.asarray(volume.data), options.compositing == "over"
-        # what is around the object would be fog
+        data = np.asarray(volume.data)
         ends = [data.min(), data.max()]  # which `sampled` may leave out
         low, high = spread_of(np.append(sampled(volume).ravel(), ends))[:2]
-        clim = range_of_object(volume) if over else (low, high if high > low else low + 1)
+        clim = low, high if high > low else low + 1
+        if options.compositing == "over":  # the background would be fog
+            clim = range_of_object(volume)
     cmap = options.cmap or ("white" if options.compositing == "isosurface" else "gray")
     if options.compositing == "average" and options.clim is None and options.window is None:
         clim = clim[0], brightest_mean(volume, clim[0])
@@ -335,15 +325,8 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
     return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
 
 
-def _transfer_of_bricks(copy: Volume, source: VoxelSource) -> Transfer:
-    """The automatic one, from a copy and the middle of the volume at full resolution."""
-    low = [max(0, (n - 128) // 2) for n in source.shape]
-    high = [min(n, begin + 128) for n, begin in zip(source.shape, low, strict=True)]
-    return transfer_by_copy(copy, np.asarray(source.read(low, high)))
-
-
 def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
-    """The light that the options ask for, or that is usual for what they show; none of several volumes."""
+    """The light of the options: by default on surfaces, never on several volumes."""
     shade = None if options.shade is None else flag("shade", options.shade)
     if shade and not alone:
         raise ValueError("shade: several volumes are shown without light; leave it out.")
@@ -354,8 +337,8 @@ def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lig
 
 
 def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel that fits into memory, stretched to the whole's bounds."""
-    most = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
-    copy = source.subsampled(min(stride_of(source.shape, most), min(source.shape) // 2))
-    whole = [(n - 1) * s / (m - 1) for n, s, m in zip(source.shape, source.spacing, copy.shape, strict=True)]
-    return Volume(copy.data, whole, copy.origin)
+    """A copy of every n-th voxel that fits into memory, stretched to the bounds of the source."""
+    max_voxels = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
+    copy = source.subsampled(min(stride_of(source.shape, max_voxels), min(source.shape) // 2))
+    axes = zip(source.shape, source.spacing, copy.shape, strict=True)
+    return Volume(copy.data, [(n - 1) * s / (m - 1) for n, s, m in axes], copy.origin)

@@ -1,4 +1,4 @@
-"""What a program is doing, shown by tqdm on standard error while it takes longer than a second."""
+"""Shows the running task with tqdm on standard error, if it takes longer than a second."""
 
 import sys
 import threading
@@ -12,11 +12,10 @@ from typing import Any
 import jax
 
 
-INTERVAL = 1.0
-"""Seconds until a task is shown, and from one update to the next."""
-
-COMPILING = "/jax/core/compile/backend_compile_duration"
-"""JAX's event of a program that is compiled: a number when it begins, and a duration when it has ended."""
+INTERVAL = 1.0  # seconds until a task is shown, and between updates
+COMPILING = (
+    "/jax/core/compile/backend_compile_duration"  # JAX's event: a scalar at its begin, a duration at its end
+)
 
 
 @contextmanager
@@ -39,7 +38,7 @@ def every_second(tell: Callable[[float], object]) -> Iterator[None]:
 
 @cache  # JAX 0.8 forgets no listener
 def _compiled_now() -> list[str]:
-    """Names of the programs that are being compiled, from now on."""
+    """List of the programs being compiled, updated from now on."""
     names: list[str] = []
 
     def begin(event: str, value: float | int, **about: Any) -> None:
@@ -57,17 +56,17 @@ def _compiled_now() -> list[str]:
 
 @contextmanager
 def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Iterator[Callable[[], object]]:
-    """Show a task, and the program that it compiles, while it takes longer than a second; nothing if
-    `quiet`, or where stderr is no terminal, but in notebooks. Of a `total` of steps, a bar shows how many are
-    done; the context gives the function to call after each."""
+    """Show a task, and the program being compiled, if it takes longer than a second: in a terminal or a
+    notebook, unless `quiet`. With a `total` of steps, a bar shows the finished ones. The context's value is
+    the function to call after each step."""
     from tqdm import tqdm
 
     kernel = "ipykernel" in sys.modules
     if kernel and find_spec("ipywidgets") is not None:
         from tqdm.notebook import tqdm
-    how: dict[str, Any] = {"bar_format": "{desc}: {elapsed}"} if total is None else {}
+    form: dict[str, Any] = {"bar_format": "{desc}: {elapsed}"} if total is None else {}
     disable = quiet or not (kernel or sys.stderr.isatty())
-    with tqdm(desc=task, total=total, delay=INTERVAL, disable=disable, leave=False, **how) as bar:
+    with tqdm(desc=task, total=total, delay=INTERVAL, disable=disable, leave=False, **form) as bar:
         if disable:
             yield bar.update
             return

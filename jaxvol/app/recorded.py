@@ -1,5 +1,4 @@
-"""The options that made a picture, written into a PNG, and read as data that anyone may have made. No file is
-read because a picture names it."""
+"""Writes the options of a picture into its PNG, and reads them as untrusted data, which name no files."""
 
 import argparse
 import json
@@ -12,11 +11,11 @@ from ..fitting.files import transfer_fields, transfer_of_fields
 from ..scene.transfer import Transfer, TransferFunction
 
 
-KEYWORD = "jaxvol"  # of the text in a PNG
+KEYWORD = "jaxvol"  # of the PNG's text
 
 
-def words_of(name: str, value: Any) -> list[str]:
-    """An option as words of a command line."""
+def words_of(name: str, value: object) -> list[str]:
+    """Command-line words of an option."""
     flag = name.replace("_", "-")
     if isinstance(value, bool):
         return [f"--{flag}" if value else f"--no-{flag}"]
@@ -27,9 +26,9 @@ def words_of(name: str, value: Any) -> list[str]:
 
 
 def text_of(
-    settings: Mapping[str, Any], file: Any, transfer: Any = None, further: Sequence[str] = ()
+    settings: Mapping[str, Any], file: object, transfer: Transfer | None = None, further: Sequence[str] = ()
 ) -> dict[str, str]:
-    """Text of a PNG: options as command-line words, the volume's file, a `TransferFunction`."""
+    """Text of a PNG: options as words, file name, a `TransferFunction`, and options of `further` files."""
     words = [word for name, value in settings.items() for word in words_of(name, value)]
     content: dict[str, Any] = {"options": words, "file": str(file)}
     if further:
@@ -40,26 +39,25 @@ def text_of(
 
 
 def text_of_options(options: argparse.Namespace, transfer: Transfer) -> dict[str, str]:
-    """Text of changed options, with a transfer function that was read; other files are only named."""
+    """Text of changed options, with a transfer function that was read from a file."""
     further = [name for name in ("labels", "others") if getattr(options, name)]
-    given = {name: getattr(options, name) for name in options.defaults.keys() - {"quiet"}}
-    changed = {name: value for name, value in given.items() if value != options.defaults[name]}
-    kept = {name: value for name, value in changed.items() if name not in further}
-    settings = {name: value for name, value in kept.items() if not isinstance(value, Path)}
+    values = {name: getattr(options, name) for name in options.defaults.keys() - {"quiet", *further}}
+    changed = {name: value for name, value in values.items() if value != options.defaults[name]}
+    settings = {name: value for name, value in changed.items() if not isinstance(value, Path)}
     from_file = options.transfer is not None or options.recorded_transfer is not None
     return text_of(settings, options.file, transfer if from_file else None, further)
 
 
 def recorded_in(path: Path) -> dict[str, Any]:
-    """What `text_of` wrote: `options`, unchecked words, and maybe a `transfer`."""
+    """Content of a PNG written with `text_of`: `options`, unchecked words, and optionally `transfer`."""
     from PIL import Image
 
     if not path.is_file():
         raise ValueError(f"there is no file {path}.")
     try:
-        with Image.open(path, formats=["PNG"]) as picture:  # decodes no pixels, and limits texts
+        with Image.open(path, formats=["PNG"]) as picture:  # decodes no pixels; limits the size of texts
             text = picture.info.get(KEYWORD)
-    except Exception as fault:  # of Pillow's many kinds
+    except Exception as fault:  # Pillow raises many kinds
         raise ValueError(f"{path} cannot be read as a PNG: {shortened(str(fault))}") from fault
     if not isinstance(text, str):
         raise ValueError(f"{path} holds no settings of jaxvol: another program saved it.")

@@ -1,4 +1,4 @@
-"""One line from a volume to a picture, the one that `jaxvol render` makes."""
+"""Shows the picture of a volume that `jaxvol render` makes, in one call."""
 
 import inspect
 import os
@@ -23,21 +23,22 @@ from ..scene.space import enter
 from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
-from .automatic import check_known
-from .picture import Scene, scene_of, with_march
-from .settings import DEFAULTS, ELSEWHERE, check_exclusive
+from .automatic import check_known, reports_arguments
+from .picture import PictureRequest, scene_of, with_march
+from .settings import ALIASES, DEFAULTS, check_exclusive
 
 
-OF_CAMERAS = {"direction", "view_up", "view_angle", "parallel", "size"}
+CAMERA_OPTIONS = {"direction", "view_up", "view_angle", "parallel", "size"}
 FAINT = 0.01
-"""Opacity that is hardly seen: before white, it changes the 8 bits of a pixel by 1."""
+"""Largest opacity that is hardly visible: on white, it changes 8-bit colours by 1."""
 
 
+@reports_arguments
 def show(
-    volume: Volume | str | os.PathLike[str] | Any, transfer: Transfer | Any | None = None, **options: Any
+    volume: Volume | str | os.PathLike[str], transfer: Transfer | None = None, **options: Any
 ) -> Rendering:
-    """Renders a volume, and shows it, as `jaxvol render FILE` does: framed, upright, lit, with colours for
-    labels, by a march that is planned for it.
+    """Renders a volume and shows it, as `jaxvol render FILE` does: framed, upright, lit, with a colour for
+    each label, by a planned march.
 
         jv.show("ct.nii.gz", preset="CT-Bone", direction=(0, -1, 0), size=800, background="black")
         jv.show("mr.nii.gz", compositing="maximum", window=400, level=200)
@@ -45,53 +46,51 @@ def show(
 
     Args:
         volume: a `Volume`, or the path of a file that `jv.load` reads.
-        transfer: a transfer function. By default that of `preset` or `cmap`, or else what suits the values;
-            or labels get a colour each.
-        options: those of `jaxvol render`, with _ for -. Colours: `preset`, `cmap`, `clim`, or `window` and
-            `level`, `unit_distance`, `labels` (a file). More volumes: `others`, each a file or `Volume`, and
-            its transfer function, or a colormap and maybe its range. Look: `compositing`, `isovalue`,
-            `shade`, `background`. Camera: `camera`, a `Camera` or six numbers, `direction`, `view_up`,
-            `view_angle`, `parallel`, `zoom`, `size`. What is cut away: `clip_box`, `clip_plane`,
-            `clip_inside_out`. How it is computed: `step` or `tolerance`, `memory`, `quiet`. Of a raw file:
-            `shape`, `dtype`, `offset`, `spacing`, `nan`, `time`, `channel`.
-            `jaxvol render --help` describes each.
+        transfer: a transfer function; by default that of `preset` or `cmap`, else `automatic_transfer`, or
+            `labels_shown`.
+        options: the options of `jaxvol render`, with _ for -, which `jaxvol render --help` describes.
+            Colours: `preset`, `cmap`, `clim`, or `window` and `level`, `unit_distance`, `labels` (a file).
+            More volumes: `others`, each a file or `Volume`, or a tuple of it and a transfer function, or of
+            it, a colormap, and optionally its range. Look: `compositing`, `isovalue`, `shade`, `background`.
+            Camera: `camera`, a `Camera` or six numbers, `direction`, `view_up`, `view_angle`, `parallel`,
+            `zoom`, `size`. Clipping: `clip_box`, `clip_plane`, `clip_inside_out`. Computation: `step` or
+            `tolerance`, `memory`, `quiet`. For raw files: `shape`, `dtype`, `offset`, `spacing`, `nan`,
+            `time`, `channel`.
 
     Returns:
-        The `Rendering`. In a notebook it shows itself as the last line of a cell; elsewhere it has been shown
-        in a window, or, without a display, written to a file, of which a warning says where.
+        The `Rendering`. In a notebook it is shown as the last line of a cell; elsewhere it has been shown in
+        a window, or, without a display, written to a file, whose path a warning gives.
 
     Raises:
         ValueError: for an unknown option, those that exclude each other, and as `jv.load` and `jv.render` do.
 
-    Warns of a preset whose values are others, and of an image in which hardly anything is visible.
+    Warns of a preset for another range of values, and of an image in which hardly anything is visible.
     """
-    known = DEFAULTS.keys() - {"transfer"}
-    for name in options.keys() - known:
-        told = f"show has no option {name!r}.{near(ELSEWHERE.get(name, name), DEFAULTS)}"
-        raise ValueError(f"{told} jaxvol render --help has them.")
+    for name in options.keys() - (DEFAULTS.keys() - {"transfer"}):
+        hint = near(ALIASES.get(name, name), DEFAULTS)
+        raise ValueError(f"show has no option {name!r}.{hint} jaxvol render --help has them.")
     is_file = isinstance(volume, str | os.PathLike)
-    given = {} if is_file else {"volume": volume}
-    given |= {} if transfer is None else {"transfer": transfer}
-    check_arguments("show(volume, transfer)", **given)
-    check_known("show", given, options)
+    arguments: dict[str, Any] = {} if is_file else {"volume": volume}
+    arguments |= {} if transfer is None else {"transfer": transfer}
+    check_arguments("show(volume, transfer)", **arguments)
+    check_known("show", arguments, options)
     mode = options.get("compositing", "over")
     if isinstance(mode, Isosurface) and options.get("isovalue") is None:
         options |= {"compositing": "isosurface", "isovalue": float(mode.value)}
     elif not isinstance(mode, str):
         raise ValueError(f"compositing must be a name; got {described(mode)}, which jaxvol.render takes.")
     if isinstance(options.get("camera"), Camera):
-        for name in options.keys() & OF_CAMERAS:
+        for name in options.keys() & CAMERA_OPTIONS:
             raise ValueError(f"camera is a Camera, which has its own {name}; leave {name} out.")
     options["transfer"] = transfer
     check_exclusive(options)
     keep_programs_by_default()
     file = Path(volume) if is_file else volume
-    chosen = Namespace(**DEFAULTS | options, recorded_transfer=None, file=file)
-    scene = scene_of(chosen)
-    scene = with_march(scene, chosen, [scene.camera])
-    rendering = replace(scene.picture(chosen.quiet), background=scene.background)
-    if why := why_empty(scene, rendering):
-        warnings.warn(why, stacklevel=2)
+    namespace = Namespace(**DEFAULTS | options, recorded_transfer=None, file=file)
+    scene = with_march(scene_of(namespace), namespace)
+    rendering = replace(scene.picture(namespace.quiet), background=scene.background)
+    if reason := why_empty(scene, rendering):
+        warnings.warn(reason, stacklevel=2)
     if not in_notebook():
         open_window(rendering)
     return rendering
@@ -104,11 +103,11 @@ _known = [
 ]
 _positional = [*inspect.signature(show).parameters.values()][:2]
 show.__signature__ = inspect.Signature([*_positional, *_known])  # pyright: ignore[reportFunctionMemberAccess]
-"""What editors and notebooks complete."""
+"""Signature for completion in editors and notebooks."""
 
 
-def why_empty(scene: Scene, rendering: Rendering) -> str | None:
-    """Why an image shows nothing, and what to change; None if a pixel is more opaque than `FAINT`."""
+def why_empty(scene: PictureRequest, rendering: Rendering) -> str | None:
+    """Explain an image that shows nothing; None if a pixel is more opaque than `FAINT`."""
     volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
     alone = scene.volume.field is None and scene.volume.labels is None and not scene.others
     if alone and (data := np.asarray(scene.volume.data)).min() == data.max():
@@ -126,27 +125,27 @@ def why_empty(scene: Scene, rendering: Rendering) -> str | None:
     return f"nothing is visible: {_why_nothing(scene)}"
 
 
-def _why_nothing(scene: Scene) -> str:
-    """Why all pixels are transparent."""
+def _why_nothing(scene: PictureRequest) -> str:
+    """Explain why all pixels are transparent."""
     volume, transfer = scene.volume, scene.transfer
     space, zero = scene.march.locate(volume), jnp.zeros((), jnp.int32)
     lengths = jax.jit(jax.vmap(lambda o, d: enter(space, apart(o), apart(d), (zero, zero)).length))
-    if not (lengths(*(each.reshape(-1, 3) for each in scene.camera.rays())) > 0).any():
+    if not (lengths(*(vectors.reshape(-1, 3) for vectors in scene.camera.rays())) > 0).any():
         bounds = " to ".join(str(np.asarray(corner)) for corner in volume.corners)
-        what = f"the volume, {bounds}, or what the clip leaves of it, which may be thinner than a pixel"
-        return f"no ray of the camera meets {what}."
+        clipped = "or what the clip leaves of it, which may be thinner than a pixel"
+        return f"no ray of the camera meets the volume, {bounds}, {clipped}."
     data = np.asarray(volume.data)
     low, high = float(data.min()), float(data.max())
-    where = f"the volume's values run from {low:g} to {high:g}"
+    values = f"the volume's values run from {low:g} to {high:g}"
     if isinstance(scene.compositing, Isosurface):
-        return f"{where}, and no ray crosses the isosurface's value, {float(scene.compositing.value):g}."
+        return f"{values}, and no ray crosses the isosurface's value, {float(scene.compositing.value):g}."
     if not isinstance(transfer, TransferFunction):
-        return f"{where}, and the transfer function shows none of those that the rays meet."
+        return f"{values}, and the transfer function shows none of those that the rays meet."
     shown = np.flatnonzero(np.asarray(transfer.extinction) > 0)
     if not shown.size:
-        return f"{where}, and the transfer function's opacity is 0 everywhere."
+        return f"{values}, and the transfer function's opacity is 0 everywhere."
     # the opacity of a point extends to its neighbours, that of the first and the last to infinity
-    at = [-np.inf, *np.asarray(transfer.values), np.inf]
-    first, last = float(at[shown[0]]), float(at[shown[-1] + 2])
+    points = [-np.inf, *np.asarray(transfer.values), np.inf]
+    first, last = float(points[shown[0]]), float(points[shown[-1] + 2])
     advice = f" A clim from {low:g} to {high:g} would show something." if first > low or last < high else ""
-    return f"{where}, and the transfer function shows values between {first:g} and {last:g}.{advice}"
+    return f"{values}, and the transfer function shows values between {first:g} and {last:g}.{advice}"

@@ -18,10 +18,11 @@ from jaxvol.app.automatic import (
     range_of_object,
     spread_of,
     thresholds,
+    transfer_of_bricks,
 )
 from jaxvol.app.commands.animate import turned
 from jaxvol.app.framing import MARGIN, clipped_points, framed, visible_points
-from jaxvol.app.picture import _transfer_of_bricks, copy_of
+from jaxvol.app.picture import copy_of
 from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
 
@@ -106,7 +107,7 @@ def test_of_a_large_volume_a_copy_tells_the_same_if_grain_is_looked_at_as_it_is(
     source = source_of(volume)
     copy = copy_of(source, 2**28)
     assert max(copy.shape) <= 80
-    whole, found = jv.automatic_transfer(volume), _transfer_of_bricks(copy, source)
+    whole, found = jv.automatic_transfer(volume), transfer_of_bricks(copy, source)
     for name in ("values", "colors", "extinction"):
         np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-5)
     # waves of six voxels are grain to those who see every second voxel alone
@@ -376,7 +377,7 @@ def test_values_of_objects_are_no_strays():
     bright = np.where(np.indices(noise.shape).sum(0) > 50, 255.0, noise.clip(-20, 20) + 60)  # saturated
     two[6:12], two[12:18] = 100, 200
     for data in (noise, bright, two, labels()):
-        assert spread_of(data).told == ""
+        assert spread_of(data).warning == ""
 
 
 def test_a_distance_is_shown_where_it_is_0():

@@ -1,1 +1,1 @@
-"""Subcommands of the command `jaxvol`, one a file, which adds its own parser; and what they share."""
+"""Subcommands of `jaxvol`, and their shared options."""

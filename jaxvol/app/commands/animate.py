@@ -1,4 +1,4 @@
-"""`jaxvol animate`: a volume file seen from a camera that turns about it, as GIF or MP4."""
+"""`jaxvol animate`: renders an orbit about a volume to a GIF or MP4."""
 
 import argparse
 import time
@@ -11,7 +11,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import UInt8
 
-from ..._util.checks import integer, output_file
+from ..._util.checks import Arrayable, integer, output_file
 from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
 from ...fitting.bijections import RigidMotion
@@ -20,14 +20,13 @@ from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import scene_of, with_march
 from ..progress import progress
 from ..show import why_empty
-from .options import Parser, add_output, add_scene, add_vector
+from .options import Parser, add_option, add_output, add_scene
 
 
-FRAMED_VIEWS, PLANNED_VIEWS = 24, 4
-"""Evenly spaced views of an orbit that must show all that is visible, and for which its march is planned."""
+FRAMED_VIEWS, PLANNED_VIEWS = 24, 4  # evenly spaced views to frame the camera and to plan the march
 
 
-def _animate(options: argparse.Namespace) -> None:
+def run_animate(options: argparse.Namespace) -> None:
     count = integer("--frames", options.frames, 1, 2**20)
     path = output_file("--output", options.output)
     kind = path.suffix.lower()
@@ -66,8 +65,8 @@ def _animate(options: argparse.Namespace) -> None:
         print(f"{path}: {empty[0]}")
 
 
-def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
-    """The camera, turned about an axis through its focal point."""
+def turned(camera: Camera, degrees: float, axis: Arrayable) -> Camera:
+    """The camera turned about an axis through its focal point."""
     axis = np.asarray(axis, float)
     if not np.isfinite(axis).all() or not axis.any():
         raise ValueError(f"--axis must not be 0; got {' '.join(map(str, axis))}.")
@@ -76,37 +75,35 @@ def turned(camera: Camera, degrees: float, axis: Any) -> Camera:
 
 
 def angles_of(degrees: float, frames: int) -> list[float]:
-    """Angles from 0 to `degrees`, evenly spaced; where that is a whole turn, to one frame before it."""
+    """Evenly spaced angles from 0 to `degrees`; of full turns, to one frame before `degrees`."""
     closed = degrees % 360 == 0
     return [degrees * i / max(frames if closed else frames - 1, 1) for i in range(frames)]
 
 
 def _write_gif(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
-    """Each frame has 256 colours of its own, and lasts for whole hundredths of a second."""
+    """Write a GIF: 256 colours per frame, durations in hundredths of a second."""
     from PIL import Image
 
-    pictures = (Image.fromarray(image).quantize(256) for image in images)
-    how: dict[str, Any] = {"duration": 10 * round(100 / fps), "loop": 0, "disposal": 1}
-    next(pictures).save(path, save_all=True, append_images=pictures, **how)
+    pictures: Any = (Image.fromarray(image).quantize(256) for image in images)
+    duration = 10 * round(100 / fps)
+    next(pictures).save(path, save_all=True, append_images=pictures, duration=duration, loop=0, disposal=1)
 
 
 def _write_mp4(path: Path, images: Iterator[UInt8[np.ndarray, "height width 3"]], fps: float) -> None:
-    """H.264 with colours at half the resolution, which every player shows."""
+    """Write H.264 with half the resolution for colours, which every player shows."""
     from imageio.v3 import imopen
 
-    how: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "macro_block_size": 2}
+    kwargs: dict[str, Any] = {"codec": "libx264", "pixelformat": "yuv420p", "quality": 8, "fps": fps}
     with imopen(path, "w", plugin="FFMPEG", legacy_mode=True) as opened:
         file: Any = opened
-        file.write(images, is_batch=True, fps=fps, ffmpeg_log_level="error", **how)
+        file.write(images, is_batch=True, ffmpeg_log_level="error", macro_block_size=2, **kwargs)
 
 
 def add_animate(parser: Parser) -> None:
-    parser.set_defaults(execute=_animate)
     add_scene(parser)
     add_output(parser, "orbit.gif", "what to write: .gif, or .mp4, which needs jaxvol[video]")
-    text = "what the camera turns about, through its focal point (default: --view-up)"
-    add_vector(parser, "--axis", "X Y Z", text)
-    parser.add_argument("--frames", type=int, default=36, metavar="N", help="how many images (default: 36)")
-    text = "angle that the camera turns about --axis (default: 360)"
-    parser.add_argument("--degrees", type=float, default=360.0, metavar="ANGLE", help=text)
-    parser.add_argument("--fps", type=float, default=12.0, help="frames a second (default: 12)")
+    text = "axis that the camera turns about, through its focal point (default: --view-up)"
+    add_option(parser, "--axis", "X Y Z", text)
+    add_option(parser, "--frames", "N", "number of images (default: 36)", type=int, default=36)
+    add_option(parser, "--degrees", "ANGLE", "angle of the turn about --axis (default: 360)", default=360.0)
+    add_option(parser, "--fps", "FPS", "frames a second (default: 12)", default=12.0)

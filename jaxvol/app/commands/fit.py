@@ -1,4 +1,4 @@
-"""`jaxvol fit`: a transfer function that makes given images of a volume."""
+"""`jaxvol fit`: fits a transfer function to images of a volume."""
 
 import argparse
 import warnings
@@ -12,10 +12,10 @@ from ..progress import progress
 from .options import Parser, add_clim, add_output, add_quiet, add_sampling, add_volume, refuse_to_replace
 
 
-def _fit(options: argparse.Namespace) -> None:
+def run_fit(options: argparse.Namespace) -> None:
     refuse_to_replace(options, "output", "checkpoint")
     output_file("--output", options.output)
-    # these are checked before the volume is read
+    # checked before the volume is read
     views = read_views(options.images, options.cameras)
     if options.labels is not None:
         raise ValueError("--labels: fit finds one transfer function of the values, not one for each label.")
@@ -43,18 +43,14 @@ def _fit(options: argparse.Namespace) -> None:
 
 
 def add_fit(parser: Parser) -> None:
-    parser.set_defaults(execute=_fit)
     add_volume(parser)
     add_sampling(parser)
     text = "sRGB, as PNG"
     parser.add_argument("--images", type=Path, nargs="+", required=True, metavar="IMAGE", help=text)
-    text = (
-        "a list with one object per image: position, focal_point, and optionally view_up, view_angle, "
-        "parallel_scale, window"
-    )
+    text = "list of an object per image: position, focal_point [view_up, view_angle, parallel_scale, window]"
     parser.add_argument("--cameras", type=Path, required=True, metavar="JSON", help=text)
     add_output(parser, "transfer.json", "JSON to write")
-    text = "of the transfer function, flat grey at first (default: 8)"
+    text = "points of the transfer function, initially flat grey (default: 8)"
     parser.add_argument("--points", type=int, default=8, metavar="N", help=text)
     add_clim(parser)
     parser.add_argument("--max-steps", type=int, default=100, metavar="N", help="at most (default: 100)")

@@ -1,5 +1,5 @@
-"""`jaxvol demo`: a page of what the toolkit does, and the functions below that make its pictures. And `jaxvol
-figures`: a page of the papers' figures, by scripts and records that only a checkout of the repository has."""
+"""`jaxvol demo`: a page of the toolkit's features, with the functions below that draw its pictures. `jaxvol
+figures`: a page of the papers' figures, from scripts and records in a checkout of the repository."""
 
 import argparse
 import html
@@ -50,10 +50,9 @@ def grain(folder: Path, size: tuple[int, int], resolution: int) -> None:
 
 
 def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
-    """A fit by gradients, in seconds. Given were two images of an engine, of 48 x 48 pixels, but not the
-    transfer function that made them. From flat grey, the method of Levenberg and Marquardt finds one by
-    derivatives of the renderer. The view below was in none of the images: at the start, as found, and in
-    truth."""
+    """A fit by gradients, in seconds: two images of an engine, of 48 x 48 pixels, determine their transfer
+    function. The Levenberg-Marquardt method starts from flat grey and uses derivatives of the renderer. The
+    view below is none of the two: at the start, fitted, and true."""
     import warnings
 
     import jaxvol as jv
@@ -68,9 +67,9 @@ def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
     residual = jv.ImageResidual(lambda transfer, camera: (engine, transfer, camera, march), views)
     grey = jv.flat_grey(engine, points=8)
     with warnings.catch_warnings(action="ignore"):  # of colours that are nowhere visible
-        found = jv.fit(residual, grey, max_steps=12)
+        fitted = jv.fit(residual, grey, max_steps=12)
     new_view = jv.Camera.looking_at(engine, (0.8, 0.9, 0.7), size=size).zoom(1.4)
-    for name, transfer in (("start", grey), ("found", found.parameters), ("true", true)):
+    for name, transfer in (("start", grey), ("found", fitted.parameters), ("true", true)):
         image = jv.render(engine, transfer, new_view, march).image(background=(1, 1, 1))
         jv.save_png(folder / f"fit_{name}.png", image)
 
@@ -78,7 +77,7 @@ def fit(folder: Path, size: tuple[int, int], resolution: int) -> None:
 PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit_found", "fit_true")}
 
 
-def _demo(options: argparse.Namespace) -> None:
+def run_demo(options: argparse.Namespace) -> None:
     from ..._util.checks import output_file
     from ...xla.persistent_cache import keep_programs_by_default
     from ..progress import progress
@@ -86,13 +85,13 @@ def _demo(options: argparse.Namespace) -> None:
     keep_programs_by_default()
     page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'
     output_file("--output", options.output / "index.html")
-    with TemporaryDirectory() as made:  # after an error nothing has changed
-        folder = Path(made)
+    with TemporaryDirectory() as name:  # after an error nothing has changed
+        folder = Path(name)
         for section, pictures in PICTURES.items():
             print(f"{options.output}: {', '.join(pictures)}", flush=True)
             with progress(f"drawing {', '.join(pictures)}", quiet=options.quiet):
                 section(folder, tuple(options.size), options.resolution)
-            images = "".join(f'<img src="{name}.png" alt="{name}" width="32%"> ' for name in pictures)
+            images = "".join(f'<img src="{file}.png" alt="{file}" width="32%"> ' for file in pictures)
             page += f"{images}<pre>{html.escape(inspect.getsource(section))}</pre>\n"
         (folder / "index.html").write_text(page, encoding="utf-8")
         options.output.mkdir(parents=True, exist_ok=True)
@@ -102,14 +101,13 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def add_demo(parser: Parser) -> None:
-    parser.set_defaults(execute=_demo)
     add_output(parser, "jaxvol-demo", "folder to write")
     add_quiet(parser)
     add_size(parser)
     parser.add_argument("--resolution", type=int, default=320, metavar="N", help="voxels along the head")
 
 
-def _figures(options: argparse.Namespace) -> None:
+def run_figures(options: argparse.Namespace) -> None:
     from ..._util.checks import output_file
 
     folder = output_file("--output", options.output / "index.html").parent
@@ -119,7 +117,7 @@ def _figures(options: argparse.Namespace) -> None:
 
 
 def checkout() -> Path:
-    """The checkout of the repository: the one that this package is part of, else the working directory."""
+    """Folder of the repository: that of this package, else the working directory."""
     for folder in (Path(__file__).parents[3], Path.cwd()):
         if (folder / "paper_figs" / "index.py").is_file():
             return folder
@@ -127,7 +125,6 @@ def checkout() -> Path:
 
 
 def add_figures(parser: Parser) -> None:
-    parser.set_defaults(execute=_figures)
     add_output(parser, "jaxvol-figures", "folder to write")
     text = "some of them, such as fig09"
     parser.add_argument("--only", nargs="+", default=(), metavar="NAME", help=text)

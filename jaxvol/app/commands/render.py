@@ -1,4 +1,4 @@
-"""`jaxvol render`, an image of a volume file, and `jaxvol plan`, the cheapest way to it."""
+"""`jaxvol render`: renders a volume file. `jaxvol plan`: prints the cheapest march within a tolerance."""
 
 import argparse
 import time
@@ -13,22 +13,21 @@ from ...scene.labels import LabelTransferFunction
 from ...scene.rendering import Rendering
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs_by_default
-from ..picture import Scene, scene_of, with_march
+from ..picture import PictureRequest, scene_of, with_march
 from ..progress import progress
 from ..recorded import text_of_options
 from ..show import why_empty
 from .options import SWITCH, Parser, add_output, add_scene, refuse_to_replace
 
 
-def _render(options: argparse.Namespace) -> None:
+def run_render(options: argparse.Namespace) -> None:
     begun = time.perf_counter()
     refuse_to_replace(options, "output", "depth")
     image_file("--output", options.output, 4 if options.transparent else 3)
     if options.depth:
         image_file("--depth", options.depth, 0)
     keep_programs_by_default()
-    scene = scene_of(options)
-    scene = with_march(scene, options, [scene.camera])
+    scene = with_march(scene_of(options), options)
     ready = time.perf_counter()
     rendering = scene.picture(options.quiet)
     ended = time.perf_counter()
@@ -42,20 +41,20 @@ def _render(options: argparse.Namespace) -> None:
     save_image(options.output, image, text=text_of_options(options, scene.transfer) if is_png else {})
     if options.depth:
         print(f"{save_image(options.depth, rendering.depth)}: distances, world length")
-    if why := why_empty(scene, rendering):
-        print(f"{options.output}: {why}")
+    if reason := why_empty(scene, rendering):
+        print(f"{options.output}: {reason}")
 
 
 def legend(volume: Volume, transfer: LabelTransferFunction) -> str:
-    """The labels that a volume has, each with its colour."""
+    """Text of a volume's labels with their colours."""
     kinds = np.unique(np.asarray(volume.labels))
     colors = displayed(np.asarray(transfer.stacked.colors, np.float32)[None, :, -1])[0]
     ids = volume.label_ids or range(256)
-    told = [f"{ids[kind]} #{bytes(colors[kind]).hex()}" for kind in kinds.tolist() if 0 < kind < len(colors)]
-    return f"labels {', '.join(told[:24])}{', …' * (len(told) > 24)}"
+    texts = [f"{ids[kind]} #{bytes(colors[kind]).hex()}" for kind in kinds.tolist() if 0 < kind < len(colors)]
+    return f"labels {', '.join(texts[:24])}{', …' * (len(texts) > 24)}"
 
 
-def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> None:
+def _print_facts(path: Path, scene: PictureRequest, rendering: Rendering, spent: str) -> None:
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
     shape = scene.volume.shape if scene.source is None else scene.source.shape
@@ -73,12 +72,8 @@ def _print_facts(path: Path, scene: Scene, rendering: Rendering, spent: str) -> 
 
 
 def add_render(parser: Parser) -> None:
-    parser.set_defaults(execute=_render)
     add_scene(parser)
-    text = (
-        "image to write: .png or .jpg (sRGB, 8 bits), .tif or .npy (linear float32). A .png holds the "
-        "options that made it: see --like"
-    )
+    text = "image to write: .png (with its options: see --like), .jpg, .tif or .npy (linear float32)"
     add_output(parser, "out.png", text)
     text = "write opacity instead of a background: .png (straight alpha), .tif or .npy (premultiplied)"
     parser.add_argument("--transparent", action=SWITCH, default=False, help=text)
@@ -86,7 +81,7 @@ def add_render(parser: Parser) -> None:
     parser.add_argument("--depth", type=Path, metavar="FILE", help=text)
 
 
-def _plan(options: argparse.Namespace) -> None:
+def run_plan(options: argparse.Namespace) -> None:
     if options.step is not None:
         raise ValueError("--step sets the step; jaxvol plan finds one: leave it out.")
     keep_programs_by_default()
@@ -95,11 +90,8 @@ def _plan(options: argparse.Namespace) -> None:
         plans = scene.plans([scene.camera], options.tolerance)
     print(*plans)
     if scene.source is not None:
-        print(
-            f"by a copy whose voxels are {scene.coarser:.3g} times as long: render divides the step by that"
-        )
+        print(f"for a copy with voxels {scene.coarser:.3g} times as long: render divides the step by that")
 
 
 def add_plan(parser: Parser) -> None:
-    parser.set_defaults(execute=_plan)
     add_scene(parser)

@@ -1,5 +1,4 @@
-"""`jaxvol datasets`, `jaxvol info` and `jaxvol view`: volumes to fetch, what a file holds, and a page of the
-browser on which it is turned and changed. What takes long to import is imported where it is used."""
+"""`jaxvol datasets`, `info`, `view`: fetch, describe or show volumes. Slow imports are inside functions."""
 
 import argparse
 import sys
@@ -13,7 +12,7 @@ from ..settings import header_of
 from .options import SWITCH, Parser, add_others, add_transfer, add_volume
 
 
-def _datasets(options: argparse.Namespace) -> None:
+def run_datasets(options: argparse.Namespace) -> None:
     from ...io import datasets
 
     if options.action == "list":
@@ -32,20 +31,19 @@ def _datasets(options: argparse.Namespace) -> None:
 
 
 def add_datasets(parser: Parser) -> None:
-    parser.set_defaults(execute=_datasets)
     parser.add_argument("action", choices=("list", "fetch"), help="what to do")
     parser.add_argument("name", nargs="?", help="of the volume to fetch, as listed")
 
 
-def _info(options: argparse.Namespace) -> None:
+def run_info(options: argparse.Namespace) -> None:
     from ..._util.image_record import volume_arguments
     from ...io.formats import labelled, read_record
     from ...scene.volume import Volume
 
-    told = header_of(options)
-    how = {name: told.pop(name) for name in ("nan", "channel")} | {"time": told["time"]}
-    record = read_record(options.file, **told)
-    arguments = volume_arguments(record, **how)
+    header = header_of(options)
+    choice = {name: header.pop(name) for name in ("nan", "channel")} | {"time": header["time"]}
+    record = read_record(options.file, **header)
+    arguments = volume_arguments(record, **choice)
     if options.spacing is not None:
         arguments["spacing"] = options.spacing
     volume = Volume(**arguments)
@@ -53,9 +51,9 @@ def _info(options: argparse.Namespace) -> None:
         volume = labelled(volume, options.labels)
     data = np.asarray(volume.data)
     assumed = "spacing" not in arguments
-    # of every k-th voxel of a large volume: sorting all takes seconds and memory
-    some, shares = data.ravel()[:: max(1, data.size // 4_000_000)].astype(np.float32), (1, 25, 50, 75, 99)
-    percentiles = zip(shares, np.percentile(some, shares), strict=True)
+    # every k-th voxel of a large volume: sorting all takes seconds and memory
+    sample, shares = data.ravel()[:: max(1, data.size // 4_000_000)].astype(np.float32), (1, 25, 50, 75, 99)
+    percentiles = zip(shares, np.percentile(sample, shares), strict=True)
     counts, bars = np.log1p(np.histogram(data, 64)[0]), " ▁▂▃▄▅▆▇█"
     heights = np.ceil(counts / counts.max() * (len(bars) - 1)).astype(int)
     low, high = f"{float(data.min()):g}", f"{float(data.max()):g}"
@@ -77,8 +75,8 @@ def _info(options: argparse.Namespace) -> None:
         "histogram": f"{low} |{''.join(bars[height] for height in heights)}| {high}, heights by logarithm",
     }
     if volume.labels is not None:
-        found = np.unique(np.asarray(volume.labels))
-        rows["labels"] = f"{found.size}, from {found[0]} to {found[-1]}"
+        labels = np.unique(np.asarray(volume.labels))
+        rows["labels"] = f"{labels.size}, from {labels[0]} to {labels[-1]}"
     if ids := volume.label_ids:
         rows["ids"] = f"{len(ids)}, from {ids[0]} to {ids[-1]}; voxels hold their numbers"
     for name, text in rows.items():
@@ -90,17 +88,16 @@ def _numbers(values: Any, between: str = " ") -> str:
 
 
 def add_info(parser: Parser) -> None:
-    parser.set_defaults(execute=_info)
     add_volume(parser)
 
 
-def _view(options: argparse.Namespace) -> None:
+def run_view(options: argparse.Namespace) -> None:
     from ..picture import is_automatic, look_of, other_of, volume_of
     from ..viewer import serve
 
-    others = tuple(map(other_of, options.others or ()))
-    look = (volume_of(options),) if is_automatic(options) else look_of(options)
-    page = serve(*look, lit=options.shade, title=options.file.name, others=others, port=options.port)
+    pairs = tuple(map(other_of, options.others or ()))
+    look = (volume_of(options), None) if is_automatic(options) else look_of(options)
+    page = serve(*look, lit=options.shade, title=options.file.name, others=pairs, port=options.port)
     print(f"{options.file}: {page.url} (Ctrl-C ends it)", flush=True)
     if options.browser:
         webbrowser.open(page.url)
@@ -108,7 +105,6 @@ def _view(options: argparse.Namespace) -> None:
 
 
 def add_view(parser: Parser) -> None:
-    parser.set_defaults(execute=_view)
     add_volume(parser)
     add_transfer(parser)
     add_others(parser)

@@ -1,4 +1,4 @@
-"""`jaxvol warm`: compiles the programs of usual pictures, and keeps them for the processes to come."""
+"""`jaxvol warm`: compiles the programs of usual pictures, and keeps them for later processes."""
 
 import argparse
 from argparse import Namespace
@@ -11,7 +11,7 @@ from ...io.phantoms import phantom
 from ...render import render
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs
-from ..picture import Scene, scene_of, with_march
+from ..picture import PictureRequest, scene_of, with_march
 from ..progress import progress
 from ..settings import DEFAULTS
 from .options import Parser, add_quiet, add_size
@@ -30,49 +30,45 @@ KINDS: dict[str, dict[str, Any]] = {
     "X-ray": {"compositing": "integral"},
     "isosurface": {"compositing": "isosurface", "isovalue": 60.0},
 }
-"""Pictures of 8-bit voxels, by what they show: options of `jaxvol render`."""
+"""Pictures of 8-bit voxels: name, and options of `jaxvol render`."""
 
-TYPES = np.int16, np.float32
-"""Other types of voxels, of which the first kind is drawn."""
-
-RESOLUTION = 64
-"""Voxels along each axis."""
+TYPES = np.int16, np.float32  # more types of voxels, for the first kind of picture
+RESOLUTION = 64  # voxels along each axis
 
 
-def _warm(options: argparse.Namespace) -> None:
+def run_warm(options: argparse.Namespace) -> None:
     folder = keep_programs()
     head = phantom("head", RESOLUTION)
-    others = [Volume(np.asarray(head.data, kind), head.spacing, head.origin) for kind in TYPES]
-    pictures = {name: (head, how) for name, how in KINDS.items()}
-    pictures |= {f"of {np.dtype(t).name}": (each, {}) for t, each in zip(TYPES, others, strict=True)}
+    pictures = {name: (head, settings) for name, settings in KINDS.items()}
+    for kind in TYPES:
+        volume = Volume(np.asarray(head.data, kind), head.spacing, head.origin)
+        pictures[f"of {np.dtype(kind).name}"] = volume, {}
     with progress("compiling", len(pictures) + 1, quiet=options.quiet) as done:
-        for name, (volume, how) in pictures.items():
-            scene = _drawn(volume, tuple(options.size), **how)
+        for name, (volume, settings) in pictures.items():
+            scene = _drawn(volume, tuple(options.size), **settings)
             print(f"{name}: {scene.march.quadrature}, {len(scene.march.transforms)} transforms", flush=True)
             done()
         scene = _drawn(head, tuple(options.size), shade=False)
-        jax.block_until_ready(jax.grad(lambda transfer: _mean(scene, transfer))(scene.transfer))
+
+        def mean(transfer: Any) -> Any:
+            return render(scene.volume, transfer, scene.camera, scene.march).image(scene.background).mean()
+
+        jax.block_until_ready(jax.grad(mean)(scene.transfer))
         print("gradient of the transfer function", flush=True)
         done()
     files = [file for file in folder.iterdir() if file.is_file()]
     print(f"{folder}: {len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.1f} MB")
 
 
-def _drawn(volume: Volume, size: tuple[int, ...], **how: Any) -> Scene:
-    """A scene that was rendered once."""
-    given = {"quiet": True, "size": size, "recorded_transfer": None, "file": volume}
-    chosen = Namespace(**DEFAULTS | how | given)
-    scene = scene_of(chosen)
-    scene = with_march(scene, chosen, [scene.camera])
+def _drawn(volume: Volume, size: tuple[int, ...], **settings: Any) -> PictureRequest:
+    """The scene of the settings, rendered once."""
+    settings |= {"quiet": True, "size": size, "recorded_transfer": None, "file": volume}
+    options = Namespace(**DEFAULTS | settings)
+    scene = with_march(scene_of(options), options)
     scene.render(scene.camera)
     return scene
 
 
-def _mean(scene: Scene, transfer: Any) -> Any:
-    return render(scene.volume, transfer, scene.camera, scene.march).image(scene.background).mean()
-
-
 def add_warm(parser: Parser) -> None:
-    parser.set_defaults(execute=_warm)
     add_size(parser)
     add_quiet(parser)

@@ -1,10 +1,10 @@
-"""Looks at volumes: `view` in a notebook, `serve` as a page, which `jaxvol view FILE` shows. One `model`,
-drawn in `tiles` by a thread, and one list of `controls` have two faces, `notebook` and `page`."""
+"""Interactive viewers: `view` in a notebook, `serve` as a page, which `jaxvol view FILE` shows. A `model`,
+drawn in `tiles` by a thread, and a list of `controls` have two faces, `notebook` and `page`."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..._util.checks import integer
+from ..._util.checks import Arrayable, integer
 from ...compositing.blending import Compositing
 from ...compositing.modes import Mode
 from ...lighting.shading import Lighting
@@ -13,6 +13,7 @@ from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs_by_default
+from ..automatic import reports_arguments
 from .state import initial
 
 
@@ -21,50 +22,50 @@ if TYPE_CHECKING:
     from .page import Page
 
 
+@reports_arguments
 def view(
-    volume: Volume | Any,
-    transfer: Transfer | Any | None = None,
-    camera: Camera | Any | None = None,
-    march: March | Any | None = None,
+    volume: Volume,
+    transfer: Transfer | None = None,
+    camera: Camera | None = None,
+    march: March | None = None,
     *,
-    lighting: Lighting | Any | None = None,
+    lighting: Lighting | None = None,
     lit: bool = True,
-    compositing: Mode | Compositing[Any] | Any = "over",
-    background: Any = (1.0, 1.0, 1.0),
-    size: tuple[int, int] | Any = (640, 480),
-    others: Sequence[tuple[Volume, Transfer]] | Any = (),
+    compositing: Mode | Compositing[Any] = "over",
+    background: Arrayable | str = (1.0, 1.0, 1.0),
+    size: tuple[int, int] = (640, 480),
+    others: Sequence[tuple[Volume, Transfer]] = (),
 ) -> "NotebookView":
-    """Shows a volume in a notebook, to be turned and changed by the pointer.
+    """Shows a volume in a notebook, with an interactive camera and controls.
 
-    Drag to orbit; drag with shift or the right button to move; turn the wheel to come nearer; click to pick a
-    point, of which slices are shown, or twice to return. Beside the image are sides to look from, the mode,
-    the transfer function's points, which are dragged on its curve, or its labels, clips, the step and each
-    transform. While something changes, the image is as coarse as it must be to follow within some 150 ms; at
-    rest it has all pixels. Where another program must be compiled, the old image stays. It needs
-    `pip install "jaxvol[notebooks]"`. Compiled programs are kept, as by `keep_programs`.
+    Drag to orbit; drag with shift or the right button to pan; turn the wheel to zoom; click to pick a point
+    and see slices through it; double-click to reset the camera. Controls beside the image set the side to
+    look from, the mode, the transfer function (points are dragged on its curve) or its labels, clips, the
+    step and each transform. During a change the image is coarse, to follow within some 150 ms; at rest it has
+    all pixels. The old image stays while another program is compiled. Compiled programs are kept, as by
+    `keep_programs`. Needs `pip install "jaxvol[notebooks]"`.
 
     Args:
-        volume: what is looked at.
-        transfer: a `TransferFunction`, of which up to 16 points can be edited; a `LabelTransferFunction`,
-            whose labels can be hidden, and made fainter or denser; another is shown and not edited. By
-            default one that is found from the volume's values; voxels that seem to be labels get a colour
-            each.
-        camera: by default `automatic_camera`. Its size does not count.
-        march: whose transforms are on at first, and whose step is that of the fine image, from 1/16 to 16
-            voxels. By default steps of half a voxel by the midpoint rule, with `SpaceLeaping`,
-            `AlphaCorrection` and `EarlyTermination`.
-        lighting: the light that can be turned on, by default `Phong`; none under a mode that shows no
-            single place, such as `Average`.
+        volume: the `Volume`.
+        transfer: a `TransferFunction`, editable up to 16 points; a `LabelTransferFunction`, whose labels can
+            be hidden, and made fainter or denser; other kinds are shown without controls. By default
+            `labels_shown` if voxels seem to be labels, else `automatic_transfer`.
+        camera: the initial camera, by default `automatic_camera`. Its size is ignored.
+        march: the initial march; its step, from 1/16 to 16 voxels, is that of the fine image. By default
+            steps of half a voxel with the midpoint rule, `SpaceLeaping`, `AlphaCorrection` and
+            `EarlyTermination`.
+        lighting: the light, by default `Phong`; None under a mode that shows no single place, such as
+            `Average`.
         lit: whether the light is on at first.
         compositing: as for `render`.
-        background: linear RGB, or a name.
+        background: linear RGB, or a colour's name.
         size: (width, height) of the image in the notebook's pixels.
-        others: pairs of a volume and its transfer function, shown in the same image, without light, by
-            "over" or "integral". The controls are those of `volume`.
+        others: pairs of a volume and its transfer function in the same image, without controls; only for
+            "over" and "integral", without light.
 
     Returns:
         A widget `v`. Without `others`, `render(v.volume, v.transfer, v.camera, v.march, lighting=v.lighting,
-        compositing=v.compositing)` renders what it shows.
+        compositing=v.compositing)` renders its image.
 
     Raises:
         ValueError: as `render` does, and for other steps or backgrounds.
@@ -75,37 +76,36 @@ def view(
     except ImportError as fault:
         raise ImportError(f"view needs {fault.name}: pip install 'jaxvol[notebooks]'") from fault
     keep_programs_by_default()
-    how = {"lighting": lighting, "lit": lit, "compositing": compositing, "background": background}
-    return NotebookView(*initial(volume, transfer, camera, march, size=size, others=others, **how))
+    look: dict[str, Any] = {"lighting": lighting, "lit": lit, "compositing": compositing}
+    look |= {"background": background, "size": size, "others": others}
+    return NotebookView(*initial(volume, transfer, camera, march, **look))
 
 
+@reports_arguments
 def serve(
-    volume: Volume | Any,
-    transfer: Transfer | Any | None = None,
-    camera: Camera | Any | None = None,
-    march: March | Any | None = None,
+    volume: Volume,
+    transfer: Transfer | None = None,
+    camera: Camera | None = None,
+    march: March | None = None,
     *,
-    port: int | Any = 8080,
+    port: int = 8080,
     title: str = "jaxvol",
-    **how: Any,
+    **options: Any,
 ) -> "Page":
-    """Serves a page on which a volume is shown, as `view` does in a notebook, to browsers on this machine.
+    """Serves a page with the viewer of `view` to browsers on this machine.
 
-    Only this machine can connect, and only pages that this server sent (others that a browser shows may not);
-    from another machine, by `ssh -L 8080:localhost:8080`. What a browser sends are numbers, colors and names
-    of controls; nothing of it is evaluated or used as a path. It needs `pip install "jaxvol[view]"`.
+    Only pages of this server can connect, and only from this machine; from another machine, use
+    `ssh -L 8080:localhost:8080`. Browsers send numbers, colors and names of controls, which are neither
+    evaluated nor used as paths. Needs `pip install "jaxvol[view]"`.
 
     Args:
-        volume: as for `view`.
-        transfer: as for `view`.
-        camera: as for `view`.
-        march: as for `view`.
-        port: from 1 to 65535; if it is taken, the next free one.
-        title: of the page's panel.
-        how: `lighting`, `lit`, `compositing`, `background` and `others`, as for `view`.
+        volume: as for `view`, as are `transfer`, `camera` and `march`.
+        port: port from 1 to 65535; the next free one if it is taken.
+        title: title of the page's panel.
+        options: `lighting`, `lit`, `compositing`, `background` and `others`, as for `view`.
 
     Returns:
-        The `Page`, with its `url`. It is served until `Page.close`, or the end of the process.
+        The `Page`, with its `url`, served until `Page.close` or the end of the process.
 
     Raises:
         ValueError: as `view` does, and for another port.
@@ -117,4 +117,4 @@ def serve(
         raise ImportError(f"serve needs {fault.name}: pip install 'jaxvol[view]'") from fault
     port = integer("port", port, 1, 65535)
     keep_programs_by_default()
-    return Page(*initial(volume, transfer, camera, march, **how), port=port, title=title)
+    return Page(*initial(volume, transfer, camera, march, **options), port=port, title=title)

@@ -1,7 +1,6 @@
-"""What can be changed in a viewer? Its controls by groups, for both faces."""
+"""Controls of a viewer, in groups, for both faces."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -15,29 +14,25 @@ from .slices import slice_controls
 from .state import ISOSURFACE, MAX_STEP, MIN_STEP
 
 
-FOLDED = {"clip", "save", "march"}
-"""Groups that are closed at first."""
-
+FOLDED = {"clip", "save", "march"}  # initially folded groups
 SIDES = {f"{'+-'[sign < 0]}{name}": (axis, sign) for axis, name in enumerate("xyz") for sign in (1, -1)}
-"""From which the camera looks: the axis, and which end of it."""
 
 
 def controls_of(model: Model) -> dict[str, list[Control]]:
-    """Controls by the heading of their group. A change of one may change what others show."""
+    """Controls by the heading of their group. A change of a control may change the values of others."""
     groups = {"view": _view_controls, "transfer function": transfer_controls, "slices": slice_controls}
     groups |= {"clip": _clip_controls, "save": _save_controls, "march": _march_controls}
-    made = {heading: controls(model) for heading, controls in groups.items()}
-    return {heading: controls for heading, controls in made.items() if controls}
+    return {heading: group for heading, controls in groups.items() if (group := controls(model))}
 
 
-def _bound(model: Model, kind: str, label: str, name: str, **more: Any) -> Control:
-    """A control of a field of the state."""
-    how = lambda: getattr(model.state, name), lambda to: model.change(**{name: to})
-    return Control(kind, label, *how, **more)
+def _checkbox(model: Model, label: str, name: str) -> Control:
+    """A checkbox of a field of the state."""
+    get, put = lambda: getattr(model.state, name), lambda value: model.change(**{name: value})
+    return Control("checkbox", label, get, put)
 
 
 def _view_controls(model: Model) -> list[Control]:
-    """From where the volume is looked at, and how cells become pixels."""
+    """Controls of camera, mode, light and background."""
     data = np.asarray(model.scene.volume.data)
     modes = [*model.scene.modes, *([] if model.scene.others else [ISOSURFACE])]
     low, high = float(data.min()), float(data.max())
@@ -46,7 +41,7 @@ def _view_controls(model: Model) -> list[Control]:
     def get_isovalue() -> float:
         return min(max(rounded(model.state.isovalue, span), low), rounded(low + span, span))
 
-    isovalue = get_isovalue, lambda to: model.change(isovalue=to)
+    isovalue = get_isovalue, lambda value: model.change(isovalue=value)
     unit = rounded(span / 1000, span / 1000)
 
     def look(side: str) -> None:
@@ -65,16 +60,16 @@ def _view_controls(model: Model) -> list[Control]:
     background = lambda: display_color(np.array(model.state.background)), set_background
     return [
         Control("buttons", "look from", set=look, choices=(*SIDES, "reset")),
-        _bound(model, "checkbox", "orthographic", "parallel"),
+        _checkbox(model, "orthographic", "parallel"),
         Control("dropdown", "mode", lambda: model.state.mode, set_mode, choices=modes),
         Control("slider", "isovalue", *isovalue, (low, rounded(low + span, span), unit)),
-        _bound(model, "checkbox", "light", "lit"),
+        _checkbox(model, "light", "lit"),
         Control("color", "background", *background),
     ]
 
 
 def _clip_controls(model: Model) -> list[Control]:
-    """A box and a plane, of which any change turns clipping on."""
+    """Controls of the clip box and plane; any change turns clipping on."""
     bounds, chosen = model.state.box, "none"
 
     def range_of(axis: int) -> Control:
@@ -82,9 +77,9 @@ def _clip_controls(model: Model) -> list[Control]:
         low, high = bounds[ends]
         step = (high - low) / 200
 
-        def put(both: tuple[float, float]) -> None:
+        def put(interval: tuple[float, float]) -> None:
             box = [*model.state.box]
-            box[ends] = both[0], max(both[1], both[0] + step)
+            box[ends] = interval[0], max(interval[1], interval[0] + step)
             model.change(clip=True, box=tuple(box))
 
         return Control("range", "xyz"[axis], lambda: model.state.box[ends], put, (low, high, step))
@@ -101,7 +96,7 @@ def _clip_controls(model: Model) -> list[Control]:
         model.change(clip=True, offset=offset)
 
     return [
-        _bound(model, "checkbox", "clip", "clip"),
+        _checkbox(model, "clip", "clip"),
         *map(range_of, range(3)),
         Control("dropdown", "cut from", lambda: chosen, choose, choices=("none", "view", *SIDES)),
         Control("slider", "depth", lambda: model.state.offset, set_depth, limits=(-1.0, 1.0, 0.01)),
@@ -110,7 +105,7 @@ def _clip_controls(model: Model) -> list[Control]:
 
 def _save_controls(model: Model) -> list[Control]:
     pixels = [1920.0]
-    width = Control("number", "width", lambda: pixels[0], lambda to: pixels.__setitem__(0, to))
+    width = Control("number", "width", lambda: pixels[0], lambda value: pixels.__setitem__(0, value))
     return [width, Control("buttons", "image", set=lambda _: model.save(pixels[0]), choices=("save PNG",))]
 
 

@@ -1,4 +1,4 @@
-"""The controls of a viewer's transfer function: presets, its curve and points, or its labels."""
+"""Controls of a viewer's transfer function: presets, curve and points, or labels."""
 
 import math
 from collections.abc import Callable
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import to_hex
 
+from ..._util.checks import Arrayable
 from ...scene.labels import LabelTransferFunction
 from ...scene.presets import PRESETS, fitted_range, preset
 from ...scene.transfer import TransferFunction
@@ -21,14 +22,14 @@ from .control import Control, press_of
 from .model import Model
 
 
-MAX_LABEL_OPACITY = 4.0  # factor of a label's extinction
+MAX_LABEL_OPACITY = 4.0  # largest factor of a label's extinction
 BINS, WIDTH, HEIGHT = 128, 320, 110  # of the plot of the histogram
-GIVEN = "as given"
+ORIGINAL = "as given"
 PLOT = Template(Path(__file__).with_name("curve.html").read_text("utf-8"))
 
 
 def transfer_controls(model: Model) -> list[Control]:
-    """The controls of the transfer function that is shown at first, of its kind."""
+    """The controls for the kind of the initial transfer function."""
     if isinstance(model.state.transfer, LabelTransferFunction):
         return _label_controls(model)
     if isinstance(model.state.transfer, TransferFunction):
@@ -42,7 +43,7 @@ def edit(model: Model, change: Callable[..., Any], *arguments: Any) -> None:
 
 
 def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]:
-    """The least and the greatest value, and log(1 + count) of the bins between them, 1 at most."""
+    """Least and greatest value, and log(1 + count) of the bins between them, scaled to at most 1."""
     values = sampled(volume).ravel().astype(np.float64)
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
@@ -52,12 +53,12 @@ def histogram(volume: Volume) -> tuple[float, float, Float[np.ndarray, " bins"]]
 
 
 def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel: float, chosen: int) -> str:
-    """A pad: histogram, square root of the opacity (which shows thin materials), and the points as parts."""
+    """HTML of a pad: histogram, square root of the opacity (to show thin materials), points as parts."""
     at, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction)
     across = WIDTH * np.clip((at - low) / (high - low), 0, 1)
     colors = [editing.display_color(color) for color in np.asarray(transfer.colors)]
 
-    def height(extinction: Any) -> Any:
+    def height(extinction: Arrayable) -> Any:
         return HEIGHT - (HEIGHT - 2) * np.sqrt(-np.expm1(-np.asarray(extinction, np.float64) * voxel))
 
     def points(down: Float[np.ndarray, " n"]) -> str:
@@ -78,10 +79,10 @@ def _plot(low: float, high: float, bars: Any, transfer: TransferFunction, voxel:
 
 
 def _point_controls(model: Model) -> list[Control]:
-    """Presets, curve, window and level; value, colour and opacity (in a voxel) of the chosen point."""
+    """Controls of presets, curve, window and level, and value, colour and opacity (in a voxel) of a point."""
     low, high, bars = histogram(model.scene.volume)
-    voxel, given, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
-    shown = GIVEN
+    voxel, original, chosen, gesture, note = model.scene.voxel, model.state.transfer, 0, "", ""
+    shown = ORIGINAL
 
     def transfer() -> TransferFunction:
         return cast(TransferFunction, model.state.transfer)
@@ -93,11 +94,10 @@ def _point_controls(model: Model) -> list[Control]:
 
     def choose_preset(name: str) -> None:
         nonlocal note, shown
-        values = sampled(model.scene.volume)
-        clim, told = (None, "") if name == GIVEN else fitted_range(name, values)
-        note = f'<div style="font-size: 11px">{told or ""}</div>'
-        shown = name
-        put(lambda _: given if name == GIVEN else preset(name, clim, preset_unit(model.scene.volume)))
+        volume, shown = model.scene.volume, name
+        clim, warning = (None, None) if name == ORIGINAL else fitted_range(name, sampled(volume))
+        note = f'<div style="font-size: 11px">{warning or ""}</div>'
+        put(lambda _: original if name == ORIGINAL else preset(name, clim, preset_unit(volume)))
 
     def press(message: str) -> None:
         nonlocal chosen, gesture
@@ -114,7 +114,7 @@ def _point_controls(model: Model) -> list[Control]:
                 put(editing.with_points_at, [value])
                 values = np.asarray(transfer().values)
                 chosen = min(int(np.searchsorted(values, np.float32(value))), len(values) - 1)
-                gesture = number if len(values) > count else ""  # where there was no room, nothing is dragged
+                gesture = number if len(values) > count else ""  # without a new point, nothing is dragged
         elif not twice:
             put(editing.with_value, chosen, value)
             put(editing.with_opacity, chosen, opacity, voxel)
@@ -123,14 +123,14 @@ def _point_controls(model: Model) -> list[Control]:
         def get() -> float:
             return float(np.clip(editing.rounded(editing.window_level(transfer())[index], span), *limits[:2]))
 
-        def set_one(value: float) -> None:
-            both = [*editing.window_level(transfer())]
-            both[index] = value
-            put(editing.with_window_level, *both)
+        def set_value(value: float) -> None:
+            window_level = [*editing.window_level(transfer())]
+            window_level[index] = value
+            put(editing.with_window_level, *window_level)
 
-        return Control("slider", label, get, set_one, limits)
+        return Control("slider", label, get, set_value, limits)
 
-    # in NumPy: a program for another number of points would wait for one that is being compiled
+    # NumPy: JAX would compile a program per number of points, after the one being compiled
     value, color, opacity = (
         lambda: editing.rounded(float(np.asarray(transfer().values)[chosen]), span),
         lambda: editing.display_color(np.asarray(transfer().colors)[chosen]),
@@ -141,19 +141,19 @@ def _point_controls(model: Model) -> list[Control]:
     span = editing.rounded(last - first, last - first)
     unit, middle = 10.0 ** np.ceil(np.log10(span) - 3), editing.rounded((first + last) / 2, span)
     controls = [
-        Control("dropdown", "preset", lambda: shown, choose_preset, choices=(GIVEN, *PRESETS)),
+        Control("dropdown", "preset", lambda: shown, choose_preset, choices=(ORIGINAL, *PRESETS)),
         Control("pad", "curve", lambda: _plot(low, high, bars, transfer(), voxel, chosen) + note, press),
         of_range("window", 0, (min(unit, window), 2 * span, unit)),
         of_range("level", 1, (middle - span, middle + span, unit)),
-        Control("number", "value", value, lambda to: put(editing.with_value, chosen, to)),
-        Control("color", "color", color, lambda to: put(editing.with_color, chosen, to)),
-        Control("slider", "opacity", opacity, lambda to: put(editing.with_opacity, chosen, to, voxel)),
+        Control("number", "value", value, lambda new: put(editing.with_value, chosen, new)),
+        Control("color", "color", color, lambda new: put(editing.with_color, chosen, new)),
+        Control("slider", "opacity", opacity, lambda new: put(editing.with_opacity, chosen, new, voxel)),
     ]
     return controls if len(transfer().values) <= editing.MAX_POINTS else controls[:-3]
 
 
 def _label_controls(model: Model) -> list[Control]:
-    """A visible label, by name or densest colour, whether it is shown, and its extinction's factor."""
+    """Controls of a label, chosen by name or densest colour: visibility, and factor of its extinction."""
     stacked: Any = model.state.transfer.stacked  # pyright: ignore[reportAttributeAccessIssue]
     extinction = np.asarray(stacked.extinction)
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()

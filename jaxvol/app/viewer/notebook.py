@@ -1,4 +1,4 @@
-"""A viewer in a notebook: rendercanvas shows the image and takes the pointer, ipywidgets are the controls."""
+"""The viewer in a notebook, with rendercanvas for image and pointer and ipywidgets for the controls."""
 
 import asyncio
 import contextlib
@@ -23,28 +23,27 @@ from ...scene.volume import Volume
 from .control import PRESSED, Control
 from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
-from .state import Scene, State
+from .state import State, ViewerSetup
 from .tiles import Pixels
 
 
-WIDE = {"width": "98%"}  # layout of what stands in a line of its own
+WIDE = {"width": "98%"}  # layout of widgets that fill a line, and of the controls, for JupyterLab's width
 PANEL = {"width": "298px", "flex": "0 0 auto", "display": "block", "overflow": "hidden auto"}
-"""Of the controls, which stand beside 640 pixels of an image in JupyterLab 1400 pixels wide."""
 
 
 class NotebookView(ipywidgets.HBox):
-    """What `view` returns: an image with its controls, a widget of ipywidgets.
+    """Widget of an image with its controls, made by `view`.
 
     Attributes:
-        model: the viewer's state, `model.state`; `model.wait()` waits until it is drawn.
+        model: the viewer's model, with `model.state`; `model.wait()` waits until it is drawn.
         canvas: the image, a canvas of rendercanvas.
 
     Args:
-        scene: what is looked at. `view` makes it.
-        state: how at first.
+        scene: the constant part of the viewer, made by `view`.
+        state: the initial state.
     """
 
-    def __init__(self, scene: Scene, state: State):
+    def __init__(self, scene: ViewerSetup, state: State):
         super().__init__()
         self._loop: asyncio.AbstractEventLoop | None = None
         with contextlib.suppress(RuntimeError):
@@ -72,7 +71,7 @@ class NotebookView(ipywidgets.HBox):
 
     @property
     def volume(self) -> Volume:
-        """What is looked at; of labels without a transfer function, a smooth volume with them."""
+        """The volume; for labels without a transfer function, that of `labels_shown`."""
         return self.model.scene.volume
 
     @property
@@ -92,16 +91,16 @@ class NotebookView(ipywidgets.HBox):
 
     @property
     def lighting(self) -> Lighting | None:
-        """The light, None if it is off."""
+        """The light, or None if it is off."""
         return self.model.scene.light(self.model.state)
 
     @property
     def compositing(self) -> Compositing[Any]:
-        """How cells become a pixel."""
+        """The compositing."""
         return self.model.scene.compositing(self.model.state)
 
     def close(self) -> None:
-        """Remove the widget, and end its thread. A cell that shows another viewer does not end it."""
+        """Remove the widget and end its thread, which continues when a cell shows another viewer."""
         self.model.close()
         self.canvas._is_closed = True  # its scheduler ends; in rendercanvas 2.7, its `close` calls itself
         ipywidgets.Widget.close(self.canvas)
@@ -112,7 +111,7 @@ class NotebookView(ipywidgets.HBox):
         path.write_bytes(png)
         self._set_status(f"saved in the notebook's folder:\n{path}")
 
-    # The thread that draws calls these two; widgets belong to the thread of the event loop.
+    # The drawing thread calls these two; widgets belong to the thread of the event loop.
 
     def _show(self, pixels: Pixels, stage: Stage) -> None:
         self._in_loop(lambda: self.canvas.show(pixels, JPEG_QUALITY[stage]))
@@ -154,7 +153,7 @@ class NotebookView(ipywidgets.HBox):
         self.model.change(orbit=self.model.first.orbit)
 
     def _widget(self, control: Control) -> ipywidgets.Widget:
-        """A widget that shows what a control describes, and changes the model."""
+        """The widget of a control."""
         if control.kind == "buttons":
             narrow = {"width": "auto", "min_width": "30px", "padding": "0 4px"}
             buttons = [ipywidgets.Button(description=text, layout=narrow) for text in control.choices]
@@ -168,11 +167,10 @@ class NotebookView(ipywidgets.HBox):
         return widget
 
     def _change(self, change: Callable[[Any], None], value: Any) -> None:
-        """Change the model, and let all controls show it; not while they are being made to."""
-        if self._updating:
-            return
-        change(value)
-        self._update()
+        """Change the model and update all controls, unless the change is part of an update."""
+        if not self._updating:
+            change(value)
+            self._update()
 
     def _update(self) -> None:
         self._updating = True
@@ -184,27 +182,27 @@ class NotebookView(ipywidgets.HBox):
 
 
 def _widget_of_value(control: Control) -> Any:
-    how: dict[str, Any] = {"value": control.get(), "layout": WIDE}
+    kwargs: dict[str, Any] = {"value": control.get(), "layout": WIDE}
     if control.kind == "pad":
-        return Pad(**how)
-    how["description"] = control.label
+        return Pad(**kwargs)
+    kwargs["description"] = control.label
     if control.kind == "checkbox":
-        return ipywidgets.Checkbox(indent=False, **how)
-    how["style"] = {"description_width": "78px"}
+        return ipywidgets.Checkbox(indent=False, **kwargs)
+    kwargs["style"] = {"description_width": "78px"}
     low, high, step = control.limits
     if control.kind == "dropdown":
-        return ipywidgets.Dropdown(options=control.choices, **how)
-    if control.kind == "range":
-        return ipywidgets.FloatRangeSlider(min=low, max=high, step=step, readout_format=".4g", **how)
+        return ipywidgets.Dropdown(options=control.choices, **kwargs)
     if control.kind == "log slider":
-        return ipywidgets.FloatLogSlider(base=2, min=math.log2(low), max=math.log2(high), step=0.25, **how)
-    if control.kind == "slider":
-        return ipywidgets.FloatSlider(min=low, max=high, step=step, readout_format=".4g", **how)
-    return (ipywidgets.FloatText if control.kind == "number" else ipywidgets.ColorPicker)(**how)
+        limits = {"min": math.log2(low), "max": math.log2(high), "step": 0.25}
+        return ipywidgets.FloatLogSlider(base=2, **limits, **kwargs)
+    if control.kind in ("range", "slider"):
+        slider = ipywidgets.FloatRangeSlider if control.kind == "range" else ipywidgets.FloatSlider
+        return slider(min=low, max=high, step=step, readout_format=".4g", **kwargs)
+    return (ipywidgets.FloatText if control.kind == "number" else ipywidgets.ColorPicker)(**kwargs)
 
 
 class Pad(anywidget.AnyWidget):
-    """HTML whose boxes tell where they are pressed."""
+    """HTML whose boxes send the positions of presses."""
 
     _esm = Path(__file__).with_name("pad.js").read_text("utf-8").replace("$pressed", PRESSED)
     value = traitlets.Unicode().tag(sync=True)
@@ -212,19 +210,19 @@ class Pad(anywidget.AnyWidget):
 
 
 class PromptCanvas(RenderCanvas):
-    """Calls event handlers at once, and sends an image as soon as fewer than two wait for the browser: not at
-    ticks of rendercanvas's scheduler, not once more without loss, and with moves not held back for 20 ms."""
+    """A canvas without delays: events are handled at once, and an image is sent if fewer than two wait for
+    the browser; without rendercanvas's scheduler, lossless repeats and 20 ms between moves."""
 
     _esm = RenderCanvas._esm.replace("setThrottle(20)", "setThrottle(0)")
     pixels: Pixels | None = None
 
-    def __init__(self, **how: Any):
-        super().__init__(**how)
+    def __init__(self, **kwargs: Any):
+        super().__init__(**kwargs)
         self._bitmap = self.get_bitmap_context()
         self.request_draw(self._set_bitmap)
 
     def show(self, pixels: Pixels, quality: int) -> None:
-        """Send an image as JPEG of this quality, in place of unsent ones; in the event loop's thread."""
+        """Send an image as JPEG, in place of unsent ones. Call it in the event loop's thread."""
         self.pixels, self._quality = pixels, quality
         self.request_draw()
 

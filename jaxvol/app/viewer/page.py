@@ -1,5 +1,5 @@
-"""A viewer as a page of its own, by viser, which turns the camera in the browser. The image is the background
-of viser's scene, which is empty."""
+"""The viewer as a page, with viser, which turns the camera in the browser. The image is the background of an
+empty scene."""
 
 import contextlib
 import html
@@ -23,49 +23,46 @@ from ..._util.checks import shortened
 from .control import PRESSED, Control
 from .controls import FOLDED, controls_of
 from .model import JPEG_QUALITY, Model, Stage
-from .state import Orbit, Scene, State
+from .state import Orbit, State, ViewerSetup
 from .tiles import Pixels
 
 
 HOST = "127.0.0.1"
 OWN_NAMES = {HOST, "localhost"}
-# of viser's widgets, only a text field sends what a script tells: each pad has a hidden one
+# only viser's text field sends the text of a script: each pad has a hidden one
 PAD = Template(Path(__file__).with_name("pad.html").read_text("utf-8"))
 
 
 class _Server(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """None: no tunnel to a public address, which any client could ask for otherwise."""
+        """Refuse a tunnel to a public address, which any client may request."""
         return None
 
 
 class Page:
-    """What `serve` returns: a server of pages on which a volume is looked at.
-
-    Each page (tab of a browser) has a view of its own.
+    """A server of viewer pages, made by `serve`. Each page (tab of a browser) has an independent view.
 
     Attributes:
-        url: to open in a browser.
-        port: on which it is served.
-        models: of the pages that are open, by viser's numbers of clients.
-        shown: scene and first state.
+        url: address to open in a browser.
+        port: port of the server.
+        models: viewer models of the open pages, by viser's client numbers.
+        shown: scene and initial state.
 
     Args:
-        scene: what is looked at. `serve` makes it.
-        state: how at first.
+        scene: the constant part of the viewer, made by `serve`.
+        state: the initial state.
         port: as for `serve`, as is `title`.
     """
 
-    def __init__(self, scene: Scene, state: State, *, port: int, title: str):
+    def __init__(self, scene: ViewerSetup, state: State, *, port: int, title: str):
         self.shown = scene, state
         low, high = (np.asarray(corner, np.float64) for corner in scene.volume.corners)
-        # viser's cameras have limits that suit scenes of about this size
+        # the limits of viser's cameras suit scenes of size 1
         self._center, self._radius = (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-30)
         self.models: dict[int, Model] = {}
-        # browsers open connections in advance, and close those that they do not need
-        log = logging.getLogger("websockets.server")
-        log.addFilter(_in_one_line)
-        with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
+        # browsers open connections in advance, and close unneeded ones
+        logging.getLogger("websockets.server").addFilter(_in_one_line)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's banner
             self._server = _Server(host=HOST, port=port, label=title, verbose=False)
         self.port = self._server.get_port()
         self.url = f"http://localhost:{self.port}"
@@ -82,13 +79,13 @@ class Page:
         self._server.on_client_disconnect(self._closed)
 
     def close(self) -> None:
-        """Serve no more."""
+        """Stop the server."""
         for model in list(self.models.values()):
             model.close()
         self._server.stop()
 
     async def _only_own_pages(self, connection: Any) -> None:
-        """Refuse pages of others; viser reads messages only after this, so theirs are dropped here."""
+        """Refuse foreign pages, and drop their messages, which viser would read after this callback."""
         client = self._server._websock_server._live_connections[connection.client_id]
         origin = urlsplit(client.request.headers.get("Origin", "") if client.request else "")
         if origin.hostname not in OWN_NAMES or origin.port != self.port:
@@ -114,7 +111,7 @@ class Page:
         async def turned(camera: viser.CameraHandle) -> None:
             position, focal = (self._center + self._radius * v for v in (camera.position, camera.look_at))
             (width, height), first = self.shown[1].size, self.shown[1].orbit.view_angle
-            # a window that is narrower than what was framed shows all of its width
+            # a narrower window than the framed one shows its whole width
             narrower = max(1.0, width / height * camera.image_height / max(camera.image_width, 1))
             camera.fov = 2 * math.atan(narrower * math.tan(math.radians(first) / 2))
             orbit = Orbit.at(position, focal, camera.up_direction, math.degrees(camera.fov))
@@ -122,7 +119,7 @@ class Page:
 
         client.camera.on_update(turned)
 
-        async def picked(event: Any) -> Any:  # beside the others, in turn
+        async def picked(event: Any) -> Any:  # a coroutine, so that viser calls it in order
             model.pick(*event.screen_pos)
 
         client.scene.on_click()(picked)  # pyright: ignore[reportArgumentType]
@@ -135,12 +132,12 @@ class Page:
 
 
 def _in_one_line(record: logging.LogRecord) -> bool:
-    """Whether to log a record; a client's unknown message is told in one line."""
-    told = record.getMessage()
-    if told == "connection handler failed" and record.exc_info:
+    """Filter log records; shorten that of a client's unknown message to one line."""
+    message = record.getMessage()
+    if message == "connection handler failed" and record.exc_info:
         fault = shortened(record.exc_info[1])
         record.msg, record.exc_info = f"a page was sent away: its message is unknown ({fault})", None
-    return told != "opening handshake failed"
+    return message != "opening handshake failed"
 
 
 class _Panel:
@@ -171,11 +168,11 @@ class _Panel:
         widget = _widget(self.client.gui, control)
         source = self.client.gui.add_text(control.label, "") if control.kind == "pad" else widget
 
-        # viser runs coroutines one after the other, and plain functions in any order
+        # viser runs coroutines in order, plain functions in any order
         async def changed(event: Any) -> None:
-            if event.client is not None:  # in a browser, and not by `_update`
+            if event.client is not None:  # from a browser, not from `_update`
                 value, orbit = source.value, self.model.state.orbit
-                with contextlib.suppress(ValueError, KeyError):  # of what no widget sends
+                with contextlib.suppress(ValueError, KeyError):  # of messages that no widget sends
                     control.set("#{:02x}{:02x}{:02x}".format(*value) if control.kind == "color" else value)
                 if self.model.state.orbit is not orbit:
                     self._turn(self.model.state.orbit)
@@ -185,15 +182,15 @@ class _Panel:
             widget.on_click(changed)
             return
         if control.kind == "pad":
-            told, field = control.get, {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
-            control = replace(control, get=lambda: PAD.substitute(**field, content=told()))
+            get, fields = control.get, {"field": source._impl.uuid, "pressed": html.escape(PRESSED)}
+            control = replace(control, get=lambda: PAD.substitute(**fields, content=get()))
             _update(widget, control)
         self._widgets.append((widget, control))
         source.on_update(changed)
 
     def _update(self) -> None:
-        for each in self._widgets:
-            _update(*each)
+        for widget, control in self._widgets:
+            _update(widget, control)
 
 
 def _widget(gui: viser.GuiApi, control: Control) -> Any:
@@ -201,7 +198,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
         return gui.add_html("")
     if control.kind == "buttons":
         return gui.add_button_group(control.label, tuple(control.choices))
-    label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # may wrap where words meet
+    label = re.sub("(?<=[a-z])(?=[A-Z])", "\u200b", control.label)  # lines may break between words
     value = _value(control)
     if control.kind == "range":
         return gui.add_multi_slider(label, *control.limits, value)
@@ -214,18 +211,18 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
 
 
 def _update(widget: Any, control: Control) -> None:
-    """Let a widget show what the model has."""
+    """Update a widget from the model."""
     if control.kind == "pad":
         if widget.content != (content := control.get()):
             widget.content = content
         return
     value = _value(control)
-    # what only rounding has changed is not sent back, or a slider would lag behind in a drag
+    # rounded values are not sent back, or a slider would lag behind a drag
     if not (isinstance(value, float) and math.isclose(value, widget.value, rel_tol=1e-5)):
         widget.value = value
 
 
 def _value(control: Control) -> Any:
-    """What a control shows; of a colour viser's three integers."""
+    """Value of a control, a colour as viser's three integers."""
     value = control.get()
     return tuple(round(255 * channel) for channel in to_rgb(value)) if control.kind == "color" else value

@@ -1,4 +1,4 @@
-"""Three slices through the point that was picked: where is it, and what lies around it?"""
+"""Slices through the picked point across the three axes of the voxels."""
 
 import base64
 from typing import Any
@@ -19,12 +19,12 @@ SIDE = 256  # pixels of the longest axis
 
 
 def slice_controls(model: Model) -> list[Control]:
-    """A pad of slices across the voxels' axes, oriented as world or camera. A press moves the point."""
+    """A pad of slices, oriented as the world or the camera. A press moves the point."""
     volume = model.scene.volume
     if np.ndim(volume.data) != 3 or volume.field is not None:
         return []
     low, high = np.percentile(np.asarray(sampled(volume), np.float32), (0.5, 99.5)).tolist()
-    origin, spacing = (np.asarray(each, np.float64) for each in (volume.origin, volume.spacing))
+    origin, spacing = np.asarray(volume.origin, np.float64), np.asarray(volume.spacing, np.float64)
     turn = np.eye(3) if volume.direction is None else np.asarray(volume.direction, np.float64)
     last = np.array(volume.shape) - 1
     pixels = np.maximum(SIDE * last * spacing / (last * spacing).max(), 1).round().astype(int)
@@ -37,12 +37,12 @@ def slice_controls(model: Model) -> list[Control]:
     palette = colors_of(look) if isinstance(look, LabelTransferFunction) else None
 
     def indices() -> np.ndarray:
-        """Of the point, or of the middle of the volume, in voxels."""
+        """Voxel coordinates of the point, or of the middle of the volume."""
         point = model.state.point
         return last / 2 if point is None else np.clip((point - origin) @ turn / spacing, 0, last)
 
-    def one(axis: int, at: np.ndarray) -> str:
-        a, b = (each for each in range(3) if each != axis)
+    def slice_of(axis: int, at: np.ndarray) -> str:
+        a, b = (number for number in range(3) if number != axis)
         data = np.asarray(volume.data).take(round(at[axis]), axis).astype(np.float32)
         rgb = np.clip((data - low) / ((high - low) or 1.0), 0, 1)[..., None].repeat(3, axis=2)
         if palette is not None:
@@ -56,28 +56,28 @@ def slice_controls(model: Model) -> list[Control]:
         drawing.line([x, 0, x, pixels[b]], AXES[a][1], 2)
         drawing.line([0, y, pixels[a], y], AXES[b][1], 2)
         drawing.rectangle([0, 0, *(pixels[[a, b]] - 1)], outline=AXES[axis][1], width=3)
-        source = base64.b64encode(png_of(np.asarray(picture))).decode()
-        how = f"flex: {pixels[a]} 0 0; min-width: 0; cursor: crosshair; touch-action: none"
-        return f'<img data-pad="{axis}" draggable="false" style="{how}" src="data:image/png;base64,{source}">'
+        source = f"data:image/png;base64,{base64.b64encode(png_of(np.asarray(picture))).decode()}"
+        style = f"flex: {pixels[a]} 0 0; min-width: 0; cursor: crosshair; touch-action: none"
+        return f'<img data-pad="{axis}" draggable="false" style="{style}" src="{source}">'
 
     def get() -> str:
         nonlocal shown
         at = indices()
         if shown[0] != tuple(at):
-            here = tuple(np.round(at).astype(int))
-            value = f"{float(np.asarray(volume.data)[here]):.5g}"
-            kind = 0 if palette is None else int(labels[here])
-            value += "" if palette is None else f", label {ids.get(kind, kind)}"
-            where = ", ".join(f"{each:.4g}" for each in origin + turn @ (at * spacing))
-            slices = "".join(one(axis, at) for axis in range(3))
+            index = tuple(np.round(at).astype(int))
+            value = f"{float(np.asarray(volume.data)[index]):.5g}"
+            if palette is not None:
+                value += f", label {ids.get(int(labels[index]), int(labels[index]))}"
+            place = ", ".join(f"{number:.4g}" for number in origin + turn @ (at * spacing))
+            slices = "".join(slice_of(axis, at) for axis in range(3))
             text = f'<div style="display: flex; gap: 6px; align-items: flex-end; margin: 4px">{slices}</div>'
-            text += f'<div style="font-size: 11px; margin: 0 4px">at ({where}): {value}</div>'
+            text += f'<div style="font-size: 11px; margin: 0 4px">at ({place}): {value}</div>'
             shown = tuple(at), text
         return shown[1]
 
     def press(message: str) -> None:
         (_, pad, _, _, x, y), at = press_of(message), indices()
-        a, b = (each for each in range(3) if each != int(pad))
+        a, b = (number for number in range(3) if number != int(pad))
         at[a] = (1 - x if down[a] else x) * last[a]
         at[b] = (y if down[b] else 1 - y) * last[b]
         model.mark(origin + turn @ (at * spacing))

@@ -11,7 +11,7 @@ from skimage.io import imread
 import jaxvol as jv
 from jaxvol.app.automatic import brightest_mean, range_of_object, xray_transfer
 from jaxvol.app.cli import main
-from jaxvol.app.picture import Scene
+from jaxvol.app.picture import PictureRequest
 from jaxvol.app.show import why_empty
 from jaxvol.compositing.blending import Over
 from jaxvol.compositing.modes import compositing_of
@@ -320,7 +320,7 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
     transfer, expected = HIDING[case]
     volume = jv.Volume(np.linspace(20, 90, 8, dtype=np.float32).reshape(2, 2, 2))
     camera, march = jv.Camera.looking_at(volume, size=(8, 8)), jv.March(0.1)
-    scene = Scene(volume, transfer, camera, Over(), None, (1, 1, 1), (), None, None, march)
+    scene = PictureRequest(volume, transfer, camera, Over(), None, (1, 1, 1), (), None, None, march)
     empty = jv.Rendering(*jax.device_put((np.zeros((8, 8, 4), np.float32), np.zeros((8, 8), bool))))
     said = why_empty(scene, empty)
     assert said is not None

@@ -60,7 +60,7 @@ class Shown:
     def __init__(self):
         self.images, self.told = [], []
         self.model = Model(*begun(), lambda *image: self.images.append(image), self.told.append)
-        self.model.rest = 0
+        self.model.idle_delay = 0
 
     def after(self, change):
         """The fine image after a change of the state."""
@@ -218,7 +218,7 @@ def test_another_program_is_compiled_beside_the_old_image(monkeypatch):
     monkeypatch.setattr("jaxvol.app.viewer.model.TileRenderer", Renderer)
     told: list[str] = []
     model = Model(*begun(), lambda *_: None, told.append)
-    model.rest = 0
+    model.idle_delay = 0
     model.ask(model.state)
     assert model.wait(60)
     gate.acquire()
@@ -459,7 +459,7 @@ def test_slices_pass_through_the_point_and_move_it(controlled):
     pad.set("1,2,,false,0.25,1")  # across z: x of the data runs along -y of the world, and y along x
     np.testing.assert_allclose(model.state.point, at(0.75 * 23, 0, 11.5), rtol=1e-6)
     pad.set("2,0,,false,1,0")
-    with pytest.raises(ValueError, match="a press lies somewhere"):
+    with pytest.raises(ValueError, match="the position of a press must be two numbers"):
         pad.set("2,0,,false,nan,0")
     np.testing.assert_allclose(model.state.point, at(0.75 * 23, 23, 23), rtol=1e-6)
     told = re.search(r"at \((.*)\): (.*)</div>", pad.get())

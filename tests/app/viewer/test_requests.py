@@ -10,13 +10,13 @@ from jaxvol.app.viewer.model import Model
 class Log(Model):
     """A model of numbers that waits to be let go on, and what it did."""
 
-    def __init__(self, parts: int = 4, rest: float = 0.0):
+    def __init__(self, parts: int = 4, idle_delay: float = 0.0):
         self.done: list[tuple[str, int]] = []
         self.told: list[str] = []
         self.gate = threading.Semaphore(0)
         self.parts = parts
         none: Any = None
-        self.rest = rest
+        self.idle_delay = idle_delay
         super().__init__(none, none, none, self.told.append)
 
     def ask(self, request: Any):
@@ -62,7 +62,7 @@ def test_a_newer_request_cancels_a_fine_image_between_two_parts():
 
 
 def test_of_many_requests_the_one_begun_is_finished_and_the_last_one_follows():
-    log = Log(rest=60)
+    log = Log(idle_delay=60)
     log.ask(1)
     while log._next is not None:
         time.sleep(0.001)
