@@ -63,7 +63,7 @@ def quick_march(step: Arrayable, transforms: Sequence[Transform] = ()) -> March:
 
 class PictureRequest(NamedTuple):
     """Arguments of `render`. `volume` is a coarser copy of `source`, if that is read in bricks with `memory`
-    bytes. `others`: more volumes, with their transfer functions. `march`: None until it is planned."""
+    bytes. `extra_pairs`: more volumes with their transfer functions. `march`: None until it is planned."""
 
     volume: Volume
     transfer: Transfer
@@ -75,7 +75,7 @@ class PictureRequest(NamedTuple):
     source: VoxelSource | None = None
     memory: int | None = None
     march: Any = None
-    others: tuple[tuple[Volume, Transfer], ...] = ()
+    extra_pairs: tuple[tuple[Volume, Transfer], ...] = ()
 
     @property
     def coarser(self) -> float:
@@ -87,7 +87,7 @@ class PictureRequest(NamedTuple):
         """Render an image with `march`."""
         kwargs: dict[str, Any] = {"compositing": self.compositing, "lighting": self.lighting}
         if self.source is None:
-            pair = with_others(self.volume, self.transfer, self.others)
+            pair = with_others(self.volume, self.transfer, self.extra_pairs)
             rendering = render(*pair, camera, self.march, **kwargs)
         else:
             kwargs["memory"] = self.memory
@@ -101,7 +101,7 @@ class PictureRequest(NamedTuple):
 
     def plans(self, cameras: Sequence[Camera], tolerance: float | None) -> list[Plan]:
         """The cheapest march within a tolerance, for each camera."""
-        if self.others:
+        if self.extra_pairs:
             raise ValueError("others: several volumes are not planned for; render them by a step.")
         kwargs: dict[str, Any] = {"transforms": self.transforms, "once": len(cameras) == 1}
         kwargs |= {"compositing": self.compositing, "lighting": self.lighting}
@@ -129,13 +129,13 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
     several = options.others if isinstance(options.others, list | tuple) else [options.others]
-    source, others = None, tuple(map(other_of, several))
+    source, pairs = None, tuple(map(other_of, several))
     if options.memory is None:
         name = "volume" if isinstance(options.file, Volume) else options.file
         with progress(f"reading {name}", quiet=options.quiet):
             volume, transfer = look_of(options)
     else:
-        if options.labels is not None or others:
+        if options.labels is not None or pairs:
             raise ValueError("memory reads one volume, without labels and others.")
         if isinstance(options.file, Volume):
             raise ValueError("memory is of files; volume is a Volume.")
@@ -151,11 +151,11 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         if IN_MEMORY * source.dtype.itemsize * math.prod(source.shape) <= options.memory:
             volume, source = source.subsampled(1), None
 
-    warn_of_gap(volume, others)
-    lighting = _lighting(options, mode, alone=not others)
-    camera = _camera(options, [(volume, transfer), *others], orbit, planes).zoom(options.zoom)
+    warn_of_gap(volume, pairs)
+    lighting = _lighting(options, mode, alone=not pairs)
+    camera = _camera(options, [(volume, transfer), *pairs], orbit, planes).zoom(options.zoom)
     look = mode, lighting, background, transforms, source, options.memory
-    return PictureRequest(volume, transfer, camera, *look, others=others)
+    return PictureRequest(volume, transfer, camera, *look, extra_pairs=pairs)
 
 
 def look_of(options: Namespace) -> tuple[Volume, Transfer]:
@@ -234,10 +234,10 @@ def other_of(entry: Volume | str | Path | Sequence[Any]) -> tuple[Volume, Transf
 def with_march(scene: PictureRequest, options: Namespace, cameras: Sequence[Camera] = ()) -> PictureRequest:
     """The scene with the step of the options, or the shortest planned for `cameras`, by default its own."""
     step = options.step
-    if step is None and scene.others:
+    if step is None and scene.extra_pairs:
         if options.tolerance is not None:
             raise ValueError("tolerance is for one volume; give a step.")
-        volumes = scene.volume, *(volume for volume, _ in scene.others)
+        volumes = scene.volume, *(volume for volume, _ in scene.extra_pairs)
         step = min(float(np.min(volume.spacing)) for volume in volumes) / 2
     if step is not None:
         return scene._replace(march=quick_march(step, scene.transforms))

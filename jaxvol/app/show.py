@@ -109,7 +109,7 @@ show.__signature__ = inspect.Signature([*_positional, *_known])  # pyright: igno
 def why_empty(scene: PictureRequest, rendering: Rendering) -> str | None:
     """Explain an image that shows nothing; None if a pixel is more opaque than `FAINT`."""
     volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
-    alone = scene.volume.field is None and scene.volume.labels is None and not scene.others
+    alone = scene.volume.field is None and scene.volume.labels is None and not scene.extra_pairs
     if alone and (data := np.asarray(scene.volume.data)).min() == data.max():
         return f"all voxels have the value {float(data.flat[0]):g}: there is nothing to see in the volume"
     if np.isnan(opacity):

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...io.phantoms import phantom
 from ...render import render
+from ...scene.transfer import Transfer
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs
 from ..picture import PictureRequest, scene_of, with_march
@@ -50,7 +51,7 @@ def run_warm(options: argparse.Namespace) -> None:
             done()
         scene = _drawn(head, tuple(options.size), shade=False)
 
-        def mean(transfer: Any) -> Any:
+        def mean(transfer: Transfer) -> Any:
             return render(scene.volume, transfer, scene.camera, scene.march).image(scene.background).mean()
 
         jax.block_until_ready(jax.grad(mean)(scene.transfer))

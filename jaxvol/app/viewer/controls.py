@@ -34,7 +34,7 @@ def _checkbox(model: Model, label: str, name: str) -> Control:
 def _view_controls(model: Model) -> list[Control]:
     """Controls of camera, mode, light and background."""
     data = np.asarray(model.scene.volume.data)
-    modes = [*model.scene.modes, *([] if model.scene.others else [ISOSURFACE])]
+    modes = [*model.scene.modes, *([] if model.scene.extra_pairs else [ISOSURFACE])]
     low, high = float(data.min()), float(data.max())
     span = high - low or max(abs(low), 1.0)
 

@@ -159,7 +159,7 @@ def _label_controls(model: Model) -> list[Control]:
     labels = np.flatnonzero(extinction.max(axis=1) > 0).tolist()
     colors = editing.colors_of(model.state.transfer)[labels]  # pyright: ignore[reportArgumentType]
     ids = dict(enumerate(model.scene.volume.label_ids or ()))
-    names, chosen = [str(ids.get(label, label)) for label in labels], 0
+    names, chosen, highest = [str(ids.get(label, label)) for label in labels], 0, MAX_LABEL_OPACITY
 
     def choose(name: str) -> None:
         nonlocal chosen
@@ -188,14 +188,11 @@ def _label_controls(model: Model) -> list[Control]:
     def set_opacity(opacity: float) -> None:
         edit(model, LabelTransferFunction.with_opacity, {labels[chosen]: opacity})
 
-    def opacity() -> float:
-        return min(get("opacity"), MAX_LABEL_OPACITY)
-
     if not names:
         return [Control("pad", get=lambda: "no label can be seen")]
     return [
         Control("dropdown", "label", lambda: names[chosen], choose, choices=names),
         Control("pad", "labels", legend, press),
         Control("checkbox", "shown", lambda: bool(get("shown")), show),
-        Control("slider", "opacity", opacity, set_opacity, (0.0, MAX_LABEL_OPACITY, 0.05)),
+        Control("slider", "opacity", lambda: min(get("opacity"), highest), set_opacity, (0.0, highest, 0.05)),
     ]

@@ -150,7 +150,7 @@ class Model:
             self._set_status(f"saving {width} x {height}: {count} of {len(tiles)} tiles\n")
             renderer.draw(pixels, grid, column, row)
         # settings hold neither further files nor labels: `jaxvol render` could not repeat the picture
-        repeatable = not self.scene.others and isinstance(state.transfer, TransferFunction)
+        repeatable = not self.scene.extra_pairs and isinstance(state.transfer, TransferFunction)
         text = text_of(self.scene.settings(state), "", state.transfer) if repeatable else {}
         self._set_status(f"saved {width} x {height}\n")
         self._deliver(png_of(pixels[:height, :width], text))

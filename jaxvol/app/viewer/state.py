@@ -165,7 +165,7 @@ class ViewerSetup:
     lighting: Lighting  # while light is on
     voxel: float  # world length of a step of 1
     modes: dict[str, Compositing[Any]]  # besides isosurfaces, for a single volume
-    others: tuple[tuple[Volume, Transfer], ...] = ()  # more volumes in the image, without controls
+    extra_pairs: tuple[tuple[Volume, Transfer], ...] = ()  # more volumes in the image, without controls
 
     def march(self, state: State, step_factor: float = 1.0) -> March:
         """The march, with `step_factor` times the step."""
@@ -192,7 +192,7 @@ class ViewerSetup:
     @cached_property
     def ends(self) -> Float[np.ndarray, "2 3"]:
         """The lowest and the highest corner of the world box around all volumes."""
-        volumes = self.volume, *(volume for volume, _ in self.others)
+        volumes = self.volume, *(volume for volume, _ in self.extra_pairs)
         bounds = np.stack([np.asarray(volume.bounds) for volume in volumes])
         return np.stack([bounds[:, ::2].min(axis=0), bounds[:, 1::2].max(axis=0)])
 
@@ -208,7 +208,7 @@ class ViewerSetup:
 
     def light(self, state: State) -> Lighting | None:
         """The light, if it is on and the mode can be lit; None for several volumes."""
-        lit = state.lit and self.compositing(state).can_be_lit and not self.others
+        lit = state.lit and self.compositing(state).can_be_lit and not self.extra_pairs
         return self.lighting if lit else None
 
     def seen_from(self, state: State, toward: Vector) -> Orbit:
@@ -218,7 +218,7 @@ class ViewerSetup:
         orbit = replace(state.orbit, toward=toward).turned(0, 0)  # not straight from above
         view = orbit.toward, orbit.view_up, orbit.view_angle
         kwargs: Any = {"parallel": state.parallel, "size": state.size, "least": FAINT, "centered": True}
-        pair = with_others(self.volume, state.transfer, self.others)
+        pair = with_others(self.volume, state.transfer, self.extra_pairs)
         return Orbit.of(automatic_camera(*pair, *view, **kwargs))
 
     def settings(self, state: State) -> dict[str, Any]:
@@ -244,13 +244,13 @@ class ViewerSetup:
 
 
 @reports_arguments
-def checked_pairs(others: Sequence[tuple[Volume, Transfer]]) -> tuple[tuple[Volume, Transfer], ...]:
+def checked_pairs(pairs: Sequence[tuple[Volume, Transfer]]) -> tuple[tuple[Volume, Transfer], ...]:
     """Pairs of a volume and its transfer function. **Raises** `ValueError` for anything else."""
-    pairs: Any = tuple(others) if isinstance(others, list | tuple) else (others,)
-    for pair in pairs:
+    entries: Any = tuple(pairs) if isinstance(pairs, list | tuple) else (pairs,)
+    for pair in entries:
         if not isinstance(pair, tuple) or tuple(map(type, pair))[:1] != (Volume,) or len(pair) != 2:
             raise ValueError(f"others must be pairs (Volume, transfer function); got {described(pair)}.")
-    return tuple((volume, sized(transfer, volume)) for volume, transfer in pairs)
+    return tuple((volume, sized(transfer, volume)) for volume, transfer in entries)
 
 
 @reports_arguments

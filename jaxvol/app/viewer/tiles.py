@@ -92,7 +92,7 @@ class TileRenderer:
 
     def rendered(self, camera: Camera) -> Rendering:
         """Render with a camera of a tile's size."""
-        pair = with_others(self.scene.volume, self.state.transfer, self.scene.others)
+        pair = with_others(self.scene.volume, self.state.transfer, self.scene.extra_pairs)
         return render(*pair, camera, self.march, compositing=self.mode, lighting=self.light)
 
     def rgba(self, grid: Grid, column: int, row: int) -> Float[Array, "side side 4"]:
