@@ -1,8 +1,7 @@
 """Default transfer functions: from a volume's histogram, or with a colour for each of its labels."""
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -48,14 +47,6 @@ DENSE, BRIGHT = (236, 208, 160), (255, 246, 226)
 RARE, FAR, BEYOND = 1e-4, 0.25, 6.0
 """Strays: the largest fraction of the voxels, and the least gap to the range of all others, as a fraction of
 that range; `BEYOND` is the least gap of a fill value above the others (below them: `FAR`)."""
-
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def reports_arguments(function: F) -> F:
-    """Leave wrong arguments to the function's own errors, where jaxtyping or beartype check annotations."""
-    function.__dict__["__no_type_check__"] = True  # with `typing.no_type_check`, pyright ignores them
-    return function
 
 
 class Spread(NamedTuple):
@@ -131,7 +122,6 @@ def preset_unit(volume: Volume | VoxelSource) -> float:
     return size if size < SMALL else 1.0
 
 
-@reports_arguments
 def automatic_transfer(volume: Volume) -> TransferFunction:
     """A transfer function from a volume's histogram.
 
@@ -329,7 +319,6 @@ def is_body(data: Shaped[np.ndarray, "nx ny nz"], first: float, second: float) -
     return bool(inside.sum() >= BODY * middle.sum()) and not is_grain
 
 
-@reports_arguments
 def labels_shown(volume: Volume, around: Transfer | None = None) -> tuple[Volume, LabelTransferFunction]:
     """A volume and a transfer function that show labels, each in a distinct colour, and can be lit: the
     volume's labels, or its values, if they seem to be labels.

@@ -17,7 +17,7 @@ from ..scene.labels import LabelTransferFunction
 from ..scene.several import pairs_of
 from ..scene.transfer import Transfer, TransferFunction, sized
 from ..scene.volume import Volume
-from .automatic import automatic_transfer, check_known, reports_arguments, sampled, stride_of, unit_of
+from .automatic import automatic_transfer, check_known, sampled, stride_of, unit_of
 
 
 VISIBLE = 0.1  # least opacity of a visible voxel, along a hundredth of the volume's diagonal
@@ -35,7 +35,6 @@ CUT_FACE, OTHER_FACE = 0.1, 1 / 3
 `OTHER_FACE` times as much of the opposite one: the neck, or the pot of a plant."""
 
 
-@reports_arguments
 def automatic_camera(
     volume: Volume | Sequence[Volume],
     transfer: Transfer | Sequence[Transfer],

@@ -23,7 +23,7 @@ from ..scene.space import enter
 from ..scene.transfer import Transfer, TransferFunction, voxel_size
 from ..scene.volume import Volume
 from ..xla.persistent_cache import keep_programs_by_default
-from .automatic import check_known, reports_arguments
+from .automatic import check_known
 from .picture import PictureRequest, scene_of, with_march
 from .settings import ALIASES, DEFAULTS, check_exclusive
 
@@ -33,7 +33,6 @@ FAINT = 0.01
 """Largest opacity that is hardly visible: on white, it changes 8-bit colours by 1."""
 
 
-@reports_arguments
 def show(
     volume: Volume | str | os.PathLike[str], transfer: Transfer | None = None, **options: Any
 ) -> Rendering:

@@ -13,7 +13,6 @@ from ...scene.camera import Camera
 from ...scene.transfer import Transfer
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs_by_default
-from ..automatic import reports_arguments
 from .state import initial
 
 
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from .page import Page
 
 
-@reports_arguments
 def view(
     volume: Volume,
     transfer: Transfer | None = None,
@@ -81,7 +79,6 @@ def view(
     return NotebookView(*initial(volume, transfer, camera, march, **look))
 
 
-@reports_arguments
 def serve(
     volume: Volume,
     transfer: Transfer | None = None,

@@ -34,7 +34,7 @@ from ...scene.occupancy import BLOCK
 from ...scene.several import together, with_others
 from ...scene.transfer import Transfer, sized
 from ...scene.volume import Volume
-from ..automatic import automatic_transfer, labels_if_any, reports_arguments
+from ..automatic import automatic_transfer, labels_if_any
 from ..framing import FAINT, VISIBLE, automatic_camera, is_placed, warn_of_gap
 
 
@@ -243,7 +243,6 @@ class ViewerSetup:
         return changed
 
 
-@reports_arguments
 def checked_pairs(pairs: Sequence[tuple[Volume, Transfer]]) -> tuple[tuple[Volume, Transfer], ...]:
     """Pairs of a volume and its transfer function. **Raises** `ValueError` for anything else."""
     entries: Any = tuple(pairs) if isinstance(pairs, list | tuple) else (pairs,)
@@ -253,7 +252,6 @@ def checked_pairs(pairs: Sequence[tuple[Volume, Transfer]]) -> tuple[tuple[Volum
     return tuple((volume, sized(transfer, volume)) for volume, transfer in entries)
 
 
-@reports_arguments
 def initial(
     volume: Volume,
     transfer: Transfer | None = None,
