@@ -206,7 +206,7 @@ def render_rays(
         )
     least = float(jnp.finfo(directions.dtype).tiny)
     message = f"directions must not have length 0, or below {least:.2g}."
-    directions = _unit(require(directions, lambda d: (abs(d) >= least).any(axis=-1), message))
+    directions = _unit(require(directions, lambda d: (abs(d) >= least).any(-1, keepdims=True), message))
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
     source = GivenRays(origins, directions, _pixels(pixels, origins), first)
