@@ -15,7 +15,7 @@ from .._util.noise import hashed_uniforms_4, is_key
 from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
-from ..ray import check_arguments
+from ..ray import bands_of, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
@@ -235,6 +235,9 @@ def path_trace(
     transfer = sized(transfer, volume)
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
     check_one_channel(volume, "path_trace")
+    if (bands := bands_of(transfer, volume)) != 3:
+        got = f"{bands} of {described(transfer)}"
+        raise ValueError(f"transfer must give three colours to path_trace; got {got}.")
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):
