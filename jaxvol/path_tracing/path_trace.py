@@ -22,7 +22,7 @@ from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
-from ..xla.differentiation import forward_only
+from ..xla.differentiation import forward_only, refuse_reverse_mode
 from ..xla.platform import is_traced
 from ..xla.trees import constant, is_none
 from .fixed_paths import check_voxels, has_step, with_constant_paths
@@ -232,6 +232,8 @@ def path_trace(
             function has a step (if it is traced, the derivative is NaN).
     """
     order = "path_trace(volume, transfer, camera, lights)"
+    given = volume, transfer, camera, lights, materials, anisotropy
+    refuse_reverse_mode(given, FORWARD_ONLY)
     transfer = sized(transfer, volume)
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
     check_one_channel(volume, "path_trace")
