@@ -118,6 +118,10 @@ def render(
     In float32, the gradient with respect to extinction is lost in rounding along rays of optical depth above
     14 (`experiments/stability.py`, "gradients of opaque rays").
 
+    Second derivatives by voxels, camera and place leave out the bends of a piecewise linear transfer function
+    at its control points; `quadrature="preintegrated"` smooths these over a cell, and has them. Those by
+    camera and place also leave out the bends of the interpolated values at voxels' faces.
+
     Without `AlphaCorrection` an image jumps when a sample crosses the exit. The gradient with respect to the
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
