@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, integer, require
+from ._util.memory import memory_available
 from .compositing.blending import Compositing
 from .compositing.modes import Mode, compositing_of
 from .engine.devices import Devices
@@ -30,6 +31,12 @@ from .xla.sharding import shard_number
 
 PLANNED = 1 / 255
 """Tolerance of `march="auto"`: one level of an 8-bit image."""
+
+BYTES = 136
+"""Memory of a ray until its image is done (measured: 110 to 160): its place, what it has seen, the result."""
+
+LARGE = 2**31
+"""Bytes of an image from which on it is compared with the memory that is left."""
 
 
 def render(
@@ -142,6 +149,7 @@ def render(
     assert isinstance(march, March)
     _warn_of_step(volume, march)
     n, source = integer("antialias", antialias, 1), camera
+    _warn_of_size(camera, n)
     if n > 1:
         source = finer(camera, n)
     if until is not None:
@@ -164,6 +172,17 @@ def _warn_of_step(volume: Volume, march: March) -> None:
     if step > across:
         told = f"march.step is {step:.4g}, longer than the volume, which is {across:.4g} across"
         warnings.warn(f"{told}; half a voxel is {min(spacing) / 2:.4g}.", stacklevel=3)
+
+
+def _warn_of_size(camera: Camera, antialias: int) -> None:
+    """Say so if an image may take more than half of the memory that is left."""
+    width, height = camera.size
+    taken = width * height * antialias**2 * BYTES
+    if taken > LARGE and taken > (left := memory_available()) / 2:
+        rays = "" if antialias == 1 else f" of {antialias} x {antialias} rays"
+        told = f"{width} x {height} pixels{rays} take some {taken / 2**30:.3g} GiB of memory"
+        remedy = "render parts of the image, camera.crop(left, top, width, height), whose pixels are the same"
+        warnings.warn(f"{told}, and {left / 2**30:.3g} GiB are left; {remedy}.", stacklevel=3)
 
 
 def render_rays(

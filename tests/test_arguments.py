@@ -1,8 +1,10 @@
 """Errors for wrong arguments in place of a volume, transfer function, camera or march, and their advice."""
 
+import importlib
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import jax
@@ -13,6 +15,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol._util.checks import all_finite, check_answer
+from jaxvol._util.memory import memory_available, memory_of_device
 from jaxvol.lighting import ConstantLight, HeadLight, Material, Phong, ScattererTemplates
 
 from .scenes import in_float64
@@ -173,6 +176,26 @@ def test_numbers_of_two_lengths_are_told_of_x64():
         pytest.raises(ValueError, match="made before jax_enable_x64 was set"),
     ):
         check_answer(TRANSFER, "add", np.float64(1), np.float32(1))
+
+
+def test_images_that_may_not_fit_into_memory_are_told_of_before_they_are_begun(monkeypatch):
+    module = importlib.import_module("jaxvol.render")
+
+    def begun(*_: Any, **__: Any) -> Any:
+        raise InterruptedError
+
+    monkeypatch.setattr(module, "render_scene", begun)
+    assert 0 < memory_available() <= memory_of_device()
+    monkeypatch.setattr(module, "memory_available", lambda: 80 * 2**30)
+    message = r"{} x {} pixels{} take some 50\.7 GiB of memory, and 80 GiB are left; .*camera\.crop"
+    for side, antialias, rays in ((20_000, 1, ""), (5_000, 4, " of 4 x 4 rays")):
+        with (
+            pytest.warns(UserWarning, match=message.format(side, side, rays)),
+            pytest.raises(InterruptedError),
+        ):
+            jv.render(VOLUME, TRANSFER, replace(CAMERA, size=side), MARCH, antialias=antialias)
+    with pytest.raises(InterruptedError):  # without a warning, which would be an error here
+        jv.render(VOLUME, TRANSFER, replace(CAMERA, size=17_000), MARCH)
 
 
 # ---- numbers that are known only when a program runs ----
