@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ._util.checks import all_finite, check_answer, described
-from ._util.vec3 import Scalar, Vec3
+from ._util.vec3 import Color, Scalar, Vec3
 from .compositing.blending import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
@@ -26,9 +26,9 @@ from .march.march import Cell, March
 from .scene.camera import Camera, without_ends
 from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
-from .scene.several import Several
+from .scene.several import Several, Together
 from .scene.space import Line, Ray, Space, enter, world_gradient
-from .scene.transfer import Classification, Measured, Transfer, TransferFunction
+from .scene.transfer import Classification, Measured, Transfer, TransferFunction, classification_of
 from .scene.transfer2d import TransferFunction2D
 from .scene.volume import Volume, grids, without_voxels
 from .xla.differentiation import check_captured
@@ -201,6 +201,7 @@ def check_channels(
             if isinstance(field, Several):
                 got = f"{len(field.volumes)} volumes"
             raise ValueError(f"{name}: {given} needs a single volume of one channel; got {got}.")
+    bands_of(transfer, volume, lighting)
     if lighting is not None and not lighting.reads_gradient:  # as `Phong` does, where samples are placed
         _check_near(volume, lighting)
 
@@ -218,6 +219,43 @@ def _check_near(volume: Volume, lighting: Lighting) -> None:
             f"{far:.3g} in {spacing.dtype}, for voxels of {voxel:.2g}. Move the volume (origin), the camera "
             "and the lights near 0."
         )
+
+
+def bands_of(transfer: Transfer, volume: Volume, lighting: Lighting | None = None) -> int:
+    """Number of colours that a transfer function gives a sample: 3 but for a user's (`Transfer.bands`).
+
+    Raises:
+        ValueError: if its classifier returns no colours and extinction, if transfer functions of several
+            volumes differ, and for a lighting that is to shade other than three colours.
+    """
+    bands, kind = transfer.bands, type(transfer).__name__
+    if bands is None and isinstance(transfer, Together) and isinstance(volume.field, Several):
+        each = [bands_of(*pair) for pair in zip(transfer.transfers, volume.field.volumes, strict=True)]
+        if len(set(each)) > 1:
+            raise ValueError(f"transfer functions must have equally many colours; got {each}.")
+        bands = each[0]
+    if bands is None:
+        place = (jax.ShapeDtypeStruct((), volume.spacing.dtype),) * 3
+        answer = eqx.filter_eval_shape(lambda t, v, at: _classified(t, v, at), transfer, volume, place)
+        colors: Any = ()
+        try:
+            colors, extinction = answer
+            shapes = {jnp.shape(number) for number in (*colors, extinction)}
+        except (TypeError, ValueError):
+            shapes = None
+        if shapes != {()} or not colors:
+            expected = "((c1, c2, ...), extinction), colours and extinction of a sample, all of them numbers"
+            raise ValueError(f"{kind}.classifier must return {expected}; got {eqx.tree_pformat(answer)}.")
+        bands = len(colors)
+    if bands != 3 and lighting is not None:
+        light = described(lighting)
+        raise ValueError(f"lighting: {light} shades three colours; {kind}.classifier returns {bands}.")
+    return bands
+
+
+def _classified(transfer: Transfer, volume: Volume, coordinate: Vec3) -> Any:
+    classification = classification_of(transfer, volume)
+    return classification.classify(classification.at(coordinate))
 
 
 NEVER = int(jnp.iinfo(jnp.int32).max)
@@ -269,9 +307,13 @@ def begin(scene: Scene, ray: Ray, track: Track, outputs: Outputs | None = "all")
     compositing = scene.compositing
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
+    composite = compositing.begin(zero, outputs)
+    if isinstance(compositing, Weighting) and composite.color is not None:
+        bands = bands_of(scene.transfer, scene.volume)
+        composite = composite if bands == 3 else replace(composite, color=(zero,) * bands)
     return Progress(
         index=count,
-        composite=compositing.begin(zero, outputs),
+        composite=composite,
         stats=SampleStats(count, no) if outputs == "all" else None,
         finished=no,
         track=track,
@@ -355,7 +397,7 @@ def add(
     at: Progress,
     piece: Cell,
     measured: Measured,
-    color: Vec3 | None,
+    color: Color | None,
     alpha: Scalar,
     *,
     divided: bool,
@@ -426,24 +468,28 @@ class Pixel(NamedTuple):
     """What is computed after the march: premultiplied colour and opacity, the distance from the ray's origin,
     infinite where nothing is visible, and a unit normal, if the mode has one."""
 
-    rgba: Float[Array, "4"]
+    rgba: Float[Array, " n"]
     depth: Scalar
     normal: Float[Array, "3"] | None = None
 
 
-def resolve(scene: Scene, line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Pixel:
+def resolve(scene: Scene, line: Line, rgba: Float[Array, " n"], depth: Scalar, selected: PyTree) -> Pixel:
     """The pixel of a ray that is not transparent, from what its march found, by the compositing mode."""
     compositing = scene.compositing
     if isinstance(compositing, Selection):
         return _selected(compositing, scene, line, rgba, selected)
     assert isinstance(compositing, Weighting)
     found = compositing.resolved(scene.classification, rgba)
-    check_answer(compositing, "resolved", found, rgba)
+    check_answer(compositing, "resolved", found, _pixel_like(scene, rgba))
     return Pixel(found, depth)
 
 
+def _pixel_like(scene: Scene, rgba: Float[Array, " n"]) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct((bands_of(scene.transfer, scene.volume) + 1,), rgba.dtype)
+
+
 def _selected(
-    compositing: Selection[Any], scene: Scene, line: Line, rgba: Float[Array, "4"], state: PyTree
+    compositing: Selection[Any], scene: Scene, line: Line, rgba: Float[Array, " n"], state: PyTree
 ) -> Pixel:
     ray, march = enter(scene.space, *line), scene.march
     # a selected depth is a fixed number of steps: its derivative by the step is depth / step
@@ -454,7 +500,7 @@ def _selected(
     moving = chosen + _movement(march, ray, scene.volume, chosen, scale)
     sampler = RaySampler(ray, scene.classification, scale, gradient, (chosen, moving), scene.space)
     found = compositing.pixel(sampler, state)
-    check_answer(compositing, "pixel", found, (rgba, rgba[3]))
+    check_answer(compositing, "pixel", found, (_pixel_like(scene, rgba), rgba[3]))
     pixel, depth = found
     normal = compositing.normal(sampler, depth)
     if normal is not None:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._util.checks import Arrayable, described, finite_array, integer, require
+from ._util.memory import memory_available
 from .compositing.blending import Compositing
 from .compositing.modes import Mode, compositing_of
 from .engine.devices import Devices
@@ -30,6 +31,12 @@ from .xla.sharding import shard_number
 
 PLANNED = 1 / 255
 """Tolerance of `march="auto"`: one level of an 8-bit image."""
+
+BYTES = 136
+"""Memory of a ray until its image is done (measured: 110 to 160): its place, what it has seen, the result."""
+
+LARGE = 2**31
+"""Bytes of an image from which on it is compared with the memory that is left."""
 
 
 def render(
@@ -118,6 +125,10 @@ def render(
     In float32, the gradient with respect to extinction is lost in rounding along rays of optical depth above
     14 (`experiments/stability.py`, "gradients of opaque rays").
 
+    Second derivatives by voxels, camera and place leave out the bends of a piecewise linear transfer function
+    at its control points; `quadrature="preintegrated"` smooths these over a cell, and has them. Those by
+    camera and place also leave out the bends of the interpolated values at voxels' faces.
+
     Without `AlphaCorrection` an image jumps when a sample crosses the exit. The gradient with respect to the
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
@@ -138,6 +149,7 @@ def render(
     assert isinstance(march, March)
     _warn_of_step(volume, march)
     n, source = integer("antialias", antialias, 1), camera
+    _warn_of_size(camera, n)
     if n > 1:
         source = finer(camera, n)
     if until is not None:
@@ -160,6 +172,17 @@ def _warn_of_step(volume: Volume, march: March) -> None:
     if step > across:
         told = f"march.step is {step:.4g}, longer than the volume, which is {across:.4g} across"
         warnings.warn(f"{told}; half a voxel is {min(spacing) / 2:.4g}.", stacklevel=3)
+
+
+def _warn_of_size(camera: Camera, antialias: int) -> None:
+    """Say so if an image may take more than half of the memory that is left."""
+    width, height = camera.size
+    taken = width * height * antialias**2 * BYTES
+    if taken > LARGE and taken > (left := memory_available()) / 2:
+        rays = "" if antialias == 1 else f" of {antialias} x {antialias} rays"
+        told = f"{width} x {height} pixels{rays} take some {taken / 2**30:.3g} GiB of memory"
+        remedy = "render parts of the image, camera.crop(left, top, width, height), whose pixels are the same"
+        warnings.warn(f"{told}, and {left / 2**30:.3g} GiB are left; {remedy}.", stacklevel=3)
 
 
 def render_rays(
@@ -206,7 +229,7 @@ def render_rays(
         )
     least = float(jnp.finfo(directions.dtype).tiny)
     message = f"directions must not have length 0, or below {least:.2g}."
-    directions = _unit(require(directions, lambda d: (abs(d) >= least).any(axis=-1), message))
+    directions = _unit(require(directions, lambda d: (abs(d) >= least).any(-1, keepdims=True), message))
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
     source = GivenRays(origins, directions, _pixels(pixels, origins), first)

@@ -1,15 +1,21 @@
 """Errors for wrong arguments in place of a volume, transfer function, camera or march, and their advice."""
 
+import importlib
+import subprocess
+import sys
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol._util.checks import check_answer
+from jaxvol._util.checks import all_finite, check_answer
+from jaxvol._util.memory import memory_available, memory_of_device
 from jaxvol.lighting import ConstantLight, HeadLight, Material, Phong, ScattererTemplates
 
 from .scenes import in_float64
@@ -170,3 +176,161 @@ def test_numbers_of_two_lengths_are_told_of_x64():
         pytest.raises(ValueError, match="made before jax_enable_x64 was set"),
     ):
         check_answer(TRANSFER, "add", np.float64(1), np.float32(1))
+
+
+def test_images_that_may_not_fit_into_memory_are_told_of_before_they_are_begun(monkeypatch):
+    module = importlib.import_module("jaxvol.render")
+
+    def begun(*_: Any, **__: Any) -> Any:
+        raise InterruptedError
+
+    monkeypatch.setattr(module, "render_scene", begun)
+    assert 0 < memory_available() <= memory_of_device()
+    monkeypatch.setattr(module, "memory_available", lambda: 80 * 2**30)
+    message = r"{} x {} pixels{} take some 50\.7 GiB of memory, and 80 GiB are left; .*camera\.crop"
+    for side, antialias, rays in ((20_000, 1, ""), (5_000, 4, " of 4 x 4 rays")):
+        with (
+            pytest.warns(UserWarning, match=message.format(side, side, rays)),
+            pytest.raises(InterruptedError),
+        ):
+            jv.render(VOLUME, TRANSFER, replace(CAMERA, size=side), MARCH, antialias=antialias)
+    with pytest.raises(InterruptedError):  # without a warning, which would be an error here
+        jv.render(VOLUME, TRANSFER, replace(CAMERA, size=17_000), MARCH)
+
+
+# ---- numbers that are known only when a program runs ----
+
+
+def cameras(x: Any, **more: Any) -> jv.Camera:
+    return jv.Camera((3.0, x, 0.0), (0.0, 0.0, 0.0), size=(4, 4), **more)
+
+
+def functions(x: Any) -> jv.TransferFunction:
+    return jv.TransferFunction((0, 1), np.ones((2, 3)), (1, 1 + x))
+
+
+INTRINSICS, EYE, UP = np.diag([4.0, 4.0, 1.0]), np.eye(3), (0.0, 1.0, 0.0)
+PROBE = {"beta_range": (1.1, 2.0), "sigma_range": (1.1, 2.0), "gamma_range": (5.0, 30.0)}
+TRACED: dict[str, tuple[Callable[[Any], Any], float, str]] = {
+    "a voxel": (lambda x: jv.Volume(jnp.ones((2, 2, 2)).at[0, 1, 0].add(x)), np.inf, "data must be finite"),
+    "spacing": (lambda x: jv.Volume(VOLUME.data, (1, 1 + x, 1)), -1, "spacing must be positive"),
+    "origin": (lambda x: jv.Volume(VOLUME.data, origin=(x, 0, 0)), np.inf, "origin must be finite"),
+    "axes": (lambda x: jv.Volume(VOLUME.data, direction=EYE * (1 + x)), 1, "direction must be"),
+    "points": (lambda x: jv.TransferFunction((x, 1), EYE[:2], (0, 1)), 2, "values must increase"),
+    "colours": (lambda x: jv.TransferFunction((0, 1), EYE[:2] + x, (0, 1)), np.inf, "colors must be finite"),
+    "extinction": (functions, -2, "extinction must not be negative"),
+    "opacities": (lambda x: jv.TransferFunction.from_points([(0, UP, x), (1, UP, 0)]), 2, "opacity must be"),
+    "a unit": (
+        lambda x: jv.TransferFunction.from_points([(0, UP, 0), (1, UP, 0)], 1 + x),
+        -2,
+        "unit_distance",
+    ),
+    "a table": (
+        lambda x: jv.TransferFunction2D((0, 1), (0, 1 + x), np.ones((2, 2, 3)), EYE[:2, :2]),
+        -3,
+        "magn",
+    ),
+    "a label": (lambda x: jv.LabelTransferFunction([functions(0)]).with_opacity({0: 1 + x}), -2, "opacity"),
+    "radiance": (lambda x: jv.RadianceField(1 + x), -2, "scale must not be negative"),
+    "a camera": (cameras, np.inf, "position must be finite"),
+    "up": (lambda x: cameras(0.0, view_up=(1, 1 + x, 0)), -1, "view_up must not be zero or point along"),
+    "an angle": (
+        lambda x: cameras(0.0, view_angle=30 + x),
+        150,
+        "view_angle must be greater than 0 and less",
+    ),
+    "a scale": (lambda x: cameras(0.0, parallel_scale=1 + x), -1, "parallel_scale must be greater than 0"),
+    "a zoom": (lambda x: cameras(0.0).zoom(1 + x), -2, "zoom factor must be greater than 0"),
+    "a side": (lambda x: jv.Camera.looking_at(VOLUME, (x, 0, 0)), 0, "direction must not be zero"),
+    "K": (lambda x: jv.Camera.from_intrinsics(INTRINSICS + x, EYE, (0, 0, 1), 4), 1, "K must be"),
+    "R": (
+        lambda x: jv.Camera.from_intrinsics(INTRINSICS, EYE * (1 + x), (0, 0, 1), 4),
+        1,
+        "R must be a rotation",
+    ),
+    "a pitch": (
+        lambda x: jv.Camera.from_detector((0, 0, 1), (0, 0, 0), EYE[0], EYE[1], 1 + x, 4),
+        -2,
+        "pixel_pitch",
+    ),
+    "a step": (lambda x: jv.March(1 + x), -1, "step must be greater than 0"),
+    "a box": (lambda x: jv.Clip((x, 1, 0, 1, 0, 1)), 1.5, "box must be"),
+    "a plane": (lambda x: jv.Clip(planes=[((0, 0, 0), (0, 0, 1 + x))]), -1, "must not be 0"),
+    "an end": (lambda x: jv.EarlyTermination(0.5 + x), 1, "opacity_left must be"),
+    "a probe": (lambda x: jv.ToroidalMap(20, 10 + x, **PROBE), -20, "gamma_range must begin beyond"),
+    "a value": (lambda x: jv.Isosurface(x), np.inf, "value must be finite"),
+    "a light": (lambda x: jv.lighting.DirectionalLight((0, 0, 1), (1, 1, 1 + x)), -2, "irradiance must not"),
+    "a surface": (lambda x: Phong(specular_power=1 + x), -1, "specular_power must be greater"),
+    "a material": (lambda x: Material(0.5, 1 + x), -1, "mean_free_path must be greater"),
+}
+"""What is made of a number 0, a wrong number, and the error's text."""
+
+
+def test_wrong_numbers_are_nan_in_a_program_without_calls_of_the_host_and_named_without_jit():
+    """All kinds share a program: each is wrong in turn."""
+
+    @jax.jit
+    def faults(x):
+        parts = (make(x[k]) for k, (make, _, _) in enumerate(TRACED.values()))
+        return jnp.stack([~all_finite(part) for part in parts])
+
+    zeros = np.zeros(len(TRACED), np.float32)
+    zeros[list(TRACED).index("a side")] = 1  # 0 is the wrong one
+    assert "callback" not in str(jax.make_jaxpr(faults)(zeros))
+    np.testing.assert_array_equal(faults(zeros), False)
+    for k, (name, (make, wrong, message)) in enumerate(TRACED.items()):
+        x = zeros.copy()
+        x[k] = wrong
+        np.testing.assert_array_equal(faults(x), np.arange(len(x)) == k, err_msg=name)
+        with jax.disable_jit(), pytest.raises(ValueError, match=message):
+            jax.jit(make)(np.float32(wrong))
+
+
+WRONG = (np.inf, -2, np.nan, np.inf, -1.5, -1, -3, np.inf, -1, 151, np.nan)
+"""By argument of `image_and_gradient`."""
+
+
+@jax.jit
+def image_and_gradient(x):
+    """The gradient is of the lower pixels' sum."""
+
+    def image(x):
+        volume = jv.Volume(jnp.ones((2, 2, 2)) + x[0], (2.0, 2 + x[1], 2), (-1, -1, -1 + x[2]))
+        transfer = jv.TransferFunction((0, 2), 0.5 + jnp.zeros((2, 3)).at[0].add(x[3]), (0.1, 1 + x[4]))
+        march = jv.March(0.3 + x[5], (jv.Clip((-2, 0.5 + x[6], -2, 2, -2, 2)),))
+        camera = jv.Camera((5.0, 1 + x[7], 0), (0, 0, 0), (0, 1 + x[8], 0), 30 + x[9], size=(2, 2))
+        until = 9 + jnp.zeros((2, 2)).at[1, 0].add(x[10])
+        rgba = jv.render(volume, transfer, camera, march, until=until, outputs="rgba").rgba
+        return jnp.sum(rgba[1]), rgba
+
+    (_, rgba), gradient = jax.value_and_grad(image, has_aux=True)(x)
+    return rgba, gradient
+
+
+def test_wrong_numbers_are_nan_in_image_and_gradient_of_a_program_and_of_the_same_exported(tmp_path):
+    """The exported program runs in a process that has no jaxvol."""
+    given = np.zeros((len(WRONG) + 1, len(WRONG)), np.float32)
+    np.fill_diagonal(given, WRONG)
+    images, gradients = (np.stack(each) for each in zip(*map(image_and_gradient, given), strict=True))
+    seen = np.isnan(images).any(axis=-1)
+    np.testing.assert_array_equal(np.isnan(images[..., :3]).all(axis=-1), seen)
+    expected = np.zeros(seen.shape, bool)
+    expected[:10], expected[10, 1, 0] = True, True  # all pixels, or that whose ray ends nowhere
+    np.testing.assert_array_equal(seen, expected)
+    np.testing.assert_array_equal(np.isnan(np.diagonal(gradients)), True)
+    assert np.all(np.isfinite(gradients[-1]))
+    assert np.sum(gradients[-1] != 0) >= 4
+
+    program = jax.export.export(image_and_gradient)(jax.ShapeDtypeStruct(given.shape[1:], given.dtype))
+    (tmp_path / "program").write_bytes(program.serialize())
+    np.save(tmp_path / "given.npy", given)
+    start = """import sys
+sys.modules["jaxvol"] = None  # an import would raise ImportError
+import jax.export, numpy as np
+program = jax.export.deserialize(open("program", "rb").read())
+images, gradients = zip(*map(program.call, np.load("given.npy")))
+np.savez("found.npz", images=images, gradients=gradients)"""
+    subprocess.run([sys.executable, "-I", "-c", start], cwd=tmp_path, check=True)
+    with np.load(tmp_path / "found.npz") as found:
+        np.testing.assert_allclose(found["images"], images, rtol=1e-6)
+        np.testing.assert_allclose(found["gradients"], gradients, rtol=1e-5, atol=1e-6)

@@ -1,5 +1,5 @@
 """Checks arguments. Errors name the argument, what came and what was expected: a `ValueError` at once for
-shapes and Python values, one of `equinox.error_if` in the program for traced values."""
+shapes and known values, NaN in the program for traced ones."""
 
 import contextlib
 import operator
@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array
 
 from ..xla.platform import is_traced
-from ..xla.sharding import varies_over
 from ..xla.trees import PyTree
 
 
@@ -56,19 +55,21 @@ def printable(text: str) -> str:
 
 
 def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """Check that `holds(value, *others)` is true everywhere, and return `value`: **raises** `ValueError`, or,
-    of traced values, an Equinox runtime error, if what is returned is used. Inside `jax.shard_map`, where
-    these do not work, a traced value becomes NaN. `holds` gets NumPy arrays if all are concrete; `{got}` is
-    the value."""
-    if is_traced(value, *others):
-        if any(map(varies_over, jax.tree.leaves((value, others)))):
-            return jax.tree.map(lambda leaf: jnp.where(jnp.all(holds(value, *others)), leaf, jnp.nan), value)
-        # blank lines separate it from Equinox's own text, which is long under a plain `jax.jit`
-        message = f"\n\n{message.format(got='a value known only when the program runs')}\n"
-        return eqx.error_if(value, ~jnp.all(holds(value, *others)), message)
-    # in NumPy, which compiles nothing
-    if not np.all(holds(*(np.asarray(each) for each in (value, *others)))):
-        raise ValueError(message.format(got=np.asarray(value)))
+    """Check that `holds(value, *others)` is true everywhere, and return `value`: **raises** `ValueError`.
+    Inside a program, where that is unknown, numbers of which it is false become NaN, and so does their
+    gradient: JAX would keep and export no program that calls the host. Under `jax.disable_jit` the error is
+    raised there. `holds` gets NumPy arrays if all are concrete, and its answer broadcasts to `value`; `{got}`
+    is the value."""
+    array: Any = value
+    if is_traced(array, *others):
+        holding = holds(array, *others)
+        if is_traced(holding):
+            return array * jnp.where(holding, 1, jnp.nan).astype(array.dtype)
+        array = jax.lax.stop_gradient(array)  # differentiated, but known
+    else:  # in NumPy, which compiles nothing
+        holding = holds(*(np.asarray(each) for each in (array, *others)))
+    if not np.all(holding):
+        raise ValueError(message.format(got=described(array) if is_traced(array) else np.asarray(array)))
     return value
 
 

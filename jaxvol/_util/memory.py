@@ -26,6 +26,18 @@ def memory_of_device() -> int:
     return machine if limit == "max" else min(machine, int(limit))
 
 
+def memory_available() -> int:
+    """Bytes of the default device's memory that nobody uses now; all of them where that is unknown."""
+    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
+    reported = (device.memory_stats() or {}) if isinstance(device, jax.Device) else {}
+    if reported.get("bytes_limit"):
+        return reported["bytes_limit"] - reported.get("bytes_in_use", 0)
+    host = Path("/proc/meminfo")
+    lines = host.read_text().splitlines() if host.is_file() else []
+    free = [1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable")]
+    return min([memory_of_device(), *free])
+
+
 def give_back() -> None:
     """Gives memory that was freed back to the system, where the C library is one that keeps it (glibc)."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None

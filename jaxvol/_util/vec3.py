@@ -16,6 +16,9 @@ Scalar: TypeAlias = Float[Array, "..."]
 
 Vec3: TypeAlias = tuple[Scalar, Scalar, Scalar]
 
+Color: TypeAlias = tuple[Scalar, ...]
+"""Colours of a sample: red, green and blue, but for a transfer function of other `bands`."""
+
 
 def apart(vector: Float[Array, "3"]) -> Vec3:
     """The components of a stacked vector."""

@@ -16,16 +16,16 @@ from ..engine import brick_march
 from ..engine.acceleration import NO_ACCELERATION, VolumeAcceleration
 from ..engine.devices import Devices, mesh_of, on_all
 from ..engine.image import RenderOutputs
-from ..engine.resolve import resolve_image
+from ..engine.resolve import resolve_image, with_pixels
 from ..engine.tiling import RenderOptions
 from ..lighting.shading import Lighting
 from ..march.march import March
 from ..march.transforms import SpaceLeaping, ToroidalMap
-from ..ray import Scene, check_arguments
+from ..ray import Scene, bands_of, check_arguments
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
 from ..scene.occupancy import BLOCK
-from ..scene.rendering import Details, Rendering
+from ..scene.rendering import Rendering
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, part_of
 from ..xla.compiling import compiled
@@ -178,6 +178,7 @@ def scene_of(
     volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
     # its voxels are kept as they are stored, so that none is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
+    bands_of(transfer, volume, lighting)
     return strong(
         Scene(volume, sized(transfer, volume), camera, march, compositing_of(compositing), lighting)
     )
@@ -208,12 +209,9 @@ def _image(scene: Scene, traversal: Traversal) -> Rendering:
     if not selects:
         pixels = _resolve_image(scene, options, NO_ACCELERATION, (rendering.rgba, rendering.depth, None))
     elif pixels is None:  # no brick was read
-        pixels = jnp.zeros((*rendering.rgba.shape[:-1], 5), rendering.rgba.dtype).at[..., 4].set(jnp.inf)
-    details = Details()
-    if request.outputs == "all":
-        normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
-        details = rendering.details._replace(depth=pixels[..., 4], normal=normal, selected=None)
-    return Rendering(pixels[..., :4], rendering.exhausted, details)
+        shape, bands = rendering.rgba.shape[:-1], bands_of(scene.transfer, scene.volume)
+        pixels = jnp.zeros((*shape, bands + 2), rendering.rgba.dtype).at[..., bands + 1].set(jnp.inf)
+    return with_pixels(scene, rendering, pixels, request.outputs)
 
 
 def _on(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Color, Scalar
 from ..march.march import Cell, March
 from ..scene.transfer import Classification, Measured, Transfer
 from ..scene.volume import Volume
@@ -40,7 +40,7 @@ class Fragment(NamedTuple):
     depth: Scalar
     cell: Cell
     measured: Measured
-    color: Vec3 | None
+    color: Color | None
     valid: Bool[Array, ""]
 
     @property
@@ -63,7 +63,7 @@ class Compositing(eqx.Module, Generic[State]):
         """The state with the next fragment."""
 
     @abstractmethod
-    def end(self, state: State) -> tuple[Float[Array, "4"], Scalar | None]:
+    def end(self, state: State) -> tuple[Float[Array, " n"], Scalar | None]:
         """Premultiplied colour and opacity; and the depth past the entry, if it is computed, infinite where
         nothing is visible."""
 
@@ -106,15 +106,14 @@ class Composite(eqx.Module):
     """Sums of the weights w of a ray's cells so far, of w × colour and of w × depth, if computed."""
 
     opacity: Scalar
-    color: Vec3 | None = None
+    color: Color | None = None
     moment: Scalar | None = None
 
-    def add(self, weight: Scalar, color: Vec3 | None = None, depth: Scalar | None = None) -> "Composite":
+    def add(self, weight: Scalar, color: Color | None = None, depth: Scalar | None = None) -> "Composite":
         """With one more cell."""
         sums = moment = None
         if self.color is not None and color is not None:
-            r, g, b = (sum_ + weight * part for sum_, part in zip(self.color, color, strict=True))
-            sums = r, g, b
+            sums = tuple(sum_ + weight * part for sum_, part in zip(self.color, color, strict=True))
         if self.moment is not None and depth is not None:
             moment = self.moment + weight * depth
         return Composite(self.opacity + weight, sums, moment)
@@ -150,7 +149,7 @@ class Weighting(Compositing[Composite]):
         """By default 1: what is in front hides nothing."""
         return jnp.ones_like(state.opacity)
 
-    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+    def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
         """The pixel of a ray that is not transparent, from its Σ w c and Σ w, where it is computed after the
         march. `classification`: of the transfer function that was given, not of that of `marched`. JAX also
         differentiates it at sums of 0, where neither value nor derivative may be NaN."""
@@ -180,7 +179,7 @@ class Weighting(Compositing[Composite]):
         return state.add(self.weight(fragment.alpha, state.opacity), fragment.color, fragment.depth)
 
     @final
-    def end(self, state: Composite) -> tuple[Float[Array, "4"], Scalar | None]:
+    def end(self, state: Composite) -> tuple[Float[Array, " n"], Scalar | None]:
         assert state.color is not None
         rgba = jnp.stack([*state.color, state.opacity])
         if state.moment is None:
@@ -230,7 +229,7 @@ class OpticalDepths(Weighting):
         return worth
 
     @abstractmethod
-    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+    def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
         """The pixel, from sums of optical depths."""
 
 

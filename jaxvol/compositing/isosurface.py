@@ -85,7 +85,7 @@ class Isosurface(Selection[Crossing]):
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         return transfer.visible(blocks)
 
-    def pixel(self, sampler: RaySampler, state: Crossing) -> tuple[Float[Array, "4"], Scalar]:
+    def pixel(self, sampler: RaySampler, state: Crossing) -> tuple[Float[Array, " n"], Scalar]:
         depth = self._implicit(sampler, jax.lax.stop_gradient(self._root(sampler, state)))
         classification = sampler.classification
         # the value itself rather than that at the root, which is rounded
@@ -129,6 +129,7 @@ class Isosurface(Selection[Crossing]):
 class _Crossings(Transfer):
     """Of positive extinction where the value is crossed between the two ends of a cell, else transparent."""
 
+    bands = 3
     value: Float[Array, ""]
 
     def classifier(self) -> Classify:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Color, Scalar, Vec3
 from ..march.march import March
 from ..scene.occupancy import Blocks
 from ..scene.several import Together
@@ -49,9 +49,10 @@ class LineIntegral(OpticalDepths):
     def resolves_transparent(self) -> bool:
         return True
 
-    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+    def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
         whole = sums / SCALE
-        return whole.at[3].set(-jnp.expm1(-whole[3]))
+        opacity = len(whole) - 1
+        return whole.at[opacity].set(-jnp.expm1(-whole[opacity]))
 
 
 class _Thinner(Transfer):
@@ -68,6 +69,10 @@ class _Thinner(Transfer):
 
     def attributes(self, volume: Volume, coordinate: Vec3) -> Measured:
         return self.transfer.attributes(volume, coordinate)
+
+    @property
+    def bands(self) -> int | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.transfer.bands
 
     @property
     def channels(self) -> int | None:
@@ -91,14 +96,14 @@ class _Thinner(Transfer):
         return self.transfer.search()
 
     def vjp(
-        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+        self, measured: Measured, color: Color, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
         of = self.transfer.vjp(measured, color, SCALE * extinction, integrated=integrated)
         return _Thinner(of[0]), of[1]
 
 
 def _thinner(classify: Classify) -> Classify:
-    def thinner(measured: Measured) -> tuple[Vec3, Scalar]:
+    def thinner(measured: Measured) -> tuple[Color, Scalar]:
         color, extinction = classify(measured)
         return color, SCALE * extinction
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import number
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Color, Scalar, Vec3
 from ..march.march import March
 from ..scene.occupancy import Blocks
 from ..scene.transfer import Classification, Classify, Measured, Transfer
@@ -48,7 +48,7 @@ class Extreme(Selection[Chosen]):
     def depth(self, state: Chosen) -> Scalar:
         return state[1]
 
-    def pixel(self, sampler: RaySampler, state: Chosen) -> tuple[Float[Array, "4"], Scalar]:
+    def pixel(self, sampler: RaySampler, state: Chosen) -> tuple[Float[Array, " n"], Scalar]:
         _, depth = state
         rgba = layer(*sampler.shaded(depth), self.thickness)
         return rgba, jnp.where(rgba[3] <= 0, jnp.inf, depth)
@@ -157,7 +157,7 @@ class Average(OpticalDepths):
         longest = march.locate(volume).diagonal + march.step
         return _Values(jax.lax.stop_gradient(1 / longest)), march
 
-    def resolved(self, classification: Classification, sums: Float[Array, "4"]) -> Float[Array, "4"]:
+    def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
         # of rays that only fill up a chunk, sums are 0, and derivatives must not be NaN
         mean = sums[0] / jnp.where(sums[3] == 0, 1, sums[3])
         return layer(*classification.classify(classification.searched((mean,))), self.thickness)
@@ -166,6 +166,7 @@ class Average(OpticalDepths):
 class _Values(Transfer):
     """A fog whose red is the volume's value."""
 
+    bands = 3
     extinction: Float[Array, ""]
 
     def classifier(self) -> Classify:
@@ -179,7 +180,7 @@ class _Values(Transfer):
         return self.classifier()  # a mean of values comes first of what is measured
 
 
-def layer(color: Vec3, extinction: Scalar, thickness: Scalar) -> Float[Array, "4"]:
+def layer(color: Color, extinction: Scalar, thickness: Scalar) -> Float[Array, " n"]:
     """Premultiplied colour and opacity of a layer."""
     opacity = -jnp.expm1(-extinction * thickness)
     return opacity * jnp.stack([*color, jnp.ones_like(opacity)])

@@ -7,7 +7,7 @@ from typing import NamedTuple, cast
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._util.vec3 import Scalar, Vec3, along
+from .._util.vec3 import Color, Scalar, Vec3, along
 from ..lighting.shading import Sample
 from ..scene.occupancy import Blocks
 from ..scene.space import Ray, Space
@@ -59,18 +59,20 @@ class RaySampler(NamedTuple):
         return jnp.where(depth == number, moving, depth * self.depth_scale)
 
     def color(
-        self, depth: Scalar, measured: Measured, classified: tuple[Vec3, Scalar], transmittance: Scalar
-    ) -> Vec3:
+        self, depth: Scalar, measured: Measured, classified: tuple[Color, Scalar], transmittance: Scalar
+    ) -> Color:
         """Colour of what was classified at this depth, behind this transmittance; lit if there is light."""
         color, extinction = classified
         if self.classification.light is None:
             return color
         place, (direction, pixel) = self.place(depth), (self.ray.direction, self.ray.pixel)
         point = self.space.world(place)
-        sample = Sample(point, direction, measured, color, extinction, transmittance, pixel, place)
+        red, green, blue = color
+        shown = (red, green, blue), extinction, transmittance
+        sample = Sample(point, direction, measured, *shown, pixel, place)
         return self.classification.light(sample)
 
-    def shaded(self, depth: Scalar) -> tuple[Vec3, Scalar]:
+    def shaded(self, depth: Scalar) -> tuple[Color, Scalar]:
         """Colour, shaded if there is a lighting, and extinction at this depth; nothing in front hides it."""
         measured = self.classification.at(self.coordinate(depth))
         classified = self.classification.classify(measured)
@@ -92,7 +94,7 @@ class Selection(Compositing[State]):
         """The chosen depth, past the entry; infinite if there is none."""
 
     @abstractmethod
-    def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, "4"], Scalar]:
+    def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, " n"], Scalar]:
         """Premultiplied colour and opacity, and the depth that is reported (infinite where nothing is
         visible), of a ray for which a depth was chosen. JAX differentiates it. To compute with a depth, use
         `sampler.differentiable_depth(depth)`."""
@@ -115,7 +117,7 @@ class Selection(Compositing[State]):
     def can_be_lit(self) -> bool:
         return True
 
-    def end(self, state: State) -> tuple[Float[Array, "4"], Scalar]:
+    def end(self, state: State) -> tuple[Float[Array, " n"], Scalar]:
         depth = self.depth(state)
         none, chosen = jnp.zeros_like(depth), (~jnp.isinf(depth)).astype(depth.dtype)
         return jnp.stack([none, none, none, chosen]), depth
@@ -147,6 +149,6 @@ class FirstVisible(Selection[Scalar]):
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
         return transfer.visible(blocks)
 
-    def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, "4"], Scalar]:
+    def pixel(self, sampler: RaySampler, state: Scalar) -> tuple[Float[Array, " n"], Scalar]:
         color, _ = sampler.shaded(state)
         return jnp.stack([*color, jnp.ones_like(state)]), state

@@ -191,7 +191,7 @@ class ImageVjp(NamedTuple):
             return sums
         if cotangent.details.depth is not None:
             # depth is measured from the ray's origin, and a sample's from the entry
-            toward = jnp.where(rendering.rgba[..., 3] > 0, cotangent.depth, 0)
+            toward = jnp.where(rendering.opacity > 0, cotangent.depth, 0)
             of_rays = eqx.tree_at(lambda ray: ray.t_in, of_rays, of_rays.t_in + toward)
         of_volume, of_source, of_march = pull(of_rays)[0]
         total = total._replace(volume=added(total.volume, of_volume), march=added(total.march, of_march))

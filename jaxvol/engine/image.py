@@ -29,7 +29,7 @@ from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import check_not_sharded, mesh_of, on_all, over_devices
 from .gradients import render_vjp
 from .rays import RayTiles, vmap_rays
-from .resolve import Found, resolve_image
+from .resolve import Found, resolve_image, with_pixels
 from .shifts import begin_rays
 from .stages import is_staged, staged_image
 from .tiling import Adjoint, RenderOptions, Tiling
@@ -91,16 +91,11 @@ def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAccelera
     marched = scene.marched._replace(compositing=jax.lax.stop_gradient(scene.compositing))
     if isinstance(scene.compositing, Selection):
         marched = constant(marched)
-    all_ = options.outputs == "all"
-    options = replace(options, outputs="all" if all_ else "depth")
+    outputs = options.outputs
+    options = replace(options, outputs="all" if outputs == "all" else "depth")
     rendering = _image(marched, options, acceleration)
-    details = rendering.details
-    pixels = _pixels(scene, options, acceleration, (rendering.rgba, rendering.depth, details.selected))
-    if not all_:
-        return Rendering(pixels[..., :4], rendering.exhausted)
-    normal = pixels[..., 5:] if pixels.shape[-1] > 5 else None
-    details = details._replace(depth=pixels[..., 4], normal=normal, selected=None)
-    return Rendering(pixels[..., :4], rendering.exhausted, details)
+    found = rendering.rgba, rendering.depth, rendering.details.selected
+    return with_pixels(scene, rendering, _pixels(scene, options, acceleration, found), outputs)
 
 
 def _image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:

@@ -19,6 +19,7 @@ Where rays leap over empty space, the first march records each ray's first and l
 second one leaps over all others, which saves two fifths of the samples in the head.
 """
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
-from .._util.vec3 import Scalar, Vec3, along
+from .._util.vec3 import Color, Scalar, along
 from ..compositing.blending import Weighting
 from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
@@ -47,7 +48,7 @@ class Cotangents(NamedTuple):
     """For each ray, the cotangents of colour and opacity, c̄ and ā; `worth`, Σ w_j q_j; and, where the loss
     depends on depth, `depth`, d̄ / A, and `middle`, D - t_in."""
 
-    color: Vec3
+    color: Color
     opacity: Scalar
     worth: Scalar
     depth: Scalar | None = None
@@ -56,14 +57,14 @@ class Cotangents(NamedTuple):
     @classmethod
     def of(cls, ray: Ray, rendering: Rendering, gradient: Rendering) -> "Cotangents":
         """Of rays (groups, rays in a group), from their part of the image and of its cotangent."""
-        red, green, blue, opacity = (gradient.rgba[..., i] for i in range(4))
-        final, worth = rendering.rgba[..., 3], jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
+        *color, opacity = (gradient.rgba[..., i] for i in range(gradient.rgba.shape[-1]))
+        final, worth = rendering.opacity, jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
         if gradient.details.depth is None:
-            return cls((red, green, blue), opacity, worth)
+            return cls(tuple(color), opacity, worth)
         visible = final > 0
         middle = jnp.where(visible, rendering.depth - ray.t_in, 0)
         depth = jnp.where(visible, gradient.depth, 0) / jnp.where(visible, final, 1)
-        return cls((red, green, blue), opacity, worth, depth, middle)
+        return cls(tuple(color), opacity, worth, depth, middle)
 
 
 class Total(NamedTuple):
@@ -143,12 +144,11 @@ class Replay(SampleVisitor):
     ) -> tuple[Scalar, PyTree, Total]:
         each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
         whole = with_fields(ray, reach=None)
-        red, green, blue = each.color
         classify = vmap_cells(self.prepared.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.prepared.march.sample(cell) for cell in samples.cells]
         weights = weights_of(self.prepared, at, samples.opacity)
-        of_color = [(weight * red, weight * green, weight * blue) for weight in weights.weight]
+        of_color = [tuple(weight * of for of in each.color) for weight in weights.weight]
         shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
         if self.shader is not None:
@@ -162,7 +162,7 @@ class Replay(SampleVisitor):
                 colors = [part.color for part in shaded]
             else:  # also of invisible samples, which are worth something: they would become visible
                 colors = lit_colors(self.shader, self.prepared, ray, samples.cells, colors, samples.light)
-        worth = [red * r + green * g + blue * b + each.opacity for r, g, b in colors]
+        worth = [_dot(each.color, color) + each.opacity for color in colors]
         if each.depth is not None:
             worth = [
                 value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
@@ -180,9 +180,9 @@ class Replay(SampleVisitor):
                 clear = jnp.where(live, self._weight_of_thin(weights.before[i]) * cell.width, 0)
                 # what a unit of emission shows as, where nothing is visible, too
                 seen = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
-                r, g, b = (of * seen for of in each.color)
-                of_extinction = of_extinction - (r * color[0] + g * color[1] + b * color[2])
-                of_transfer, of_read = self.scene.transfer.emission_vjp(measured, (r, g, b), of_extinction)
+                emission = tuple(of * seen for of in each.color)
+                of_extinction = of_extinction - _dot(emission, color)
+                of_transfer, of_read = self.scene.transfer.emission_vjp(measured, emission, of_extinction)
             else:
                 of_transfer, of_read = self.scene.transfer.vjp(
                     measured, of_color[i], of_extinction, integrated=self.prepared.march.integrates
@@ -304,3 +304,7 @@ class Replay(SampleVisitor):
                 slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], whole - front)
                 slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
         return front, [jnp.stack(each) for each in slopes]
+
+
+def _dot(a: Color, b: Color) -> Scalar:
+    return reduce(jnp.add, map(jnp.multiply, a, b))

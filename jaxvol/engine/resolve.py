@@ -5,7 +5,7 @@ For modes that resolve, and for lightings that shade pixels: `ray.resolve` says 
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from jaxtyping import Array, Float, Int
 from .._util.vec3 import Scalar
 from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
-from ..ray import Scene, resolve
+from ..ray import Scene, bands_of, resolve
+from ..scene.rendering import Details, Rendering
 from ..scene.space import Line
 from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import in_front, in_place
@@ -24,17 +25,15 @@ from .rays import lines_at
 from .tiling import RenderOptions, Tiling
 
 
-NUMBERS = 5
-"""Of a pixel: its colour, opacity and depth; three more where there is a normal."""
-
-Found: TypeAlias = tuple[Float[Array, "*rays 4"], Float[Array, "*rays"], PyTree]
+Found: TypeAlias = tuple[Float[Array, "*rays colors"], Float[Array, "*rays"], PyTree]
 """What a march found, of rays: `Rendering.rgba`, `Rendering.depth` and `Details.selected`."""
 
 
 def resolve_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, found: Found
 ) -> Float[Array, "*rays numbers"]:
-    """Pixels, their depths, and their normals where these are asked for, from what the march found."""
+    """Pixels, their depths, and their normals where these are asked for, from what the march found: numbers
+    that `with_pixels` takes apart."""
     packed, mode = acceleration.packed(scene), scene.compositing
     if options.adjoint == "forward":
         fetches = [replace(fetch, steady=True) for fetch in fetches_of(packed.volume)]
@@ -42,7 +41,7 @@ def resolve_image(
     prepared = packed.prepared()
     with_normal = isinstance(mode, Selection) and mode.has_normal and options.outputs == "all"
 
-    def one(line: Line, rgba: Float[Array, "4"], depth: Scalar, selected: PyTree) -> Float[Array, " numbers"]:
+    def one(line: Line, rgba: Float[Array, " n"], depth: Scalar, selected: PyTree) -> Float[Array, " m"]:
         pixel = resolve(prepared, line, rgba, depth, selected)
         normal = [pixel.normal] if with_normal and pixel.normal is not None else []
         return jnp.concatenate([pixel.rgba, pixel.depth[None], *normal])
@@ -51,7 +50,9 @@ def resolve_image(
         return jax.vmap(one)(lines_at(scene.source, indices), *found)
 
     whole = isinstance(mode, Weighting) and mode.resolves_transparent
-    resolved = of_visible(some, options.tiling, found, NUMBERS + 3 * with_normal, whole=whole)
+    resolved = of_visible(
+        some, options.tiling, found, bands_of(scene.transfer, scene.volume), 3 * with_normal, whole=whole
+    )
     return resolved * jnp.where(scene.has_fault, jnp.nan, 1).astype(resolved.dtype)
 
 
@@ -59,17 +60,20 @@ def of_visible(
     some: Callable[..., Float[Array, "chunk numbers"]],
     tiling: Tiling,
     found: Found,
-    numbers: int,
+    bands: int,
+    more: int,
     *,
     whole: bool = False,
 ) -> Float[Array, "*rays numbers"]:
-    """Pixels of so many numbers by `some(indices, *found)`, called for a chunk of visible pixels at a time,
-    or once, for all pixels, if `Tiling.chunk` is 0. Transparent pixels are 0, at infinite depth; they are
-    computed, too, for their derivatives, if asked for the `whole`."""
+    """Pixels of this number of colours, opacity, depth and so many numbers `more`, by
+    `some(indices, *found)`, called for a chunk of visible pixels at a time, or once, for all pixels, if
+    `Tiling.chunk` is 0. Transparent pixels are 0, at infinite depth; they are computed, too, for their
+    derivatives, if asked for the `whole`."""
+    numbers = bands + 2 + more
     shape, size = found[1].shape, tiling.chunk
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(shape) :]), found)
-    visible = flat[0][:, 3] != 0
-    nothing = jnp.zeros((visible.size, numbers), flat[0].dtype).at[:, 4].set(jnp.inf)
+    visible = flat[0][:, flat[0].shape[1] - 1] != 0
+    nothing = jnp.zeros((visible.size, numbers), flat[0].dtype).at[:, bands + 1].set(jnp.inf)
     if visible.size == 0:
         return nothing.reshape(*shape, numbers)
     # Nothing can be computed at an infinite depth, and a derivative there would be NaN.
@@ -94,5 +98,17 @@ def of_visible(
         pixels = computed(chosen)
     pixels = nothing.at[chosen].set(pixels.reshape(-1, numbers), mode="drop")
     if whole:
-        pixels = pixels.at[:, 4].set(jnp.where(visible, pixels[:, 4], jnp.inf))
+        pixels = pixels.at[:, bands + 1].set(jnp.where(visible, pixels[:, bands + 1], jnp.inf))
     return pixels.reshape(*shape, numbers)
+
+
+def with_pixels(
+    scene: Scene, rendering: Rendering, pixels: Float[Array, "*rays numbers"], outputs: Any
+) -> Rendering:
+    """The rendering of a march, with pixels that were computed after it."""
+    depth = bands_of(scene.transfer, scene.volume) + 1
+    details = Details()
+    if outputs == "all":
+        normal = pixels[..., depth + 1 :] if pixels.shape[-1] > depth + 1 else None
+        details = rendering.details._replace(depth=pixels[..., depth], normal=normal, selected=None)
+    return Rendering(pixels[..., :depth], rendering.exhausted, details)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Scalar
 from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
 from ..march.march import Cell
@@ -130,7 +130,7 @@ def march_segment(
     ahead = Ahead.of(rays, at, scene.march.step)
     samples = _sampled(scene, number, ahead)
     ray, _ = ahead.place
-    colors: list[Vec3] | list[None]
+    colors: Any
     values = [read[:1] for read in samples.measured]
     if isinstance(scene.compositing, Selection):
         colors, values = [None] * len(samples.cells), samples.measured
@@ -220,11 +220,11 @@ def _searched(classification: Classification, live: Bool[Array, ""], read: list[
     return [(*each, *more) for each, more in zip(read, found, strict=True)]
 
 
-def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Vec3]:
+def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Any]:
     """The colours of cells, as classified."""
     classify = vmap_cells(scene.classification.of_cells)
 
-    def all_(measured: list[Measured]) -> list[Vec3]:
+    def all_(measured: list[Measured]) -> list[Any]:
         return [classify(each)[0] for each in measured]
 
     # Means, and what is looked up, would be computed again for each use if they were fused into the

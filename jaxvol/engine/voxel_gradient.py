@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from ..scene.volume import Volume, grids, voxels_of, with_fetches, with_voxels
 from ..scene.voxel_fetch import Extent, Fetch, Fetched, Recording, Zeros, perturbations_of, scatter_add
+from ..xla.sharding import varying
 
 
 Sums: TypeAlias = list[Array | None]
@@ -70,9 +71,11 @@ def check_fetched(volume: Volume, sums: Sums) -> None:
 
 
 def zero_perturbations(volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: Any) -> list[Any]:
-    """Perturbations of 0 of what was fetched, where its gradient is asked for."""
+    """Perturbations of 0 of what was fetched, where its gradient is asked for: varying as the sums do, since
+    inside `jax.shard_map` the cotangents of what does not vary are summed over the shards."""
     each = zip(voxels_of(volume), fetched, sums, strict=True)
-    return [[] if sum_ is None else perturbations_of(data, found, dtype) for data, found, sum_ in each]
+    zeros = [[] if sum_ is None else perturbations_of(data, found, dtype) for data, found, sum_ in each]
+    return varying(zeros, sums)
 
 
 def with_cotangents(sums: Sums, volume: Volume, fetched: list[list[Fetched]], cotangents: list[Any]) -> Sums:

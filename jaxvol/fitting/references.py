@@ -102,6 +102,6 @@ def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera
             "jv.read_views, or its pixels with jv.from_srgb(image / 255)."
         )
     image = finite_array(name, given, (*camera.size[::-1], None)).astype(jnp.float32)
-    if image.shape[2] not in (3, 4):
-        raise ValueError(f"{name} must have 3 or 4 channels; got {image.shape[2]}.")
+    if image.shape[2] < 3:
+        raise ValueError(f"{name} must have 3 channels, or those of Rendering.rgba; got {image.shape[2]}.")
     return camera, image, variance

@@ -74,8 +74,8 @@ class ImageResidual(eqx.Module):
             `(volume, transfer, camera, march)`, and `lighting` as a fifth entry if it is lit; of several
             volumes lists, as for `render`. The solver chooses the adjoint.
         views: pairs (camera, image), at least one. An image is (height, width, 3), linear RGB over
-            `background`, or (height, width, 4), as `Rendering.rgba`; or a `PathTraced`, which is put before
-            `background`.
+            `background`, or as `Rendering.rgba`, (height, width, 4) but for more colours; or a `PathTraced`,
+            which is put before `background`.
         background: linear RGB behind the volume, for three-channel images.
         compositing: as in `render`.
         noise: standard deviation of the noise of the references: a number; or a list with a number, an array
@@ -167,7 +167,10 @@ class ImageResidual(eqx.Module):
                 camera = camera.crop(0, first, camera.size[0], rows)
             how: Any = {"compositing": self.compositing, "lighting": lighting, "adjoint": adjoint}
             rendering = render(volume, transfer, camera, march, outputs="rgba", **how)
-            rendered = rendering.rgba if channels == 4 else rendering.image(self.references.background)
+            rendered = rendering.rgba if channels > 3 else rendering.image(self.references.background)
+            if rendered.shape[-1] != channels:
+                got = f"{rendered.shape[-1]} of the rendering, and {channels} of the view"
+                raise ValueError(f"views must have the channels of Rendering.rgba; got {got}.")
             row = first + jnp.arange(rows)
             at = view, jnp.minimum(row, height - 1)
             # the last piece may reach past the image

@@ -15,14 +15,14 @@ from .._util.noise import hashed_uniforms_4, is_key
 from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
-from ..ray import check_arguments
+from ..ray import bands_of, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
-from ..xla.differentiation import forward_only
+from ..xla.differentiation import forward_only, refuse_reverse_mode
 from ..xla.platform import is_traced
 from ..xla.trees import constant, is_none
 from .fixed_paths import check_voxels, has_step, with_constant_paths
@@ -232,9 +232,14 @@ def path_trace(
             function has a step (if it is traced, the derivative is NaN).
     """
     order = "path_trace(volume, transfer, camera, lights)"
+    given = volume, transfer, camera, lights, materials, anisotropy
+    refuse_reverse_mode(given, FORWARD_ONLY)
     transfer = sized(transfer, volume)
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
     check_one_channel(volume, "path_trace")
+    if (bands := bands_of(transfer, volume)) != 3:
+        got = f"{bands} of {described(transfer)}"
+        raise ValueError(f"transfer must give three colours to path_trace; got {got}.")
     lights = lights_of(lights)
     materials = () if materials is None else materials_of(materials)
     if volume.labels is None and any(material.label is not None for material in materials):

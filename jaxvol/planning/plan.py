@@ -183,7 +183,7 @@ def plan(
         first = search(ends, tolerance, {})
         seen = first.render(COARSEST, "midpoint").image
     between = shows and is_empty(seen)
-    opaque = probe.mean(np.asarray(seen.rgba)[:, 3] >= 1 - ends) if over else 0.0
+    opaque = probe.mean(np.asarray(seen.opacity) >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     brightest = brightest_of(seen)
     within = search(ends / brightest, MARGIN * tolerance - share, first.rendered if brightest == 1 else {})
@@ -269,5 +269,5 @@ def _occupied_in_a_row(mode: Compositing[Any], transfer: Transfer, blocks: Block
 def brightest_of(image: Rendering) -> float:
     """The brightest colour, 1 or more: by so much of what is left of a ray its early end may err."""
     rgba = np.asarray(image.rgba, np.float64)
-    seen = rgba[:, 3] > 1e-3
-    return float(max(1.0, np.max(rgba[seen, :3] / rgba[seen, 3:], initial=0.0)))
+    seen = rgba[:, -1] > 1e-3
+    return float(max(1.0, np.max(rgba[seen, :-1] / rgba[seen, -1:], initial=0.0)))

@@ -40,6 +40,7 @@ class LabelTransferFunction(Transfer):
             rendering a volume without labels.
     """
 
+    bands = 3
     stacked: TransferFunction
     """All functions, stacked along a leading axis for the label; the last is that of invisible labels."""
     opacity: Float[Array, " labels"]

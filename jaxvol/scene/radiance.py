@@ -50,6 +50,7 @@ class RadianceField(Transfer):
             rendering a volume of another number of channels.
     """
 
+    bands = 3
     scale: Float[Array, ""]
     density: Activation
     color: Activation

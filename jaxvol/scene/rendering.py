@@ -55,7 +55,8 @@ class Rendering(eqx.Module):
     camera.
 
     Attributes:
-        rgba: linear colour, premultiplied by opacity, and opacity; not composited over a background.
+        rgba: linear colour, premultiplied by opacity, and opacity; not composited over a background. Of a
+            `Transfer` of n colours, n + 1 numbers, the opacity last.
         exhausted: whether the ray took `March.max_samples` before it was finished.
         depth: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
             opacity, world length; infinite where nothing is visible.
@@ -75,10 +76,15 @@ class Rendering(eqx.Module):
     other than `"over"` say what their depth is.
     """
 
-    rgba: Float[Array, "*rays 4"]
+    rgba: Float[Array, "*rays numbers"]
     exhausted: Bool[Array, "*rays"]
     details: Details = Details()
     background: tuple[float, ...] = eqx.field(static=True, default=(1.0, 1.0, 1.0))
+
+    @property
+    def opacity(self) -> Float[Array, "*rays"]:
+        """The last of the numbers of `rgba`."""
+        return self.rgba[..., self.rgba.shape[-1] - 1]
 
     @property
     def depth(self) -> Float[Array, "*rays"]:
@@ -114,6 +120,8 @@ class Rendering(eqx.Module):
 
         Warns of 8-bit colours.
         """
+        if (numbers := self.rgba.shape[-1]) != 4:
+            raise ValueError(f"image needs a rendering of three colours; this one has {numbers - 1}.")
         given = self.background if background is None else background
         background = linear_color("background", given, (..., 3))
         warn_of_8_bits("background", background, stacklevel=3)
@@ -145,14 +153,14 @@ class Rendering(eqx.Module):
 
     def _repr_png_(self) -> bytes | None:
         """What notebooks show: the image as a PNG, if it is one."""
-        if self.rgba.ndim != 3 or is_traced(self.rgba):
+        if self.rgba.ndim != 3 or self.rgba.shape[-1] != 4 or is_traced(self.rgba):
             return None
         _warn_if_empty(self)
         return png_of(displayed(np.asarray(self.image(), np.float32)))
 
 
 def _warn_if_empty(rendering: Rendering) -> None:
-    if not np.asarray(rendering.rgba)[..., 3].any():  # NaN is not nothing
+    if not np.asarray(rendering.opacity).any():  # NaN is not nothing
         what = "does the camera see the volume, and the transfer function show its values?"
         told = f"nothing is visible, all pixels are transparent: {what} jaxvol.show says why."
         warnings.warn(told, stacklevel=4)  # where a method was called, which equinox wraps
@@ -190,7 +198,7 @@ def pooled(rendering: Rendering, n: int) -> Rendering:
             lambda leaf: reduce(leaf.reshape(height, n, width, n, *leaf.shape[2:]), axis=(1, 3)), tree
         )
 
-    mean, details, opacity = partial(of_pixels, jnp.mean), rendering.details, rendering.rgba[..., 3]
+    mean, details, opacity = partial(of_pixels, jnp.mean), rendering.details, rendering.opacity
     depth, normal, samples = details.depth, details.normal, details.samples
     if depth is not None:
         visible = ~jnp.isinf(depth)

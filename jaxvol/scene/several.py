@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._util.checks import described
-from .._util.vec3 import Scalar, Vec3, apart
+from .._util.vec3 import Color, Scalar, Vec3, apart
 from ..xla.trees import is_none
 from .occupancy import BLOCK, Blocks, Sums
 from .transfer import Classify, Measured, Transfer, sized
@@ -209,6 +209,10 @@ class Together(Transfer):
     """How many channels each volume has."""
 
     @property
+    def bands(self) -> int | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 3 if all(each.bands == 3 for each in self.transfers) else None
+
+    @property
     def channels(self) -> int:
         return sum(self.counts)
 
@@ -244,7 +248,7 @@ class Together(Transfer):
     def classifier(self) -> Classify:
         each = [transfer.classifier() for transfer in self.transfers]
 
-        def classify(measured: Measured) -> tuple[Vec3, Scalar]:
+        def classify(measured: Measured) -> tuple[Color, Scalar]:
             own, shares = self._own(measured)
             classified = [function(part) for function, part in zip(each, own, strict=True)]
             return _mixed([(color, share * e) for (color, e), share in zip(classified, shares, strict=True)])
@@ -259,7 +263,7 @@ class Together(Transfer):
         return blocks.meeting([transfer.visible(own) for transfer, own in both])
 
     def emission_vjp(
-        self, measured: Measured, emission: Vec3, extinction: Scalar
+        self, measured: Measured, emission: Color, extinction: Scalar
     ) -> tuple["Together", Measured]:
         """As `vjp`, by cotangents of emission and extinction, which suffice where the extinction is 0."""
         own, shares = self._own(measured)
@@ -270,8 +274,8 @@ class Together(Transfer):
                 classify = jax.vmap(classify)
             color, own_extinction = classify(part)
             of_extinction = extinction + sum(of * c for of, c in zip(emission, color, strict=True))
-            r, g, b = (of * share * own_extinction for of in emission)
-            of_transfer, of_part = transfer.vjp(part, (r, g, b), share * of_extinction)
+            of_color = tuple(of * share * own_extinction for of in emission)
+            of_transfer, of_part = transfer.vjp(part, of_color, share * of_extinction)
             of_transfers.append(of_transfer)
             of_values += of_part[:count]
             attributes = measured[self.channels][len(of_attributes)]
@@ -289,13 +293,13 @@ class Together(Transfer):
         return [(*measured[a:b], *own, *searched) for a, b, own, searched in parts], shares
 
 
-def _mixed(classified: list[tuple[Vec3, Scalar]]) -> tuple[Vec3, Scalar]:
+def _mixed(classified: list[tuple[Color, Scalar]]) -> tuple[Color, Scalar]:
     """Colour and extinction of all together; where nothing is visible, the mean of the colours."""
     whole = jnp.sum(jnp.stack([extinction for _, extinction in classified]), axis=0)
     empty, count = whole == 0, len(classified)
     safe = jnp.where(empty, 1, whole)
-    mixed = [jnp.zeros_like(whole)] * 3
+    mixed = [jnp.zeros_like(whole)] * len(classified[0][0])
     for color, extinction in classified:
         weight = jnp.where(empty, 1 / count, extinction / safe)
         mixed = [sum_ + weight * part for sum_, part in zip(mixed, color, strict=True)]
-    return (mixed[0], mixed[1], mixed[2]), whole
+    return tuple(mixed), whole

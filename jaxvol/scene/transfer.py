@@ -7,7 +7,7 @@ and extinction (`classifier`), and how great the extinction can be in a block of
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -20,7 +20,7 @@ from .._util.checks import Arrayable, finite_array, flag, increasing, not_negati
 from .._util.piecewise_means import mean_by_rows, mean_by_spans, span_index, span_rows
 from .._util.srgb import warn_of_8_bits
 from .._util.texts import is_concrete, pasted
-from .._util.vec3 import Scalar, Vec3
+from .._util.vec3 import Color, Scalar, Vec3
 from ..xla.memo import memoized_of
 from ..xla.memory import gather, row_sums
 from ..xla.platform import in_numpy, is_traced
@@ -35,8 +35,8 @@ it depends on. Of a cell
 that is integrated (`Classification.spanned`): the mean of the values at its ends, then what else is read in
 its middle, and last two tuples, `front` and `back`: the value at each end, and what `search` found for it."""
 
-Classify: TypeAlias = Callable[[Measured], tuple[Vec3, Scalar]]
-"""From `Measured` to colour (r, g, b) and extinction (1/length)."""
+Classify: TypeAlias = Callable[[Measured], tuple[Color, Scalar]]
+"""From `Measured` to colour (r, g, b), or as many numbers as there are `bands`, and extinction (1/length)."""
 
 
 class Classification(NamedTuple):
@@ -78,7 +78,13 @@ class Transfer(eqx.Module):
     `quadrature="preintegrated"`; `channels`, so that volumes of other numbers of them
     are refused; `valid` if parameters must do more than be finite. `search`, `visible` and `vjp` only save
     time. Extinctions of one's own are not checked: they must not be negative.
+
+    A classifier may return n colours, of spectra or features: pixels then have n + 1 numbers, the opacity
+    last, in every mode, but for light and pictures, which are of three.
     """
+
+    bands: ClassVar[int | None] = None
+    """Number of colours of the classifier; None, the default: found by tracing it, at each call."""
 
     @abstractmethod
     def classifier(self) -> Classify:
@@ -132,7 +138,7 @@ class Transfer(eqx.Module):
         return self.majorant(blocks) > 0
 
     def vjp(
-        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+        self, measured: Measured, color: Color, extinction: Scalar, *, integrated: bool = False
     ) -> tuple["Transfer", Measured]:
         """Vector–Jacobian product of classifying many samples, or `integrated` cells: the cotangents of the
         transfer function and of what was measured, including what `search` found; None without a derivative.
@@ -193,6 +199,7 @@ class TransferFunction(Transfer):
             negative extinction, NaN or infinity, or lengths that differ.
     """
 
+    bands = 3
     values: Float[Array, " n"]
     colors: Float[Array, "n 3"]
     extinction: Float[Array, " n"]
@@ -237,7 +244,7 @@ class TransferFunction(Transfer):
         more = ", per_voxel=True" if self.per_voxel else ""
         return f"TransferFunction(values={values}, colors={colors}, extinction={extinction}{more})"
 
-    def __call__(self, value: Scalar) -> tuple[Vec3, Scalar]:
+    def __call__(self, value: Scalar) -> tuple[Color, Scalar]:
         """Colour (r, g, b) and extinction of a value."""
         search, measured = self.search(), (value,)
         return self.classifier()(measured if search is None else (*measured, *search(measured)))
@@ -319,7 +326,7 @@ class TransferFunction(Transfer):
         return span_rows(jax.lax.stop_gradient(self.values), at_points)
 
     def vjp(
-        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+        self, measured: Measured, color: Color, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         if integrated:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from .._util import bilinear
 from .._util.checks import Arrayable, finite_array, increasing, require
 from .._util.piecewise_linear import ROUNDING, Range, not_negative, points_around, table_row
-from .._util.vec3 import Scalar, Vec3, length
+from .._util.vec3 import Color, Scalar, Vec3, length
 from ..xla.memory import row_sums
 from ..xla.platform import is_traced
 from .occupancy import Blocks
@@ -42,6 +42,7 @@ class TransferFunction2D(Transfer):
     Functions for Interactive Volume Rendering", 2002.
     """
 
+    bands = 3
     values: Float[Array, " n"]
     magnitudes: Float[Array, " m"]
     colors: Float[Array, "n m 3"]
@@ -106,7 +107,7 @@ class TransferFunction2D(Transfer):
         nearest = rgb[np.argmin(np.maximum(far[:, :, None], away[:, None]), axis=0)]
         return cls(lines, others, jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
 
-    def __call__(self, value: Scalar, magnitude: Scalar) -> tuple[Vec3, Scalar]:
+    def __call__(self, value: Scalar, magnitude: Scalar) -> tuple[Color, Scalar]:
         """Colour (r, g, b) and extinction of a value and a magnitude of the gradient."""
         return self.classifier()((value, magnitude, *self.search()((value, magnitude))))
 
@@ -145,7 +146,7 @@ class TransferFunction2D(Transfer):
         return classify
 
     def vjp(
-        self, measured: Measured, color: Vec3, extinction: Scalar, *, integrated: bool = False
+        self, measured: Measured, color: Color, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
         # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
         value, magnitude, cell, along, across = measured

@@ -1,5 +1,7 @@
 """Which of JAX's transformations does an array undergo, and which modes of differentiation are refused?"""
 
+from collections.abc import Iterator
+from itertools import chain
 from typing import Any
 
 import equinox as eqx
@@ -13,14 +15,25 @@ from .platform import is_traced
 from .trees import PyTree
 
 
-def transformations(leaf: Any) -> list[str]:
-    """Names of JAX's tracers around an array, the innermost first. Names, since JAX does not export their
-    classes. Transformations outside of a `jax.jit` cannot be seen."""
-    names = []
+def tracers(leaf: Any) -> Iterator[Any]:
+    """JAX's tracers around an array, the innermost first. Those outside of a `jax.jit` cannot be seen."""
     while is_traced(leaf):
-        names.append(type(leaf).__name__)
+        yield leaf
         leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
-    return names
+
+
+def transformations(leaf: Any) -> list[str]:
+    """Names of the `tracers` around an array. Names, since JAX does not export their classes."""
+    return [type(tracer).__name__ for tracer in tracers(leaf)]
+
+
+def refuse_reverse_mode(tree: PyTree, message: str) -> None:
+    """Raises `ValueError` where the tree is known to be differentiated in reverse mode, before any work; not
+    under `jax.linearize`. A `jax.jit` in between and older versions of JAX hide it: then `forward_only`
+    refuses."""
+    for tracer in chain.from_iterable(map(tracers, jax.tree.leaves(tree))):
+        if getattr(getattr(tracer, "_trace", None), "is_vjp", False):
+            raise ValueError(message)
 
 
 def check_captured(what: str, function: Any) -> None:

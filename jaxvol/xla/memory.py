@@ -71,13 +71,16 @@ def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> 
     by an `optimization_barrier`, which has no such effect on CPU."""
     if on_gpu():
         return jax.lax.optimization_barrier(f(*arguments))
-    f = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
+    plain = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
+
+    def always(*arguments: Any) -> Any:
+        return varying(plain(*arguments), live, arguments)
 
     def never(*arguments: Any) -> Any:
         def filled(leaf: Any) -> Array:
             fill = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
             return jnp.full(leaf.shape, fill, leaf.dtype)
 
-        return varying(jax.tree.map(filled, jax.eval_shape(f, *arguments)), live, arguments)
+        return varying(jax.tree.map(filled, jax.eval_shape(plain, *arguments)), live, arguments)
 
-    return jax.lax.cond(live, f, never, *arguments)
+    return jax.lax.cond(live, always, never, *arguments)

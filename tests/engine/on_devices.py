@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec as P
+from jax.sharding import Mesh, NamedSharding, PartitionSpec as P
 
 import jaxvol as jv
 from jaxvol.engine import devices
@@ -107,6 +107,33 @@ def balance(_: Any):
         counts = seen.reshape(-1)[dealt].reshape(8, -1).sum(axis=1)
         assert counts.sum() == seen.sum()
         assert counts.min() > 0.8 * counts.mean(), (name, counts)
+
+
+def sharded_by_caller(_: Any):
+    """The gradient by every leaf, of rays that a caller shards: that of replicated leaves is summed once."""
+    volume = anisotropic_noise()
+    leaves = volume, soft_transfer(3.0), jv.March(0.2, (jv.AlphaCorrection(),)), around(volume)
+    arrays, static = eqx.partition(leaves, eqx.is_inexact_array)
+    rows, columns = np.indices((8, 8), np.float32).reshape(2, -1) * 2
+    target, two = weights((64, 1))[0], all_devices()[:2]
+
+    def seen(arrays: Any, *pixels: Any) -> jax.Array:
+        volume, transfer, march, camera = eqx.combine(arrays, static)
+        origins, directions = (jnp.stack(part, -1) for part in jax.vmap(camera.ray)(*pixels))
+        return jv.render_rays(volume, transfer, origins, directions, march).rgba
+
+    def gradient(image: Any, *given: Any) -> Any:
+        return jax.jit(jax.grad(lambda arrays, *pixels: jnp.sum(image(arrays, *pixels) * target)))(*given)
+
+    one = gradient(seen, arrays, columns, rows)
+    assert sum(bool(jnp.any(leaf != 0)) for leaf in jax.tree.leaves(one)) >= 10
+    specs = {"in_specs": (P(), P("rays"), P("rays")), "out_specs": P("rays")}
+    for mesh in (Mesh(np.array(two), ("rays",)), jax.make_mesh((2,), ("rays",), devices=two)):
+        places = tuple(NamedSharding(mesh, spec) for spec in specs["in_specs"])
+        given = jax.device_put((arrays, columns, rows), places)
+        for checked in (True, False):
+            image = jax.shard_map(seen, mesh=mesh, **specs, check_vma=checked)
+            assert_same_gradient(gradient(image, *given), one)
 
 
 # ---- slow ----

@@ -53,13 +53,16 @@ def fault(request) -> str | None:
     return request.config.option.fault
 
 
+CASES = "image_and_gradient", "owned_bricks", "sharded_by_caller"
+
+
 def test_work_is_balanced_and_image_gradient_and_owned_bricks_are_those_of_one_device(fault, tmp_path):
     (gradient, one), whole = scenes.whole_gradient(), scenes.whole()
     known: dict[str, Any] = {name: getattr(one, name) for name in ("rgba", "depth", "samples")}
     known |= {f"{name} by bricks": getattr(whole, name) for name in ("rgba", "depth")}
     known |= {f"gradient {i}": leaf for i, leaf in enumerate(jax.tree.leaves(gradient))}
     np.savez(tmp_path / "known.npz", **known)
-    on_eight_devices(fault, tmp_path / "known.npz", "balance", "image_and_gradient", "owned_bricks")
+    on_eight_devices(fault, tmp_path / "known.npz", "balance", *CASES)
 
 
 @pytest.mark.slow

@@ -587,3 +587,32 @@ def test_memory_of_the_gradient_does_not_grow_with_the_number_of_samples():
     few, many = workspace(128), workspace(2048)
     assert many <= 1.05 * few
     assert many <= 2**30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quadrature", ["midpoint", "preintegrated"])
+def test_hessians_of_integrated_cells_have_the_bends_of_the_transfer_function(quadrature):
+    """By finite changes of the voxels that pass control points: of sampled cells, most of it is missing."""
+    with in_float64():
+        random, (x, y, z) = np.random.default_rng(1), np.meshgrid(*[np.linspace(-1, 1, 8)] * 3, indexing="ij")
+        voxels = jnp.asarray(np.exp(-2 * (x**2 + y**2 + z**2)) + 0.2 * np.sin(5 * x) * np.cos(4 * y))
+        volume = jv.Volume(voxels, (2 / 7,) * 3, (-1, -1, -1))
+        camera = jv.Camera.looking_at(volume, (1, 0.2, 0.1), size=(8, 8))
+        wanted, along = jnp.asarray(random.random((8, 8, 4))), random.normal(size=voxels.shape)
+        along = jnp.asarray(along / np.linalg.norm(along))
+        points = np.linspace(-0.5, 1.5, 16), random.random((16, 3)), np.tile([0.1, 3.0], 8)
+        transfer, march = jv.TransferFunction(*points), jv.March(0.2, (jv.AlphaCorrection(),), quadrature)
+
+        @jax.jit
+        def gradient_and_product(voxels):
+            def loss(voxels):
+                seen = eqx.tree_at(lambda volume: volume.data, volume, voxels)
+                return jnp.sum((jv.render(seen, transfer, camera, march, outputs="rgba").rgba - wanted) ** 2)
+
+            return jax.jvp(jax.grad(loss), (voxels,), (along,))
+
+        _, product = gradient_and_product(voxels)
+        after, before = (gradient_and_product(voxels + e * along)[0] for e in (0.03, -0.03))
+        change = (after - before) / 0.06
+        missing = float(jnp.linalg.norm(product - change) / jnp.linalg.norm(change))
+        assert missing < 0.01 if quadrature == "preintegrated" else missing > 0.5, missing

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -37,6 +38,12 @@ FAULTS = [
         "devices: each ray of a beam that is not full is taken for another",
         "engine.devices:dealt_rays",
         lambda dealt: lambda *given: (*dealt(*given)[:2], dealt(*given)[2][::-1]),
+        (DEVICES,),
+    ),
+    Fault(
+        "shards: the cotangent of each fetch is summed over the shards, and so is the gradient by voxels",
+        "engine.voxel_gradient:zero_perturbations",
+        lambda zeros: lambda *given: jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), zeros(*given)),
         (DEVICES,),
     ),
     Fault(

@@ -31,6 +31,24 @@ def _without_bulge(box_of):
 
 FAULTS: list[Fault] = [
     Fault(
+        "colours: a gradient leaves out those after the third",
+        "engine.replay:_dot",
+        lambda _: lambda a, b: sum(x * y for x, y in zip(a[:3], b[:3], strict=True)),
+        (
+            "scene/test_own_transfer.py::"
+            "test_nine_colours_are_those_of_closed_forms_in_both_engines_and_so_is_their_gradient",
+        ),
+    ),
+    Fault(
+        "constructors: wrong numbers pass where they are traced",
+        "_util.checks:require",
+        lambda _: lambda value, *rest: value,
+        (
+            "test_arguments.py::"
+            "test_wrong_numbers_are_nan_in_a_program_without_calls_of_the_host_and_named_without_jit",
+        ),
+    ),
+    Fault(
         "owned bricks: what is behind is not dimmed",
         "compositing.blending:joined",
         lambda _: lambda front, back: jax.tree.map(jnp.add, front, back),

@@ -331,7 +331,8 @@ def of_images(scene=seen, max_jacobian=2**30, **how):
 HERE = Path(__file__).parent
 BAD = [
     (lambda: images(BLANK[:4]), r"views\[0\].*\(16, 20, n\).*\(4, 20, 3\)"),
-    (lambda: images(BLANK[..., :2]), r"views\[0\].* must have 3 or 4 channels; got 2"),
+    (lambda: images(BLANK[..., :2]), r"views\[0\].* must have 3 channels, or those of .*rgba; got 2"),
+    (of_images(image=BLANK[..., [0, 1, 2, 0, 1]]), r"channels of Rendering\.rgba; got 4 .* 5 of the view"),
     (lambda: images(BLANK * np.nan), r"views\[0\].* must be finite"),
     (lambda: images(BLANK.astype(np.uint8)), r"views\[0\]: .*, floats .*; got uint8.*from_srgb"),
     (lambda: images(view=1), r"views\[0\] must be a pair .*got a tuple"),

@@ -5,6 +5,7 @@ quadrature in float64 (light scattered once), with Chandrasekhar's half-space, a
 of the same random numbers.
 """
 
+import importlib
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -310,6 +311,23 @@ def test_reverse_mode_is_refused(derivative):
 
     with pytest.raises(ValueError, match=r"forward mode only; take jax.jacfwd"):
         jax.eval_shape(derivative(loss), np.ones(3, np.float32))
+
+
+def test_reverse_mode_is_refused_before_anything_is_traced(monkeypatch):
+    def unreachable(*_: Any) -> Any:
+        raise AssertionError("paths are traced")
+
+    def loss(radiance: Any) -> jax.Array:
+        return SCENE._replace(lights=lit(SUN, LAMP, ConstantLight(radiance))).traced().radiance.sum()
+
+    monkeypatch.setattr(importlib.import_module("jaxvol.path_tracing.path_trace"), "_traced", unreachable)
+    at = jnp.ones(3)
+    for derivative in (jax.grad, jax.jacrev, lambda loss: jax.jit(jax.value_and_grad(loss))):
+        with pytest.raises(ValueError, match="forward mode only"):
+            derivative(loss)(at)
+    for derivative in (jax.jacfwd, lambda loss: partial(jax.linearize, loss), lambda loss: loss):
+        with pytest.raises(AssertionError, match="paths are traced"):
+            derivative(loss)(at)
 
 
 def test_images_by_groups_are_over_a_background():

@@ -62,7 +62,7 @@ class Clip(Transform):
             expected = "(x_min, x_max, y_min, y_max, z_min, z_max), minima below maxima"
             box = finite_array("box", box, (6,))
             self.box = require(
-                box, lambda ends: ends[0::2] < ends[1::2], f"box must be {expected}; got {{got}}."
+                box, lambda ends: (ends[0::2] < ends[1::2]).all(), f"box must be {expected}; got {{got}}."
             )
         self.origins, self.normals = _planes(planes)
         if box is None and not len(self.origins):
