@@ -1,14 +1,14 @@
-"""At which mean free path do templates come nearest to path-traced views, under the parameters of the paper?
+"""At which mean free path do templates come nearest to path-traced views, under the paper's parameters?
 
-Published templates as in Lee, Kwon and Shin 2016: an opacity of 50 %, four packets, a threshold of 0.01 on whole
-levels, hence up to 60 photons a template; 8 templates, blended; occlusion also tested at 2 and 4 times the
-distance; hard occlusion with a cut-off of 0.02 as published, or soft occlusion, which is ours. Beside them
-templates by transport, under the same march of eight steps a voxel. The extinction that the camera's rays
-meet is known, or follows from the mean free path, 1/λ.
+Published templates as in Lee, Kwon and Shin 2016: an opacity of 50 %, four packets, a threshold of 0.01 on
+whole levels, hence up to 60 photons a template; 8 templates, blended; occlusion also tested at 2 and 4 times
+the distance; hard occlusion with a cut-off of 0.02 as published, or soft occlusion, which is ours. Beside
+them templates by transport, under the same march of eight steps a voxel. The extinction that the camera's
+rays meet is known (of published templates alone), or follows from the mean free path, 1/λ.
 
 Nothing is fitted by derivatives (the image under hard occlusion has none, and fits stall where the loss has
-several minima): λ is scanned over a factor of 256, in steps of √2, and twice more around the least loss. The
-paper gives no scale, so at each λ the brightness is the one that brings the image nearest. Scenes are the
+several minima): λ is scanned over a factor of 256, in octaves, and ever closer around the least loss, down
+to steps of 2 %. The true λ is none of the steps. The paper gives no scale, so at each λ the brightness is the one that brings the image nearest. Scenes are the
 ball of `mean_free_path`, and CT of a head as one material, read from the folder JAXVOL_DATA and left out
 without it.
 """
@@ -29,12 +29,14 @@ from .scenes import CT_HEAD, on_cube
 
 
 CT = "CT of a head"
-FACTORS = 2.0 ** np.arange(-5, 3.1, 0.5)
+FACTORS = 2.0 ** (np.arange(-5, 4) + 0.1)
 """Scanned mean free paths, over the true one."""
 FLAT = 1.1
 """Errors up to so many times the least are told as a range of λ."""
 PAPER: dict[str, Any] = {"templates": 8, "blend": True, "threshold_on": "level"}
-FORMS = {"hard": {**PAPER, "occlusion": "hard"}, "soft": PAPER, "transport": None}
+FORMS: dict[str, dict[str, Any]] = {"hard": {**PAPER, "occlusion": "hard"}, "soft": PAPER}
+WAYS = ("hard", 0.0), ("hard", 1.0), ("soft", 0.0), ("soft", 1.0), ("transport", 1.0)
+"""Forms of templates, and whether the extinction is 1/λ."""
 MARKS = {"hard": "C3s", "soft": "C1D", "transport": "C0^"}
 
 
@@ -58,11 +60,11 @@ def scan(measured: Callable[[float], dict[str, float]]) -> dict[str, Any]:
     chi = [row["reduced chi-squared"] for row in rows.values()]
     padded = np.array([np.inf, *chi, np.inf])
     minima = int(np.sum((padded[1:-1] < padded[:-2]) & (padded[1:-1] <= padded[2:])))
-    for halvings in (3, 5):  # steps of 9 % and 2 % around the least so far
+    for octaves in (1 / 2, 1 / 8, 1 / 32):  # around the least so far
         middle = min(rows, key=lambda factor: rows[factor]["reduced chi-squared"])
-        for step in range(-3, 4):
-            factor = middle * 2.0 ** (step / 2**halvings)
-            if FACTORS[0] <= factor <= FACTORS[-1] and factor not in rows:
+        for step in (-3, -2, -1, 1, 2, 3) if octaves < 1 / 2 else (-1, 1):
+            factor = middle * 2.0 ** (step * octaves)
+            if FACTORS[0] <= factor <= FACTORS[-1]:
                 rows[factor] = measured(factor)
     rows = dict(sorted(rows.items()))
     best = min(rows, key=lambda factor: rows[factor]["reduced chi-squared"])
@@ -79,8 +81,8 @@ def scan(measured: Callable[[float], dict[str, float]]) -> dict[str, Any]:
 
 def scans(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[str, dict[str, Any]]:
     views, rows = scene.views(truth, chosen.size, chosen.paths), {}
-    for tied, (suffix, form) in ((tied, each) for each in FORMS.items() for tied in (0.0, 1.0)):
-        options = form or {"form": "transport", "nodes": scene.nodes, "levels": scene.levels}
+    for form, tied in WAYS:
+        options = FORMS.get(form, {"form": "transport", "nodes": scene.nodes, "levels": scene.levels})
 
         def measured(factor: float, tied: float = tied, options: dict[str, Any] = options) -> Any:
             given, images = times(factor, truth) | {"tied": np.float32(tied)}, []
@@ -89,7 +91,7 @@ def scans(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[str, d
                 images.append(jv.render(*plain, lighting=lighting, outputs="rgba").image((0, 0, 0)))
             return nearest(images, [view for _, view in views])
 
-        name = suffix + (TIED if tied else KNOWN)
+        name = form + (TIED if tied else KNOWN)
         rows[name] = scan(measured)
         print(name, {key: value for key, value in rows[name].items() if key != "profile"}, flush=True)
     return rows
@@ -106,21 +108,22 @@ def draw(result: dict[str, Any]) -> Any:
     rows = result["scans"]
     figure, (axes,) = charts.panels(1, 2, 10, 4.4)
     names = list(rows)
-    for n, (form, mark) in enumerate(MARKS.items()):
-        for tied, suffix in enumerate((KNOWN, TIED)):
-            fits = [(x, each[form + suffix]) for x, name in enumerate(names) for each in rows[name].values()]
-            points = [(x + 0.13 * (2 * n + tied - 2.5), fit["ratio"]) for x, fit in fits]
-            how: dict[str, Any] = {"linestyle": "none", "fillstyle": "full" if tied else "none"}
-            axes[0].plot(*zip(*points, strict=True), mark, label=form + suffix, alpha=0.8, **how)
-    for name, style in zip((names[min(2, len(names) - 1)], names[-1]), ("-", "--"), strict=True):
+    for n, (form, tied) in enumerate(WAYS):
+        way = form + (TIED if tied else KNOWN)
+        fits = [(x, each[way]) for x, name in enumerate(names) for each in rows[name].values()]
+        points = [(x + 0.13 * (n - 2), fit["ratio"]) for x, fit in fits]
+        how: dict[str, Any] = {"linestyle": "none", "fillstyle": "full" if tied else "none"}
+        axes[0].plot(*zip(*points, strict=True), MARKS[form], label=way, alpha=0.8, **how)
+    for name, style in zip(names[1 :: max(1, len(names) - 2)], ("-", "--"), strict=False):
         for form, mark in MARKS.items():
             profile = np.transpose(next(iter(rows[name].values()))[form + TIED]["profile"])
-            axes[1].loglog(*profile, mark[:-1] + style, label=f"{form}, {name}")
+            about = name if name == CT else f"{name} thick"
+            axes[1].loglog(*profile, mark[:-1] + style, label=f"{form}, {about}")
     axes[0].set(ylabel="λ of the least error / λ true", yscale="log")
     axes[0].set_xticks(range(len(names)), [name.replace(" of", "\nof") for name in names])
     axes[0].set_xlabel("diameter of the ball / λ, and a head")
     axes[1].set(xlabel="λ / λ true", ylabel="rms error / mean, extinction 1/λ")
-    axes[1].legend(fontsize=7)
+    axes[1].legend(fontsize=8)
     for panel, line in zip(axes, (axes[0].axhline, axes[1].axvline), strict=True):
         line(1, color="k", linewidth=0.8)
         charts.plain_numbers(panel)

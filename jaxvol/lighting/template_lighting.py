@@ -226,6 +226,10 @@ class ScattererTemplates(Lighting):
         self.photons = available if photons is None else min(available, integer("photons", photons, 1))
 
     @property
+    def reads_value(self) -> bool:
+        return any(material.values is not None for material in self.materials)
+
+    @property
     def farthest_read(self) -> float | None:
         if self.form == "transport":
             return None
