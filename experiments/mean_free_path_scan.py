@@ -6,9 +6,9 @@ the distance; hard occlusion with a cut-off of 0.02 as published, or soft occlus
 them templates by transport, under the same march of eight steps a voxel. The extinction that the camera's
 rays meet is known (of published templates alone), or follows from the mean free path, 1/λ.
 
-Nothing is fitted by derivatives (the image under hard occlusion has none, and fits stall where the loss has
-several minima): λ is scanned over a factor of 256, in octaves, and ever closer around the least loss, down
-to steps of 2 %. The true λ is none of the steps. The paper gives no scale, so at each λ the brightness is the one that brings the image nearest. Scenes are the
+Nothing is fitted by derivatives (the image under hard occlusion has none): λ is scanned over a factor of 256,
+in octaves, and ever closer around the least loss, down to steps of 2 %. The true λ is none of the steps. The
+paper gives no scale, so at each λ the brightness is the one that brings the image nearest. Scenes are the
 ball of `mean_free_path`, and CT of a head as one material, read from the folder JAXVOL_DATA and left out
 without it.
 """

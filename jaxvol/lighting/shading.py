@@ -130,7 +130,7 @@ class Lighting(eqx.Module):
 
     @property
     def reads_value(self) -> bool:
-        """Whether samples are shaded by the volume's value, so that it must have one channel. By default so."""
+        """Whether samples read the volume's value, so that it must have one channel. By default so."""
         return True
 
     @property
