@@ -28,7 +28,6 @@ from .scenes import skin_head
 
 
 PAPER = 2.2
-OPAQUE = 0.95
 SKIN, MUSCLE, BONE = (
     jv.Material(opacity, length, index, values=values)
     for opacity, length, index, values in (
@@ -57,8 +56,8 @@ def lightings(seed: int) -> dict[str, ScattererTemplates | None]:
 
 
 def noise(rgba: np.ndarray) -> float:
-    """Standard deviation of the noise of opaque pixels, over their mean."""
-    color, opaque = rgba[..., :3], rgba[..., 3] > OPAQUE
+    """Standard deviation of the noise of what is mostly opaque, over its mean."""
+    color, opaque = rgba[..., :3], rgba[..., 3] > 0.5
     return float(np.sqrt(boundary_noise(color, opaque) / 3) / color[opaque].mean())
 
 

@@ -51,6 +51,12 @@ def render_far_away():
     jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=away)())
 
 
+def render_colors(lighting):
+    volume = jv.Volume(np.zeros((4, 4, 4, 4), np.float32), labels=np.zeros((4, 4, 4), np.uint8))
+    camera = jv.Camera.looking_at(volume, size=(3, 2))
+    return jv.render(volume, jv.RadianceField(), camera, jv.March(0.1), lighting=lighting).rgba
+
+
 BAD = {
     "world points of float32": (render_far_away, "reads at world points, which lie 0.7 apart at 5.85e.06"),
     # templates
@@ -136,6 +142,14 @@ BAD = {
         lambda: Phong(ConstantLight()),
         "lights must hold jaxvol lights, of any kind but ConstantLight",
     ),
+    "colours whose materials are values": (
+        lambda: render_colors(lit(Material(0.5, 1.0, values=(0, 1)))()),
+        "lighting: a ScattererTemplates needs a single volume of one channel",
+    ),
+    "colours by Phong": (
+        lambda: render_colors(Phong()),
+        "lighting: a Phong needs a single volume of one channel",
+    ),
     "Phong without lights": (lambda: Phong(()), "lights must be"),
     "Phong by a name": (lambda: Phong("sun"), "lights must be"),
     "ambient": (lambda: Phong(ambient=-0.1), "ambient must not be negative"),
@@ -150,6 +164,12 @@ def test_bad_input_is_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("form", ["published", "transport"])
+def test_volumes_of_colours_are_lit_if_materials_are_labels(form):
+    lighting = lit(Material(0.5, 1.0, label=1), form=form)()
+    assert jax.eval_shape(lambda: render_colors(lighting)).shape == (2, 3, 4)
 
 
 def test_the_threshold_that_is_advised_leaves_photons():
