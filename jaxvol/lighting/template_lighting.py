@@ -102,7 +102,8 @@ class ScattererTemplates(Lighting):
     show, since invisible points are not lit.
 
     Args:
-        materials: one or several. Where two overlap, the first counts.
+        materials: one or several. Where two overlap, the first counts. In a volume of colours
+            (`RadianceField`), they are distinguished by labels.
         lights: one or several, of any kind but `HeadLight`.
         templates: number per material, by default 8, of which each pixel uses one, chosen at random (the
             paper does not say which). A single one has no noise, takes less time, and is lopsided in the same

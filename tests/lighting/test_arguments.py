@@ -25,6 +25,7 @@ from jaxvol.lighting.materials import materials_of
 from jaxvol.lighting.packet_tree import PacketTree
 from jaxvol.lighting.template_lighting import with_baked_light
 
+from ..scenes import slow
 from .samples import shaded
 
 
@@ -166,7 +167,7 @@ def test_bad_input_is_named(case):
         make()
 
 
-@pytest.mark.parametrize("form", ["published", "transport"])
+@pytest.mark.parametrize("form", ["published", *slow("transport")])
 def test_volumes_of_colours_are_lit_if_materials_are_labels(form):
     lighting = lit(Material(0.5, 1.0, label=1), form=form)()
     assert jax.eval_shape(lambda: render_colors(lighting)).shape == (2, 3, 4)
