@@ -1,6 +1,7 @@
 """Are mean free paths recovered from lit images, and reported as undetermined where they are?"""
 
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,7 @@ def test_a_scan_finds_the_mean_free_path_and_brightness_of_a_render_of_templates
         return np.asarray(rendered(volume, transfer, camera, march, lighting=lighting).rgba)[..., :3]
 
     reference = brightness * seen(2**octaves)
-    view = SimpleNamespace(radiance=reference, standard_error=np.full_like(reference, 1e-3))
+    view: Any = SimpleNamespace(radiance=reference, standard_error=np.full_like(reference, 1e-3))
     found = scan(lambda factor: nearest([seen(factor)], [view]))
     assert abs(np.log2(found["ratio"]) - octaves) < 1 / 32
     assert found["brightness"] == pytest.approx(brightness, rel=0.03)
