@@ -11,8 +11,7 @@ three times too short, and see two views. Four ways:
 - the path tracer itself, with other paths in each step; and from where templates by transport end.
 
 Each is repeated with other references, and other templates. A warning says where a model does not fit: then,
-standard errors do not tell of its bias. Fits of published templates stall (their loss has several minima):
-`mean_free_path_scan` has these.
+standard errors do not tell of its bias. Fits of published templates stalled: `mean_free_path_scan` scans.
 """
 
 import time
@@ -275,7 +274,7 @@ def draw(result: dict[str, Any]) -> Any:
     panel.set(ylabel="λ found / λ true", title="One ball")
     charts.numbered(panel, [float(x) for x in rows], list(rows))
     panel.set_xlabel("optical thickness, diameter / λ")
-    charts.legend_below(figure, panel, 2)
+    charts.legend_below(figure, panel, 1)
     return figure
 
 

@@ -33,12 +33,11 @@ def draw(result: dict[str, Any]) -> Any:
             found = [fits[name]["ratio"][at] for fits in rows[scene].values()]
             panel.plot(np.full(len(found), x + 0.12 * (n - 1)), found, MARKS[name], **how)
             how["label"] = None
-    panel.axhspan(0.9, 1.1, color="0.9", zorder=0)
+    panel.axhspan(0.95, 1.05, color="0.9", zorder=0)
     panel.axhline(1, color="k", linewidth=0.8)
-    panel.set(ylabel="λ found / λ true", yscale="log")
+    panel.set(ylabel="λ found / λ true")
     told = [f"{HEADS[scene][at]}\nof {len(HEADS[scene])}" for scene, at in parts]
     panel.set_xticks(range(len(parts)), told)
-    charts.plain_numbers(panel)
     charts.legend_below(figure, panel, 1)
     return figure
 
