@@ -95,6 +95,9 @@ def mean_free_path(density: Arrayable, cross_section: Arrayable) -> Float[Array,
         density: n, scatterers per volume, 1/length³, > 0.
         cross_section: σ, the effective area of each, length², > 0.
 
+    Returns:
+        The mean distance between scatterings, for `Material`.
+
     Raises:
         ValueError: for numbers that are not above 0 or not finite.
     """
