@@ -202,13 +202,15 @@ def times(factor: float, given: dict[str, Any]) -> dict[str, Any]:
 FIXED = {"materials": None, "extinction": jv.Fixed(), "tied": jv.Fixed()}
 
 
-def told(found: jv.Fit, truth: dict[str, Any]) -> dict[str, Any]:
-    """A row: what was found, over what is true."""
+def told(found: jv.Fit, truth: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
+    """A row: what was found, over what is true, and whether the fit left its start: else it is no estimate."""
     assert found.uncertainty is not None
     true = [float(each.mean_free_path) for each in truth["materials"]]
     errors = [e for name, e in found.uncertainty.standard_errors.items() if "mean_free_path" in name]
     paths = [float(each.mean_free_path) for each in found.parameters["materials"]]
+    first = [float(each.mean_free_path) for each in start["materials"]]
     return {
+        "moved": paths != first,
         "ratio": [path / t for path, t in zip(paths, true, strict=True)],
         "standard error": [float(error) / t for error, t in zip(errors, true, strict=True)],
         "reduced chi-squared": float(found.uncertainty.reduced_chi_squared or 0),
@@ -246,7 +248,7 @@ def from_paths(
         for name, found in zip(names, fits, strict=True):
             # of several fits, the first one may warn, and the time is that of all
             last = {"warned of a misfit": misfit, "seconds": seconds} if found is fits[-1] else {}
-            rows[name] = {**told(found, truth), **last}
+            rows[name] = {**told(found, truth, start), **last}
             print(name, rows[name], flush=True)
     return rows
 

@@ -114,7 +114,8 @@ def draw(result: dict[str, Any]) -> Any:
         points = [(x + 0.13 * (n - 2), fit["ratio"]) for x, fit in fits]
         how: dict[str, Any] = {"linestyle": "none", "fillstyle": "full" if tied else "none"}
         axes[0].plot(*zip(*points, strict=True), MARKS[form], label=way, alpha=0.8, **how)
-    for name, style in zip(names[1 :: max(1, len(names) - 2)], ("-", "--"), strict=False):
+    profiles = dict.fromkeys((names[min(1, len(names) - 1)], names[-1]))
+    for name, style in zip(profiles, ("-", "--"), strict=False):
         for form, mark in MARKS.items():
             profile = np.transpose(next(iter(rows[name].values()))[form + TIED]["profile"])
             about = name if name == CT else f"{name} thick"

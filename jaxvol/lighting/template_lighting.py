@@ -105,11 +105,11 @@ class ScattererTemplates(Lighting):
         materials: one or several. Where two overlap, the first counts. In a volume of colours
             (`RadianceField`), they are distinguished by labels.
         lights: one or several, of any kind but `HeadLight`.
-        templates: number per material, by default 8, of which each pixel uses one, chosen at random (the
-            paper does not say which). A single one has no noise, takes less time, and is lopsided in the same
+        templates: number per material, by default 8, of which each pixel uses one, chosen at random, which
+            shows as noise (the paper blends them). A single one has no noise, takes less time, and is lopsided in the same
             way everywhere. With `"transport"`, each node of the grid uses one of 256, by default, and more
             take no more time.
-        blend: use all templates for every sample, instead. This has less noise, and takes as much longer as
+        blend: use all templates for every sample, instead, as the paper does against noise. This has less noise, and takes as much longer as
             there are templates.
         photons: keep this many of each template's brightest photons, scaled to the energy of all. By default
             all.
