@@ -203,7 +203,7 @@ FIXED = {"materials": None, "extinction": jv.Fixed(), "tied": jv.Fixed()}
 
 
 def told(found: jv.Fit, truth: dict[str, Any], start: dict[str, Any]) -> dict[str, Any]:
-    """A row: what was found, over what is true, and whether the fit left its start: else it is no estimate."""
+    """A row: what was found, over what is true; if the fit never left its start, it is no estimate."""
     assert found.uncertainty is not None
     true = [float(each.mean_free_path) for each in truth["materials"]]
     errors = [e for name, e in found.uncertainty.standard_errors.items() if "mean_free_path" in name]

@@ -106,11 +106,11 @@ class ScattererTemplates(Lighting):
             (`RadianceField`), they are distinguished by labels.
         lights: one or several, of any kind but `HeadLight`.
         templates: number per material, by default 8, of which each pixel uses one, chosen at random, which
-            shows as noise (the paper blends them). A single one has no noise, takes less time, and is lopsided in the same
-            way everywhere. With `"transport"`, each node of the grid uses one of 256, by default, and more
-            take no more time.
-        blend: use all templates for every sample, instead, as the paper does against noise. This has less noise, and takes as much longer as
-            there are templates.
+            shows as noise (the paper blends them). A single one has no noise, takes less time, and is
+            lopsided in the same way everywhere. With `"transport"`, each node of the grid uses one of 256, by
+            default, and more take no more time.
+        blend: use all templates for every sample, instead, as the paper does against noise. This has less
+            noise, and takes as much longer as there are templates.
         photons: keep this many of each template's brightest photons, scaled to the energy of all. By default
             all.
         occlusion: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
