@@ -190,9 +190,11 @@ def check_channels(
             f"volume must have as many channels as {type(transfer).__name__} reads, {reads}; got {channels}. "
             "Several volumes are given as lists: render([a, b], [of_a, of_b], ...)."
         )
+    # materials of colours are distinguished by labels, which a group of volumes does not have
+    needs_value = isinstance(volume.field, Several) or (lighting is not None and lighting.reads_value)
     single = {
         "compositing": described(compositing) if compositing.reads_value else None,
-        "lighting": None if lighting is None else described(lighting),
+        "lighting": None if lighting is None or not needs_value else described(lighting),
         "march.quadrature": '"preintegrated"' if march.integrates else None,
     }
     for name, given in single.items():

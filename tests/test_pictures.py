@@ -24,7 +24,7 @@ PANELS = {
     "paper_figs/output/kisti_fig.webp": (4, 2),
     "paper_figs/output/kye_conditions.webp": (4, 4),
     "paper_figs/output/lee_fig4.webp": (3, 2),
-    "paper_figs/output/lee_fig6.webp": (3, 4),
+    "paper_figs/output/lee_fig6.webp": (4, 4),
     "paper_figs/output/lee_fig_steps.webp": (3, 4),
     "paper_figs/output/lee_hand.webp": (4, 1),
     "paper_figs/output/lee_printed.webp": (2, 2),

@@ -15,7 +15,8 @@ from jaxvol.io.phantoms.canvas import FAR, Canvas
 from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, HeadLight, Lighting, Phong, ScattererTemplates
 
-from ..lighting import FLESH, march
+from ..lighting import FLESH, UNLIT, march
+from ..published_light import ALIKE, BLENDED as BLENDS, EACH, noise
 from ..scenes import CT_HEAD, SCENES, Scene, cropped, grid, on_cube, skin_head
 from . import BLACK, Panel, Panels, panel
 
@@ -205,18 +206,18 @@ def lee_fig6(chosen: Namespace) -> Panels:
     subjects["a frog phantom"] = frog(*sizes)
     if folder:
         subjects["a frog (labels)"] = tissues(folder, sizes[0])
-    columns: dict[str, Any] = {
-        "unlit": None,
-        "hard, one of 8 for each pixel": {"occlusion": "hard"},
-        "soft, 4 templates blended": BLENDED,
-    }
+    kinds = {BLENDS: {"blend": True}, EACH: {}, ALIKE: {"templates": 1}}
+    hard = {"occlusion": "hard", "threshold_on": "level"}
     rows: Panels = []
     for name, (scene, materials, direction) in subjects.items():
         lights, row = (DirectionalLight(direction, (40.0, 40.0, 40.0)), ConstantLight((1.3, 1.3, 1.3))), []
-        for title, how in columns.items():
-            lighting = None if how is None else ScattererTemplates(materials, lights, **how)
-            caption = name if lighting is None else f"{lighting.photons} photons a template at most"
-            row.append(panel(lit(scene, lighting), caption, "" if rows else title))
+        lightings = {
+            kind: ScattererTemplates(materials, lights, **hard, **how) for kind, how in kinds.items()
+        }
+        for title, lighting in {UNLIT: None, **lightings}.items():
+            rgba = jv.render(*scene[:3], march(scene), lighting=lighting, outputs="rgba").rgba
+            caption = name if lighting is None else f"noise {noise(np.asarray(rgba)):.2f} of the mean"
+            row.append(panel(np.asarray(rgba)[..., :3], caption, "" if rows else title))
         rows.append(row)
     return rows
 

@@ -7,7 +7,7 @@ from .lights import (
     Light as Light,
     PointLight as PointLight,
 )
-from .materials import Material as Material
+from .materials import Material as Material, mean_free_path as mean_free_path
 from .phong import Phong as Phong
 from .shading import Lighting as Lighting, Shading as Shading
 from .simulation import (

@@ -1,5 +1,6 @@
 """Materials: how they scatter light, and where in a volume they are."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -44,8 +45,11 @@ class Material(eqx.Module):
     Args:
         opacity: α, the fraction of light absorbed at each scattering, in [0, 1]: 1 minus the transparency of
             Lee, Kwon and Shin (2016), and, for a white colour, 1 minus the single-scattering albedo of path
-            tracing. Scatterer templates need an opacity above 0, see their `threshold`.
-        mean_free_path: λ, the mean distance between scatterings, world length, > 0.
+            tracing. Scatterer templates need an opacity above 0, see their `threshold`. The paper's
+            transparency is T(d), of the transfer function at the material's value d. To tie α to it, also
+            in its gradient: `-jnp.expm1(-transfer(d)[1] * mean_free_path)`, with the `levels` of templates.
+        mean_free_path: λ, the mean distance between scatterings, world length, > 0; see
+            `lighting.mean_free_path`.
         refractive_index: positive; 1 in air.
         values: (low, high), the range of volume values that are this material, low < high.
         label: the volume's label for this material. Without `values` or `label`, it is everywhere.
@@ -82,6 +86,23 @@ class Material(eqx.Module):
     @property
     def optics(self) -> Optics:
         return Optics(self.opacity, self.mean_free_path, self.refractive_index)
+
+
+def mean_free_path(density: Arrayable, cross_section: Arrayable) -> Float[Array, ""]:
+    """Mean free path λ = 1 / (√2 n σ), world length (Lee, Kwon and Shin 2016, after Maxwell and Boltzmann).
+
+    Args:
+        density: n, scatterers per volume, 1/length³, > 0.
+        cross_section: σ, the effective area of each, length², > 0.
+
+    Returns:
+        The mean distance between scatterings, for `Material`.
+
+    Raises:
+        ValueError: for numbers that are not above 0 or not finite.
+    """
+    n, area = number("density", density, above=0), number("cross_section", cross_section, above=0)
+    return 1 / (math.sqrt(2) * n * area)
 
 
 def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:

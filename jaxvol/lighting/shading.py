@@ -129,6 +129,11 @@ class Lighting(eqx.Module):
         return False
 
     @property
+    def reads_value(self) -> bool:
+        """Whether samples read the volume's value, so that it must have one channel. By default so."""
+        return True
+
+    @property
     def farthest_read(self) -> float | None:
         """Distance from a sample, world length, up to which its shading reads the volume. By default None:
         unknown, or unbounded."""

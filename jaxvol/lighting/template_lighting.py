@@ -102,14 +102,15 @@ class ScattererTemplates(Lighting):
     show, since invisible points are not lit.
 
     Args:
-        materials: one or several. Where two overlap, the first counts.
+        materials: one or several. Where two overlap, the first counts. In a volume of colours
+            (`RadianceField`), they are distinguished by labels.
         lights: one or several, of any kind but `HeadLight`.
-        templates: number per material, by default 8, of which each pixel uses one, chosen at random (the
-            paper does not say which). A single one has no noise, takes less time, and is lopsided in the same
-            way everywhere. With `"transport"`, each node of the grid uses one of 256, by default, and more
-            take no more time.
-        blend: use all templates for every sample, instead. This has less noise, and takes as much longer as
-            there are templates.
+        templates: number per material, by default 8, of which each pixel uses one, chosen at random, which
+            shows as noise (the paper blends them). A single one has no noise, takes less time, and is
+            lopsided in the same way everywhere. With `"transport"`, each node of the grid uses one of 256, by
+            default, and more take no more time.
+        blend: use all templates for every sample, instead, as the paper does against noise. This has less
+            noise, and takes as much longer as there are templates.
         photons: keep this many of each template's brightest photons, scaled to the energy of all. By default
             all.
         occlusion: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
@@ -224,6 +225,10 @@ class ScattererTemplates(Lighting):
                 )
             self.templates, self.levels, available = shape[1], (), shape[-1]
         self.photons = available if photons is None else min(available, integer("photons", photons, 1))
+
+    @property
+    def reads_value(self) -> bool:
+        return any(material.values is not None for material in self.materials)
 
     @property
     def farthest_read(self) -> float | None:

@@ -41,7 +41,8 @@ class RadianceField(Transfer):
 
     Gradients reach all channels (`Volume.data`), in every adjoint; but see `SpaceLeaping` about what is leapt
     over.
-    `quadrature="preintegrated"`, modes that compare values and lightings are refused, as they need one value.
+    `quadrature="preintegrated"`, modes that compare values and lightings are refused, as they need one value;
+    but for `ScattererTemplates` whose materials have no `values`, but labels.
 
     Source: Mildenhall et al. 2020; activation behind interpolation: Sun et al. 2022 (DVGO).
 

@@ -25,6 +25,7 @@ from jaxvol.lighting.materials import materials_of
 from jaxvol.lighting.packet_tree import PacketTree
 from jaxvol.lighting.template_lighting import with_baked_light
 
+from ..scenes import slow
 from .samples import shaded
 
 
@@ -49,6 +50,12 @@ def render_far_away():
     camera = jv.Camera.looking_at(volume, size=(2, 2))
     away = ScattererTemplate(jnp.ones((1, 1, 2, 3)), jnp.ones((1, 1, 2)))
     jv.render(volume, TRANSFER, camera, jv.March(0.05), lighting=lit(given=away)())
+
+
+def render_colors(lighting):
+    volume = jv.Volume(np.zeros((4, 4, 4, 4), np.float32), labels=np.zeros((4, 4, 4), np.uint8))
+    camera = jv.Camera.looking_at(volume, size=(3, 2))
+    return jv.render(volume, jv.RadianceField(), camera, jv.March(0.1), lighting=lighting).rgba
 
 
 BAD = {
@@ -136,6 +143,14 @@ BAD = {
         lambda: Phong(ConstantLight()),
         "lights must hold jaxvol lights, of any kind but ConstantLight",
     ),
+    "colours whose materials are values": (
+        lambda: render_colors(lit(Material(0.5, 1.0, values=(0, 1)))()),
+        "lighting: a ScattererTemplates needs a single volume of one channel",
+    ),
+    "colours by Phong": (
+        lambda: render_colors(Phong()),
+        "lighting: a Phong needs a single volume of one channel",
+    ),
     "Phong without lights": (lambda: Phong(()), "lights must be"),
     "Phong by a name": (lambda: Phong("sun"), "lights must be"),
     "ambient": (lambda: Phong(ambient=-0.1), "ambient must not be negative"),
@@ -150,6 +165,12 @@ def test_bad_input_is_named(case):
     make, message = BAD[case]
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.parametrize("form", ["published", *slow("transport")])
+def test_volumes_of_colours_are_lit_if_materials_are_labels(form):
+    lighting = lit(Material(0.5, 1.0, label=1), form=form)()
+    assert jax.eval_shape(lambda: render_colors(lighting)).shape == (2, 3, 4)
 
 
 def test_the_threshold_that_is_advised_leaves_photons():

@@ -36,6 +36,9 @@ LIGHTS = (
 MATERIALS = Material(0.5, 0.15, 1.4, values=(0.0, 0.5)), Material(0.8, 0.1, 1.5, values=(0.5, 2.0))
 
 
+LABELLED = Material(0.5, 0.15, 1.4, label=1), Material(0.8, 0.1, 1.5, label=2)
+
+
 LEAVES = {
     "opacity": lambda s: s[4].materials[0].opacity,
     "mean free path": lambda s: s[4].materials[0].mean_free_path,
@@ -52,9 +55,10 @@ LEAVES = {
 }
 
 
-def test_gradients_match_central_differences():
+@pytest.mark.parametrize("colors", [False, True])
+def test_gradients_match_central_differences(colors):
     """Of all inputs, through the growth of the templates; of a small volume, since a piecewise linear field
-    has many kinks."""
+    has many kinks. Of a volume of values, and of one of colours with labels."""
     with in_float64():
         noise, transfer = anisotropic_noise(), soft_transfer()
         volume = jv.Volume(np.asarray(noise.data)[:6, :5, :7], (0.3, 0.4, 0.25), (-0.5, 0.2, 0.1))
@@ -64,14 +68,22 @@ def test_gradients_match_central_differences():
         camera = jv.Camera((1.9, -1.3, 1.7), np.asarray(volume.center), (0.1, 0, 1), 40.0, size=(6, 5))
         march = jv.March(0.21, (jv.AlphaCorrection(),), "midpoint")
         how: Any = {"templates": 2, "packets": 2, "photons": 4, "reach": (2.0,), "seed": 5}
-        scene = in_double((volume, transfer, camera, march, ScattererTemplates(MATERIALS, LIGHTS, **how)))
+        materials, leaves = MATERIALS, LEAVES
+        if colors:
+            data = np.random.default_rng(2).uniform(0.2, 0.9, (*volume.shape, 4))
+            labels = np.random.default_rng(3).integers(0, 3, volume.shape, np.uint8)
+            volume = jv.Volume(data, volume.spacing, volume.origin, labels=labels)
+            materials, transfer = LABELLED, jv.RadianceField(2.0)
+            leaves = {name: of for name, of in LEAVES.items() if name not in ("colors", "extinction")}
+            leaves["scale"] = lambda s: s[1].scale
+        scene = in_double((volume, transfer, camera, march, ScattererTemplates(materials, LIGHTS, **how)))
         weights = jnp.asarray(np.random.default_rng(5).normal(size=(5, 6, 4)))
 
         def loss(scene):
             return jnp.sum(jv.render(*scene[:4], lighting=scene[4]).rgba * weights)
 
         program = eqx.filter_jit(eqx.filter_value_and_grad(loss))
-        check_gradient(program, scene, LEAVES, step=2e-8, rtol=1e-5, atol=1e-6, least=1e-5)
+        check_gradient(program, scene, leaves, step=2e-8, rtol=1e-5, atol=1e-6, least=1e-5)
 
 
 def test_the_gradient_at_default_settings_is_that_of_the_reference():

@@ -98,6 +98,24 @@ def lighting_of(occlusion, photons=PAIR, *, cutoff=1e-6, materials=MATERIALS, **
     return ScattererTemplates(materials, lights(**of_lights), **how)
 
 
+LABELLED = tuple(
+    Material(each.opacity, each.mean_free_path, each.refractive_index, label=label)
+    for label, each in enumerate(MATERIALS, 1)
+)
+"""The materials by labels, as volumes of colours need them."""
+
+
+def colored_middle(lighting, places):
+    """The lit colour of the node at the origin of a volume that stores the colours and extinctions of `nodes`
+    and the labels of `LABELLED`."""
+    plain, points = nodes(dict(places)), np.asarray(list(SEEN), np.float32)
+    values, stored = np.asarray(plain.data), np.asarray([(*c, e) for c, e in SEEN.values()], np.float32)
+    data = stored[np.argmin(abs(values[..., None] - points), axis=-1)]
+    labels = np.select([(values > 0.9) & (values < 1.3), (values > 1.9) & (values < 2.3)], [1, 2])
+    volume = jv.Volume(data, origin=plain.origin, labels=labels.astype(np.uint8))
+    return colors_of(lighting, volume, jv.RadianceField(), [(0, 0, 0)])[0]
+
+
 def middle(lighting, places=(), transmittance=1.0):
     """The lit colour of the node at the origin."""
     return colors_of(lighting, nodes(dict(places)), TRANSFER, [(0, 0, 0)], transmittance)[0]
@@ -142,12 +160,15 @@ STEPS: dict[str, tuple[Any, ...]] = {
 }
 
 
+@pytest.mark.parametrize("colors", [False, True])
 @FORMS
-def test_each_step_is_that_of_the_paper(occlusion):
+def test_each_step_is_that_of_the_paper(occlusion, colors):
+    """In a volume of values, and in one of colours with labels, such as the paper's photographs of a body."""
+    seen, materials = (colored_middle, LABELLED) if colors else (middle, MATERIALS)
     for name, (places, light, hard, soft) in STEPS.items():
         brightness, inner = hard if occlusion == "hard" else soft
         arriving = POWER * (np.pi if "sky" in light else 1)
-        found = middle(lighting_of(occlusion, **light), places)
+        found = seen(lighting_of(occlusion, materials=materials, **light), places)
         same(found, arriving * brightness * (COLOR[SKIN] + inner), name)
 
 

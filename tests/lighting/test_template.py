@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxvol as jv
 from experiments.printed_templates import PrintedTree
 from jaxvol.lighting import (
     DirectionalLight,
     Material,
     ScattererTemplate,
     ScattererTemplates,
+    mean_free_path,
     scatterer_template,
     scatterer_templates,
 )
@@ -302,7 +304,38 @@ def test_gradients_match_central_differences_and_photons_do_not_appear_at_once()
         assert seen(jnp.asarray([0.4, 0.8, 1.0]))[1][2] == 0
 
 
+def test_a_material_that_takes_its_opacity_from_the_transfer_function_has_its_gradient():
+    """The paper's T(d), as the docstring of `Material` has it; against central differences."""
+    with in_float64():
+
+        @jax.jit
+        @jax.value_and_grad
+        def seen(extinction):
+            transfer, path = jv.TransferFunction((0.0, 1.0, 2.0), np.ones((3, 3)), extinction), 0.8
+            material = Material(-jnp.expm1(-transfer(jnp.asarray(0.7))[1] * path), path, 1.3)
+            template = scatterer_template(material, 0, packets=2, threshold=0.11, levels=2, merge=0)
+            waves = jnp.sin(template.offset @ jnp.asarray([0.7, -1.1, 0.4]) + 0.3)
+            return material.optics.reflectance * jnp.sum(template.intensity * waves)
+
+        at, step = np.array([0.4, 0.9, 3.0]), 1e-6
+        slope = np.asarray(seen(jnp.asarray(at))[1])
+        for h in step * np.eye(3):
+            difference = float(seen(jnp.asarray(at + h))[0] - seen(jnp.asarray(at - h))[0]) / (2 * step)
+            np.testing.assert_allclose(slope @ h / step, difference, rtol=1e-5, atol=1e-9)
+        assert np.abs(slope[:2]).min() > 1e-3
+        assert slope[2] == 0  # 0.7 lies between the first two points
+
+
 # ---------------------------------------------------------------- materials
+
+
+def test_a_mean_free_path_follows_from_how_many_scatterers_there_are():
+    """Maxwell's: air at 0 °C, 2.69e25 molecules a cubic metre of 0.37 nm diameter, has 61 nm."""
+    section = math.pi * 0.37e-9**2
+    np.testing.assert_allclose(mean_free_path(2.69e25, section), 61e-9, rtol=0.01)
+    for density, section in ((-1.0, 1.0), (1.0, 0.0), (np.nan, 1.0)):
+        with pytest.raises(ValueError, match="must be"):
+            mean_free_path(density, section)
 
 
 def test_templates_take_no_memory_to_speak_of():
