@@ -81,7 +81,8 @@ def places(traversal: Traversal) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Where the cells of rays begin, (*rays, cells): whether in the volume, in which column of bricks, and at
     which node along γ."""
     bricks, rays, step = traversal.grid, traversal.rays, float(traversal.scene.march.step)
-    depths = jnp.arange(math.ceil(float(rays.length.max()) / step) + 1) * step
+    number = math.ceil(float(rays.length.max()) / step) + 1
+    depths = jnp.asarray(step * np.arange(number), rays.length.dtype)
     inside, *coordinate = (np.moveaxis(np.asarray(each), 0, -1) for each in located(rays, depths))
     beta, sigma = (
         np.clip(np.nan_to_num(along) // size, 0, count - 1).astype(int)

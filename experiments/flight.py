@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 import jaxvol as jv
 
 from . import charts
-from .harness import chosen_scenes, experiment, frame, some_of
+from .harness import chosen_scenes, experiment, image, some_of
 from .minimum_distance import PHANTOM, PUBLISHED, SCENES, march, wrong
 from .ray_leaps import Marcher, Saved, grid_of
 from .scenes import Scene
@@ -112,8 +112,8 @@ def by_angle(rays: np.ndarray) -> dict[str, list[float]]:
 
 def spoiled(scene: Scene, cells: Sequence[int]) -> dict[str, float]:
     """Share of wrong pixels in the engine's image, by R."""
-    reference = frame(scene, march(scene))
-    images = {cell: frame(scene, march(scene, jv.SpaceLeaping(PUBLISHED, cell, block=1))) for cell in cells}
+    reference = image(scene, march(scene))
+    images = {cell: image(scene, march(scene, jv.SpaceLeaping(PUBLISHED, cell, block=1))) for cell in cells}
     return {str(cell): float(np.mean(wrong(found, reference))) for cell, found in images.items()}
 
 

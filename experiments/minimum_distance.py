@@ -19,15 +19,17 @@ steps of a voxel and of a quarter: what starts save of both is what they could s
 
 from argparse import Namespace
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import jaxvol as jv
+from jaxvol.metrics import rmse
 
-from . import charts, harness, timing
-from .harness import chosen_scenes, experiment, frame, some_of
+from . import charts, harness, marches, timing
+from .harness import chosen_scenes, experiment, recorded, some_of
 from .ray_leaps import Marcher, Saved, grid_of
 from .scenes import AIRWAY, OF_AIRWAY, SCENES as OUTSIDE, Scene, inside
 
@@ -96,7 +98,7 @@ def named(method: str, cell: int) -> str:
 
 
 def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, dict[str, Any]]:
-    """Time, error and wrong pixels of a scene's frame under every method."""
+    """Time, error and wrong pixels of a scene's image under every method."""
     leaps = {MAP: jv.SpaceLeaping("distance"), HIERARCHY: jv.SpaceLeaping(HIERARCHY)}
     leaps[OF_TWO] = jv.SpaceLeaping("distance", block=2)
     leaps[VOXELS] = jv.SpaceLeaping("distance", block=1)
@@ -104,12 +106,18 @@ def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, d
         leaps |= {named(method, cell): jv.SpaceLeaping(method, cell) for method in (PUBLISHED, PROVEN)}
         leaps[named(OF_VOXELS, cell)] = jv.SpaceLeaping(PUBLISHED, cell, block=1)
     under = {name: march(scene, each) for name, each in leaps.items()} | {NONE: march(scene)}
-    rows = harness.compare(scene, under, repetitions)
-    reference = frame(scene, under[NONE])
-    for name, row in rows.items():
-        row["wrong"] = float(np.mean(wrong(frame(scene, under[name]), reference)))
+    drawn = {name: partial(harness.image, scene, each) for name, each in under.items()}
+    seconds = timing.interleaved(drawn, repetitions)
+    images = {name: draw() for name, draw in drawn.items()}
+    truth = harness.image(scene, marches.converged(scene.step, harness.FINER)).rgba
+    rows = {}
+    for name, found in images.items():
         base = VOXELS if name.startswith(OF_VOXELS) else MAP
-        row["speed-up"] = timing.ratio(rows[base]["all seconds"], row["all seconds"])
+        rows[name] = {
+            **harness.row(seconds[name], seconds[MAP], rmse(found.rgba, truth)),
+            "wrong": float(np.mean(wrong(found, images[NONE]))),
+            "speed-up": timing.ratio(seconds[base], seconds[name]),
+        }
     return rows
 
 
@@ -174,7 +182,9 @@ def draw_counts(panel: Any, cells: Sequence[int], counts: dict[str, Any]) -> Non
     quick={"size": 64, "repetitions": 2, "cells": (8, 32), "resolution": 48},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
-    scenes, counts = {}, {}
+    others = [name for name in SCENES if name not in chosen.only]
+    same = {"cells": list(chosen.cells)}
+    scenes, counts = (recorded(chosen, part, others, same) for part in ("scenes", "counts"))
     for name, scene in chosen_scenes(chosen, SCENES, PHANTOM, chosen.size):
         scenes[name] = measure(scene, chosen.cells, chosen.repetitions)
         finer = {WHOLE: scene, QUARTER: scene._replace(step=scene.step / 4)}
