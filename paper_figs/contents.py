@@ -45,7 +45,7 @@ class Entry:
         return f"{self.name}.{'md' if self.name in TABLES else 'webp'}"
 
 
-TABLES = "table1", "kim_table1", "kisti_table", "lee_tables"
+TABLES = "table1", "kim_table1", "kim_once", "kisti_table", "lee_tables"
 """Those that are tables, in Markdown."""
 
 ENTRIES = (
