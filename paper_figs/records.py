@@ -171,8 +171,8 @@ def kim_table1(result: dict[str, Any]) -> str:
 
 
 def kim_once(result: dict[str, Any]) -> str:
-    """A row for each split and view: what is incomplete and wrong if bricks are read once, by overlap, and what
-    is read, by ours, too."""
+    """A row for each split and view: what is incomplete and wrong if bricks are read once, by overlap, and
+    what is read, by ours, too."""
     ways, ours = (NONE, PRINTED, FORMULA), METHODS[:2]
     head = [
         "β, σ, γ",
