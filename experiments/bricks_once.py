@@ -33,7 +33,7 @@ from .scan_conversion import BODY
 
 NONE, FORMULA, PRINTED = "no overlap", "K*", "overlap as printed"
 SPLITS: tuple[Split, ...] = ((2, 2, 1), (2, 1, 2), (1, 1, 4), (2, 2, 2), (2, 4, 2), (2, 2, 4))
-ASKED = "voxels asked for at the paper's size, times the volume"
+ASKED = "voxels asked for of the paper's, times the volume"
 LIMIT = 1 / 255
 
 
@@ -140,12 +140,8 @@ def main(chosen: Namespace) -> dict[str, Any]:
         paper = extensions(probe(), large, split)
         methods: dict[str, Any] = {n: EachOnce(ext) for n, ext in extensions(scan, bricks, split).items()}
         methods |= {"overlap": "overlap", "reload": "reload"}
-        rows[named(split)] = {
-            "voxels asked for of the paper's, times the volume": {
-                n: asked(large, ext) for n, ext in paper.items()
-            },
-            "views": {view: {} for view in EYES},
-        }
+        sizes = {name: asked(large, extension) for name, extension in paper.items()}
+        rows[named(split)] = {ASKED: sizes, "views": {view: {} for view in EYES}}
         for (view, whole), (name, method) in ((v, m) for v in wholes.items() for m in methods.items()):
             how: dict[str, Any] = {"bricks": split, "method": method, "outputs": "rgba"}
             found = jv.render_bricks(*scene, camera(view, chosen.size), march, **how)

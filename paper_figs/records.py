@@ -171,8 +171,8 @@ def kim_table1(result: dict[str, Any]) -> str:
 
 
 def kim_once(result: dict[str, Any]) -> str:
-    """A row for each split and view: what is incomplete and wrong if bricks are read once, by overlap, and
-    what is read, by ours, too."""
+    """A row for each split and view in which bricks read once without overlap leave rays incomplete: what is
+    incomplete and wrong, by overlap, and what is read, by ours, too."""
     ways, ours = (NONE, PRINTED, FORMULA), METHODS[:2]
     head = [
         "β, σ, γ",
@@ -186,6 +186,8 @@ def kim_once(result: dict[str, Any]) -> str:
     lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for name, row in result["splits"].items():
         for view, found in row["views"].items():
+            if not found[NONE]["incomplete rays"]:
+                continue
             percent = [
                 " / ".join(f"{100 * found[way][what]:.2f}" for way in ways)
                 for what in ("incomplete rays", "wrong pixels")
