@@ -81,7 +81,7 @@ def vessels(folder: Path, size: int, resolution: int) -> Scene:
 
 WHOLE, QUARTER = "steps of a voxel", "of a quarter"
 PHANTOM = "colon phantom"
-SCENES: dict[str, Callable[..., Scene]] = {"airway": airway, "vessels": vessels, PHANTOM: colon}
+SCENES: dict[str, Callable[..., Scene]] = {"airway": airway, PHANTOM: colon}
 
 
 def march(scene: Scene, *leaps: jv.SpaceLeaping) -> jv.March:
