@@ -171,7 +171,7 @@ def draw_counts(panel: Any, cells: Sequence[int], counts: dict[str, Any]) -> Non
             left = [100 * (1 - counts[steps]["saved"][str(cell)][part]) for cell in cells]
             label = f"{'leaps and samples' if part == 'both' else part}, {steps}"
             panel.plot(cells, left, style + line, label=label)
-    panel.set_ylim(0, 100)
+    panel.set_ylim(0, 140)  # with room for a legend
 
 
 @experiment(

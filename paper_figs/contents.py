@@ -138,9 +138,10 @@ ENTRIES = (
         "Fig. 5: time against the size of the grid's cells",
         "At R = 8, 53 % less time than with the distance map alone, in CT of a colon of 512 x 512 x 541 "
         "voxels. Larger and smaller cells gain less.",
-        "The cross is the paper's number. Ours, off a distance map of voxels (orange points against the "
-        "orange line), gains 19 % in both: that map alone leaves little to gain. Bars are 95 % intervals of "
-        "medians of few runs, so that a median may be at their end.",
+        "The cross is the paper's number. Counted per ray (below), R = 8 saves most of leaps and samples, 57 "
+        "and 59 %; in CPU time, off a distance map of voxels (orange points against the orange line), 16 and "
+        "9 %, beside other programs. Bars are 95 % intervals of medians of few runs, so that a median may be "
+        "at their end.",
         "minimum_distance",
     ),
     Entry(
@@ -148,8 +149,8 @@ ENTRIES = (
         "chae",
         "Fig. 6: images against the size of the grid's cells",
         "R = 8 and 16 look like the reference; R = 32 distorts visibly.",
-        "Wrong pixels are green. At R = 32 and 64 parts of folds are missing: the method is not "
-        "conservative. In CT of an airway, the last row, no pixel is wrong.",
+        "Wrong pixels are green. At R = 32 part of a fold is missing: the method is not conservative. In CT "
+        "of an airway no pixel is wrong; of vessels, in the last rows, pieces are missing from R = 8 on.",
         data=True,
     ),
     Entry(

@@ -91,20 +91,21 @@ def chae_fig5(result: dict[str, Any], path: Path) -> None:
             panel.errorbar(cells, median, ends, fmt=style, markersize=4, capsize=3, label=method)
         for cell in cells:
             wrong = 100 * rows[named(PUBLISHED, cell)]["wrong"]
-            panel.text(cell, 0.03, f"{wrong:.2g} %", ha="center", color="C3")
+            share = f"{wrong:.2g}" if wrong >= 1e-3 or not wrong else "< 0.001"
+            panel.text(cell, 0.03, f"{share} %", ha="center", color="C3", size="small")
         for method, color, line in ((MAP, "k", "--"), (VOXELS, "C1", "--"), (HIERARCHY, "C2", "-.")):
             panel.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
         off = rows[VOXELS]["ratio"]["median"] * CHAE[1]  # the paper's map is one of voxels
         panel.plot(CHAE[0], off, "kx", markersize=8, label="the paper, off the map of voxels")
         charts.numbered(panel, cells)
-        panel.set(xlim=(1.7, 95), ylim=(0, 1.25), xlabel="R, side of the grid's cells, pixels")
+        panel.set(xlim=(1.7, 95), ylim=(0, 1.6), xlabel="R, side of the grid's cells, pixels")
         panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map")
         draw_counts(left, cells, result["counts"][scene])
         charts.numbered(left, cells)
         left.set(xlim=(1.7, 95), xlabel="R, side of the grid's cells, pixels")
-    axes[0].set_ylabel("time / that by the distance map")
+    axes[0].set_ylabel("CPU time / that by the distance map")
     below[0].set_ylabel("left of those by the map of voxels, %")
-    below[0].legend()
+    below[0].legend(loc="upper center")
     figure.suptitle("Bars: 95 % intervals. Red numbers: wrong pixels under min_distance")
     charts.legend_below(figure, axes[0], 3)
     charts.save(figure, path)
