@@ -138,7 +138,7 @@ def draw(result: dict[str, Any]) -> Any:
     scenes, cells = result["scenes"], result["cells"]
     figure, axes = charts.panels(len(scenes), 4, 16, 3.2 * len(scenes) + 0.6, sharey="col")
     labels = (
-        "time / that by the distance map",
+        "CPU time / that by the distance map",
         "leaps, samples left, %",
         "wrong pixels (> 1/255), %",
         "RMSE of the image",
