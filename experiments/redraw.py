@@ -21,13 +21,14 @@ OTHERS = {
     *(
         "adaptive_error",
         "bricks",
+        "bricks_once",
         "compare",
         "compare_avx512",
         "compare_gpu",
         "compare_small",
         "compare_untuned",
     ),
-    *("gradient_agreement", "gradient_agreement_gpu", "out_of_core", "probe_geometry", "shading"),
+    *("gradient_agreement", "gradient_agreement_gpu", "octree", "out_of_core", "probe_geometry", "shading"),
     *("viewer_latency", "visible_shading"),
 }
 """Records without a chart."""

@@ -16,17 +16,22 @@ import numpy as np
 Name = TypeVar("Name", bound=Hashable)
 
 
-def interleaved(programs: dict[Name, Callable[[], Any]], repetitions: int) -> dict[Name, list[float]]:
+def interleaved(
+    programs: dict[Name, Callable[[], Any]],
+    repetitions: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[Name, list[float]]:
     """Seconds of every run of every program, warm: one run of each to compile it, then rounds of one run
-    each, in an order that is reversed from one round to the next."""
+    each, in an order that is reversed from one round to the next. By `time.process_time`, CPU seconds, which
+    other programs on the machine disturb less."""
     for program in programs.values():
         jax.block_until_ready(program())
     seconds: dict[Name, list[float]] = {name: [] for name in programs}
     for repetition in range(repetitions):
         for name in list(programs)[:: 1 if repetition % 2 == 0 else -1]:
-            start = time.perf_counter()
+            start = clock()
             jax.block_until_ready(programs[name]())
-            seconds[name].append(time.perf_counter() - start)
+            seconds[name].append(clock() - start)
     return seconds
 
 

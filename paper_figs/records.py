@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments import charts, templates
+from experiments import charts, flight, templates
+from experiments.bricks_once import ASKED, FORMULA, NONE, PRINTED
 from experiments.harness import Main
 from experiments.kisti import (
     BOTH as ERT_AND_ESS,
@@ -19,7 +20,16 @@ from experiments.kisti import (
     SKIPPED,
 )
 from experiments.marches import BOTH, EMPTY, JITTER, PLAIN
-from experiments.minimum_distance import HIERARCHY, MAP, OF_VOXELS, PROVEN, PUBLISHED, VOXELS, named
+from experiments.minimum_distance import (
+    HIERARCHY,
+    MAP,
+    OF_VOXELS,
+    PROVEN,
+    PUBLISHED,
+    VOXELS,
+    draw_counts,
+    named,
+)
 
 from .common import from_record, table_from_record
 
@@ -69,10 +79,11 @@ CHAE = 8, 0.47  # R, time over that of the distance map
 
 
 def chae_fig5(result: dict[str, Any], path: Path) -> None:
-    """A panel for each scene; below the points of the published method, their shares of wrong pixels."""
+    """A column for each scene: times, and below the points of the published method their shares of wrong
+    pixels; and what starts leave of leaps and samples."""
     scenes, cells = result["scenes"], result["cells"]
-    figure, (axes,) = charts.panels(1, len(scenes), 4.4 * len(scenes), 4.4, sharey=True)
-    for panel, (scene, rows) in zip(axes, scenes.items(), strict=True):
+    figure, (axes, below) = charts.panels(2, len(scenes), 4.4 * len(scenes), 7.6, sharey="row")
+    for panel, left, (scene, rows) in zip(axes, below, scenes.items(), strict=True):
         for method, style in ((PUBLISHED, "C3o-"), (OF_VOXELS, "C1^-"), (PROVEN, "C0s-")):
             ratios = [rows[named(method, cell)]["ratio"] for cell in cells]
             median = np.array([r["median"] for r in ratios])
@@ -80,18 +91,28 @@ def chae_fig5(result: dict[str, Any], path: Path) -> None:
             panel.errorbar(cells, median, ends, fmt=style, markersize=4, capsize=3, label=method)
         for cell in cells:
             wrong = 100 * rows[named(PUBLISHED, cell)]["wrong"]
-            panel.text(cell, 0.03, f"{wrong:.2g} %", ha="center", color="C3")
+            share = f"{wrong:.2g}" if wrong >= 1e-3 or not wrong else "< 0.001"
+            panel.text(cell, 0.03, f"{share} %", ha="center", color="C3", size="small")
         for method, color, line in ((MAP, "k", "--"), (VOXELS, "C1", "--"), (HIERARCHY, "C2", "-.")):
             panel.axhline(rows[method]["ratio"]["median"], color=color, linestyle=line, label=method)
         off = rows[VOXELS]["ratio"]["median"] * CHAE[1]  # the paper's map is one of voxels
         panel.plot(CHAE[0], off, "kx", markersize=8, label="the paper, off the map of voxels")
         charts.numbered(panel, cells)
-        panel.set(xlim=(2.7, 95), ylim=(0, 1.25), xlabel="R, side of the grid's cells, pixels")
+        panel.set(xlim=(1.7, 95), ylim=(0, 1.6), xlabel="R, side of the grid's cells, pixels")
         panel.set_title(f"{scene}: {rows[MAP]['seconds'] * 1e3:.0f} ms by the distance map")
-    axes[0].set_ylabel("time / that by the distance map")
+        draw_counts(left, cells, result["counts"][scene])
+        charts.numbered(left, cells)
+        left.set(xlim=(1.7, 95), xlabel="R, side of the grid's cells, pixels")
+    axes[0].set_ylabel("CPU time / that by the distance map")
+    below[0].set_ylabel("left of those by the map of voxels, %")
+    below[0].legend(loc="upper center")
     figure.suptitle("Bars: 95 % intervals. Red numbers: wrong pixels under min_distance")
     charts.legend_below(figure, axes[0], 3)
     charts.save(figure, path)
+
+
+def chae_fig1(result: dict[str, Any], path: Path) -> None:
+    charts.save(flight.draw(result), path)
 
 
 # -- Kim, Kwon and Shin 2008
@@ -148,6 +169,38 @@ def kim_rows(result: dict[str, Any], condition: str) -> str:
 def kim_table1(result: dict[str, Any]) -> str:
     """A table for each condition."""
     return "\n".join(kim_rows(result, condition) for condition in result["conditions"])
+
+
+def kim_once(result: dict[str, Any]) -> str:
+    """A row for each split and view in which bricks read once without overlap leave rays incomplete: what is
+    incomplete and wrong, by overlap, and what is read, by ours, too."""
+    ways, ours = (NONE, PRINTED, FORMULA), METHODS[:2]
+    head = [
+        "β, σ, γ",
+        "from",
+        "incomplete rays %: " + " / ".join(ways),
+        "wrong pixels %",
+        "read, times the volume: " + " / ".join((*ways, *ours)),
+        "loads: " + " / ".join((*ways, *ours)),
+        "at the paper's size: " + " / ".join(ways),
+    ]
+    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for name, row in result["splits"].items():
+        for view, found in row["views"].items():
+            if not found[NONE]["incomplete rays"]:
+                continue
+            percent = [
+                " / ".join(f"{100 * found[way][what]:.2f}" for way in ways)
+                for what in ("incomplete rays", "wrong pixels")
+            ]
+            reads = [
+                " / ".join(format(found[way][what], form) for way in (*ways, *ours))
+                for what, form in (("read, times the volume", ".2f"), ("loads", "d"))
+            ]
+            asked = " / ".join(f"{row[ASKED][way]:.3f}" for way in ways)
+            cells = [name.replace(",", " × "), view, *percent, *reads, asked]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
 
 
 BEST = "2,4,2"
@@ -297,8 +350,10 @@ def lee_fig1(result: dict[str, Any], path: Path) -> None:
 
 RECORDS: dict[str, Main] = {
     "table1": table_from_record("table1", "overhead", table1),
+    "chae_fig1": from_record("chae_fig1.webp", "flight", chae_fig1),
     "chae_fig5": from_record("chae_fig5.webp", "minimum_distance", chae_fig5),
     "kim_table1": table_from_record("kim_table1", "bricks", kim_table1),
+    "kim_once": table_from_record("kim_once", "bricks_once", kim_once),
     "kim_fig9": from_record("kim_fig9.webp", "bricks", kim_fig9),
     "kisti_table": table_from_record("kisti_table", "kisti", kisti_table),
     "lee_fig1": from_record("lee_fig1.webp", "templates", lee_fig1),

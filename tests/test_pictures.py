@@ -12,7 +12,7 @@ DRAWN = "docs", "docs/pictures", "paper_figs/output", "experiments/results"
 LEAST = 256
 
 PANELS = {
-    "paper_figs/output/chae_fig6.webp": (5, 3),
+    "paper_figs/output/chae_fig6.webp": (5, 5),
     "paper_figs/output/fig01.webp": (2, 4),
     "paper_figs/output/fig09.webp": (4, 4),
     "paper_figs/output/fig10.webp": (4, 4),
@@ -20,7 +20,7 @@ PANELS = {
     "paper_figs/output/fig12.webp": (4, 4),
     "paper_figs/output/fig13.webp": (4, 1),
     "paper_figs/output/gallery.webp": (4, 7),
-    "paper_figs/output/kim_fig8.webp": (3, 2),
+    "paper_figs/output/kim_fig8.webp": (5, 2),
     "paper_figs/output/kisti_fig.webp": (4, 2),
     "paper_figs/output/kye_conditions.webp": (4, 4),
     "paper_figs/output/lee_fig4.webp": (3, 2),

@@ -21,7 +21,7 @@ RELATIVE, ABSOLUTE = 0.1, 2e-5
 
 PROMISED = sorted(name for name, entry in atlas.ENTRIES.items() if entry.outcome != "documented")
 """Entries in which jaxvol holds, or says that it does not; the others only show where a method ends."""
-QUICK = ["rays that run out of samples"]
+QUICK = ["distance maps along a wall", "rays that run out of samples"]
 
 
 @pytest.mark.parametrize("name", [*QUICK, *slow(*(name for name in PROMISED if name not in QUICK))])

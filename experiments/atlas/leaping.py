@@ -9,7 +9,8 @@ from jaxtyping import Array
 
 import jaxvol as jv
 
-from ..scenes import on_cube
+from ..ray_leaps import Marcher, grid_of
+from ..scenes import Scene, on_cube
 from .entry import LEVEL, colors, entry
 
 
@@ -73,6 +74,41 @@ def sheets_thinner_than_a_cell_of_rays(ratio: float, size: int) -> dict[str, flo
         wrong = np.abs(sheet_image(ratio * cell, size, method, cell) - truth).max(axis=-1) > LEVEL
         found[f"{method}, R = {cell}"] = float(np.sum(wrong & sheet) / max(np.sum(sheet), 1))
     return found
+
+
+EYE, WALL = 16.0, 4.5
+"""Heights, voxels."""
+
+
+def above_a_wall(angle: float, size: int) -> Scene:
+    """A camera whose middle ray meets a flat wall at an angle, in degrees; steps of a voxel."""
+    line = np.clip(WALL + 0.5 - np.arange(24, dtype=np.float32), 0, 1)  # 1/2 at the height of the wall
+    volume = jv.Volume(np.broadcast_to(line, (384, 16, 24)).copy())
+    turn, eye = np.radians(angle), (4.0, 7.5, EYE)
+    target = 4 + np.cos(turn), 7.5, EYE - np.sin(turn)
+    camera = jv.Camera(eye, target, (0, 1, 0), 0.5, size=(size, size))
+    return Scene(volume, jv.TransferFunction([0.5, 0.51], [RED, RED], [0.0, 50.0]), camera, 1.0)
+
+
+@entry(
+    "jaxvol.SpaceLeaping",
+    "angle between rays and wall, degrees",
+    (90.0, 60.0, 40.0, 20.0, 10.0, 5.0, 2.0),
+    "leaps of a ray",
+    "distance map",
+    limit=10.0,
+)
+def distance_maps_along_a_wall(angle: float, size: int) -> dict[str, float]:
+    """How flat may rays meet a wall before leaps by a distance map of voxels are many?
+
+    The nearest voxel is that of the wall, so that a ray at a small angle to it takes many short leaps; the
+    image stays right. Counted per ray. With "min_distance", rays begin where the nearest corner of a cell met
+    the wall, which saves most of these leaps; "hierarchy" leaps over the stretches of a beam instead."""
+    scene = above_a_wall(angle, size)
+    marcher = Marcher(scene)
+    alone = marcher.count(scene.camera)
+    started = marcher.count(scene.camera, grid_of(alone.hit, 8).start)
+    return {"distance map": float(alone.leaps.mean()), "min_distance, R = 8": float(started.leaps.mean())}
 
 
 def steep_image(ramp: float, size: int, low: float, *, leaps: bool) -> np.ndarray:

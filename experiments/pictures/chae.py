@@ -16,18 +16,20 @@ from . import BLACK, Panels, panel
 
 CELLS = (8, 16, 32, 64)
 WHOLE = 2  # size of the image over that of the part that is shown
-MIDDLE, OF_AIRWAY = (0.38, 0.52), (0.5, 0.5)
+MIDDLE, OF_AIRWAY, OF_VESSELS = (0.38, 0.52), (0.5, 0.5), (0.5, 0.5)
 GREEN = (0.0, 0.7, 0.05)
 
 
 def chae_fig6(chosen: Namespace) -> Panels:
     """A part of the image without leaping, and under growing cells. Below, wrong pixels are green, as in the
-    row of CT."""
+    row of CT; of vessels both."""
     rows = under_cells(minimum_distance.colon(None, chosen.size * WHOLE, chosen.resolution), MIDDLE, "colon")
     if chosen.data is None:
         return rows
     airway = minimum_distance.airway(chosen.data, chosen.size * WHOLE, chosen.resolution)
-    return [*rows, under_cells(airway, OF_AIRWAY, "CT airway")[1]]
+    vessels = minimum_distance.vessels(chosen.data, chosen.size * WHOLE, chosen.resolution)
+    rows.append(under_cells(airway, OF_AIRWAY, "CT airway")[1])
+    return [*rows, *under_cells(vessels, OF_VESSELS, "vessels")]
 
 
 def under_cells(scene: Scene, middle: tuple[float, float], name: str) -> Panels:

@@ -35,6 +35,7 @@ def test_the_tables_in_the_readme_are_those_of_the_kept_records():
     split = record.read(record.RESULTS / "bricks.json")["result"]
     for condition in split["conditions"]:
         assert records.kim_rows(split, condition) in text
+    assert records.kim_once(record.read(record.RESULTS / "bricks_once.json")["result"]) in text
     assert records.lee_tables(record.read(record.RESULTS / "templates.json")["result"]) in text
     measured = record.read(record.RESULTS / "kisti.json")["result"]
     for table in (records.speed_ups(measured, part) for part in ("shaded", "scenes")):

@@ -11,7 +11,8 @@ import pytest
 
 import jaxvol as jv
 from experiments.bricks import each_at_once
-from jaxvol.bricks import VoxelSource
+from experiments.bricks_once import EachOnce
+from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
 
 from .scenes import (
@@ -305,6 +306,40 @@ def test_the_naive_order_is_visibly_wrong():
     assert np.mean(wrong > 0.02) > 0.01
     # only the order is wrong: what is hidden behind what, not how much is
     np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
+
+
+@pytest.mark.slow
+def test_bricks_read_once_miss_rays_that_come_back_fewer_with_overlap():
+    """As published. Without overlap a ray is complete if it meets bricks in the order of their centres."""
+    data, transfer, probe = probe_fog(10.0, 20.0)
+    camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(24, 24))
+    march, grid = jv.March(0.5, (probe,)), BrickGrid(SCAN, (39, 47, 16))
+    one = jv.render(jv.Volume(data), transfer, camera, march, outputs="rgba")
+
+    def image(extension):
+        method = EachOnce(extension)
+        found = jv.render_bricks(
+            data, transfer, camera, march, bricks=(1, 1, 4), method=method, outputs="rgba"
+        )
+        return method.incomplete, float(np.mean(np.abs(found.rgba - one.rgba).max(-1) > 1 / 255))
+
+    origin, direction = (np.asarray(part).reshape(-1, 1, 3) for part in camera.rays())
+    points = probe.to_toroidal(origin + np.linspace(200, 400, 4001)[:, None] * direction)
+    ranges = np.array([probe.beta_range, probe.sigma_range, probe.gamma_range])
+    part = (np.asarray(points) - ranges[:, 0]) / np.ptp(ranges, axis=1)
+    inside = np.all((part >= 0) & (part <= 1), axis=-1)
+    middles = ranges.mean(1) + np.outer((np.arange(4) + 0.5) * 16 / 63 - 0.5, [0, 0, np.ptp(ranges[2])])
+    distances = np.linalg.norm(np.asarray(probe.to_world(middles)) - (300, 10, 55), axis=-1)
+    rank = np.argsort(np.argsort(distances))[np.clip(part[..., 2] * 63 // 16, 0, 3).astype(int)]
+    paths = [ranks[within] for ranks, within in zip(rank, inside, strict=True) if within.any()]
+    expected = np.mean([np.any(np.diff(path) < 0) for path in paths])
+    incomplete, wrong = image([0.0] * 3)
+    assert expected > 0.1
+    assert incomplete == pytest.approx(expected, abs=3 / len(paths))
+    assert wrong > 0.05
+    with_overlap = image(overlap_of(probe, grid))
+    assert with_overlap[0] < incomplete / 2
+    assert with_overlap[1] < wrong / 2
 
 
 @pytest.mark.slow

@@ -59,7 +59,8 @@ class SpaceLeaping(Transform):
     regions visible must start above 0, or not leap.
 
     Where it fails: `experiments/stability.py`, "sheets thinner than a cell of rays",
-    "occupancy under steep transfer functions", "gradients of what is leapt over".
+    "distance maps along a wall", "occupancy under steep transfer functions",
+    "gradients of what is leapt over".
 
     Raises:
         ValueError: for another method, a smaller cell, another block or one with another method. When
