@@ -12,7 +12,7 @@ FLAT = 1e-3
 
 
 def directions(subject: str, columns: np.ndarray) -> np.ndarray:
-    """Unit directions (columns), orthonormal up to shear. Raises `ValueError` for other or coplanar ones."""
+    """Unit directions (columns), made orthonormal unless sheared. Raises `ValueError` for other lengths."""
     lengths = np.linalg.norm(columns, axis=0)
     turn = columns / np.where(lengths > 0, lengths, 1)
     if not (np.all(np.abs(lengths - 1) <= ROUNDED) and abs(np.linalg.det(turn)) > FLAT):  # also for NaN

@@ -153,7 +153,7 @@ def increasing(name: str, value: Arrayable) -> Array:
         array,
         lambda v: (v[1:] >= v[:-1]).all() & (v[2:] > v[:-2]).all(),
         f"{name} must increase from point to point, but for two equal ones that make a step; got {{got}}. "
-        "Sort them, and keep at most two that are equal.",
+        "Sort them, and let no three be equal.",
     )
 
 
@@ -231,7 +231,5 @@ def check_answer(owner: object, method: str, answer: PyTree, expected: PyTree) -
         types = {leaf.dtype.name for leaf in jax.tree.leaves((answer, expected)) if hasattr(leaf, "dtype")}
         hint = ""
         if types >= {"float32", "float64"}:
-            hint = (
-                " Were the step, the camera or the volume made before jax_enable_x64 was set? Make all after."
-            )
+            hint = " Were the step, the camera or the volume made before jax_enable_x64 was set? Remake them."
         raise ValueError(f"{type(owner).__name__}.{method} must return {wanted}; got {returned}.{hint}")
