@@ -44,16 +44,13 @@ def save_image(
             hold, NaN, infinite colours, and a path that cannot be written.
     """
     if not isinstance(path, str | os.PathLike):
-        fault = f"path must be a str or a path; got {described(path)}"
-        raise ValueError(f"{fault}. It comes first, as in save_png(path, image).")
+        raise ValueError(f"path must be a str or a path; got {described(path)}. The path comes first.")
     image = _numbers("linear", linear, (0, 3, 4))
     channels = image.shape[2] if image.ndim == 3 else 0
     path = image_file("path", path, channels)
     ending = path.suffix.lower()
     if channels and not np.isfinite(image).all():
-        raise ValueError(
-            f"linear must not be infinite; {np.isinf(image).sum()} of its {image.size} values are."
-        )
+        raise ValueError(f"linear must not be infinite; {np.isinf(image).sum()} of {image.size} values are.")
     if channels and ending not in (".npy", ".tif", ".tiff"):
         warn_of_8_bits("linear", image, stacklevel=3)
     with whole_file(path) as part:
@@ -111,9 +108,7 @@ def show_images(images: Checked[Mapping[str, Arrayable]], columns: Checked[int] 
         ValueError: for no image, an image of another shape, NaN, and a number of columns below 1.
     """
     if not isinstance(images, Mapping) or not images:
-        raise ValueError(
-            f"images must be a dict of at least one image, such as {{'head': ...}}; got {described(images)}."
-        )
+        raise ValueError(f"images must be a dict of at least one image by name; got {described(images)}.")
     arrays = {name: _numbers(f"images[{name!r}]", image, (0, 3)) for name, image in images.items()}
     columns = min(integer("columns", columns, 1), len(arrays))
     rows = math.ceil(len(arrays) / columns)

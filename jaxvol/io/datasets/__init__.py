@@ -147,9 +147,7 @@ def fetch(name: Checked[str], *, folder: str | os.PathLike[str] | None = None, p
             "variable JAXVOL_DATA to the folder."
         ) from fault
     except ValueError as fault:
-        raise ValueError(
-            f"{dataset.url} has another SHA-512 than {dataset.name} is published with. It was not kept."
-        ) from fault
+        raise ValueError(f"{dataset.url} has another SHA-512 than {dataset.name}; it is not kept.") from fault
     return target
 
 

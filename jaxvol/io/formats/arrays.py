@@ -146,8 +146,7 @@ def _npy_header(stream: Any) -> tuple[tuple[int, ...], Any, np.dtype]:
         raise
     except Exception as fault:  # NumPy raises different errors for different faults
         raise Refused(f"has no valid .npy header ({fault!r}).") from fault
-    pickles = "Arrays of objects are pickles, which are never read."
-    check(dtype.kind in "biuf", f"holds an array of type {dtype}; expected integers or floats. {pickles}")
+    check(dtype.kind in "biuf", f"must hold numbers; got type {dtype} (object: pickles, never read).")
     is_volume = min(shape, default=1) >= 1 and math.prod(shape) < 2**48
     check(is_volume, f"must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
     return shape, "F" if fortran else "C", dtype

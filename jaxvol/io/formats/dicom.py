@@ -78,15 +78,13 @@ def read_dicom(path: Path, spacing: Arrayable | None = None, time: int | None = 
     if path.name.upper() == "DICOMDIR":
         folders = folders_below(path.parent)
         names = ", ".join(str(folder.relative_to(path.parent)) for folder in folders[:8]) or "no folder"
-        hint = "beside it holds DICOM images. Give the path of one of them."
-        check(len(folders) == 1, f": {names} {hint}")
+        check(len(folders) == 1, f": {names} beside it holds DICOM images. Give the path of one of them.")
         with refusing(folders[0]):
             return read_dicom(folders[0], spacing, time)
     headers = series_headers(path)
     slices = [image for file, header in headers.items() for image in _slices(file, header, spacing)]
-    must = "must hold at least 2 slices of a series, and fewer than 2**31 voxels"
     is_volume = 2 <= len(slices) <= MOST_VOXELS // math.prod(slices[0].shape[1:] if slices else (1,))
-    check(is_volume, f"{must}; got {len(slices)}.")
+    check(is_volume, f"must hold at least 2 slices, and fewer than 2**31 voxels; got {len(slices)} slices.")
     first, must = slices[0], "slices of one series must agree in size, spacing and directions"
     for image in slices:
         has_grid = np.allclose(image.grid, first.grid, rtol=1e-4, atol=1e-4)
@@ -197,8 +195,7 @@ def _slices(path: Path, header: Any, spacing: Arrayable | None) -> list[Slice]:
         shape = int(header.get("NumberOfFrames") or 1), int(header.Rows), int(header.Columns)
         channels, bits = int(header.get("SamplesPerPixel", 1)), int(header.get("BitsAllocated", 0))
         is_grey = channels == 1 and min(shape) > 0 and bits in (1, 8, 16, 32, 64)
-        got = f"{shape} of {channels} values of {bits} bits"
-        check(is_grey, f"must hold slices of one value per pixel; got {got}.")
+        check(is_grey, f"must hold one value per pixel; got {shape} of {channels} values of {bits} bits.")
         held = path.stat().st_size * (1 if syntax in [*SYNTAXES][:3] else MOST_COMPRESSED)
         check_size(held, math.prod(shape) * bits // 8, more=True)
         shared = list(header.get("SharedFunctionalGroupsSequence") or [])[:1]

@@ -39,9 +39,8 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
 
         def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
             expected, size = count * np.dtype(dtype).itemsize, len(items[tag])
-            hint = "Voxels of a compressed file have less: save it uncompressed."
-            must = f": item {TITLES[tag]} must have {expected} bytes"
-            check(size == expected, f"{must}; it has {size}. {hint}")
+            fault = f": item {TITLES[tag]} must have {expected} bytes; it has {size}."
+            check(size == expected, f"{fault} Is the file compressed? Save it uncompressed.")
             return np.frombuffer(items[tag], dtype)
 
         planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
@@ -78,14 +77,13 @@ def _items(path: Path) -> dict[str, bytes]:
     n_bytes, items = file_size(path), {}
     with path.open("rb") as stream:
         magic = stream.read(len(MAGIC))
-        hint = "Other programs write files of other formats that end in .vol."
-        must = f"is not a Kretz file: it must begin with {MAGIC!r}"
-        check(magic == MAGIC, f"{must}; got {magic!r}. {hint}")
+        must = f"is not a Kretz file, but another that ends in .vol: it must begin with {MAGIC!r}"
+        check(magic == MAGIC, f"{must}; got {magic!r}.")
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
             title = TITLES.get(tag, tag)
-            cut = f"is cut short: item {title} is to end at byte {end}, and it ends at {n_bytes}."
+            cut = f"is cut short: item {title} is to end at byte {end}, and the file ends at {n_bytes}."
             check(end <= n_bytes, cut)
             check(tag not in items, f"holds item {title} twice.")
             if tag in MEANING:

@@ -61,8 +61,7 @@ def read_mrc(path: Path) -> ImageRecord:
     with path.open("rb") as stream:
         size, extended = file_size(path), stream.read(96)[92:]
     longest = min(int.from_bytes(extended, order) for order in ("little", "big"))
-    cut = f"is cut short: its extended header is longer than its {size} bytes."
-    check(longest <= size, cut)  # mrcfile would allocate them
+    check(longest <= size, "is cut short before the end of its header.")  # mrcfile would allocate it
     file: Any = library("mrcfile", path).mmap(path, permissive=True)
     header, data = file.header, np.asanyarray(file.data)
     if data.ndim not in (3, 4) or data.dtype.kind not in "iuf":

@@ -45,8 +45,7 @@ def save(volume: Checked[Volume], path: Checked[str | os.PathLike[str]]) -> Path
     hint = "The volume comes first, as in save(volume, path)."
     ensure(isinstance(volume, Volume), f"volume must be a Volume; got {described(volume)}. {hint}")
     ensure(isinstance(path, str | os.PathLike), f"path must be a str or a path; got {described(path)}.")
-    fault = "volume must have voxels; got a volume with a field. Save an array of its values."
-    ensure(volume.field is None, fault)
+    ensure(volume.field is None, "volume must have voxels; got a field. Save an array of its values.")
     path = output_file("path", path)
     name, kind = path.name.lower(), volume.data.dtype.name
     in_npz = name.endswith(".npz")

@@ -33,8 +33,8 @@ def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> 
             key, _, value = line.partition(separator)
             is_long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
             check(not is_long, f"cannot be read: its header has the field {shortened(line)}.")
-            is_short = len(fields) < MOST_FIELDS
-            check(is_short, f"cannot be read: its header has more than {MOST_FIELDS} fields.")
+            fault = f"cannot be read: its header has more than {MOST_FIELDS} fields."
+            check(len(fields) < MOST_FIELDS, fault)
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 
@@ -126,8 +126,7 @@ def read_nrrd(path: Path) -> ImageRecord:
 def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
     """Fields of the header, the position of its end, and the file of the voxels, which may be missing."""
     fields, end = text_header(path, "=", "ElementDataFile")
-    no_header = "cannot be read: no header of a MetaImage, which ends in ElementDataFile."
-    check("ElementDataFile" in fields, no_header)
+    check("ElementDataFile" in fields, "cannot be read: its header must end in the field ElementDataFile.")
     data_file = fields["ElementDataFile"]
     return fields, end, path if data_file.upper() == "LOCAL" else path.parent / data_file
 
@@ -147,8 +146,7 @@ def read_metaimage(path: Path) -> ImageRecord:
     must = f"ElementType must be one of {', '.join(META_TYPES)}, and BinaryData true"
     is_read = kind in META_TYPES and flag("BinaryData")
     check(is_read, f": {must}; got {kind[:40]!r} and {text[:20]!r}.")
-    missing = f"cannot be read: there is no file of its voxels, {shortened(str(source))}."
-    check(source.is_file(), missing)
+    check(source.is_file(), f"cannot be read: there is no file of its voxels, {shortened(str(source))}.")
     if source != path:
         size = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file
         is_size = re.fullmatch("-1|[0-9]{1,15}", size)

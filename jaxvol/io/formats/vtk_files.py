@@ -41,8 +41,7 @@ def _legacy(content: bytes) -> tuple[Any, ...]:
     words = {line.split()[0].upper(): line.split()[1:] for line in head.splitlines()[2:] if line.split()}
     dataset = words.get("DATASET", ["none"])
     is_image = head.startswith("# vtk DataFile") and dataset == ["STRUCTURED_POINTS"] and match
-    got = shortened(" ".join(dataset))
-    check(is_image, f"must hold a DATASET of STRUCTURED_POINTS with scalars; got {got}.")
+    check(is_image, f"must hold STRUCTURED_POINTS with scalars; got {shortened(' '.join(dataset))}.")
     if "SCALARS" in words:
         kind, count = [*words["SCALARS"], "1"][1:3]
     elif "COLOR_SCALARS" in words:

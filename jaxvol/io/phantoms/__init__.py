@@ -79,7 +79,7 @@ def phantom(name: str, resolution: Checked[int] = 128, *, seed: Checked[int] = 0
         seed: of the textures of `head` and `colon`, polyps and folds of `colon`, and the tree of `vessels`.
 
     Returns:
-        The `Volume`; that of `labels` has labels.
+        The `Volume`, with labels for the phantom `labels`.
 
     Raises:
         ValueError: for an unknown name, and for numbers that are too small or not integers.
