@@ -1,1 +1,1 @@
-"""Helpers that need nothing of jaxvol but `xla`: checks, files, arrays of voxels, tables, random numbers."""
+"""Helpers that depend only on `jaxvol.xla`: checks, files, arrays of voxels, tables, random numbers."""

@@ -1,4 +1,4 @@
-"""The axes x, y, z in another order."""
+"""Permutations of the axes x, y, z."""
 
 from collections.abc import Sequence
 from typing import TypeAlias, TypeVar
@@ -10,12 +10,12 @@ Axes: TypeAlias = tuple[int, int, int]
 XYZ: Axes = (0, 1, 2)
 
 
-def permuted(of_axes: Sequence[T], axes: Axes) -> tuple[T, T, T]:
-    """What belongs to x, y and z, in the order `axes`."""
+def permuted(items: Sequence[T], axes: Axes) -> tuple[T, T, T]:
+    """Items of x, y and z, reordered by the permutation `axes`."""
     a, b, c = axes
-    return of_axes[a], of_axes[b], of_axes[c]
+    return items[a], items[b], items[c]
 
 
 def inverse(axes: Axes) -> Axes:
-    """The order that undoes `axes`."""
+    """Inverse of the permutation `axes`."""
     return axes.index(0), axes.index(1), axes.index(2)

@@ -1,5 +1,4 @@
-"""Piecewise bilinear functions of two variables, constant beyond a grid of lines (two equal ones make a
-step): look-ups, and bounds over rectangles."""
+"""Piecewise bilinear functions on a grid of lines (two equal ones make a step), constant beyond it."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ from .vec3 import Scalar
 
 
 def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, "..."], Scalar]:
-    """The interval in which a value lies, and how far along, from 0 to 1. NaN stays NaN."""
+    """Index of the interval that contains a value, and the fraction of it below the value. NaN stays NaN."""
     lines = jax.lax.stop_gradient(lines)
     index = jnp.clip(points_below(lines, value) - 1, 0, lines.shape[0] - 2)
     start, end = gather(lines, index), gather(lines, index + 1)
@@ -22,37 +21,37 @@ def between_lines(lines: Float[Array, " n"], value: Scalar) -> tuple[Int[Array, 
 
 
 def slope_between_lines(lines: Float[Array, " n"], value: Scalar, index: Int[Array, "..."]) -> Scalar:
-    """The derivative of the fraction that `between_lines` finds, by the value."""
+    """Derivative of the fraction that `between_lines` returns with respect to the value."""
     gap = gather(lines, index + 1) - gather(lines, index)
     inside = (value >= lines[0]) & (value < lines[-1]) & (gap > 0)
     return jnp.where(inside, 1 / jnp.where(gap > 0, gap, 1), 0)
 
 
 def corner_rows(table: Float[Array, "n m columns"]) -> Float[Array, "cells corners"]:
-    """One row for each cell of the grid, in row-major order: the entries of its four corners."""
+    """Table with one row per cell of the grid, in row-major order: the entries of its four corners."""
     corners = [table[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1)]
     return jnp.concatenate(corners, axis=-1).reshape(-1, 4 * table.shape[2])
 
 
-def interpolate_corners(row: tuple[Scalar, ...], along: Scalar, across: Scalar) -> tuple[Scalar, ...]:
-    """The entries at these fractions of a cell: 0 between zeros, and positive between positive numbers."""
+def interpolate_corners(row: tuple[Scalar, ...], u: Scalar, v: Scalar) -> tuple[Scalar, ...]:
+    """Entries at the fractions (u, v) of a cell: 0 between zeros, and positive between positive numbers."""
 
     def mix(t: Scalar, a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
         return tuple(p * (1 - t) + q * t for p, q in zip(a, b, strict=True))
 
     n = len(row) // 4
-    first, second = (mix(across, row[at : at + n], row[at + n : at + 2 * n]) for at in (0, 2 * n))
-    return mix(along, first, second)
+    first, second = (mix(v, row[at : at + n], row[at + n : at + 2 * n]) for at in (0, 2 * n))
+    return mix(u, first, second)
 
 
 def any_between(marked: Bool[Array, "n m"], rows: Range, columns: Range) -> Bool[Array, "*blocks"]:
-    """Whether any crossing of these lines is marked: a summed-area table."""
+    """Test whether any crossing of ranges of rows and columns is marked, by a summed-area table."""
     table = jnp.pad(marked.astype(jnp.int32), ((1, 0), (1, 0)))
     table = jnp.cumsum(jnp.cumsum(table, axis=0, dtype=jnp.int32), axis=1, dtype=jnp.int32)
     flat = table.reshape(-1)
 
     def below(row: Int[Array, "*blocks"]) -> Int[Array, "*blocks"]:
-        """Number of marked crossings of these columns and the rows before this one."""
+        """Number of marked crossings of the columns with the rows before `row`."""
         start = row * table.shape[1]
         return gather(flat, start + columns[1] + 1) - gather(flat, start + columns[0])
 
@@ -60,8 +59,8 @@ def any_between(marked: Bool[Array, "n m"], rows: Range, columns: Range) -> Bool
 
 
 def greatest_between(table: Float[Array, "n m"], rows: Range, columns: Range) -> Float[Array, "*blocks"]:
-    """The greatest entry where these lines cross, by the maxima of all rectangles of powers of two."""
-    maxima = jnp.stack([jnp.stack(run_maxima(wide, 1)) for wide in run_maxima(table, 0)])
-    wide, begins = covering_runs(rows, maxima.shape[0])
-    long, others = covering_runs(columns, maxima.shape[1])
-    return jnp.max(jnp.stack([maxima[wide, long, i, j] for i in begins for j in others]), axis=0)
+    """Maximum over ranges of rows and columns, by maxima of all rectangles with sides of powers of two."""
+    maxima = jnp.stack([jnp.stack(run_maxima(rows_maxima, 1)) for rows_maxima in run_maxima(table, 0)])
+    height, tops = covering_runs(rows, maxima.shape[0])
+    width, lefts = covering_runs(columns, maxima.shape[1])
+    return jnp.max(jnp.stack([maxima[height, width, i, j] for i in tops for j in lefts]), axis=0)

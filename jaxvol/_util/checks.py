@@ -1,14 +1,15 @@
-"""Checks arguments. Errors name the argument, what came and what was expected: a `ValueError` at once for
+"""Checks of arguments. An error names the argument, its value and the expectation: a `ValueError` at once for
 shapes and known values, NaN in the program for traced ones."""
 
 import contextlib
 import operator
 import os
 import tempfile
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from types import EllipsisType
-from typing import Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, SupportsIndex, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,11 +24,17 @@ from ..xla.trees import PyTree
 T = TypeVar("T")
 
 Arrayable: TypeAlias = Any
-"""What a caller may pass for an array. `Any`: checked at run time, by errors that name the argument."""
+"""Argument that is converted to an array. `Any`: checked at run time, by errors that name the argument."""
+
+if TYPE_CHECKING:
+    Checked: TypeAlias = Annotated[T, "checked at run time"]
+else:
+    Checked = defaultdict(lambda: Any)
+"""`Checked[T]`: T for static checkers, `Any` for run-time ones, so that our own errors come first."""
 
 
-def described(value: Any) -> str:
-    """A short description of a value, for error messages."""
+def described(value: object) -> str:
+    """Short description of a value for error messages."""
     if isinstance(value, type):
         return f"the class {value.__name__}"
     if isinstance(value, np.ndarray | jax.Array):
@@ -40,7 +47,7 @@ def described(value: Any) -> str:
     return f"a {type(value).__name__}"
 
 
-def shortened(value: Any) -> str:
+def shortened(value: object) -> str:
     """`repr(value)`, without its middle if it is long."""
     try:
         text = repr(value)
@@ -50,36 +57,37 @@ def shortened(value: Any) -> str:
 
 
 def printable(text: str) -> str:
-    """A text with its control characters escaped: what stands in a file may be meant for a terminal."""
+    """Text with control characters escaped, since a file's text might control a terminal."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
-def require(value: T, holds: Callable[..., Any], message: str, *others: Any) -> T:
-    """Check that `holds(value, *others)` is true everywhere, and return `value`: **raises** `ValueError`.
-    Inside a program, where that is unknown, numbers of which it is false become NaN, and so does their
+def require(value: T, holds: Callable[..., Any], message: str, *args: Any) -> T:
+    """Return `value` if `holds(value, *args)` is true everywhere, else raise a `ValueError`.
+
+    Inside a program, where that is unknown, numbers for which it is false become NaN, and so does their
     gradient: JAX would keep and export no program that calls the host. Under `jax.disable_jit` the error is
     raised there. `holds` gets NumPy arrays if all are concrete, and its answer broadcasts to `value`; `{got}`
-    is the value."""
+    in the message is replaced by the value."""
     array: Any = value
-    if is_traced(array, *others):
-        holding = holds(array, *others)
+    if is_traced(array, *args):
+        holding = holds(array, *args)
         if is_traced(holding):
             return array * jnp.where(holding, 1, jnp.nan).astype(array.dtype)
         array = jax.lax.stop_gradient(array)  # differentiated, but known
     else:  # in NumPy, which compiles nothing
-        holding = holds(*(np.asarray(each) for each in (array, *others)))
+        holding = holds(*map(np.asarray, (array, *args)))
     if not np.all(holding):
         raise ValueError(message.format(got=described(array) if is_traced(array) else np.asarray(array)))
     return value
 
 
-def finite(values: Any) -> Any:
+def finite(values: Arrayable) -> Any:
     """Condition for `require`: neither NaN nor infinite."""
     return abs(values) < np.inf
 
 
-def all_finite(tree: Any) -> Any:
-    """Whether all floats of a tree are finite; evaluated at once if all are NumPy arrays."""
+def all_finite(tree: PyTree) -> Any:
+    """Test that all floats of a tree are finite; in NumPy if all are NumPy arrays."""
     arrays = (leaf for leaf in jax.tree.leaves(tree) if isinstance(leaf, jax.Array | np.ndarray))
     leaves = [leaf for leaf in arrays if jnp.issubdtype(leaf.dtype, jnp.inexact)]
     if all(isinstance(leaf, np.ndarray) for leaf in leaves):
@@ -88,46 +96,41 @@ def all_finite(tree: Any) -> Any:
 
 
 def finite_array(
-    name: str,
-    value: Arrayable,
-    shape: tuple[int | EllipsisType | None, ...],
-    *,
-    infinite: bool = False,
+    name: str, value: Arrayable, shape: tuple[int | EllipsisType | None, ...], *, infinite: bool = False
 ) -> Array:
-    """`value` as an array of JAX's default float type and of this shape (None: any length; a leading `...`:
-    any axes). `infinite`: infinity may come, too, but not NaN."""
+    """Convert to a finite float array of a shape (None: any length; a leading `...`: any axes)."""
     expected = str(shape).replace("None", "n").replace("Ellipsis", "*rays")
     try:
         if isinstance(value, jax.Array):
-            given = value
+            source = value
         else:  # a sequence may hold traced numbers
-            given = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+            source = jnp.asarray(value) if is_traced(value) else np.asarray(value)
         # V: JAX's own 8- and 16-bit floats; keys of `jax.random` have no kind
-        if getattr(given.dtype, "kind", "O") not in "biufV":
+        if getattr(source.dtype, "kind", "O") not in "biufV":
             raise TypeError
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
-            cast = given.astype(jnp.result_type(float)) if isinstance(given, np.ndarray) else given
+            cast = source.astype(jnp.result_type(float)) if isinstance(source, np.ndarray) else source
         with contextlib.nullcontext() if is_traced(value) else jax.ensure_compile_time_eval():
             array = jnp.asarray(cast, dtype=float)
     except (TypeError, ValueError) as fault:
-        what = f"numbers of shape {expected}" if shape else "a number"
-        raise ValueError(f"{name} must be {what}; got {shortened(value)}.") from fault
+        kind = f"numbers of shape {expected}" if shape else "a number"
+        raise ValueError(f"{name} must be {kind}; got {shortened(value)}.") from fault
     lengths = [n for n in shape if n is not ...]
-    found = array.shape[array.ndim - len(lengths) :] if ... in shape else array.shape
-    if len(found) != len(lengths) or any(n not in (None, m) for n, m in zip(lengths, found, strict=True)):
+    sizes = array.shape[array.ndim - len(lengths) :] if ... in shape else array.shape
+    if len(sizes) != len(lengths) or any(n not in (None, m) for n, m in zip(lengths, sizes, strict=True)):
         raise ValueError(f"{name} must have shape {expected}; got shape {array.shape}.")
     if infinite:
         return require(array, lambda values: abs(values) <= np.inf, f"{name} must not be NaN; got {{got}}.")
-    if isinstance(given, np.ndarray) and not np.all(finite(cast)):
-        beyond = f" in {array.dtype}" if np.all(finite(given)) else ""
-        raise ValueError(f"{name} must be finite{beyond}; got {given}.")
+    if isinstance(source, np.ndarray) and not np.all(finite(cast)):
+        beyond = f" in {array.dtype}" if np.all(finite(source)) else ""
+        raise ValueError(f"{name} must be finite{beyond}; got {source}.")
     return require(array, finite, f"{name} must be finite; got {{got}}.")
 
 
 def number(
     name: str, value: Arrayable, *, above: float = -np.inf, below: float = np.inf, unit: str = ""
 ) -> Array:
-    """`value` as a finite scalar strictly between `above` and `below`."""
+    """Convert to a finite scalar strictly between `above` and `below`."""
     bounds = (("greater than", above), ("less than", below))
     between = " and ".join(f"{word} {bound:g}" for word, bound in bounds if np.isfinite(bound))
     return require(
@@ -138,13 +141,13 @@ def number(
 
 
 def not_negative(name: str, value: Arrayable, shape: tuple[int | None, ...] = ()) -> Array:
-    """`value` as an array of finite numbers of at least 0; by default a scalar."""
+    """Convert to an array of finite numbers of at least 0; by default a scalar."""
     array = finite_array(name, value, shape)
     return require(array, lambda v: v >= 0, f"{name} must not be negative; got {{got}}.")
 
 
 def increasing(name: str, value: Arrayable) -> Array:
-    """`value` as an array of at least two numbers that increase, but for two equal ones that make a step."""
+    """Convert to an array of at least two increasing numbers; two equal ones make a step."""
     array = finite_array(name, value, (None,))
     if array.shape[0] < 2:
         raise ValueError(f"{name} must hold at least 2 control points; got {array.shape[0]}.")
@@ -157,44 +160,46 @@ def increasing(name: str, value: Arrayable) -> Array:
 
 
 def unit_interval(name: str, value: Arrayable, shape: tuple[int | None, ...]) -> Array:
-    """`value` as an array of numbers in [0, 1]."""
+    """Convert to an array of numbers in [0, 1]."""
     array = finite_array(name, value, shape)
     return require(array, lambda a: (a >= 0) & (a <= 1), f"{name} must be in [0, 1]; got {{got}}.")
 
 
-def integer(name: str, value: Any, least: int, most: int | None = None, *, otherwise: str = "") -> int:
-    """`value` as an integer from `least` to `most`, inclusive. `otherwise`: what else may come."""
-    whole = None
-    if not is_flag(value):
+def integer(
+    name: str, value: object, minimum: int, maximum: int | None = None, *, otherwise: str = ""
+) -> int:
+    """Convert to an integer in a range, inclusive. `otherwise`: text about other accepted values."""
+    number = None
+    if isinstance(value, SupportsIndex) and not is_flag(value):
         with contextlib.suppress(TypeError):
-            whole = operator.index(value)
-    if whole is None or whole < least or (most is not None and whole > most):
-        expected = f"of at least {least}" if most is None else f"from {least} to {most}"
+            number = operator.index(value)
+    if number is None or number < minimum or (maximum is not None and number > maximum):
+        expected = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
         raise ValueError(f"{name} must be an integer {expected}{otherwise}; got {described(value)}.")
-    return whole
+    return number
 
 
-def integers(name: str, values: Any) -> tuple[int, ...]:
-    """A sequence of integers of at most 64 bits."""
+def integers(name: str, values: Arrayable) -> tuple[int, ...]:
+    """Convert to a tuple of integers of at most 64 bits."""
     if np.ndim(values) != 1:
         raise ValueError(f"{name} must be a sequence of integers; got {described(values)}.")
-    return tuple(integer(f"{name}[{k}]", each, -(2**63), 2**64 - 1) for k, each in enumerate(values))
+    return tuple(integer(f"{name}[{k}]", value, -(2**63), 2**64 - 1) for k, value in enumerate(values))
 
 
-def is_flag(value: Any) -> bool:
-    """Whether a value is Python's or NumPy's True or False."""
+def is_flag(value: object) -> bool:
+    """Test for True or False of Python or NumPy."""
     return isinstance(value, bool | np.bool_)
 
 
-def flag(name: str, value: Any) -> bool:
-    """`value` as True or False."""
+def flag(name: str, value: object) -> bool:
+    """Convert to True or False."""
     if not is_flag(value):
         raise ValueError(f"{name} must be True or False; got {described(value)}.")
     return bool(value)
 
 
 def output_file(name: str, path: str | os.PathLike[str]) -> Path:
-    """The path of a file that can be written, else a `ValueError`. `whole_file` makes its folder."""
+    """Path of a file, checked to be writable. `whole_file` makes its folder."""
     path = Path(path)
     try:
         if path.is_dir():
@@ -208,28 +213,25 @@ def output_file(name: str, path: str | os.PathLike[str]) -> Path:
         if path.exists():
             path.open("ab").close()
     except (OSError, RuntimeError) as fault:  # RuntimeError: of links in a circle
-        told = getattr(fault, "strerror", None) or fault
-        raise ValueError(f"{name}: {path} cannot be written ({told}).") from fault
+        cause = getattr(fault, "strerror", None) or fault
+        raise ValueError(f"{name}: {path} cannot be written ({cause}).") from fault
     return path
 
 
-MIXED = (
-    " Were some of the step, the camera and the volume made before jax_enable_x64 was set? Make all after."
-)
-
-
-def check_answer(owner: Any, method: str, answer: PyTree, expected: PyTree) -> None:
-    """Raise a `ValueError` if a method of a user's class returned other shapes or types than expected."""
+def check_answer(owner: object, method: str, answer: PyTree, expected: PyTree) -> None:
+    """Raise a `ValueError` if a method of a custom class returned other shapes or types than expected."""
 
     def kinds(tree: PyTree) -> PyTree:
         return jax.tree.map(lambda leaf: (jnp.shape(leaf), jnp.result_type(leaf).name), tree)
 
     try:
-        same = kinds(answer) == kinds(expected)
-    except TypeError:  # something that is no array
-        same = False
-    if not same:
-        found, wanted = (eqx.tree_pformat(tree) for tree in (answer, expected))
-        mixed = {leaf.dtype.name for leaf in jax.tree.leaves((answer, expected)) if hasattr(leaf, "dtype")}
-        hint = "" if not mixed >= {"float32", "float64"} else MIXED
-        raise ValueError(f"{type(owner).__name__}.{method} must return {wanted}; got {found}.{hint}")
+        is_expected = kinds(answer) == kinds(expected)
+    except TypeError:  # a leaf that is no array
+        is_expected = False
+    if not is_expected:
+        returned, wanted = (eqx.tree_pformat(tree) for tree in (answer, expected))
+        types = {leaf.dtype.name for leaf in jax.tree.leaves((answer, expected)) if hasattr(leaf, "dtype")}
+        hint = ""
+        if types >= {"float32", "float64"}:
+            hint = " Were the step, the camera or the volume made before jax_enable_x64 was set? Remake them."
+        raise ValueError(f"{type(owner).__name__}.{method} must return {wanted}; got {returned}.{hint}")

@@ -1,5 +1,4 @@
-"""Checks the sizes of files against their headers: before memory is allocated or, if only decompressing
-tells, while a file is read, never further than one byte past the expected size."""
+"""Checks of files' sizes against their headers, before memory is allocated or while decompressing."""
 
 import importlib
 import logging
@@ -20,26 +19,26 @@ from .checks import printable
 
 CHUNK = 2**20
 MOST_VOXELS = 2**31 - 1  # Volume's own limit
-MOST_COMPRESSED = 2000  # bytes of pixels for each of a compressed file; a header that says more is refused
-# RuntimeError: of ITK, and of zipfile for encryption and unknown compression; OSError: of gzip
+MOST_COMPRESSED = 2000  # bytes of pixels per byte of a compressed file; headers that say more are refused
+# RuntimeError: by ITK, and by zipfile for encryption and unknown compression; OSError: by gzip
 CORRUPT = (EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 Stream: TypeAlias = BufferedIOBase | IO[bytes]
-"""Of a file, of gzip, of a member of a zip archive."""
+"""Stream of bytes: a file, a gzip stream or a member of a zip archive."""
 
 
 class Refused(ValueError):
-    """What is wrong with a file, without its path, which `refusing` puts in front."""
+    """Fault of a file, without its path, which `refusing` prepends."""
 
 
 def check(holds: object, fault: str) -> None:
-    """Raise `Refused` with this text unless what a file must be is so, which it never is of NaN."""
+    """Raise `Refused(fault)` unless a condition on a file holds."""
     if not holds:
         raise Refused(fault)
 
 
 def ensure(holds: object, fault: str) -> None:
-    """Raise `ValueError` with this text unless something holds."""
+    """Raise `ValueError(fault)` unless a condition holds."""
     if not holds:
         raise ValueError(fault)
 
@@ -56,7 +55,7 @@ def file_size(path: Path) -> int:
 
 
 def read_all(stream: Stream, expected: int, *, more: bool = False) -> bytearray:
-    """All bytes of a stream, which must be `expected`; at most one further is read. `more`: others follow."""
+    """Read the `expected` number of bytes, and fail if the stream ends sooner or, unless `more`, later."""
     content = bytearray()  # grows with the data, so a header alone allocates nothing
     while chunk := stream.read(min(expected + 1 - len(content), CHUNK)):
         content += chunk
@@ -66,7 +65,7 @@ def read_all(stream: Stream, expected: int, *, more: bool = False) -> bytearray:
 
 
 def check_size(size: int, expected: int, *, more: bool = False) -> None:
-    """Check that a file holds as many bytes of voxels as its header says; or `more`, where others follow."""
+    """Check that a file holds as many bytes of voxels as its header says. `more`: other data may follow."""
     fault = f"cut short: it holds {size}" if size < expected else f"oversized: it holds {size} or more"
     check(
         size == expected or (more and size > expected),
@@ -77,23 +76,22 @@ def check_size(size: int, expected: int, *, more: bool = False) -> None:
 
 @contextmanager
 def decoding() -> Iterator[None]:
-    """Turn any error of a decoder within the context into one that says what is wrong."""
+    """Context that turns errors of a decoder into `Refused`."""
     try:
         yield
-    except RuntimeError:  # also of whole files
+    except RuntimeError:  # `refusing` reports its reason, too
         raise
     except CORRUPT as fault:
         raise Refused(f"cannot be read: corrupt, cut short or incomplete ({reason(fault)}).") from fault
 
 
 ARGUMENTS = ("path:", "shape must", "dtype must", "spacing must", "time must", "time:")
-"""Beginnings of errors that name an argument."""
+"""Beginnings of messages that name an argument."""
 
 
 @contextmanager
 def refusing(path: Path) -> Iterator[None]:
-    """Turn whatever is raised within the context into a `ValueError` that says what is wrong with a file.
-    What libraries warn of and log, which may be a line for each of a file's faults, is left out."""
+    """Context that turns exceptions into a `ValueError` about a file, and mutes warnings of libraries."""
     loggers = [logging.getLogger(name) for name in ("tifffile", "nibabel.global", "pydicom")]
     before = [logger.disabled for logger in loggers]
     try:
@@ -109,22 +107,22 @@ def refusing(path: Path) -> Iterator[None]:
             raise
         if isinstance(fault, Refused):
             raise ValueError(f"path: {path}{'' if str(fault).startswith(':') else ' '}{fault}") from fault
-        told = f"{reason(fault)}. Is it cut short, or of a kind that is not supported?"
-        raise ValueError(f"path: {path} cannot be read: {told}") from fault
+        hint = "Is it cut short, or of a kind that is not supported?"
+        raise ValueError(f"path: {path} cannot be read: {reason(fault)}. {hint}") from fault
     finally:
         for logger, disabled in zip(loggers, before, strict=True):
             logger.disabled = disabled
 
 
 def reason(fault: BaseException) -> str:
-    """The last line of an error, without the place in ITK's source with which its errors begin."""
+    """Last line of an error's message, without the line of ITK's source with which ITK's messages begin."""
     last = str(fault).strip().rpartition("\n")[2]
-    told = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
-    return printable(told).rstrip(".") or type(fault).__name__
+    text = re.sub(r"^.*ERROR: \w+\s*\(0x[0-9a-f]+\): |^\[\w+\] \w+: ", "", last.strip())[:200]
+    return printable(text).rstrip(".") or type(fault).__name__
 
 
 def library(name: str, path: Path) -> Any:
-    """A module that reads files. Raises `ImportError` that says what to install for `path`."""
+    """Import a module that reads `path`. Raises an `ImportError` that says what to install."""
     try:
         return importlib.import_module(name)
     except ImportError as fault:
@@ -134,6 +132,6 @@ def library(name: str, path: Path) -> Any:
 def as_array(
     content: bytes | bytearray, shape: Sequence[int], dtype: np.dtype, order: Literal["C", "F"]
 ) -> np.ndarray:
-    """Bytes as an array in native byte order, with its last axis fastest in memory."""
+    """Array from bytes, in native byte order, with its last axis fastest in memory."""
     array = np.frombuffer(content, dtype).reshape(shape, order=order)
     return np.ascontiguousarray(array, dtype=dtype.newbyteorder("="))

@@ -1,5 +1,4 @@
-"""One record of what a file, or an image of another library, says of its array, and the one function that
-makes the arguments of `Volume` of it."""
+"""Record of an array of voxels and its metadata, and its conversion to arguments of `Volume`."""
 
 import itertools
 import math
@@ -19,36 +18,36 @@ from .voxels import WHOLE, check_shape, is_flat, within
 
 
 ALONG_AXES = 1e-5
-"""Greatest deviation of directions from the world's axes that is ignored: 0.01 voxels in 1000."""
+"""Maximum deviation of directions from the world's axes that is ignored: 0.01 voxels in 1000."""
 
-INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a caller and the reader of a file
+INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a user's call and `warn_caller`
 
 
 @dataclass
 class ImageRecord:
-    """What is known of an array of voxels, as its writer meant it."""
+    """Array of voxels and its metadata, as its writer meant them."""
 
-    data: Any  # the array as it is stored, of NumPy or one that is read box by box
-    axes: Sequence[str]  # the name of each of its axes, in order
+    data: Any  # the stored array, of NumPy or one that is read box by box
+    axes: Sequence[str]  # names of its axes, in order
     steps: Mapping[str, float] = field(default_factory=dict)  # signed distances along x, y, z, where known
-    units: Mapping[str, str | None] | str | None = None  # of each of these, or one of all
-    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)  # of the first voxel, along x, y, z
-    direction: np.ndarray | None = None  # of the axes x, y, z in the world, as columns
-    convention: str = ""  # where the world's axes point: "LPS" (left, back, head), "RAS" or such; "": nowhere
-    slope: float = 1.0  # a value is slope times the stored number plus intercept
+    units: Mapping[str, str | None] | str | None = None  # units of the steps, or their common unit
+    origin: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)  # position of the first voxel along x, y, z
+    direction: np.ndarray | None = None  # directions of the axes x, y, z in the world, as columns
+    convention: str = ""  # directions of the world's axes: "LPS" (left, back, head), "RAS" or such; "": none
+    slope: float = 1.0  # value = slope * stored number + intercept
     intercept: float = 0.0
-    missing: tuple[float, ...] = ()  # stored numbers that mean that there is no value
+    missing: tuple[float, ...] = ()  # stored numbers that represent missing values
     unsigned: bool = False  # stored integers have no sign, whatever their type (`_Unsigned` of NetCDF)
     labels: Mapping[int, str] = field(default_factory=dict)  # names of the values of a segmentation
-    assumed: list[str] = field(default_factory=list)  # what was taken in place of what the file does not say
+    assumed: list[str] = field(default_factory=list)  # assumptions in place of missing metadata
     also: dict[str, Any] = field(default_factory=dict)  # further arguments of `Volume`
-    what: str = "data"  # how errors begin
+    what: str = "data"  # beginning of error messages
     format: str = ""
-    is_chosen: bool = False  # one of several times was chosen as the file was read
+    is_chosen: bool = False  # the reader has selected one of several times
 
     @property
     def letters(self) -> str:
-        """The letter of each axis. Raises `ValueError` for axes that are not known."""
+        """Letters of the axes. Raises `ValueError` for unknown axes."""
         return axis_letters(self.what, self.axes, self.note)
 
     @property
@@ -60,23 +59,21 @@ class ImageRecord:
         self.assumed += [] if text in self.assumed else [text]
 
     def unit(self, letter: str) -> str | None:
-        """The unit of the step along an axis, as it is stored."""
+        """Unit of the step along an axis, as stored."""
         return self.units if isinstance(self.units, str | None) else self.units.get(letter)
 
     def millimetres(self) -> np.ndarray:
-        """Lengths in mm of the units along x, y, z; unknown ones as of another axis, or 1 (see `assumed`)."""
-        told = [self.unit(letter) for letter in "xyz"]
-        known = [length_of(unit) for unit in told]
-        usual = next(filter(None, known), None)
-        taken = "taken as 1" if usual is None else f"taken as {usual:g} mm, as along other axes"
-        for unit, length in zip(told, known, strict=True):
-            if unit and not length:
-                self.note(f"unit {shortened(unit)}: {taken}")
-        return np.array([length or usual or 1.0 for length in known])
+        """Lengths in mm of the units along x, y, z; for an unknown unit, as along another axis, or 1."""
+        lengths = [length_of(self.unit(letter)) for letter in "xyz"]
+        usual = next(filter(None, lengths), None)
+        default = "taken as 1" if usual is None else f"taken as {usual:g} mm, as along other axes"
+        for letter, length in zip("xyz", lengths, strict=True):
+            if (unit := self.unit(letter)) and not length:
+                self.note(f"unit {shortened(unit)}: {default}")
+        return np.array([length or usual or 1.0 for length in lengths])
 
     def decode(self, stored: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-        """The values of stored numbers, and where there are none, if anywhere. Whole numbers stay so under a
-        scale of whole numbers; others are scaled in float64, and rounded once to float32."""
+        """Values of stored numbers, and a mask of missing ones, if any. An integer scale keeps integers."""
         kind = stored.dtype
         absent = [kind.type(number) for number in self.missing if holds(kind, number)]
         mask = np.isin(stored, absent) if absent else None
@@ -87,53 +84,52 @@ class ImageRecord:
         if not self.is_scaled:
             return stored, mask
         if stored.dtype.kind in "iu" and slope.is_integer() and intercept.is_integer() and stored.size:
-            most = max(abs(int(end) * int(slope) + int(intercept)) for end in (stored.min(), stored.max()))
-            if most < 2**62 and max(abs(slope), abs(intercept)) < 2**63:
+            limit = max(abs(int(end) * int(slope) + int(intercept)) for end in (stored.min(), stored.max()))
+            if limit < 2**62 and max(abs(slope), abs(intercept)) < 2**63:
                 values = stored.astype(np.int64) * int(slope) + int(intercept)
-                return values.astype(np.int32 if most < 2**31 else np.int64), mask
+                return values.astype(np.int32 if limit < 2**31 else np.int64), mask
         values = np.empty(stored.shape, np.float64 if stored.dtype == np.float64 else np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # what is infinite is refused, or replaced, later
-            for plane, into in zip(stored, values, strict=True):  # which saves memory
-                into[...] = plane * np.float64(slope) + intercept
+        with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused, or replaced, later
+            for source, target in zip(stored, values, strict=True):  # plane by plane, which saves memory
+                target[...] = source * np.float64(slope) + intercept
         return values, mask
 
     def oriented(self, sizes: list[int], turned: bool = True) -> tuple[list[int], list[int], dict[str, Any]]:
-        """How axes of `sizes` voxels are brought along the world's: which of x, y, z becomes each, its sign,
-        and the known of spacing (mm), origin and direction. Not `turned`: in order, reversed where steps are
-        negative."""
-        lengths, given = self.millimetres(), np.array([self.steps.get(a, 1.0) for a in "xyz"], float)
+        """Order and signs of the data's axes (of `sizes` voxels) along the world's, and the known of spacing
+        (mm), origin and direction. If not `turned`, axes keep their order; negative steps reverse them."""
+        lengths, steps = self.millimetres(), np.array([self.steps.get(a, 1.0) for a in "xyz"], float)
         if self.steps and (unknown := [letter for letter in "xyz" if letter not in self.steps]):
             self.note(f"the distance along {', '.join(unknown)}: taken as 1, in the unit of the others")
         world = np.array([1.0 if axis in "LPS" else -1.0 for axis in self.convention or "LPS"])
         turn = np.eye(3) if self.direction is None else np.asarray(self.direction, float)
-        what, origin = f"{self.what}: its place", np.asarray(self.origin, float)
-        must, got = "must be finite, with steps longer than 0", f"{given.tolist()} from {origin.tolist()}"
-        is_place = given.all() and np.isfinite([*given, *origin, *turn.flat]).all()
-        ensure(is_place, f"{what} {must}; got {got}.")
-        turn = directions(what, turn) * world[:, None] * np.sign(given)
-        order, signs = [0, 1, 2], np.sign(given).astype(int)
-        if turned:  # the axis of the data that is nearest to each axis of the world, all three at once
+        subject, origin = f"{self.what}: its place", np.asarray(self.origin, float)
+        must, got = "must be finite, with steps longer than 0", f"{steps.tolist()} from {origin.tolist()}"
+        is_place = steps.all() and np.isfinite([*steps, *origin, *turn.flat]).all()
+        ensure(is_place, f"{subject} {must}; got {got}.")
+        turn = directions(subject, turn) * world[:, None] * np.sign(steps)
+        order, signs = [0, 1, 2], np.sign(steps).astype(int)
+        if turned:  # the assignment of the data's axes to the world's with the largest sum of cosines
             orders = map(list, itertools.permutations(range(3)))
             order = max(orders, key=lambda p: np.abs(turn[range(3), p]).sum())
             signs = np.where(np.diag(turn[:, order]) >= 0, 1, -1)
-        turn, steps = turn[:, order], (np.abs(given) * lengths)[order]
+        turn, spacing = turn[:, order], (np.abs(steps) * lengths)[order]
         last = [sizes[axis] - 1 if sign < 0 else 0 for axis, sign in zip(order, signs, strict=True)]
-        place = {"spacing": steps, "origin": world * origin * lengths + turn @ (steps * last)}
+        place = {"spacing": spacing, "origin": world * origin * lengths + turn @ (spacing * last)}
         if not np.allclose(turn * signs, np.eye(3), rtol=0, atol=ALONG_AXES):
             place["direction"] = turn * signs
         known = self.steps or self.convention or self.direction is not None or place["origin"].any()
         return order, signs.tolist(), place if known else {}
 
     def rows(self) -> dict[str, str]:
-        """The record in words, by what they are about, for `jaxvol info`."""
+        """Description of the record, by topic, for `jaxvol info`."""
         lengths = {a: f" of {step:.6g} {self.unit(a) or ''}".rstrip() for a, step in self.steps.items()}
         axes = zip(self.axes, self.data.shape, self.letters, strict=True)
-        told = ", ".join(f"{name} {n}{lengths.get(letter, '')}" for name, n, letter in axes)
+        sizes = ", ".join(f"{name} {n}{lengths.get(letter, '')}" for name, n, letter in axes)
         stored = getattr(self.data.dtype, "numpy_dtype", self.data.dtype)  # of tensorstore
         scale = f"value = {self.slope:.9g} x stored + {self.intercept:.9g}"
         rows = {
             "format": self.format,
-            "stored": f"{stored}, {told}",
+            "stored": f"{stored}, {sizes}",
             "scale": self.is_scaled and scale,
             "missing": self.missing and f"stored {', '.join(f'{n:g}' for n in self.missing)}",
             "world": self.convention and f"{self.convention}, shown as LPS (left, back, head)",
@@ -144,47 +140,47 @@ class ImageRecord:
 
 
 def holds(dtype: np.dtype, number: float) -> bool:
-    """Whether a type of integers or floats holds a number; floats may round it."""
+    """Test that a type of integers or floats can hold a number; floats may round it."""
     is_whole = dtype.kind in "iu" and float(number).is_integer()
     return dtype.kind == "f" or (is_whole and np.iinfo(dtype).min <= number <= np.iinfo(dtype).max)
 
 
 def choose(record: ImageRecord, time: int | None, channel: int | None) -> tuple[tuple[Any, ...], str]:
-    """An index of the array that chooses an image of several, and the letters of the axes that are left: x, y
-    and z, and s of several values in a voxel. Raises `ValueError` where the choice is missing or wrong."""
-    letters, shape, where = record.letters, record.data.shape, record.what.removeprefix("path: ")
+    """Index that selects one image, and the remaining axes. Raises `ValueError` for a bad choice."""
+    letters, shape, source = record.letters, record.data.shape, record.what.removeprefix("path: ")
     time = None if record.is_chosen else time
     axes = sorted(zip(letters, shape, strict=True), key=lambda axis: "xyztcs".index(axis[0]))
     sizes = ", ".join(f"{axis} {n}" for axis, n in axes)
-    given = {"t": ("time", time), "c" if "c" in letters else "s": ("channel", channel)}
-    for letter, (name, number) in given.items():
-        ensure(number is None or letter in letters, f"{name}: {where} has no such axis; it holds {sizes}.")
+    choices = {"t": ("time", time), "c" if "c" in letters else "s": ("channel", channel)}
+    for letter, (name, number) in choices.items():
+        ensure(number is None or letter in letters, f"{name}: {source} has no such axis; it holds {sizes}.")
     index: list[Any] = [slice(None)] * len(letters)
     for letter in sorted({*letters} - {*"xyz"}):
-        at = letters.index(letter)
-        name, number = given.get(letter, ("channel", None))
-        if number is None and letter == "s" and shape[at] > 1:
+        axis = letters.index(letter)
+        name, number = choices.get(letter, ("channel", None))
+        if number is None and letter == "s" and shape[axis] > 1:
             continue  # the volume's channels
-        wanted = f"{name} must be given, from 0 to {shape[at] - 1}: {where} holds {sizes}."
-        ensure(number is not None or shape[at] == 1, wanted)
-        index[at] = integer(name, number or 0, 0, shape[at] - 1)
+        missing = f"{name} must be given, from 0 to {shape[axis] - 1}: {source} holds {sizes}."
+        ensure(number is not None or shape[axis] == 1, missing)
+        index[axis] = integer(name, number or 0, 0, shape[axis] - 1)
     return tuple(index), "".join(a for a, i in zip(letters, index, strict=True) if isinstance(i, slice))
 
 
 def volume_arguments(
-    record: ImageRecord, *, time: Any = None, channel: Any = None, nan: Any = None, turned: bool = True
+    record: ImageRecord,
+    *,
+    time: int | None = None,
+    channel: int | None = None,
+    nan: float | None = None,
+    turned: bool = True,
 ) -> dict[str, Any]:
     """Arguments of `Volume` for an image: axes along the world's (if `turned`), lengths in mm, values scaled,
-    and those that are missing replaced by `nan`, by default by the least one that is there. Ids of segments,
-    and whole numbers under a scale, are numbered where float32 would round them.
-
-    Raises `ValueError` for unknown axes, a choice of `time` or `channel` that is missing or wrong, a place
-    that is none, and 2**31 voxels or more. Warns of what was assumed.
-    """
+    missing values replaced by `nan` or the minimum, and segment ids and scaled integers numbered if float32
+    would round them. Raises `ValueError` for a bad record or choice; warns of assumptions."""
     index, letters = choose(record, time, channel)
     shape = [n for n, part in zip(record.data.shape, index, strict=True) if isinstance(part, slice)]
-    most = f"{record.what} must hold 1 to 2**31 - 1 voxels; got shape {tuple(shape)}."
-    ensure(math.prod(shape) <= MOST_VOXELS, most)
+    fault = f"{record.what} must hold 1 to 2**31 - 1 voxels; got shape {tuple(shape)}."
+    ensure(math.prod(shape) <= MOST_VOXELS, fault)
     if not {*"xyz"} <= {*letters}:
         check_shape(tuple(shape[:2]))
     order, signs, place = record.oriented([shape[letters.index(a)] for a in "xyz"], turned=turned)
@@ -209,7 +205,7 @@ def volume_arguments(
 
 
 def warn_caller(text: str) -> None:
-    """Warn of something at the line that called the library."""
+    """Warn at the line that called the library."""
     level, frame = 1, sys._getframe()
     while frame is not None and frame.f_globals.get("__name__", "").startswith(INNER):
         level, frame = level + 1, frame.f_back
@@ -217,7 +213,7 @@ def warn_caller(text: str) -> None:
 
 
 def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float | None) -> np.ndarray:
-    """Values with those that are missing replaced."""
+    """Replace missing values."""
     if nan is None:
         count, n = np.count_nonzero(mask), mask.size
         ensure(count < n, f"{record.what} must hold values; all {n} are missing. Give nan=VALUE.")
@@ -229,13 +225,13 @@ def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float 
 
 
 def numbered(ids: np.ndarray) -> dict[str, Any]:
-    """Arguments of `Volume`: numbers in the order of the ids, in place of these, and the ids."""
+    """Arguments of `Volume` for integer ids: their ranks as data, and the sorted ids as `label_ids`."""
     kinds, numbers = np.unique(ids, return_inverse=True)
     return {"data": numbers.reshape(ids.shape), "label_ids": kinds.tolist()}
 
 
 class DecodedArray:
-    """The array of a record, for bricks: boxes of it are read as values, with some of its axes reversed."""
+    """Array of a record for bricks: boxes are read as decoded values, with some axes reversed."""
 
     def __init__(self, record: ImageRecord, reverse: Sequence[int], nan: float | None):
         self.record, self.reverse, self.nan, self.shape = record, reverse, nan, record.data.shape

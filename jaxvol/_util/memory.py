@@ -1,4 +1,4 @@
-"""Does an allocation fit into memory? Running out would end the process. And how is memory given back?"""
+"""Checks that allocations fit into memory, since running out ends the process; and return of freed memory."""
 
 import ctypes
 import os
@@ -7,15 +7,15 @@ from pathlib import Path
 import jax
 
 
-def require_room(wanted: int, of: str) -> None:
-    """Raises `ValueError` if the device has less than the bytes `wanted` by these arguments (`of`)."""
-    if wanted > (room := memory_of_device()):
-        asked, held = wanted / 2**30, room / 2**30
-        raise ValueError(f"{of}: asks for {asked:.3g} GiB of memory, and the device has {held:.3g} GiB.")
+def require_room(size: int, subject: str) -> None:
+    """Raise a `ValueError`, beginning with `subject`, if the device has less memory than `size` bytes."""
+    if size > (room := memory_of_device()):
+        needs, has = size / 2**30, room / 2**30
+        raise ValueError(f"{subject}: asks for {needs:.3g} GiB of memory, and the device has {has:.3g} GiB.")
 
 
 def memory_of_device() -> int:
-    """Bytes that the default device may use: its own limit, or that of the machine or container."""
+    """Bytes that the default device may use: its own limit, or the limit of the machine or container."""
     device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
     reported = (device.memory_stats() or {}).get("bytes_limit") if isinstance(device, jax.Device) else None
     if reported:
@@ -39,7 +39,7 @@ def memory_available() -> int:
 
 
 def give_back() -> None:
-    """Gives memory that was freed back to the system, where the C library is one that keeps it (glibc)."""
+    """Return freed memory to the system, if the C library keeps it (glibc)."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)

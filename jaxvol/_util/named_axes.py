@@ -1,8 +1,7 @@
-"""Records of images that say where they lie: of xarray, nibabel, SimpleITK, itk and VTK, none of which is
-imported unless an image of it comes."""
+"""Records of images of xarray, nibabel, SimpleITK, itk, VTK and Zarr, none of which is imported here."""
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,11 @@ from .files import ensure
 from .image_record import ImageRecord, volume_arguments
 
 
-EVEN = 1e-3  # part of a step by which a coordinate may be away from evenly spaced ones
+EVEN = 1e-3  # tolerance of coordinates from evenly spaced ones, in steps
 
 
-def record_of(value: Any) -> ImageRecord | None:
-    """The record of an image of one of these libraries; None for anything else."""
+def record_of(value: object) -> ImageRecord | None:
+    """Record of an image of a known library; None for anything else."""
     placed = ("GetSpacing", "GetOrigin")
     marks: dict[Callable[[Any], ImageRecord | None], tuple[str, ...]] = {
         _xarray: ("dims", "coords", "transpose", "to_numpy"),
@@ -24,12 +23,12 @@ def record_of(value: Any) -> ImageRecord | None:
         _vtk: (*placed, "GetDirectionMatrix", "GetPointData"),
         _zarr: ("metadata", "attrs", "store", "chunks"),
     }
-    found = (read for read, names in marks.items() if all(hasattr(type(value), name) for name in names))
-    return next(found, lambda _: None)(value)
+    readers = (read for read, names in marks.items() if all(hasattr(type(value), name) for name in names))
+    return next(readers, lambda _: None)(value)
 
 
-def object_arguments(value: Any) -> dict[str, Any] | None:
-    """Arguments of `Volume` for an image of these libraries, channels included; None for anything else."""
+def object_arguments(value: object) -> dict[str, Any] | None:
+    """Arguments of `Volume` for an image of a known library, channels included; None for anything else."""
     if (record := record_of(value)) is None:
         return None
     if "s" not in (letters := record.letters):
@@ -37,8 +36,8 @@ def object_arguments(value: Any) -> dict[str, Any] | None:
     return volume_arguments(record, turned=False)
 
 
-def grid_of(affine: Any) -> dict[str, Any]:
-    """`steps`, `origin` and `direction` of a record whose voxel (i, j, k) lies at `affine @ (i, j, k, 1)`."""
+def grid_of(affine: np.ndarray) -> dict[str, Any]:
+    """Fields `steps`, `origin`, `direction` of a record with voxel (i, j, k) at `affine @ (i, j, k, 1)`."""
     columns, origin = np.split(np.asarray(affine, float)[:3], [3], axis=1)
     steps = np.linalg.norm(columns, axis=0)
     with np.errstate(invalid="ignore"):
@@ -48,13 +47,13 @@ def grid_of(affine: Any) -> dict[str, Any]:
 
 
 def fields_of(header: Any) -> Any:
-    """The names in a header of nibabel; that of MINC tells none."""
+    """Names of the fields in a nibabel header; none for MINC."""
     return header.keys() if hasattr(header, "keys") else ()
 
 
-def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
-    """Record of a nibabel image, whose world is RAS. A NIfTI without sform and qform keeps the file's axes
-    from 0 on, as by SimpleITK. `stored`: numbers read before; without, a fourth axis is channels."""
+def nibabel_record(image: Any, stored: np.ndarray | None = None) -> ImageRecord:
+    """Record of a nibabel image, whose world is RAS. A NIfTI without sform and qform keeps the file's axes,
+    with origin 0, as in SimpleITK. `stored`: voxels read before; without them, a fourth axis is channels."""
     header, proxy = image.header, image.dataobj
     data = proxy.get_unscaled() if stored is None and hasattr(proxy, "get_unscaled") else stored
     data = np.asanyarray(proxy if data is None else data)
@@ -66,7 +65,7 @@ def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
     axes = "xyzsc" if stored is None else "xyztc"
     while data.ndim > 5 and data.shape[-1] == 1:
         data = data[..., 0]
-    if names := data.dtype.names:  # of colours
+    if names := data.dtype.names:  # the channels of a colour
         axes, data = "xyztc"[: data.ndim] + "s", np.stack([data[name] for name in names], axis=-1)
     else:
         place |= {"slope": getattr(proxy, "slope", 1.0), "intercept": getattr(proxy, "inter", 0.0)}
@@ -74,10 +73,10 @@ def nibabel_record(image: Any, stored: Any = None) -> ImageRecord:
 
 
 def _itk(image: Any) -> ImageRecord:
-    """The record of an image of SimpleITK, or of the package `itk`."""
+    """Record of an image of SimpleITK or of the package `itk`."""
     simple = hasattr(image, "GetDimension")
     library = sys.modules.get("SimpleITK" if simple else "itk")
-    if library is None:  # a class that only looks like theirs
+    if library is None:  # another class with the same methods
         raise ValueError(f"data must be an image of SimpleITK or itk; got {type(image).__name__}.")
     n = image.GetDimension() if simple else image.GetImageDimension()
     ensure(n == 3, f"data must be a 3-D image; got one of {n} axes. Extract one volume.")
@@ -97,15 +96,14 @@ def _vtk(image: Any) -> ImageRecord:
     return vtk_record(data, image.GetExtent(), of_cells, place)
 
 
-def vtk_sizes(extent: Any, of_cells: bool) -> list[int]:
-    """Numbers of points of an extent of VTK along x, y, z, or of cells between them."""
+def vtk_sizes(extent: Sequence[Any], of_cells: bool) -> list[int]:
+    """Numbers of points, or of cells, of a VTK extent along x, y, z."""
     first, last = np.array(extent, int).reshape(3, 2).T
     return np.maximum(last - first + (not of_cells), 1).tolist()
 
 
-def vtk_record(data: np.ndarray, extent: Any, of_cells: bool, place: Any) -> ImageRecord:
-    """The record of values [voxel, component], x fastest, at points of an extent, or at the centres of cells.
-    `place`: spacing, origin, direction."""
+def vtk_record(data: np.ndarray, extent: Sequence[Any], of_cells: bool, place: Sequence[Any]) -> ImageRecord:
+    """Record of values [voxel, component], x fastest, on an extent; `place`: spacing, origin, direction."""
     spacing, origin, turn = (np.array(numbers, float) for numbers in place)
     columns, first = turn.reshape(3, 3) * spacing, np.array(extent, int)[::2] + 0.5 * of_cells
     grid = grid_of(np.column_stack([columns, origin + columns @ first]))
@@ -115,7 +113,7 @@ def vtk_record(data: np.ndarray, extent: Any, of_cells: bool, place: Any) -> Ima
 
 
 def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """`slope`, `intercept`, `missing` and `unsigned` of a record by attributes of the CF convention."""
+    """Fields `slope`, `intercept`, `missing` and `unsigned` of a record, from CF attributes."""
     slope, intercept = float(attributes.get("scale_factor", 1)), float(attributes.get("add_offset", 0))
     fills = [attributes.get(name) for name in ("_FillValue", "missing_value")]
     numbers = [float(n) for fill in fills if not isinstance(fill, str | None) for n in np.ravel(fill)]
@@ -125,33 +123,33 @@ def cf_scale(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _zarr(value: Any) -> ImageRecord | None:
-    """The record of an array with names of axes, its own or xarray's; without, it is like any other array."""
+    """Record of a Zarr array with names of axes, its own or xarray's; None without names."""
     attributes = dict(value.attrs)
     names = getattr(value.metadata, "dimension_names", None) or attributes.get("_ARRAY_DIMENSIONS") or []
     return ImageRecord(value, list(names), **cf_scale(attributes)) if len(names) > 2 and all(names) else None
 
 
 def _xarray(value: Any) -> ImageRecord:
-    """The record of a `DataArray`: axes by name, or by `axis` of the CF convention; places by their
-    coordinates, evenly spaced, also of several axes; `direction` as `itk.xarray_from_image` keeps it."""
-    own = {name: value.coords[name] for name in value.dims if name in value.coords}
-    names = [str(getattr(own.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
+    """Record of a `DataArray`: axes by name or CF attribute `axis`, positions by even coordinates."""
+    by_dim = {name: value.coords[name] for name in value.dims if name in value.coords}
+    names = [str(getattr(by_dim.get(name), "attrs", {}).get("axis", name)) for name in value.dims]
     record = ImageRecord(value.variable, names, **cf_scale(value.attrs))  # read later, maybe from a file
     dims = {letter: dim for letter, dim in zip(record.letters, value.dims, strict=True) if letter in "xyz"}
-    named = {letter: value.coords[letter] for letter in "xyz" if letter in value.coords}
-    if len(dims) == len(named) == 3 and any(each.ndim > 1 for each in named.values()):  # of each voxel
+    coords = {letter: value.coords[letter] for letter in "xyz" if letter in value.coords}
+    is_3d = len(dims) == len(coords) == 3 and any(coord.ndim > 1 for coord in coords.values())  # per voxel
+    if not is_3d:
+        coords = {letter: coord for letter, coord in coords.items() if coord.dims == (dims.get(letter),)}
+        coords = {letter: by_dim[dim] for letter, dim in dims.items() if dim in by_dim} | coords
+    record.units = {letter: coord.attrs.get("units") for letter, coord in coords.items()}
+    if is_3d:
         first = value.isel({dim: 0 for dim in value.dims if dim not in dims.values()})
         order = [dims[letter] for letter in "xyz"]
-        world = [named[letter].broadcast_like(first).transpose(*order).to_numpy() for letter in "xyz"]
-        record.units = {letter: each.attrs.get("units") for letter, each in named.items()}
+        world = [coords[letter].broadcast_like(first).transpose(*order).to_numpy() for letter in "xyz"]
         vars(record).update(grid_of(_affine(np.stack(world))))
         return record
-    along = {a: each for a, each in named.items() if each.dims == (dims.get(a),)}
-    along = {a: own[dim] for a, dim in dims.items() if dim in own} | along
-    ends = {letter: even_step(each.to_numpy(), each.name) for letter, each in along.items()}
-    record.steps = {letter: ends.get(letter, (1.0, 0.0))[0] for letter in "xyz"} if along else {}
+    ends = {letter: even_step(coord.to_numpy(), coord.name) for letter, coord in coords.items()}
+    record.steps = {letter: ends.get(letter, (1.0, 0.0))[0] for letter in "xyz"} if coords else {}
     record.origin = [ends.get(letter, (1.0, 0.0))[1] for letter in "xyz"]
-    record.units = {letter: each.attrs.get("units") for letter, each in along.items()}
     if (turn := value.attrs.get("direction")) is not None and len(dims) == 3:
         rank = [list(dims).index(letter) for letter in "xyz"]
         record.direction = np.reshape(np.asarray(turn, float), (3, 3))[np.ix_(rank, rank)]
@@ -159,21 +157,21 @@ def _xarray(value: Any) -> ImageRecord:
     return record
 
 
-def even_step(at: np.ndarray, name: Any) -> tuple[float, float]:
-    """The distance between evenly spaced numbers, and the first. Raises `ValueError` for others."""
+def even_step(at: np.ndarray, name: object) -> tuple[float, float]:
+    """Distance between evenly spaced numbers, and the first number. Raises `ValueError` for uneven ones."""
     even = np.linspace(at[0], at[-1], at.size) if at.dtype.kind in "iuf" and at.size else np.zeros(2)
     step = float(even[1] - even[0]) if at.size > 1 else 0.0
-    is_even = step and np.abs(at - even).max() <= EVEN * abs(step)  # not of NaN
+    is_even = step and np.abs(at - even).max() <= EVEN * abs(step)  # false for NaN
     ensure(is_even, f"data must have evenly spaced numbers as coordinates; got others: {name!r}.")
     return step, float(at[0])
 
 
 def _affine(world: np.ndarray) -> np.ndarray:
-    """The affine map of positions [3, x, y, z]. Raises `ValueError` where they are none's."""
+    """Affine map of positions [3, x, y, z]. Raises `ValueError` for a curved grid."""
     first, last = world[:, 0, 0, 0], np.maximum(np.array(world.shape[1:]) - 1, 1)
     ends = world[:, -1, 0, 0], world[:, 0, -1, 0], world[:, 0, 0, -1]
     columns = (np.stack(ends, axis=1) - first[:, None]) / last
     exact = first[:, None, None, None] + np.tensordot(columns, np.indices(world.shape[1:]), 1)
-    is_affine = np.abs(world - exact).max() <= EVEN * np.linalg.norm(columns, axis=0).min()  # not of NaN
+    is_affine = np.abs(world - exact).max() <= EVEN * np.linalg.norm(columns, axis=0).min()  # false for NaN
     ensure(is_affine, "data must have evenly spaced numbers as coordinates; got those of a curved grid.")
     return np.column_stack([columns, first])

@@ -1,6 +1,6 @@
-"""Piecewise linear functions of one variable: tables of a row for each point, look-ups, and bounds."""
+"""Piecewise linear functions of one variable: tables with one row per point, look-ups, and bounds."""
 
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -13,34 +13,36 @@ from .vec3 import Scalar, Vec3
 
 
 FEW = 8
-"""Most control points among which a row is chosen by comparisons; of more, it is looked up."""
+"""Maximum number of control points for which a row is chosen by comparisons rather than by a look-up."""
 
 COMPARED = 16
-"""Up to so many control points, comparing a value with each costs less than a search."""
+"""Number of control points up to which comparing a value with all of them costs less than a search."""
 
 ROUNDING = 32 * float(jnp.finfo(jnp.float32).eps)
-"""By how much an interpolated extinction may exceed its bound, relative to the greatest of its table."""
+"""Amount by which an interpolated extinction may exceed its bound, relative to the table's maximum."""
 
 
 def few() -> int:
-    """Most points that are compared one by one: `COMPARED` where gathers are fast, else `FEW`."""
+    """Maximum number of points that are compared one by one: `COMPARED` if gathers are fast, else `FEW`."""
     return COMPARED if gathers_are_fast() and not on_gpu() else FEW
 
+
+AnyArray: TypeAlias = Array | np.ndarray  # results are of the same library
 
 Row: TypeAlias = tuple[Scalar, ...]
 """One row of a table."""
 
 Range: TypeAlias = tuple[Any, Any]
-"""Indices (blocks) of the first and the last of some control points, inclusive."""
+"""Indices (blocks) of the first and the last control point of a range, inclusive."""
 
 
-def clip_below(value: Scalar, least: Scalar) -> Scalar:
-    """The larger of the two. NaN stays NaN. A comparison takes less time than a maximum."""
-    return jnp.where(value < least, least, value)
+def clip_below(value: Scalar, minimum: Scalar) -> Scalar:
+    """Maximum of a value and `minimum`; NaN stays NaN. A comparison takes less time than `jnp.maximum`."""
+    return jnp.where(value < minimum, minimum, value)
 
 
 def not_negative(extinction: Array) -> Array:
-    """The extinction, or 0 below 0 (after an optimiser's step), without derivative there. NaN stays NaN."""
+    """Extinction clipped at 0 (after an optimiser's step), with derivative 0 below 0. NaN stays NaN."""
     return jnp.where(extinction < 0, 0, extinction)
 
 
@@ -50,69 +52,68 @@ def points_below(
     """Number of control points at or below a value, or strictly below it."""
     values, last = jax.lax.stop_gradient(values), values.shape[0] - 1
 
-    def searched(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
-        # While there are few points, comparing with all of them, one fused kernel, is faster.
-        how, side = "compare_all" if last < 2 * COMPARED else "scan_unrolled", "left" if strictly else "right"
-        return jnp.searchsorted(values, value, side=side, method=how).astype(jnp.int32)
+    def search(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
+        # one fused kernel that compares with all points is faster while they are few
+        method = "compare_all" if last < 2 * COMPARED else "scan_unrolled"
+        side = "left" if strictly else "right"
+        return jnp.searchsorted(values, value, side=side, method=method).astype(jnp.int32)
 
-    if last < COMPARED or on_gpu():  # there, a branch costs more
-        return searched(value)
+    if last < COMPARED or on_gpu():  # on a GPU, a branch costs more
+        return search(value)
     first, step = values[0], (values[-1] - values[0]) / last
 
-    def counted(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
-        """Of evenly spaced points, by a division, which may be off by one."""
+    def divide(value: Float[Array, "*batch"]) -> Int[Array, "*batch"]:
+        """Number of evenly spaced points, by a division that may be off by one."""
         guess = jnp.clip(((value - first) / step).astype(jnp.int32), 0, last - 1)
-        reached = [
-            value > at if strictly else value >= at
-            for at in (gather(values, guess), gather(values, guess + 1))
-        ]
-        return guess + sum(each.astype(jnp.int32) for each in reached)
+        points = gather(values, guess), gather(values, guess + 1)
+        reached = (value > point if strictly else value >= point for point in points)
+        return guess + sum(is_reached.astype(jnp.int32) for is_reached in reached)
 
     # compare positions rather than gaps: small deviations of gaps would add up
-    evenly = first + step * jnp.arange(last + 1, dtype=values.dtype)
-    even = jnp.all(jnp.abs(values - evenly) < 0.4 * step)
-    return jax.lax.cond(even, counted, searched, value)
+    even_values = first + step * jnp.arange(last + 1, dtype=values.dtype)
+    is_even = jnp.all(jnp.abs(values - even_values) < 0.4 * step)
+    return jax.lax.cond(is_even, divide, search, value)
 
 
-def points_around(values: Any, low: Any, high: Any) -> Range:
-    """The control points from `low` to `high`, and the next ones around; in NumPy, of NumPy arrays."""
+def points_around(values: AnyArray, low: AnyArray, high: AnyArray) -> Range:
+    """Control points from `low` to `high` and one more on either side; NumPy arrays stay in NumPy."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
-    known = isinstance(values, np.ndarray)
-    xp, below = np if known else jnp, cast(Any, _points_below if known else points_below)
-    first = xp.maximum(below(values, low) - 1, 0)
+    xp: Any = np if isinstance(values, np.ndarray) else jnp
+
+    def below(value: Any, strictly: bool = False) -> Any:
+        if isinstance(values, np.ndarray):
+            return np.searchsorted(values, value, side="left" if strictly else "right")
+        return points_below(values, value, strictly=strictly)
+
+    first = xp.maximum(below(low) - 1, 0)
     # the first point at or above `high`; the second of two points at `high`
-    last = xp.maximum(below(values, high, strictly=True), below(values, high) - 1)
+    last = xp.maximum(below(high, strictly=True), below(high) - 1)
     return first, xp.minimum(last, values.shape[0] - 1)
 
 
-def _points_below(values: np.ndarray, value: np.ndarray, *, strictly: bool = False) -> np.ndarray:
-    """As `points_below`, in NumPy."""
-    return np.searchsorted(values, value, side="left" if strictly else "right")
-
-
 def table_row(rows: Float[Array, "points columns"], point: Int[Array, "..."]) -> Row:
-    """One row. Each entry is looked up by itself, so that batched entries are whole arrays from the start."""
+    """One row of a table. Columns are gathered one by one, so that batched entries are contiguous arrays."""
     point = jnp.clip(point, 0, rows.shape[0] - 1)
     return tuple(gather(rows[:, i], point) for i in range(rows.shape[1]))
 
 
 def interpolate_row(row: Row, past: Scalar) -> tuple[Vec3, Scalar]:
     """Colour and extinction of a value at the distance `past` beyond the point of this row."""
-    r, g, b, extinction = (at + past * slope for at, slope in zip(row[1:5], row[5:9], strict=True))
-    # where it falls to 0, rounding may make it negative; NaN stays NaN
-    return (r, g, b), jnp.where(extinction < 0, 0, extinction)
+    r, g, b, extinction = (start + past * slope for start, slope in zip(row[1:5], row[5:9], strict=True))
+    return (r, g, b), not_negative(extinction)
 
 
-def positive_between(values: Any, extinction: Any, low: Any, high: Any) -> Any:
-    """Whether the extinction is positive anywhere from `low` to `high`; of NumPy arrays, in NumPy."""
+def positive_between(values: AnyArray, extinction: AnyArray, low: AnyArray, high: AnyArray) -> Any:
+    """Test whether the extinction is positive anywhere from `low` to `high`; NumPy arrays stay in NumPy."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
-    positive, n, xp = extinction > 0, values.shape[0], np if isinstance(values, np.ndarray) else jnp
+    xp: Any = np if isinstance(values, np.ndarray) else jnp
+    positive, n = extinction > 0, values.shape[0]
     if n > COMPARED:  # counting by look-up costs less than comparing with each point
         before = xp.concatenate([xp.zeros(1, np.int32), xp.cumsum(positive, dtype=np.int32)])
         # between two points the extinction is positive wherever it is at one of the two
         first, last = points_around(values, low, high)
         return before[last + 1] > before[first]
-    seen = xp.zeros(low.shape, bool)
+    result = xp.zeros(low.shape, bool)
     for point in range(n):
         # a point's extinction reaches from the point before it to the one behind it
         reached = xp.full(low.shape, positive[point])
@@ -120,8 +121,8 @@ def positive_between(values: Any, extinction: Any, low: Any, high: Any) -> Any:
             reached &= (high > values[point - 1]) | (high >= values[point])
         if point < n - 1:
             reached &= low < values[point + 1]
-        seen |= reached
-    return seen
+        result |= reached
+    return result
 
 
 def upper_bound_between(
@@ -130,28 +131,19 @@ def upper_bound_between(
     low: Float[Array, "*blocks"],
     high: Float[Array, "*blocks"],
 ) -> Float[Array, "*blocks"]:
-    """Upper bound of the extinction from `low` to `high`: at the ends or a point between, plus rounding."""
+    """Upper bound of the extinction from `low` to `high`: its maximum there, plus rounding."""
     low, high = low.astype(values.dtype), high.astype(values.dtype)
     ends = jnp.maximum(jnp.interp(low, values, extinction), jnp.interp(high, values, extinction))
     first, end = points_below(values, low, strictly=True), points_below(values, high)
-    inside = _maximum_of_range(extinction, first, end)
+    table = jnp.stack(run_maxima(extinction, 0))
+    begin = jnp.minimum(first, extinction.shape[0] - 1)
+    level, (head, tail) = covering_runs((begin, jnp.maximum(end - 1, begin)), len(table))
+    inside = jnp.where(end > first, jnp.maximum(table[level, head], table[level, tail]), 0)
     return jnp.maximum(ends, inside) + ROUNDING * extinction.max()
 
 
-def _maximum_of_range(
-    entries: Float[Array, " n"], first: Int[Array, "*batch"], end: Int[Array, "*batch"]
-) -> Float[Array, "*batch"]:
-    """Maximum of the entries from `first` to before `end`; 0 where there are none."""
-    table = jnp.stack(run_maxima(entries, 0))
-    begin = jnp.minimum(first, entries.shape[0] - 1)
-    level, (left, right) = covering_runs((begin, jnp.maximum(end - 1, begin)), len(table))
-    return jnp.where(end > first, jnp.maximum(table[level, left], table[level, right]), 0)
-
-
-def covering_runs(
-    entries: Range, levels: int
-) -> tuple[Int[Array, "*blocks"], tuple[Int[Array, "*blocks"], Int[Array, "*blocks"]]]:
-    """Two runs of 2**k entries that cover these ones: k, and where they begin."""
+def covering_runs(entries: Range, levels: int) -> tuple[Int[Array, "*blocks"], Range]:
+    """Two runs of 2**k entries that cover a range of entries: k, and the first entry of both runs."""
     first, last = entries
     reached = ((last - first + 1 >= 2**k).astype(jnp.int32) for k in range(1, levels))
     level = sum(reached, jnp.zeros_like(first))
@@ -159,12 +151,12 @@ def covering_runs(
 
 
 def run_maxima(table: Float[Array, "..."], axis: int) -> list[Float[Array, "..."]]:
-    """The maxima of 1, 2, 4, … entries from each one on along an axis."""
+    """Maxima of runs of 1, 2, 4, … entries along an axis, by the first entry of the run."""
     runs, length, n = [table], 1, table.shape[axis]
     while 2 * length <= n:
         later = jax.lax.slice_in_dim(runs[-1], length, None, axis=axis)
-        # the last ones are never asked for
-        rest = jax.lax.slice_in_dim(runs[-1], n - length, None, axis=axis)
-        runs.append(jnp.maximum(runs[-1], jnp.concatenate([later, rest], axis)))
+        # padding: runs that would end beyond the last entry are never looked up
+        tail = jax.lax.slice_in_dim(runs[-1], n - length, None, axis=axis)
+        runs.append(jnp.maximum(runs[-1], jnp.concatenate([later, tail], axis)))
         length *= 2
     return runs

@@ -1,5 +1,5 @@
-"""Means of piecewise linear functions over all values between two: of the extinction, and of the colour,
-weighted by it. n control points divide all values into n + 1 spans."""
+"""Means of piecewise linear functions over an interval: extinction, and colour weighted by extinction.
+n control points divide the values into n + 1 spans."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .piecewise_linear import Row, table_row
+from .piecewise_linear import Row, not_negative, table_row
 from .vec3 import Scalar, Vec3
 
 
 class Span(NamedTuple):
     """One row of `span_rows`: start and end value; colour (r, g, b) and extinction at the start, and their
-    slopes; integrals of emission and extinction from the first point on, with what rounding lost."""
+    slopes; integrals of emission and extinction from the first point on, and their rounding errors."""
 
     start: Scalar
     end: Scalar
@@ -30,16 +30,16 @@ class Span(NamedTuple):
     def at(self, value: Scalar) -> Row:
         """Colour and extinction of a value."""
         past = value - self.start
-        return tuple(at + past * slope for at, slope in zip(self.from_start, self.slopes, strict=True))
+        return tuple(start + past * slope for start, slope in zip(self.from_start, self.slopes, strict=True))
 
 
 def span_rows(values: Float[Array, " n"], at_points: Float[Array, "n 4"]) -> Float[Array, "spans 26"]:
-    """A table with one row for each span. `at_points`: colour (r, g, b) and extinction at the points."""
+    """Table with one row per span. `at_points`: colour (r, g, b) and extinction at the control points."""
     gap = (values[1:] - values[:-1])[:, None]
     rise, middle = at_points[1:] - at_points[:-1], (at_points[1:] + at_points[:-1]) / 2
     slopes = jnp.pad(jnp.where(gap > 0, rise / jnp.where(gap > 0, gap, 1), 0), ((1, 1), (0, 0)))
-    whole = gap * jnp.stack(_linear_means(tuple(middle.T), tuple(rise.T)), axis=-1)
-    integrals = jnp.pad(_exact_sums(whole), ((1, 0), (0, 0)))
+    span_integrals = gap * jnp.stack(_linear_means(tuple(middle.T), tuple(rise.T)), axis=-1)
+    integrals = jnp.pad(_exact_sums(span_integrals), ((1, 0), (0, 0)))
     points = jnp.concatenate([values[:, None], at_points, integrals], axis=1)
     start, end = jnp.concatenate([points[:1], points]), jnp.concatenate([points, points[-1:]])
     return jnp.concatenate(
@@ -48,15 +48,15 @@ def span_rows(values: Float[Array, " n"], at_points: Float[Array, "n 4"]) -> Flo
 
 
 def _exact_sums(terms: Float[Array, "n 4"]) -> Float[Array, "n 8"]:
-    """Cumulative sums, and behind them what is lost when they are rounded."""
+    """Cumulative sums, followed by their rounding errors."""
 
     def add(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-        (high, low), (more, rest) = a, b
-        total = high + more
+        (high, low), (added_high, added_low) = a, b
+        total = high + added_high
         part = total - high
-        lost = (high - (total - part)) + (more - part) + low + rest
-        whole = total + lost
-        return whole, lost - (whole - total)
+        lost = (high - (total - part)) + (added_high - part) + low + added_low
+        rounded = total + lost
+        return rounded, lost - (rounded - total)
 
     fixed = jax.lax.stop_gradient(terms)
     high, low = jax.lax.associative_scan(add, (fixed, jnp.zeros_like(fixed)))
@@ -65,7 +65,7 @@ def _exact_sums(terms: Float[Array, "n 4"]) -> Float[Array, "n 8"]:
 
 
 def span_index(rows: Float[Array, "spans 26"], value: Array) -> Int[Array, "..."]:
-    """The span in which a value lies, by comparison with all."""
+    """Index of the span that contains a value, by comparison with all spans."""
     index = jnp.zeros(jnp.shape(value), jnp.int32)
     for start in rows[1:, 0]:
         index = index + (value >= start).astype(jnp.int32)
@@ -75,45 +75,45 @@ def span_index(rows: Float[Array, "spans 26"], value: Array) -> Int[Array, "..."
 def mean_by_rows(
     a: Row, b: Row, front: Scalar, back: Scalar, same: Bool[Array, "..."]
 ) -> tuple[Vec3, Scalar]:
-    """Mean colour and extinction between two values in the spans of rows `a` and `b`, maybe the `same`;
-    rounded by some 1e-7 of the greatest extinction between the two, times the number of spans."""
-    here, there = Span.of(a), Span.of(b)
-    at_front, at_back = here.at(front), there.at(back)
+    """Mean colour and extinction from `front`, in the span of row `a`, to `back`, in that of `b` (`same`: in
+    one span). Rounding error: 1e-7 of the maximum extinction between them, times the number of spans."""
+    span_a, span_b = Span.of(a), Span.of(b)
+    at_front, at_back = span_a.at(front), span_b.at(back)
     rise = tuple(v - u for u, v in zip(at_front, at_back, strict=True))
     middle = tuple((u + v) / 2 for u, v in zip(at_front, at_back, strict=True))
-    # where they lie apart: to the end of the one span, over whole ones, and from the start of the other
+    # two spans: from `front` to the end of a's, over those between, from the start of b's to `back`
     up = back > front
-    first = jnp.where(up, here.end, here.start) - front
-    last = back - jnp.where(up, there.start, there.end)
-    before, behind = (tuple(slope * d for slope in span.slopes) for span, d in ((here, first), (there, last)))
-    head = _linear_means(tuple(u + d / 2 for u, d in zip(at_front, before, strict=True)), before)
-    tail = _linear_means(tuple(v - d / 2 for v, d in zip(at_back, behind, strict=True)), behind)
+    width_a = jnp.where(up, span_a.end, span_a.start) - front
+    width_b = back - jnp.where(up, span_b.start, span_b.end)
+    rise_a, rise_b = tuple(s * width_a for s in span_a.slopes), tuple(s * width_b for s in span_b.slopes)
+    head = _linear_means(tuple(u + d / 2 for u, d in zip(at_front, rise_a, strict=True)), rise_a)
+    tail = _linear_means(tuple(v - d / 2 for v, d in zip(at_back, rise_b, strict=True)), rise_b)
+    ends = span_a.to_start, span_a.to_end, span_b.to_start, span_b.to_end
     sums = [
-        jnp.where(up, to_start - to_end, to_end_there - to_start_here)
-        for to_start, to_end, to_end_there, to_start_here in zip(
-            there.to_start, here.to_end, there.to_end, here.to_start, strict=True
-        )
+        jnp.where(up, start_b - end_a, end_b - start_a)
+        for start_a, end_a, start_b, end_b in zip(*ends, strict=True)
     ]
     between = (high + low for high, low in zip(sums[:4], sums[4:], strict=True))
-    whole = jnp.where(same, 1, back - front)
+    total = jnp.where(same, 1, back - front)
     # weights of neighbouring spans sum to 1 whatever is rounded: see `mean_by_spans`
-    part, rest = first / whole, last / whole
-    rest = jnp.where(jnp.where(up, there.start == here.end, there.end == here.start), 1 - part, rest)
-    apart = (part * u + over / whole + rest * v for u, over, v in zip(head, between, tail, strict=True))
-    means = (jnp.where(same, u, v) for u, v in zip(_linear_means(middle, rise), apart, strict=True))
+    share_a, share_b = width_a / total, width_b / total
+    are_neighbours = jnp.where(up, span_b.start == span_a.end, span_b.end == span_a.start)
+    share_b = jnp.where(are_neighbours, 1 - share_a, share_b)
+    mixed = (share_a * u + over / total + share_b * v for u, over, v in zip(head, between, tail, strict=True))
+    means = (jnp.where(same, u, v) for u, v in zip(_linear_means(middle, rise), mixed, strict=True))
     return _classified(tuple(means), middle)
 
 
 @jax.custom_jvp
 def mean_by_spans(rows: Float[Array, "spans 26"], front: Scalar, back: Scalar) -> tuple[Vec3, Scalar]:
-    """The same by a sum over all spans, faster for few; derivatives are those of `mean_by_rows`."""
+    """Mean colour and extinction by a sum over all spans, faster for few; derivatives: `mean_by_rows`."""
     spans = [Span.of(tuple(row)) for row in rows]
     up = back > front
     low, high = jnp.where(up, front, back), jnp.where(up, back, front)
     rise = high - low
     inverse = 1 / jnp.where(rise > 0, rise, 1)
-    # How far from one value to the other each span begins. The weights sum to 1 whatever is rounded: XLA may
-    # compute a value twice, rounded differently, so that no sum may be divided by a difference.
+    # Starts of spans as fractions of the way from `low` to `high`. Weights sum to 1 whatever is rounded: XLA
+    # may compute a value twice, rounded differently, so that no sum may be divided by a difference.
     begins = [
         jnp.where(span.start <= low, 0, jnp.where(span.start >= high, 1, (span.start - low) * inverse))
         for span in spans[1:]
@@ -140,18 +140,17 @@ def _(primals: tuple[Array, Scalar, Scalar], tangents: tuple[Any, Any, Any]) -> 
 
 
 def _linear_means(middle: Sequence[Array], rise: Sequence[Array]) -> tuple[Array, ...]:
-    """Mean emission and extinction of linear colour and extinction, by their middle and rise."""
+    """Mean emission and extinction of linear colour and extinction, from their mid values and rises."""
     *colors, extinction = middle
-    *of_colors, of_extinction = rise
-    emission = (extinction * c + of_extinction * d / 12 for c, d in zip(colors, of_colors, strict=True))
+    *color_rises, extinction_rise = rise
+    emission = (extinction * c + extinction_rise * d / 12 for c, d in zip(colors, color_rises, strict=True))
     return (*emission, extinction)
 
 
 def _classified(means: Row, plain: Row) -> tuple[Vec3, Scalar]:
-    """Colour and extinction of these means; where that is 0, a plain mean of the colours."""
+    """Colour and extinction from mean emission and extinction; the `plain` mean colour at extinction 0."""
     *emission, extinction = means
-    # where it is 0, rounding may make it negative; NaN stays NaN
-    extinction = jnp.where(extinction < 0, 0, extinction)
+    extinction = not_negative(extinction)
     emits = extinction > float(jnp.finfo(extinction.dtype).tiny)
     r, g, b = (
         jnp.where(emits, part / jnp.where(emits, extinction, 1), color)

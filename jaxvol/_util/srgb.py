@@ -1,9 +1,10 @@
-"""The sRGB curve: linear colour to display values, and back."""
+"""Conversions between linear colour and sRGB display values, and PNG files."""
 
 import io
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
+from types import EllipsisType
 from typing import Any
 
 import jax
@@ -16,11 +17,11 @@ from .checks import Arrayable, described, finite_array
 
 
 BRIGHTEST = 8.0
-"""Of colours, above which they are hardly meant as linear RGB."""
+"""Component of a colour above which it is hardly meant as linear RGB."""
 
 
 def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
-    """Linear colour to sRGB display values, both in [0, 1]; values outside are clipped.
+    """Convert linear colour to sRGB display values, both in [0, 1]; values outside are clipped.
 
     Args:
         linear: colours, of any shape.
@@ -34,7 +35,7 @@ def to_srgb(linear: Arrayable) -> Float[Array, "*image"]:
 
 
 def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
-    """sRGB display values (as of a matplotlib colormap) to linear colour, both in [0, 1].
+    """Convert sRGB display values (as of a matplotlib colormap) to linear colour, both in [0, 1].
 
     Args:
         display: values, of any shape.
@@ -47,8 +48,8 @@ def from_srgb(display: Arrayable) -> Float[Array, "*image"]:
     return _by_curve(_from_srgb, display)
 
 
-def linear_color(name: str, color: Any, shape: Any = (3,)) -> Any:
-    """Linear RGB of this shape; or a name that matplotlib knows: "white", "#336699"."""
+def linear_color(name: str, color: Arrayable, shape: tuple[int | EllipsisType | None, ...] = (3,)) -> Any:
+    """Check linear RGB of a shape, or convert a name that matplotlib knows: "white", "#336699"."""
     if isinstance(color, str):
         from matplotlib.colors import to_rgb
 
@@ -63,26 +64,26 @@ def linear_color(name: str, color: Any, shape: Any = (3,)) -> Any:
     return color if is_traced(color) else finite_array(name, color, shape)
 
 
-def warn_of_8_bits(name: str, colors: Any, stacklevel: int = 4) -> None:
-    """Warn of colours that are hardly meant as linear RGB, where they are known."""
-    if not is_traced(colors) and (most := float(np.asarray(colors).max())) > BRIGHTEST:
-        told = f"{name} must be linear RGB, where white is 1; got up to {most:g}"
-        warnings.warn(f"{told}. For 8-bit colours, pass jv.from_srgb({name} / 255).", stacklevel=stacklevel)
+def warn_of_8_bits(name: str, colors: Arrayable, stacklevel: int = 4) -> None:
+    """Warn of colours, unless traced, that are hardly meant as linear RGB."""
+    if not is_traced(colors) and (maximum := float(np.asarray(colors).max())) > BRIGHTEST:
+        fault = f"{name} must be linear RGB, where white is 1; got up to {maximum:g}"
+        warnings.warn(f"{fault}. For 8-bit colours, pass jv.from_srgb({name} / 255).", stacklevel=stacklevel)
 
 
 def displayed(
     image: Float[np.ndarray, "height width channels"],
 ) -> UInt8[np.ndarray, "height width channels"]:
-    """Linear RGB, or premultiplied RGBA, as 8-bit sRGB with straight alpha."""
+    """Convert linear RGB, or premultiplied RGBA, to 8-bit sRGB with straight alpha."""
     color, opacity = image[..., :3], image[..., 3:]
     # straight alpha: viewers multiply by the opacity
     color = np.divide(color, opacity, out=np.zeros_like(color), where=opacity > 0) if opacity.size else color
-    shown = [_to_srgb(color, np), np.clip(opacity, 0, 1)]
-    return np.round(np.concatenate(shown, axis=-1) * 255).astype(np.uint8)
+    channels = [_to_srgb(color, np), np.clip(opacity, 0, 1)]
+    return np.round(np.concatenate(channels, axis=-1) * 255).astype(np.uint8)
 
 
 def png_of(pixels: UInt8[np.ndarray, "height width channels"], text: Mapping[str, str] = {}) -> bytes:
-    """A PNG, with texts by keyword."""
+    """Bytes of a PNG, with texts by keyword."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
@@ -96,11 +97,11 @@ def png_of(pixels: UInt8[np.ndarray, "height width channels"], text: Mapping[str
 def _by_curve(curve: Callable[[Any, Any], Any], values: Any) -> Float[Array, "*image"]:
     if isinstance(values, jax.Array) or is_traced(values):
         return _on_device(curve, jnp.asarray(values))
-    found, dtype = curve(np.asarray(values), np), jnp.result_type(float)  # compiles nothing
-    return jnp.asarray(found.astype(dtype), dtype)
+    result, dtype = curve(np.asarray(values), np), jnp.result_type(float)  # compiles nothing
+    return jnp.asarray(result.astype(dtype), dtype)
 
 
-@partial(jax.jit, static_argnums=0)  # one program for each shape, rather than one for each operation
+@partial(jax.jit, static_argnums=0)  # one program per shape, rather than one per operation
 def _on_device(curve: Callable[[Any, Any], Any], values: Array) -> Array:
     return curve(values, jnp)
 

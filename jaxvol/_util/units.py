@@ -1,4 +1,4 @@
-"""Names of units of length and of axes, as files and libraries spell them."""
+"""Names of length units and of axes, as files and libraries spell them."""
 
 import re
 import unicodedata
@@ -16,7 +16,7 @@ LENGTHS |= dict.fromkeys(("å", "a", "ang", "angstrom", "ångström", "ångstrom
 LENGTHS |= {"in": 25.4, "inch": 25.4, "inche": 25.4, '"': 25.4, "ft": 304.8, "foot": 304.8, "feet": 304.8}
 LENGTHS |= {"yd": 914.4, "yard": 914.4, "mi": 1609344.0, "mile": 1609344.0, "thou": 0.0254, "mil": 0.0254}
 LENGTHS |= {"li": 25.4 / 12, "pt": 25.4 / 72}
-"""Units of length in mm, in small letters, without a plural's s."""
+"""Lengths of units in mm, by name in lower case, without a plural's s."""
 
 NAMES = {
     "x": "x lon longitude i col column width w easting rlon right-left left-right",
@@ -27,38 +27,37 @@ NAMES = {
     "s": "s sample rgb rgba",
 }
 AXES = {name: letter for letter, names in NAMES.items() for name in names.split()}
-"""The letter of an axis by its name in small letters, without a plural's s."""
+"""Letters of axes, by name in lower case, without a plural's s."""
 
 
 def length_of(unit: str | None) -> float | None:
-    """The length of a unit in mm; None for an unknown one, such as "pixel", and for none."""
+    """Length of a unit in mm; None for no unit or an unknown one, such as "pixel"."""
     name = str(unit or "").replace("\\u00b5", "μ").replace("\\u00B5", "μ")
     name = unicodedata.normalize("NFKC", name).strip().strip(".'").lower().replace("metre", "meter")
     return next((LENGTHS[word] for word in (name, name.removesuffix("s")) if word in LENGTHS), None)
 
 
-def axis_letters(what: str, names: Sequence[str], note: Callable[[str], None]) -> str:
-    """The letter of each axis: x, y and z of space, t of time, c of channels, s of values in a voxel.
+def axis_letters(subject: str, names: Sequence[str], note: Callable[[str], None]) -> str:
+    """Letters of axes: x, y and z of space, t of time, c of channels, s of values in a voxel.
 
-    Where as many names are unknown as axes of space are missing, they are taken as these in order, and so
-    are three of which none is known. `note` is told so, but of names that only count. Raises `ValueError`,
-    which begins with `what`, for an axis that is not known otherwise, and for two of one kind.
-    """
+    If as many names are unknown as axes of space are missing, they are taken as the missing ones in order,
+    and so are three unknown names; `note` is called with a remark, unless names are only numbered. Raises
+    `ValueError`, beginning with `subject`, for other unknown names and for two axes of one kind."""
     words = [str(name).strip().lower() for name in names]
-    found = [AXES.get(word) or AXES.get(word.removesuffix("s")) or "?" for word in words]
-    if "height" in words:  # of an image, or above the ground
-        found[words.index("height")] = "y" if "y" not in found else "z"
-    missing = [letter for letter in "xyz" if letter not in found]
-    found = ["?"] * 3 if len(words) == len(missing) == 3 else found
-    unknown = [str(name) for name, letter in zip(names, found, strict=True) if letter == "?"]
+    letters = [AXES.get(word) or AXES.get(word.removesuffix("s")) or "?" for word in words]
+    if "height" in words:  # the rows of an image, or altitude
+        letters[words.index("height")] = "y" if "y" not in letters else "z"
+    missing = [letter for letter in "xyz" if letter not in letters]
+    letters = ["?"] * 3 if len(words) == len(missing) == 3 else letters
+    unknown = [str(name) for name, letter in zip(names, letters, strict=True) if letter == "?"]
     if unknown and len(unknown) == len(missing):
         free = iter(missing)
-        found = [next(free) if letter == "?" else letter for letter in found]
+        letters = [next(free) if letter == "?" else letter for letter in letters]
         if not all(re.fullmatch(r"(dim|axis|phony_dim)_?\d+", name.strip().lower()) for name in unknown):
             note(f"axes {', '.join(map(repr, unknown))}: taken as {', '.join(missing)}")
-    if "?" in found or len({*found}) < len(found):
+    if "?" in letters or len({*letters}) < len(letters):
         raise ValueError(
-            f"{what} must have axes named such as x, y, z, time and channel, each once; got "
-            f"{shortened(', '.join(map(str, names)))}. Rename or choose among them first."
+            f"{subject} must have axes named such as x, y, z, time and channel, each once; got "
+            f"{shortened(', '.join(map(str, names)))}. Rename the axes, or select some of them, first."
         )
-    return "".join(found)
+    return "".join(letters)

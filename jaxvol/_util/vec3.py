@@ -1,5 +1,5 @@
-"""Points, directions and colours as tuples of three scalars, on the march's path: batched over rays, three
-arrays run 3 to 5 times faster in a loop than one of shape (n, 3). What a user holds is stacked."""
+"""Points, directions and colours of the march, as tuples of three scalars: batched over rays, three arrays
+run 3 to 5 times faster in a loop than one of shape (n, 3). Arrays of users are stacked."""
 
 import math
 from functools import reduce
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 
 Scalar: TypeAlias = Float[Array, "..."]
-"""A number per ray, for one ray or a batch: all operations on it are elementwise."""
+"""Number per ray, for one ray or a batch: all operations on it are elementwise."""
 
 Vec3: TypeAlias = tuple[Scalar, Scalar, Scalar]
 
@@ -21,12 +21,12 @@ Color: TypeAlias = tuple[Scalar, ...]
 
 
 def apart(vector: Float[Array, "3"]) -> Vec3:
-    """The components of a stacked vector."""
+    """Components of a stacked vector."""
     return vector[0], vector[1], vector[2]
 
 
 def along(start: Vec3, rate: Vec3, s: Scalar) -> Vec3:
-    """The point `start + s rate`."""
+    """Point `start + s rate`."""
     (x, y, z), (dx, dy, dz) = start, rate
     return x + s * dx, y + s * dy, z + s * dz
 
@@ -46,7 +46,7 @@ def minus(a: Vec3, b: Vec3) -> Vec3:
 
 
 def times(a: Vec3, b: Vec3) -> Vec3:
-    """The product of each component."""
+    """Product by component."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
@@ -64,23 +64,23 @@ def dot(a: Vec3, b: Vec3) -> Scalar:
 
 
 def root(square: Scalar) -> Scalar:
-    """Square root; up to 0, it is 0 with the derivative 0. NaN stays NaN."""
+    """Square root; 0 with derivative 0 for numbers up to 0. NaN stays NaN."""
     clamped = square <= 0
     return jnp.where(clamped, 0, jnp.sqrt(jnp.where(clamped, 1, square)))
 
 
 def length(a: Vec3) -> Scalar:
-    """Length of a vector. Of that of length 0, the derivative is 0."""
+    """Length of a vector; the derivative for the vector 0 is 0."""
     return root(dot(a, a))
 
 
 def greatest(a: Vec3) -> Scalar:
-    """The greatest component."""
+    """Maximum component."""
     return jnp.maximum(jnp.maximum(a[0], a[1]), a[2])
 
 
 def turned(around_z: Vec3, direction: Vec3) -> Vec3:
-    """Rotate a vector given around the z axis to one that lies in the same way around a unit direction."""
+    """Rotate a vector from the frame around the z axis to a frame around a unit direction."""
     (x, y, z), (dx, dy, dz) = around_z, direction
     (a, b, c), (d, e, f) = orthonormal(direction)
     return x * a + y * d + z * dx, x * b + y * e + z * dy, x * c + y * f + z * dz
@@ -96,25 +96,25 @@ def orthonormal(direction: Vec3) -> tuple[Vec3, Vec3]:
 
 
 def golden_spiral(n: int) -> Float[np.ndarray, "n 3"]:
-    """`n` unit directions spread evenly over the sphere: equal steps in z, golden angles around it."""
+    """Unit directions (n) spread evenly over the sphere: equal steps in z, golden angles around it."""
     z = 1 - (2 * np.arange(n) + 1) / n
     around, across = math.pi * (1 + math.sqrt(5)) * np.arange(n), np.sqrt(1 - z**2)
     return np.stack([across * np.cos(around), across * np.sin(around), z], axis=-1)
 
 
 class Frame(eqx.Module):
-    """Coordinates along three axes, in world length; by default the world's."""
+    """Coordinate system of three axes, in world length; by default the world's."""
 
     turned: tuple[tuple[Vec3, Vec3, Vec3], tuple[Vec3, Vec3, Vec3]] | None = None
     """Unit axes, which may be sheared, and gradients of the coordinates: the axes again if orthogonal."""
 
     @classmethod
     def of(cls, direction: Float[Array, "3 3"]) -> "Frame":
-        """`direction`: its columns are the axes."""
+        """Frame whose axes are the columns of `direction`."""
         x, y, z = (apart(direction[:, axis]) for axis in range(3))
-        across = cross(y, z), cross(z, x), cross(x, y)
-        each = 1 / dot(x, across[0])
-        a, b, c = (scaled(normal, each) for normal in across)
+        normals = cross(y, z), cross(z, x), cross(x, y)
+        factor = 1 / dot(x, normals[0])
+        a, b, c = (scaled(normal, factor) for normal in normals)
         return cls(((x, y, z), (a, b, c)))
 
     def components(self, vector: Vec3) -> Vec3:
@@ -125,35 +125,35 @@ class Frame(eqx.Module):
         return x, y, z
 
     def vector(self, components: Vec3) -> Vec3:
-        """World vector of these components."""
+        """World vector from components along the axes."""
         return components if self.turned is None else _combined(self.turned[0], components)
 
     def rises(self, normal: Vec3) -> Vec3:
-        """How far one goes in the world direction `normal` by a unit along each axis."""
+        """Components along the world direction `normal` of the three axes."""
         if self.turned is None:
             return normal
         x, y, z = (dot(axis, normal) for axis in self.turned[0])
         return x, y, z
 
     def gradient(self, slopes: Vec3) -> Vec3:
-        """The world's gradient of what has these slopes along the axes."""
+        """World gradient of a function from its derivatives by the coordinates."""
         return slopes if self.turned is None else _combined(self.turned[1], slopes)
 
     @property
     def stretch(self) -> Scalar | float:
-        """The most that a component changes by a unit of world length, at least 1."""
+        """Maximum change of a component per unit of world length, at least 1."""
         if self.turned is None:
             return 1.0
         x, y, z = map(length, self.turned[1])
         return greatest((x, y, z))
 
     def diagonal(self, sides: Vec3) -> Scalar:
-        """The longest diagonal of a box with these sides along the axes."""
+        """Longest diagonal of a box, from the lengths of its sides along the axes."""
         if self.turned is None:
             return jnp.sqrt(dot(sides, sides))
         a, b, c = (scaled(axis, side) for axis, side in zip(self.turned[0], sides, strict=True))
         ends = plus(a, b), minus(a, b)
-        return reduce(jnp.maximum, (length(way(end, c)) for end in ends for way in (plus, minus)))
+        return reduce(jnp.maximum, (length(combine(end, c)) for end in ends for combine in (plus, minus)))
 
 
 def _combined(vectors: tuple[Vec3, Vec3, Vec3], factors: Vec3) -> Vec3:

@@ -1,10 +1,10 @@
-"""Which version of jaxvol is this?"""
+"""Versions of jaxvol and of other installed packages."""
 
 from importlib import metadata
 
 
 def version_of(package: str) -> str:
-    """The version of an installed package."""
+    """Version of an installed package."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:  # run from a checkout

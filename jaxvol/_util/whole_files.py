@@ -1,4 +1,4 @@
-"""Writes files that appear whole or not at all: in a temporary folder, then moved in one operation."""
+"""Atomic writes of files: to a temporary folder, then moved in one operation."""
 
 import os
 import shutil
@@ -9,13 +9,13 @@ from pathlib import Path
 
 
 _UNFINISHED: set[Path] = set()
-"""Temporary folders."""
+"""Temporary folders in use."""
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary path of the same name, to write to. At the end the file replaces `path`, or what it links
-    to (a pipe or device is written to), and its folder is made; after an error nothing has changed."""
+    """Context with a temporary path, whose file replaces `path` or its link's target if no error is raised; a
+    pipe or device is written to. Missing folders are made."""
     name, path = path.name, path.resolve()
     special = path.exists() and not (path.is_file() or path.is_dir())
     nearest = next(folder for folder in path.parents if folder.exists())  # on the same disk
@@ -35,6 +35,6 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def remove_unfinished() -> None:
-    """Remove all temporary folders, for a process that ends at once, whatever its threads still write."""
+    """Remove all temporary folders, for a process that exits while its threads may still write."""
     for folder in list(_UNFINISHED):
         shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""What comes from files and goes into them: volumes, datasets, phantoms, images."""
+"""Input and output: files of volumes and images, datasets, phantoms."""
 
 import lazy_loader
 

@@ -1,23 +1,22 @@
-"""Saves linear images as files, and shows them side by side."""
+"""Files and side-by-side figures of linear images."""
 
 import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from .._util.checks import Arrayable, described, integer, output_file
+from .._util.checks import Arrayable, Checked, described, integer, output_file
 from .._util.srgb import displayed, png_of, to_srgb, warn_of_8_bits
 from .._util.whole_files import whole_file
 
 
 def save_image(
-    path: str | os.PathLike[str] | Any, linear: Arrayable, *, text: Mapping[str, str] | None = None
+    path: Checked[str | os.PathLike[str]], linear: Arrayable, *, text: Mapping[str, str] | None = None
 ) -> Path:
-    """Write an image, in the format given by the file extension:
+    """Write an image in the format of the file extension:
 
     | extension | contents |
     |---|---|
@@ -27,34 +26,31 @@ def save_image(
     | `.npy` | linear float32, unchanged; read it with `numpy.load` |
 
     A viewer blends a transparent PNG over its background in sRGB, `Rendering.image` blends in linear light;
-    the two look different where the opacity lies between 0 and 1.
+    the results differ where the opacity lies between 0 and 1.
 
     Args:
         path: of the file. It comes first, as in `matplotlib.pyplot.imsave`; `save`, of volumes, has it last.
         linear: linear RGB, (height, width, 3), as from `Rendering.image`; or premultiplied RGBA, (height,
             width, 4), as `Rendering.rgba`; or one channel, (height, width), as `Rendering.depth`, which may
             be infinite. 8-bit formats clip to [0, 1].
-        text: texts by keyword (1 to 79 letters of Latin-1) that a PNG carries, as `Image.info` of Pillow has
-            them; other formats carry none.
+        text: texts by keyword (1 to 79 letters of Latin-1), stored in a PNG, as `Image.info` of Pillow;
+            other formats ignore them.
 
     Returns:
-        The path. Its folder is created if it does not exist. The file appears whole or not at all.
+        The path. Its folder is created if it does not exist. The write is atomic.
 
     Raises:
-        ValueError: for input that is not an array, an unknown extension, a shape that the format does not
+        ValueError: for input that is not an array, an unknown extension, a shape that the format cannot
             hold, NaN, infinite colours, and a path that cannot be written.
     """
     if not isinstance(path, str | os.PathLike):
-        told = f"path must be a str or a path; got {described(path)}"
-        raise ValueError(f"{told}. It comes first, as in save_png(path, image).")
+        raise ValueError(f"path must be a str or a path; got {described(path)}. The path comes first.")
     image = _numbers("linear", linear, (0, 3, 4))
     channels = image.shape[2] if image.ndim == 3 else 0
     path = image_file("path", path, channels)
     ending = path.suffix.lower()
     if channels and not np.isfinite(image).all():
-        raise ValueError(
-            f"linear must not be infinite; {np.isinf(image).sum()} of its {image.size} values are."
-        )
+        raise ValueError(f"linear must not be infinite; {np.isinf(image).sum()} of {image.size} values are.")
     if channels and ending not in (".npy", ".tif", ".tiff"):
         warn_of_8_bits("linear", image, stacklevel=3)
     with whole_file(path) as part:
@@ -74,8 +70,8 @@ def save_image(
     return path
 
 
-def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
-    """`save_image` for a path that must end in `.png`.
+def save_png(path: Checked[str | os.PathLike[str]], linear: Arrayable) -> Path:
+    """Write an image as PNG: `save_image` for a path that must end in `.png`.
 
     Args:
         path: as for `save_image`.
@@ -93,59 +89,56 @@ def save_png(path: str | os.PathLike[str] | Any, linear: Arrayable) -> Path:
 
 
 GAP, TITLE = 6, 20
-"""Pixels between images that `show_images` draws, and of the line above each that names it."""
+"""Pixels between images that `show_images` draws, and height of the titles above them."""
 
 INSET = 1e-3
-"""Inset of an image, pixels: on an edge between two, matplotlib below 3.11 may draw a row more or less."""
+"""Inset of an image in pixels: at a pixel's edge, matplotlib below 3.11 may draw one row more or less."""
 
 
-def show_images(images: Mapping[str, Arrayable] | Any, columns: int | Any = 3) -> None:
-    """Draw linear images side by side, each under its name, with matplotlib: one pixel of the page for each
-    of theirs, since resampling would hide what samples do. It is for notebooks, where the picture appears
-    under the cell.
+def show_images(images: Checked[Mapping[str, Arrayable]], columns: Checked[int] = 3) -> None:
+    """Draw linear images side by side under their names, with matplotlib, for notebooks. They are not
+    resampled, which would hide sampling artifacts: one pixel of an image is one pixel of the page.
 
     Args:
         images: by name, linear RGB (height, width, 3), as from `Rendering.image`, or grey (height, width).
             Values outside of [0, 1] are clipped. Sizes may differ.
-        columns: how many images stand in a row at most.
+        columns: maximum number of images in a row.
 
     Raises:
         ValueError: for no image, an image of another shape, NaN, and a number of columns below 1.
     """
     if not isinstance(images, Mapping) or not images:
-        raise ValueError(
-            f"images must be a dict of at least one image, such as {{'head': ...}}; got {described(images)}."
-        )
-    shown = {name: _numbers(f"images[{name!r}]", image, (0, 3)) for name, image in images.items()}
-    columns = min(integer("columns", columns, 1), len(shown))
-    rows = math.ceil(len(shown) / columns)
-    height, width = (max(image.shape[axis] for image in shown.values()) for axis in (0, 1))
-    across, down = columns * (width + GAP) + GAP, rows * (height + TITLE + GAP)
+        raise ValueError(f"images must be a dict of at least one image by name; got {described(images)}.")
+    arrays = {name: _numbers(f"images[{name!r}]", image, (0, 3)) for name, image in images.items()}
+    columns = min(integer("columns", columns, 1), len(arrays))
+    rows = math.ceil(len(arrays) / columns)
+    height, width = (max(image.shape[axis] for image in arrays.values()) for axis in (0, 1))
+    page_width, page_height = columns * (width + GAP) + GAP, rows * (height + TITLE + GAP)
 
-    import matplotlib.pyplot as plt  # here: slow to import, and only pictures need it
+    import matplotlib.pyplot as plt  # slow to import
 
-    figure = plt.figure(figsize=(across / 100, down / 100), dpi=100)
-    for place, (name, image) in enumerate(shown.items()):
-        row, column = divmod(place, columns)
-        left, top = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE
-        box = left + INSET, down - top - image.shape[0] + INSET, *(n - 2 * INSET for n in image.shape[1::-1])
-        axes = figure.add_axes(np.divide(box, (across, down, across, down)).tolist())
+    figure = plt.figure(figsize=(page_width / 100, page_height / 100), dpi=100)
+    for index, (name, image) in enumerate(arrays.items()):
+        row, column = divmod(index, columns)
+        x, bottom = GAP + column * (width + GAP), row * (height + TITLE + GAP) + TITLE + image.shape[0]
+        box = x + INSET, page_height - bottom + INSET, *(n - 2 * INSET for n in image.shape[1::-1])
+        axes = figure.add_axes(np.divide(box, (page_width, page_height) * 2).tolist())
         axes.imshow(np.asarray(to_srgb(image)), cmap="gray", vmin=0, vmax=1, interpolation="none")
         axes.set_axis_off()
         axes.set_title(str(name), fontsize=9, loc="left", pad=3)
     plt.show()
 
 
-def _numbers(name: str, image: Any, channels: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """An image with one of these numbers of channels; 0: no axis of channels."""
+def _numbers(name: str, image: Arrayable, channels: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Convert to an array, and check that its number of channels (0: no such axis) is one of `channels`."""
     try:
         numbers = np.asarray(image, np.float32)
     except (TypeError, ValueError) as fault:
-        told = f"{name} must be an array of numbers; got {described(image)}"
-        raise ValueError(f"{told}. For a Rendering, pass rendering.image().") from fault
-    shapes = ["(height, width)" if n == 0 else f"(height, width, {n})" for n in channels]
-    found = 0 if numbers.ndim == 2 else numbers.shape[2] if numbers.ndim == 3 else -1
-    if found not in channels or numbers.size == 0:
+        text = f"{name} must be an array of numbers; got {described(image)}"
+        raise ValueError(f"{text}. For a Rendering, pass rendering.image().") from fault
+    count = 0 if numbers.ndim == 2 else numbers.shape[2] if numbers.ndim == 3 else -1
+    if count not in channels or numbers.size == 0:
+        shapes = ["(height, width)" if n == 0 else f"(height, width, {n})" for n in channels]
         raise ValueError(f"{name} must have shape {' or '.join(shapes)}; got {numbers.shape}.")
     if np.isnan(numbers).any():
         raise ValueError(f"{name} must not be NaN; {np.isnan(numbers).sum()} of its values are.")
@@ -153,10 +146,10 @@ def _numbers(name: str, image: Any, channels: tuple[int, ...]) -> Float[np.ndarr
 
 
 def image_file(name: str, path: str | os.PathLike[str], channels: int) -> Path:
-    """Check, before rendering, that an image of these channels (0: no such axis) can be written to `path`."""
-    path, what = Path(path), {0: "one channel", 3: "colours", 4: "colours and opacity"}[channels]
-    allowed = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
-    allowed = {0: allowed[3:], 3: allowed, 4: (".png", *allowed[3:])}[channels]
-    if path.suffix.lower() not in allowed:
-        raise ValueError(f"{name}: a file of {what} must end in one of {', '.join(allowed)}; got {path}.")
+    """Check, before rendering, that an image with `channels` (0: no such axis) can be written to `path`."""
+    path, content = Path(path), {0: "one channel", 3: "colours", 4: "colours and opacity"}[channels]
+    endings = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".npy")
+    endings = {0: endings[3:], 3: endings, 4: (".png", *endings[3:])}[channels]
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"{name}: a file of {content} must end in one of {', '.join(endings)}; got {path}.")
     return output_file(name, path)

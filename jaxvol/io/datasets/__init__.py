@@ -1,7 +1,7 @@
 """Public volumes by name: the Open SciVis Datasets, downloaded once by pooch, checked, and cached.
 
-`volume = jv.datasets.load("engine")`. Files in the folder `$JAXVOL_DATA` are used in place. The list is that
-of klacansky.com/open-scivis-datasets, of the commit that `open_scivis.json` names.
+`volume = jv.datasets.load("engine")`. Files in the folder `$JAXVOL_DATA` are used in place. The list is from
+klacansky.com/open-scivis-datasets, at the commit that `open_scivis.json` names.
 """
 
 import json
@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..._util.checks import described
+from ..._util.checks import Checked, described
 from ..._util.files import MOST_VOXELS, check_size, refusing
 from ..._util.texts import near
 from ...scene.volume import Volume
@@ -26,16 +26,16 @@ OPEN_SCIVIS = "http://klacansky.com/open-scivis-datasets"
 
 @dataclass(frozen=True)
 class Dataset:
-    """What is known of a dataset without fetching it.
+    """Metadata of a dataset.
 
     Attributes:
-        name: what `fetch` and `load` call it.
+        name: name for `fetch` and `load`.
         title: as published.
         shape: number of voxels along x, y, z.
-        dtype: their type, little-endian.
-        spacing: between neighbouring voxels, in the units of its authors.
+        dtype: type of the voxels, little-endian.
+        spacing: of the voxels, in the units of the authors.
         sha512: of the raw file, in hexadecimal digits.
-        acknowledgement: to cite where the data are shown.
+        acknowledgement: to cite wherever the data are shown.
     """
 
     name: str
@@ -54,23 +54,23 @@ class Dataset:
 
     @property
     def url(self) -> str:
-        """Where it is published."""
+        """URL of the raw file."""
         return f"{OPEN_SCIVIS}/{self.name}/{self.file}"
 
     @property
     def nbytes(self) -> int:
-        """Size of the raw file."""
+        """Size of the raw file in bytes."""
         return math.prod(self.shape) * np.dtype(self.dtype).itemsize
 
 
 @cache
 def registry() -> dict[str, Dataset]:
-    """All datasets, by name."""
-    fields = json.loads(Path(__file__).with_name("open_scivis.json").read_text(encoding="utf-8"))["datasets"]
+    """Datasets by name."""
+    entries = json.loads(Path(__file__).with_name("open_scivis.json").read_text(encoding="utf-8"))["datasets"]
     keys = ("name", "size", "type", "spacing", "sha512sum", "description", "acknowledgement")
     return {
-        name: Dataset(name, *cast(Any, [tuple(v) if isinstance(v := each[k], list) else v for k in keys]))
-        for name, each in fields.items()
+        name: Dataset(name, *cast(Any, [tuple(v) if isinstance(v := entry[k], list) else v for k in keys]))
+        for name, entry in entries.items()
     }
 
 
@@ -83,14 +83,14 @@ def names() -> list[str]:
     return sorted(registry())
 
 
-def info(name: str | Any) -> Dataset:
-    """What is known of a dataset; nothing is fetched.
+def info(name: Checked[str]) -> Dataset:
+    """Look up the metadata of a dataset, without fetching it.
 
     Args:
-        name: one of `names()`, or the title that it was published under; case is ignored.
+        name: one of `names()`, or a published title; case is ignored.
 
     Returns:
-        Its entry in the published list.
+        The entry in the published list.
 
     Raises:
         ValueError: for a name that is not in the list.
@@ -103,31 +103,30 @@ def info(name: str | Any) -> Dataset:
     raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.{hint}")
 
 
-def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Path:
-    """The path of a dataset's raw file, which is fetched if it is not on this machine yet.
+def fetch(name: Checked[str], *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Path:
+    """Return the path of a dataset's raw file, after downloading it if it is not on this machine.
 
-    It is looked for in the folder that the environment variable `JAXVOL_DATA` names, as `.raw` or as
-    `.raw.gz`, then in the cache. If it is in neither, it is downloaded (`pip install "jaxvol[datasets]"`),
-    and kept if its SHA-512 is the published one.
+    The file is searched in the folder of the environment variable `JAXVOL_DATA`, as `.raw` or `.raw.gz`, then
+    in the cache, and downloaded if it is in neither (`pip install "jaxvol[datasets]"`). A download is kept if
+    its SHA-512 is the published one; of existing files, only the size is checked.
 
     Args:
-        name: one of `names()`; case is ignored. `info(name).nbytes` tells how much will be fetched.
+        name: one of `names()`; case is ignored. `info(name).nbytes` is the size of the download.
         folder: the cache; by default `jaxvol/datasets` in the user's (`$XDG_CACHE_HOME`).
-        progress: show a progress bar of what is downloaded.
+        progress: show a progress bar of the download.
 
     Returns:
-        The path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`. Of one that
-        was there before, only the size is checked.
+        The path of a file that `jv.load` reads, and, if it ends in `.raw`, `jv.render_bricks`.
 
     Raises:
         ValueError: for a name that is not in the list, a file of another size, or a download with another
             SHA-512.
-        OSError: where the server cannot be reached, has no such file, or does not send all of it.
+        OSError: if the server cannot be reached, has no such file, or does not send all of it.
         ImportError: if a download needs pooch, and it is missing.
     """
     dataset = info(name)
-    own = os.environ.get("JAXVOL_DATA")
-    for path in (Path(own, dataset.file), Path(own, f"{dataset.file}.gz")) if own else ():
+    root = os.environ.get("JAXVOL_DATA")
+    for path in (Path(root, dataset.file), Path(root, f"{dataset.file}.gz")) if root else ():
         if path.is_file():
             return _of_right_size(path, dataset)
     try:
@@ -135,35 +134,35 @@ def fetch(name: str | Any, *, folder: str | os.PathLike[str] | None = None, prog
     except ImportError as fault:
         raise ImportError(f"fetching {dataset.name} needs pooch: pip install 'jaxvol[datasets]'") from fault
     target = (Path(pooch.os_cache("jaxvol")) / "datasets" if folder is None else Path(folder)) / dataset.file
-    if target.is_file():  # pooch would hash it each time, which takes minutes for many GB
+    if target.is_file():  # pooch would hash it in every call, which takes minutes for many GB
         return _of_right_size(target, dataset)
     pooch.get_logger().setLevel("WARNING")
     get: Any = pooch.HTTPDownloader(progressbar=progress, timeout=30)
     try:
         pooch.retrieve(dataset.url, f"sha512:{dataset.sha512}", target.name, target.parent, downloader=get)
-    except OSError as fault:  # those of requests are among them
+    except OSError as fault:  # includes the errors of requests
         raise OSError(
             f"{dataset.url} cannot be fetched: {fault}. Without a connection: put {dataset.file} "
             f"({dataset.nbytes / 1e6:.1f} MB) or {dataset.file}.gz into a folder, and set the environment "
-            "variable JAXVOL_DATA to that."
+            "variable JAXVOL_DATA to the folder."
         ) from fault
     except ValueError as fault:
-        raise ValueError(
-            f"{dataset.url} has another SHA-512 than {dataset.name} is published with. It was not kept."
-        ) from fault
+        raise ValueError(f"{dataset.url} has another SHA-512 than {dataset.name}; it is not kept.") from fault
     return target
 
 
 def _of_right_size(path: Path, dataset: Dataset) -> Path:
-    """A dataset's file, after checking its size; of a packed one, `load` checks it."""
+    """Check the size of a dataset's file, unless compressed: `load` checks that."""
     if path.suffix != ".gz":
         with refusing(path):
             check_size(path.stat().st_size, dataset.nbytes)
     return path
 
 
-def load(name: str | Any, *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Volume:
-    """A dataset as a `Volume`; it is fetched first, if it is not on this machine yet.
+def load(
+    name: Checked[str], *, folder: str | os.PathLike[str] | None = None, progress: bool = True
+) -> Volume:
+    """Load a dataset, after downloading it if it is not on this machine.
 
     Args:
         name: as for `fetch`.

@@ -1,5 +1,5 @@
-"""Reads arrays that come with little else: voxels without a header, whose shape and type a caller, a JSON
-file or the name tells, `.npy` and `.npz`. NumPy's own loader takes memory as an unchecked header says."""
+"""Readers of `.npy`, `.npz` and voxels without a header, described by arguments, a JSON file or the name.
+NumPy's own loader allocates memory by an unchecked header."""
 
 import gzip
 import json
@@ -27,16 +27,17 @@ VOLUME = ("data", "spacing", "origin", "direction", "labels", "label_ids")
 
 
 def check_volume(size: Sequence[int], channels: int = 1) -> None:
-    """Refuse an image that is no volume, or several of them along further axes."""
+    """Refuse an image that is not a volume, or several along further axes."""
     must = "must be a 3-D image, or several along further axes, of fewer than 2**31 voxels"
     holds = 3 <= len(size) <= 5 and channels >= 1 and min(size) >= 1 and math.prod(size) * channels < 2**62
     check(holds, f"{must}; got size {tuple(size)} and {channels} values per voxel.")
 
 
-def read_voxels(source: Path, shape: Any, dtype: Any, begin: int, packed: str = "", more: bool = True) -> Any:
-    """Voxels of a file, the last axis fastest. `begin`: their first byte, of what gzip decompresses; -1: they
-    are the last ones. `packed`: "gzip", "zlib" (a part of the file, also by gzip), or "". `more`: other bytes
-    may follow."""
+def read_voxels(
+    source: Path, shape: Sequence[int], dtype: np.dtype, begin: int, packed: str = "", more: bool = True
+) -> np.ndarray:
+    """Read voxels, the last axis fastest. `begin`: first byte, after decompression for gzip; -1: voxels end
+    the file. `packed`: "gzip", "zlib" (a part of the file, also by gzip), or "". `more`: bytes may follow."""
     expected, held = math.prod(shape) * dtype.itemsize, file_size(source)
     with source.open("rb") as stream, decoding():
         if packed == "gzip":  # the size in its trailer is unverified and modulo 2**32: only reading tells
@@ -53,33 +54,34 @@ def read_voxels(source: Path, shape: Any, dtype: Any, begin: int, packed: str = 
     return as_array(content[:expected], shape, dtype, "C")
 
 
-def read_raw(path: Path, shape: Any = None, dtype: Any = None, offset: int = 0) -> ImageRecord:
-    """Reader for voxels without a header, x fastest. Shape and type: given, by JSON or by name."""
+def read_raw(path: Path, shape: object = None, dtype: object = None, offset: int = 0) -> ImageRecord:
+    """Reader of voxels without a header, x fastest. Shape and type: arguments, or from JSON or the name."""
     match = SCIVIS_NAME.search(path.name)
     fields = {} if match is None else {"shape": tuple(map(int, match.groups()[:3])), "dtype": match[4]}
-    given = {"shape": shape, "dtype": dtype}
-    fields |= _json_fields(path) | {name: value for name, value in given.items() if value is not None}
-    ways = {"shape": "shape=(nx, ny, nz)", "dtype": 'dtype="uint8"'}
-    if missing := [name for name in ways if name not in fields]:
+    fields |= _json_fields(path)
+    fields |= {name: arg for name, arg in (("shape", shape), ("dtype", dtype)) if arg is not None}
+    examples = {"shape": "shape=(nx, ny, nz)", "dtype": 'dtype="uint8"'}
+    if missing := [name for name in examples if name not in fields]:
         raise ValueError(
             f"path: the {' and '.join(missing)} of {path} {'are' if len(missing) > 1 else 'is'} not known. "
-            f"Give {' and '.join(ways[name] for name in missing)}, or name it name_XxYxZ_dtype.raw, or put "
-            f'{path.name}.json in its folder with {{"size": [nx, ny, nz], "type": "uint8"}}.'
+            f"Give {' and '.join(examples[name] for name in missing)}, or name it name_XxYxZ_dtype.raw, or "
+            f'put {path.name}.json in its folder with {{"size": [nx, ny, nz], "type": "uint8"}}.'
         )
-    shape, dtype = fields.pop("shape"), fields.pop("dtype")
+    sizes: Any = fields.pop("shape")
+    kind = fields.pop("dtype")
     try:
-        nx, ny, nz = map(operator.index, shape)
+        nx, ny, nz = map(operator.index, sizes)
     except (TypeError, ValueError):
         nx = ny = nz = 0
     if min(nx, ny, nz) < 1 or nx * ny * nz >= 2**48:
         must = "shape must be three positive integers (nx, ny, nz) with a product less than 2**48"
-        raise ValueError(f"{must}; got {shape!r} for {path}.")
-    found = RAW_DTYPE.fullmatch(str(getattr(dtype, "__name__", dtype)))  # np.uint8.__name__ is "uint8"
-    if found is None:
+        raise ValueError(f"{must}; got {sizes!r} for {path}.")
+    match = RAW_DTYPE.fullmatch(str(getattr(kind, "__name__", kind)))  # np.uint8.__name__ is "uint8"
+    if match is None:
         must = "dtype must be uint8, int8, uint16 to uint64, int16 to int64, float16, float32 or float64"
-        le = "optionally with le or be appended for the byte order"
-        raise ValueError(f"{must}, {le}; got {dtype!r} for {path}.")
-    stored = np.dtype(found[1].lower()).newbyteorder(">" if (found[2] or "").lower() == "be" else "<")
+        order = "optionally with le or be appended for the byte order"
+        raise ValueError(f"{must}, {order}; got {kind!r} for {path}.")
+    stored = np.dtype(match[1].lower()).newbyteorder(">" if (match[2] or "").lower() == "be" else "<")
     if path.name.lower().endswith(".gz"):
         data = read_voxels(path, (nz, ny, nx), stored, offset, "gzip", more=False).T
     else:
@@ -89,13 +91,13 @@ def read_raw(path: Path, shape: Any = None, dtype: Any = None, offset: int = 0) 
 
 
 def raw_json(path: Path) -> list[Path]:
-    """The JSON file of a raw file, if there is one: of its name with `.json` behind it, or as ending."""
+    """JSON file of a raw file, if it exists: its name with `.json` appended, or as the ending."""
     stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
     return [file for name in (path.name, stem) if (file := path.with_name(f"{name}.json")).is_file()][:1]
 
 
 def _json_fields(path: Path) -> dict[str, Any]:
-    """What the JSON file of a raw file says, under the names of `load`'s arguments."""
+    """Fields of a raw file's JSON file, under the names of `load`'s arguments."""
     for file in raw_json(path):
         try:
             fields = json.loads(file.read_text(encoding="utf-8"))
@@ -108,7 +110,7 @@ def _json_fields(path: Path) -> dict[str, Any]:
 
 
 def read_npy(path: Path) -> ImageRecord:
-    """Reader for `.npy`: one array, the data, which is mapped."""
+    """Reader of `.npy`: one array, which is memory-mapped."""
     with decoding(), path.open("rb") as stream:
         shape, order, dtype = _npy_header(stream)
         begin = stream.tell()
@@ -117,7 +119,7 @@ def read_npy(path: Path) -> ImageRecord:
 
 
 def read_npz(path: Path) -> ImageRecord:
-    """Reader for `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
+    """Reader of `.npz`: arrays named like the arguments of `Volume`, or one array of any name."""
     arrays, must = {}, "must hold an array called data, or one array"
     with decoding(), zipfile.ZipFile(path) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
@@ -134,7 +136,7 @@ def read_npz(path: Path) -> ImageRecord:
 
 
 def _npy_header(stream: Any) -> tuple[tuple[int, ...], Any, np.dtype]:
-    """Shape, order and type of the array that a `.npy` stream holds, which then stands at its first byte."""
+    """Read the header of a `.npy` stream: shape, order and type of the array."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, fortran, dtype = readers[np.lib.format.read_magic(stream)](stream)
@@ -144,8 +146,7 @@ def _npy_header(stream: Any) -> tuple[tuple[int, ...], Any, np.dtype]:
         raise
     except Exception as fault:  # NumPy raises different errors for different faults
         raise Refused(f"has no valid .npy header ({fault!r}).") from fault
-    pickles = "Arrays of objects are pickles, which are never read."
-    check(dtype.kind in "biuf", f"holds an array of type {dtype}; expected integers or floats. {pickles}")
+    check(dtype.kind in "biuf", f"must hold numbers; got type {dtype} (object: pickles, never read).")
     is_volume = min(shape, default=1) >= 1 and math.prod(shape) < 2**48
     check(is_volume, f"must hold 1 to 2**31 - 1 voxels; got shape {shape}.")
     return shape, "F" if fortran else "C", dtype

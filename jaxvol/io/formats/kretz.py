@@ -1,7 +1,7 @@
-"""Reads Kretz ultrasound files (`.vol`, of GE Voluson scanners): 16 bytes of magic, then items of group
+"""Reader of Kretz ultrasound files (`.vol`, of GE Voluson scanners): 16 bytes of magic, then items of group
 (u16), element (u16), length (u32) and bytes, little-endian. The format is not published; the items of
-`MEANING` are those of SlicerHeart's `vtkSlicerKretzFileReaderLogic` and plooney/kretz, and so are places but
-for a shift along z by a and, in SlicerHeart's RAS axes, the sign of y."""
+`MEANING` follow SlicerHeart's `vtkSlicerKretzFileReaderLogic` and plooney/kretz, and so do positions, up to a
+shift along z by a and, in SlicerHeart's RAS axes, the sign of y."""
 
 import math
 import struct
@@ -16,7 +16,7 @@ from ...march.transforms import ToroidalMap
 
 MAGIC = b"KRETZFILE 1.0   "
 
-UNEVEN = 0.01  # steps by which an angle may be away from evenly spaced ones: it misplaces a part of a voxel
+UNEVEN = 0.01  # tolerance of angles from evenly spaced ones, in steps
 
 MEANING = {  # by group and element
     "C000:1": "the number of samples along a beam",  # u16
@@ -25,24 +25,22 @@ MEANING = {  # by group and element
     "C100:1": "the distance between samples",  # f64, in metres
     "C200:1": "the distance from the apex to the first sample",  # f64, in samples
     "C200:2": "the distance from the motor axis to the apex",  # f64, in samples
-    "C300:1": "the angles of the planes",  # f64 for each, in radians; π/2 is the middle
-    "C300:2": "the angles of the beams",  # likewise
+    "C300:1": "the angles of the planes",  # f64, in radians; π/2 is the middle
+    "C300:2": "the angles of the beams",  # f64, in radians; π/2 is the middle
     "D000:1": "the voxels",  # u8, γ fastest, then σ, then β
 }
-TOLD = {tag: f"{tag} ({meaning})" for tag, meaning in MEANING.items()}
+TITLES = {tag: f"{tag} ({meaning})" for tag, meaning in MEANING.items()}
 
 
 def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], ToroidalMap]:
-    """The voxels and the map of a `.vol` file. Raises `ValueError` for a file that is none, is cut short
-    or compressed, lacks an item or holds one twice, or whose items contradict each other."""
+    """Read the voxels and the map of a `.vol` file. Raises `ValueError` for a damaged or other file."""
     with refusing(path):
         items = _items(path)
 
         def numbers(tag: str, dtype: str, count: int = 1) -> np.ndarray:
-            expected, found = count * np.dtype(dtype).itemsize, len(items[tag])
-            hint = "Of a compressed file, the voxels have less: save it uncompressed."
-            must = f": item {TOLD[tag]} must have {expected} bytes"
-            check(found == expected, f"{must}; it has {found}. {hint}")
+            expected, size = count * np.dtype(dtype).itemsize, len(items[tag])
+            fault = f": item {TITLES[tag]} must have {expected} bytes; it has {size}."
+            check(size == expected, f"{fault} Is the file compressed? Save it uncompressed.")
             return np.frombuffer(items[tag], dtype)
 
         planes, beams, samples = (int(numbers(tag, "<u2")[0]) for tag in ("C000:3", "C000:2", "C000:1"))
@@ -58,10 +56,10 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
             must = f"must be evenly spaced angles that increase, up to {UNEVEN} of a step"
             got = f"got {count} from {angles[0]} to {angles[-1]}. Resample at even angles."
             is_even = step > 0 and np.abs(angles - even).max() <= UNEVEN * step
-            check(is_even, f": item {TOLD[tag]} {must}; {got}")
+            check(is_even, f": item {TITLES[tag]} {must}; {got}")
             ends.append((float(angles[0]), float(angles[-1])))
         resolution, first, apex = (float(numbers(tag, "<f8")[0]) for tag in ("C100:1", "C200:1", "C200:2"))
-        must = f": item {TOLD['C100:1']} must be a positive length in metres"
+        must = f": item {TITLES['C100:1']} must be a positive length in metres"
         check(0 < resolution < math.inf, f"{must}; got {resolution}.")
     step = 1000 * resolution  # mm
     try:
@@ -75,24 +73,23 @@ def read_kretz(path: Path) -> tuple[UInt8[np.ndarray, "beta sigma gamma"], Toroi
 
 
 def _items(path: Path) -> dict[str, bytes]:
-    """The contents of the items of `MEANING`, all of which are there."""
-    n_bytes, found = file_size(path), {}
+    """Read the contents of all items of `MEANING`."""
+    n_bytes, items = file_size(path), {}
     with path.open("rb") as stream:
         magic = stream.read(len(MAGIC))
-        others = "Other programs write files of other kinds that end in .vol."
-        must = f"is not a Kretz file: it must begin with {MAGIC!r}"
-        check(magic == MAGIC, f"{must}; got {magic!r}. {others}")
+        must = f"is not a Kretz file, but another that ends in .vol: it must begin with {MAGIC!r}"
+        check(magic == MAGIC, f"{must}; got {magic!r}.")
         while any(head := stream.read(8)):  # zeros: the end, or padding
             group, element, length = struct.unpack("<HHI", head.ljust(8, b"\xff"))
             tag, end = f"{group:04X}:{element:X}", stream.tell() + length
-            told = TOLD.get(tag, tag)
-            cut = f"is cut short: item {told} is to end at byte {end}, and it ends at {n_bytes}."
+            title = TITLES.get(tag, tag)
+            cut = f"is cut short: item {title} is to end at byte {end}, and the file ends at {n_bytes}."
             check(end <= n_bytes, cut)
-            check(tag not in found, f"holds item {told} twice.")
+            check(tag not in items, f"holds item {title} twice.")
             if tag in MEANING:
-                found[tag] = stream.read(length)
+                items[tag] = stream.read(length)
             stream.seek(end)
-    missing = ", no item ".join(told for tag, told in TOLD.items() if tag not in found)
+    missing = ", no item ".join(title for tag, title in TITLES.items() if tag not in items)
     hint = "Compressed files, several frames and Cartesian volumes are not supported: save it as one"
     check(not missing, f"has no item {missing}. {hint} uncompressed volume as acquired.")
-    return found
+    return items

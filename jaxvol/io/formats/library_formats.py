@@ -1,5 +1,4 @@
-"""Reads formats that a library knows best: NIfTI, Analyze, MGH and MINC by nibabel, MRC and CCP4 maps by
-mrcfile, arrays of HDF5 and NetCDF files by xarray."""
+"""Readers by nibabel (NIfTI, Analyze, MGH, MINC), mrcfile (MRC, CCP4) and xarray (HDF5, NetCDF)."""
 
 import io
 import math
@@ -19,32 +18,32 @@ NIFTI = (".nii", ".nii.gz", ".hdr", ".img", ".mgh", ".mgz", ".mnc")
 MRC = (".mrc", ".map", ".ccp4", ".rec")
 HDF5 = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4", ".cdf")
 
-LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
+LARGE, BEYOND = 2**26, 8  # maximum size of a chunk: in bytes, or if larger, relative to its array
 
 
 def read_nifti(path: Path) -> ImageRecord:
     """Reader by nibabel: placed by a NIfTI's sform, if its code is positive, else its qform, else `pixdim`
-    along the file's axes. Voxels are read here, since nibabel takes memory as headers say."""
+    along the file's axes. Voxels are read here, since nibabel allocates memory by unchecked headers."""
     nibabel = library("nibabel", path)
-    with nibabel.imageglobals.ErrorLevel(31):  # what it would mend
+    with nibabel.imageglobals.ErrorLevel(31):  # no error for faults that nibabel repairs
         image: Any = nibabel.load(path)
     proxy, header, stored = image.dataobj, image.header, image.get_data_dtype()
     shape = tuple(map(int, image.shape))
     files, raw, fields = image.file_map, header, fields_of(header)
-    if "pixdim" in fields:  # as it is in the file
+    if "pixdim" in fields:  # without nibabel's repairs
         with nibabel.openers.ImageOpener(files.get("header", files["image"]).filename) as stream:
             raw = type(header).from_fileobj(stream, check=False)
     in_sform = "sform_code" in fields and header["sform_code"] > 0
     pixdim = np.ones(3) if in_sform or "pixdim" not in fields else raw["pixdim"][1:4]
     offset = raw["vox_offset"] if "vox_offset" in fields else 0
-    whole = "header" in files or "magic" not in fields or raw["magic"].tolist()[:2] == b"n+"
+    is_one_file = "header" in files or "magic" not in fields or raw["magic"].tolist()[:2] == b"n+"
     for name, holds, expected in (
         ("pixdim", np.all(pixdim > 0) and np.all(np.isfinite(pixdim)), "positive lengths"),
         ("vox_offset", 0 <= offset < 2**31, "the byte at which voxels begin"),
-        ("magic", whole, "n+1 or n+2, of voxels in the same file"),
+        ("magic", is_one_file, "n+1 or n+2, of voxels in the same file"),
         ("datatype", stored.kind in "iuf" or stored.names, "that of integers, floats, RGB or RGBA"),
     ):
-        if not holds:  # also of NaN
+        if not holds:  # also for NaN
             raise Refused(f": {name} must be {expected}; got {raw[name].tolist()!r}.")
     while len(shape) > 5 and shape[-1] == 1:
         shape = shape[:-1]
@@ -58,12 +57,11 @@ def read_nifti(path: Path) -> ImageRecord:
 
 
 def read_mrc(path: Path) -> ImageRecord:
-    """Reader, in ångström; placed by `origin`, or by the first column, row and section."""
+    """Reader of MRC and CCP4, in ångström; placed by `origin`, or by the first column, row and section."""
     with path.open("rb") as stream:
         size, extended = file_size(path), stream.read(96)[92:]
     longest = min(int.from_bytes(extended, order) for order in ("little", "big"))
-    cut = f"is cut short: its extended header is longer than its {size} bytes."
-    check(longest <= size, cut)  # mrcfile would take as many
+    check(longest <= size, "is cut short before the end of its header.")  # mrcfile would allocate it
     file: Any = library("mrcfile", path).mmap(path, permissive=True)
     header, data = file.header, np.asanyarray(file.data)
     if data.ndim not in (3, 4) or data.dtype.kind not in "iuf":
@@ -81,27 +79,27 @@ def read_mrc(path: Path) -> ImageRecord:
 
 
 def read_hdf5(path: Path, name: str | None = None) -> ImageRecord:
-    """Reader for an array, or the only one of three axes or more, as xarray describes it. Axes without names
-    are z, y, x. The attribute `element_size_um` (z, y, x) holds distances."""
+    """Reader of an array, by default of the only one with three axes or more. Axes without names are z, y, x.
+    The attribute `element_size_um` (z, y, x) holds distances."""
     xarray = library("xarray", path)
-    how: dict[str, Any] = {"mask_and_scale": False, "decode_times": False, "cache": False}
+    options: dict[str, Any] = {"mask_and_scale": False, "decode_times": False, "cache": False}
     with path.open("rb") as stream:
         is_classic = stream.read(3) == b"CDF"
     if is_classic:
-        groups = {"/": xarray.open_dataset(io.BytesIO(path.read_bytes()), engine="scipy", **how)}
+        groups = {"/": xarray.open_dataset(io.BytesIO(path.read_bytes()), engine="scipy", **options)}
     else:
         library("h5netcdf", path)
-        library("h5py", path).File(path, "r").close()  # of others, h5netcdf leaves a traceback
-        groups = xarray.open_groups(path, engine="h5netcdf", phony_dims="access", **how)
-    arrays = {f"{g.rstrip('/')}/{key}": each for g, group in groups.items() for key, each in group.items()}
-    found = [key for key, each in arrays.items() if each.ndim > 2 and name in (None, key, key[1:])]
-    told = shortened(", ".join(arrays)) if arrays else "none"
-    check(len(found) == 1, f"holds the arrays {told}: name one, as in {path.name}::/name.")
-    array = arrays[found[0]]
+        library("h5py", path).File(path, "r").close()  # for other files, h5netcdf prints a traceback
+        groups = xarray.open_groups(path, engine="h5netcdf", phony_dims="access", **options)
+    arrays = {f"{g.rstrip('/')}/{key}": array for g, group in groups.items() for key, array in group.items()}
+    matches = [key for key, array in arrays.items() if array.ndim > 2 and name in (None, key, key[1:])]
+    names = shortened(", ".join(arrays)) if arrays else "none"
+    check(len(matches) == 1, f"holds the arrays {names}: name one, as in {path.name}::/name.")
+    array = arrays[matches[0]]
     check_size(file_size(path) * MOST_COMPRESSED, array.nbytes, more=True)
     chunk = math.prod(array.encoding.get("chunksizes") or (1,)) * array.dtype.itemsize
     is_read = chunk <= max(LARGE, BEYOND * array.nbytes) and array.dtype.kind in "biuf"
-    check(is_read, f": {found[0]} must be numbers in chunks; got {array.dtype}, {chunk} bytes.")
+    check(is_read, f": {matches[0]} must be numbers in chunks; got {array.dtype}, {chunk} bytes.")
     labels = [str(label) for label in array.attrs.get("DIMENSION_LABELS", ())]
     if all(labels) and len({*labels}) == array.ndim:
         array = array.rename(dict(zip(array.dims, labels, strict=True)))

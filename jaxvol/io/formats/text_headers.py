@@ -1,5 +1,4 @@
-"""Reads NRRD (`.nrrd`, `.nhdr`) and MetaImage (`.mha`, `.mhd`). On some headers, ITK hangs, ends the process,
-or leaves voxels unset."""
+"""Readers of NRRD and MetaImage: on some headers, ITK would hang, end the process, or leave voxels unset."""
 
 import re
 from pathlib import Path
@@ -14,34 +13,34 @@ from .arrays import check_volume, read_voxels
 
 
 LONGEST, MOST_FIELDS = 900, 1024
-"""Letters of a field in an NRRD header (comments and pairs may be longer), and fields in any, at most."""
+"""Maximum letters of a field in an NRRD header (except comments and pairs), and fields in any header."""
 
 META_TYPES = {"MET_CHAR": "i1", "MET_SHORT": "i2", "MET_INT": "i4", "MET_LONG": "i4", "MET_LONG_LONG": "i8"}
 META_TYPES |= {name.replace("_", "_U", 1): f"u{code[1]}" for name, code in META_TYPES.items()}
 META_TYPES |= {"MET_FLOAT": "f4", "MET_DOUBLE": "f8"}
 NRRD_TYPES = {name[4:].replace("_", "").lower(): code for name, code in META_TYPES.items()}
 NRRD_TYPES |= {np.dtype(code).name: code for code in META_TYPES.values()} | {"long": "", "ulong": ""}
-"""By names without "signed" and blanks, "int" and "_t" at their ends."""
+"""Types by name, without "signed" and blanks, and without "int" and "_t" at the end."""
 
-DOMAIN = "domain", "space", "???", "none"  # kinds of axes of space in NRRD
+DOMAIN = "domain", "space", "???", "none"  # kinds of spatial axes in NRRD
 
 
 def text_header(path: Path, separator: str, last: str, longest: int = 2**20) -> tuple[dict[str, str], int]:
-    """Fields of a header in text, and where it ends: at an empty line or behind the field `last`."""
+    """Fields of a text header, and the position of its end: an empty line, or the end of the field `last`."""
     fields: dict[str, str] = {}
     with path.open("rb") as stream:
         while last not in fields and (line := stream.readline(2**20).decode("utf-8", "replace").strip()):
             key, _, value = line.partition(separator)
             is_long = len(line) > longest and not (key.startswith("#") or value.startswith("="))
             check(not is_long, f"cannot be read: its header has the field {shortened(line)}.")
-            is_short = len(fields) < MOST_FIELDS
-            check(is_short, f"cannot be read: its header has more than {MOST_FIELDS} fields.")
+            fault = f"cannot be read: its header has more than {MOST_FIELDS} fields."
+            check(len(fields) < MOST_FIELDS, fault)
             fields[key.strip()] = value.strip()
         return fields, stream.tell()
 
 
 def _numbers(fields: dict[str, str], names: str, default: np.ndarray) -> np.ndarray:
-    """The numbers of the first of these fields that is there, in the shape of `default`."""
+    """Numbers of the first existing field of `names`, in the shape of `default`."""
     name = next((name for name in names.split() if name in fields), None)
     if name is None:
         return default
@@ -60,16 +59,15 @@ def _sizes(text: str, channels: int = 1) -> list[int]:
 
 
 def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
-    """The fields of an NRRD file, in small letters without blanks, its magic the first; where its voxels
-    begin, and in which file, which may be missing."""
-    found, end = text_header(path, ":", "", LONGEST)
-    fields = {key.lower().replace(" ", ""): value for key, value in found.items()}
-    named = fields.get("datafile")
-    return (fields, end, path) if named is None else (fields, 0, path.parent / named)
+    """Fields of an NRRD file, in lower case without blanks, magic first; first byte and file of voxels."""
+    header, end = text_header(path, ":", "", LONGEST)
+    fields = {key.lower().replace(" ", ""): value for key, value in header.items()}
+    data_file = fields.get("datafile")
+    return (fields, end, path) if data_file is None else (fields, 0, path.parent / data_file)
 
 
 def read_nrrd(path: Path) -> ImageRecord:
-    """Reader for `.nrrd` and `.nhdr`, whose space may be that of a patient; its lengths in `space units`."""
+    """Reader of `.nrrd` and `.nhdr`, whose space may be a patient's, with lengths in `space units`."""
     fields, begin, source = nrrd_header(path)
     encoding, magic = fields.get("encoding", "").lower(), next(iter(fields), "")
     must = "a NRRD file holds its voxels, or names one file of them, in the encoding raw or gzip"
@@ -90,11 +88,11 @@ def read_nrrd(path: Path) -> ImageRecord:
     data = read_voxels(source, shape[::-1], dtype, begin, packed, more=not packed or source == path)
     vectors = re.findall(r"none|\([^)]*\)", fields.get("spacedirections", "").lower())
     kinds = [*fields.get("kinds", "").lower().split(), *["domain"] * n][:n]
-    placed = [each != "none" for each in vectors] if vectors else [each in DOMAIN for each in kinds]
-    inside, others = [k for k, is_placed in enumerate(placed[:n]) if is_placed][:3], iter("tcs")
+    placed = [vector != "none" for vector in vectors] if vectors else [kind in DOMAIN for kind in kinds]
+    inside, free = [k for k, is_placed in enumerate(placed[:n]) if is_placed][:3], iter("tcs")
     check(len(inside) == 3, f"must be a 3-D image; got axes of kinds {shortened(str(kinds))}.")
-    along = dict(zip(inside, "xyz", strict=True))
-    axes = [along.get(k) or (next(others, "s") if kinds[k] in (*DOMAIN, "time") else "s") for k in range(n)]
+    letters = dict(zip(inside, "xyz", strict=True))
+    axes = [letters.get(k) or (next(free, "s") if kinds[k] in (*DOMAIN, "time") else "s") for k in range(n)]
     quoted = {key: re.findall('"([^"]*)"', fields.get(key, "")) for key in ("labels", "spaceunits", "units")}
     labels = [name.lower() for name in quoted["labels"]]
     axes = labels if not vectors and sorted(labels) == sorted(axes) else axes
@@ -126,16 +124,15 @@ def read_nrrd(path: Path) -> ImageRecord:
 
 
 def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
-    """The fields of the header; where it ends, and the file of the voxels, which may be missing."""
+    """Fields of the header, the position of its end, and the file of the voxels, which may be missing."""
     fields, end = text_header(path, "=", "ElementDataFile")
-    no_header = "cannot be read: no header of a MetaImage, which ends in ElementDataFile."
-    check("ElementDataFile" in fields, no_header)
-    named = fields["ElementDataFile"]
-    return fields, end, path if named.upper() == "LOCAL" else path.parent / named
+    check("ElementDataFile" in fields, "cannot be read: its header must end in the field ElementDataFile.")
+    data_file = fields["ElementDataFile"]
+    return fields, end, path if data_file.upper() == "LOCAL" else path.parent / data_file
 
 
 def read_metaimage(path: Path) -> ImageRecord:
-    """Reader for `.mha` and `.mhd` of binary voxels, in LPS."""
+    """Reader of `.mha` and `.mhd` with binary voxels, in LPS."""
     fields, begin, source = metaimage_header(path)
     channels = fields.get("ElementNumberOfChannels", "1")
     channels = int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
@@ -149,8 +146,7 @@ def read_metaimage(path: Path) -> ImageRecord:
     must = f"ElementType must be one of {', '.join(META_TYPES)}, and BinaryData true"
     is_read = kind in META_TYPES and flag("BinaryData")
     check(is_read, f": {must}; got {kind[:40]!r} and {text[:20]!r}.")
-    missing = f"cannot be read: there is no file of its voxels, {shortened(str(source))}."
-    check(source.is_file(), missing)
+    check(source.is_file(), f"cannot be read: there is no file of its voxels, {shortened(str(source))}.")
     if source != path:
         size = fields.get("HeaderSize", "0")  # -1: voxels are at the end of the file
         is_size = re.fullmatch("-1|[0-9]{1,15}", size)
@@ -162,7 +158,7 @@ def read_metaimage(path: Path) -> ImageRecord:
     data = read_voxels(source, sizes, dtype, begin, packed, more=not packed or source == path)
     steps = _numbers(fields, "ElementSpacing ElementSize", np.ones(n))[:3].tolist()
     origin = _numbers(fields, "Offset Position Origin", np.zeros(n))[:3]
-    # the axes of the data follow each other; here they are columns
+    # the file lists the directions one after the other; here they are columns
     turn = _numbers(fields, "TransformMatrix Rotation Orientation", np.eye(n)).T[:3, :3]
     axes, steps = "xyztc"[:n][::-1] + "s" * several, dict(zip("xyz", steps, strict=True))
     unit = fields.get("DistanceUnits", "mm").strip("?") or "mm"

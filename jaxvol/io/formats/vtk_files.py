@@ -1,5 +1,4 @@
-"""Reads VTK's images: XML (`.vti`) and legacy files (`.vtk`) of structured points. VTK itself takes memory as
-headers say."""
+"""Readers of VTK's images (`.vti`, `.vtk`): VTK itself would allocate memory by unchecked headers."""
 
 import base64
 import math
@@ -24,7 +23,7 @@ LEGACY |= {"vtktypeuint64": "u8", "float": "f4", "double": "f8"}
 
 
 def read_vtk(path: Path) -> ImageRecord:
-    """Reader for both: the scalars at points, else the first array; of cells, at their centres."""
+    """Reader of both: the scalars at points, else the first array; values of cells lie at their centres."""
     content = path.read_bytes()
     held, dtype, count, *grid = (_xml if content.lstrip()[:1] == b"<" else _legacy)(content)
     is_text, values = isinstance(held, list), math.prod(vtk_sizes(*grid[:2])) * count
@@ -34,22 +33,21 @@ def read_vtk(path: Path) -> ImageRecord:
 
 
 def _legacy(content: bytes) -> tuple[Any, ...]:
-    """Values as bytes or words, their type, components of each; extent, whether of cells, and place."""
+    """Values as bytes or words, their type and number of components; extent, whether of cells, and place."""
     last = rb"\n(LOOKUP_TABLE[^\n]*|COLOR_SCALARS[^\n]*|(?:\w+ \d+ \d+ [a-zA-Z]\w+))[ \t]*\r?\n"
-    found: Any = re.search(last, content)
-    end = found.end() if found else 2**12
+    match: Any = re.search(last, content)
+    end = match.end() if match else 2**12
     head = content[:end].decode("latin-1")
     words = {line.split()[0].upper(): line.split()[1:] for line in head.splitlines()[2:] if line.split()}
     dataset = words.get("DATASET", ["none"])
-    is_image = head.startswith("# vtk DataFile") and dataset == ["STRUCTURED_POINTS"] and found
-    got = shortened(" ".join(dataset))
-    check(is_image, f"must hold a DATASET of STRUCTURED_POINTS with scalars; got {got}.")
+    is_image = head.startswith("# vtk DataFile") and dataset == ["STRUCTURED_POINTS"] and match
+    check(is_image, f"must hold STRUCTURED_POINTS with scalars; got {shortened(' '.join(dataset))}.")
     if "SCALARS" in words:
         kind, count = [*words["SCALARS"], "1"][1:3]
     elif "COLOR_SCALARS" in words:
         kind, count = "unsigned_char", words["COLOR_SCALARS"][-1]
     else:  # a field's first array
-        _, count, _, kind = found[1].decode().split()
+        _, count, _, kind = match[1].decode().split()
     dtype = np.dtype(LEGACY[kind.lower()]).newbyteorder(">")
     extent = [end for n in words["DIMENSIONS"] for end in (0, int(n) - 1)]
     of_cells = "CELL_DATA" in words and "POINT_DATA" not in words
@@ -65,11 +63,11 @@ def _legacy(content: bytes) -> tuple[Any, ...]:
 
 
 def _xml(content: bytes) -> tuple[Any, ...]:
-    """The same of arrays in ASCII, base64 or appended, also compressed by zlib."""
+    """Values and grid, as from `_legacy`, of an array in ASCII, base64 or appended, maybe zlib-compressed."""
     raw = re.search(rb"<AppendedData[^>]*>\s*_", content)
     appended = content[raw.end() :] if raw else b""
     text = content[: raw.end() - 1] + b"</AppendedData></VTKFile>" if raw else content
-    is_plain = b"<!DOCTYPE" not in text and b"<!ENTITY" not in text  # which may expand without end
+    is_plain = b"<!DOCTYPE" not in text and b"<!ENTITY" not in text  # entities may expand without end
     check(is_plain, "must be XML without a DOCTYPE.")
     root: Any = ElementTree.fromstring(text)
     pieces, compressor = root.findall("ImageData/Piece"), root.get("compressor")
@@ -77,9 +75,9 @@ def _xml(content: bytes) -> tuple[Any, ...]:
     got = f"{root.get('type')} of {len(pieces)} pieces, {compressor}"
     check(is_read, f"must hold one Piece of ImageData, plain or compressed by zlib; got {got}.")
     image, kinds = root.find("ImageData"), ("PointData", "CellData")
-    part = next(each for each in pieces[0] if each.tag in kinds and each.find("DataArray") is not None)
-    named = (each for each in part.findall("DataArray") if each.get("Name") == part.get("Scalars"))
-    array = next(named, part.find("DataArray"))
+    part = next(part for part in pieces[0] if part.tag in kinds and part.find("DataArray") is not None)
+    scalars = (array for array in part.findall("DataArray") if array.get("Name") == part.get("Scalars"))
+    array = next(scalars, part.find("DataArray"))
     order = "<" if root.get("byte_order", "LittleEndian") == "LittleEndian" else ">"
     dtype = np.dtype(array.get("type").lower()).newbyteorder(order)
     check(dtype.kind in "iuf", f"must hold an array of numbers; got {dtype}.")
@@ -92,24 +90,25 @@ def _xml(content: bytes) -> tuple[Any, ...]:
         held = _bytes(store, word, is_raw=is_raw, packed=compressor is not None)
     extent = pieces[0].get("Extent") or image.get("WholeExtent", "")
     places = ("Spacing", "1 1 1"), ("Origin", "0 0 0"), ("Direction", "1 0 0 0 1 0 0 0 1")
-    place = [image.get(*each).split() for each in places]
+    place = [image.get(*field).split() for field in places]
     count, of_cells = int(array.get("NumberOfComponents", "1")), part.tag == "CellData"
     return held, dtype, count, extent.split(), of_cells, place
 
 
 def _bytes(store: bytes, word: np.dtype, *, is_raw: bool, packed: bool) -> bytes:
-    """The bytes of an array behind its header: its length, or numbers and lengths of compressed blocks."""
+    """Bytes of an array after its header: its length, or number, size and lengths of compressed blocks."""
 
-    def taken(begin: int, count: int) -> bytes:
+    def decode(begin: int, count: int) -> bytes:
         length = count if is_raw else 4 * math.ceil(count / 3)
         part = store[begin : begin + length]
         return (part if is_raw else base64.b64decode(part))[:count]
 
-    first = int(np.frombuffer(taken(0, word.itemsize), word)[0])
+    first = int(np.frombuffer(decode(0, word.itemsize), word)[0])
     if not packed:
-        return taken(0, word.itemsize + min(first, len(store)))[word.itemsize :]
-    head = taken(0, (3 + min(first, len(store))) * word.itemsize)  # base64 begins again behind it
-    most, lengths = int(np.frombuffer(head, word)[1]), np.frombuffer(head, word)[3:].tolist()
-    body = taken(len(head) if is_raw else 4 * math.ceil(len(head) / 3), min(sum(lengths), len(store)))
+        return decode(0, word.itemsize + min(first, len(store)))[word.itemsize :]
+    head = decode(0, (3 + min(first, len(store))) * word.itemsize)
+    _, size, _, *lengths = np.frombuffer(head, word).tolist()
+    begin = len(head) if is_raw else 4 * math.ceil(len(head) / 3)  # base64 begins anew after the header
+    body = decode(begin, min(sum(lengths), len(store)))
     ends = np.cumsum([0, *lengths]).tolist()
-    return b"".join(zlib.decompressobj().decompress(body[a:b], most) for a, b in pairwise(ends))
+    return b"".join(zlib.decompressobj().decompress(body[a:b], size) for a, b in pairwise(ends))

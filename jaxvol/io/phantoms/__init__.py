@@ -1,12 +1,11 @@
-"""Synthetic scenes, the same at every resolution: shapes are signed distances and textures waves, in world
-units, and edges ramps of a fixed number of voxels. Drawn ones have a file each."""
+"""Synthetic volumes, independent of the resolution: shapes are signed distances and textures waves, in world
+units; edges are ramps of a fixed number of voxels."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
-from ..._util.checks import integer
+from ..._util.checks import Checked, integer
 from ...scene.volume import Volume
 from .bodies import draw_engine, draw_frog, draw_head
 from .canvas import Canvas
@@ -24,7 +23,7 @@ def _cut_block(x: Block, y: Block, z: Block) -> Block:
 
 
 def _logistic(x: Block) -> Block:
-    from scipy.special import expit  # here, so that a first image does not wait for it
+    from scipy.special import expit  # slow to import
 
     return expit(x)
 
@@ -37,7 +36,7 @@ FORMULAS: dict[str, Callable[[Block, Block, Block], Block]] = {
     "linear": lambda x, y, z: (x + 1) / 2,
     "gaussian": lambda x, y, z: np.exp((x * x + y * y + z * z) / (-2 * 0.3**2)),
 }
-"""Values at world points x, y, z, an open mesh, of phantoms whose images have a known answer."""
+"""Values at world points x, y, z (an open mesh) of phantoms whose images are known in closed form."""
 
 DRAWN: dict[str, Callable[[Canvas, np.random.Generator], np.ndarray | None]] = {
     "head": draw_head,
@@ -46,19 +45,19 @@ DRAWN: dict[str, Callable[[Canvas, np.random.Generator], np.ndarray | None]] = {
     "vessels": draw_vessels,
     "labels": draw_frog,
 }
-"""Functions that paint a canvas, and return labels, if any."""
+"""Functions that paint a canvas and return labels or None."""
 
 PHANTOMS = (*DRAWN, *FORMULAS)
 
 
-def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> Volume:
-    """A synthetic volume on the cube [-1, 1]³, `resolution` nodes along each axis.
+def phantom(name: str, resolution: Checked[int] = 128, *, seed: Checked[int] = 0) -> Volume:
+    """Make a synthetic volume on the cube [-1, 1]³, with `resolution` nodes along each axis.
 
     The value at a world point does not depend on the resolution, except at boundaries of the uint8 phantoms,
     which are ramps 2 voxels wide (in `labels`, 0.06 world units at every resolution). `u` below is
-    (world + 1) / 2, which ranges over the unit cube.
+    (world + 1) / 2, in the unit cube.
 
-    | name | type | what |
+    | name | type | content |
     |---|---|---|
     | `head` | uint8 | CT-like head, face towards -y, crown towards +z; the -z face cuts the neck. Air 0, \
     skin 78, muscle 100, brain and cord 105 to 130, bone 185 to 225, teeth 255 |
@@ -80,10 +79,10 @@ def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> V
         seed: of the textures of `head` and `colon`, polyps and folds of `colon`, and the tree of `vessels`.
 
     Returns:
-        The `Volume`; that of `labels` has labels.
+        The `Volume`, with labels for the phantom `labels`.
 
     Raises:
-        ValueError: for an unknown name and for numbers that are no integers or too small.
+        ValueError: for an unknown name, and for numbers that are too small or not integers.
     """
     if name not in PHANTOMS:
         raise ValueError(f"name must be one of {', '.join(PHANTOMS)}; got {name!r}.")
@@ -93,7 +92,7 @@ def phantom(name: str, resolution: int | Any = 128, *, seed: int | Any = 0) -> V
     if name in DRAWN:
         labels = DRAWN[name](canvas, rng)
     else:
-        for where, at in canvas.slabs():
-            canvas.values[where] = FORMULAS[name](*at)
+        for index, points in canvas.slabs():
+            canvas.values[index] = FORMULAS[name](*points)
     data = canvas.as_uint8() if name in DRAWN else canvas.values
     return Volume(data, spacing=(canvas.spacing,) * 3, origin=(-1.0, -1.0, -1.0), labels=labels)

@@ -1,5 +1,5 @@
-"""The `head`, `labels` (a frog with organs) and `engine` phantoms, whose shapes `parts.json` has. Head and
-frog face -y; the head's crown and the frog's back point to +z. 1 world unit of the head is about 14 cm."""
+"""Phantoms `head`, `labels` (a frog with organs) and `engine`, of the shapes in `parts.json`. Head and frog
+face -y; the head's crown and the frog's back point to +z. 1 world unit of the head is about 14 cm."""
 
 import json
 from functools import cache
@@ -12,23 +12,23 @@ from .canvas import Canvas, plane_waves
 from .shapes import Block, Shape, ellipsoid, shapes_of
 
 
-SOFT = 0.06  # world units over which an intensity of the frog blends into its neighbour's
+SOFT = 0.06  # width of the ramp between intensities of the frog, world units
 
 
 @cache
 def parts() -> dict[str, list[Any]]:
-    """The parts of phantoms. Of a field: whether they are joined to it or carved from it, over which distance
-    they blend, and their shapes (`shapes_of`). `painted` and `spheres` have a value and shapes, `organs` a
-    label before these; what belongs to a fetus or a wire, shapes. What a part is called may follow."""
+    """Parts of phantoms, as lists whose first entries are (a name may follow): for fields, "join" or "carve",
+    blend distance, shapes (`shapes_of`); for `painted` and `spheres`, value, shapes; for `organs`, label,
+    value, shape; for fetus and wires, shapes."""
     return json.loads(Path(__file__).with_name("parts.json").read_text("utf-8"))
 
 
 def field_of(canvas: Canvas, name: str) -> Canvas:
-    """A field of parts, at the nodes of a canvas."""
+    """Field of the parts `name`, at the nodes of a canvas."""
 
     def build(field: Canvas) -> None:
-        for how, blend, shapes, *_ in parts()[name]:
-            (field.join if how == "join" else field.carve)(shapes_of(shapes), blend)
+        for operation, blend, shapes, *_ in parts()[name]:
+            (field.join if operation == "join" else field.carve)(shapes_of(shapes), blend)
 
     return canvas.field(build)
 
@@ -71,12 +71,12 @@ def draw_frog(canvas: Canvas, rng: np.random.Generator) -> np.ndarray:
     for label, value, shape, *_ in parts()["organs"]:
         (organ,) = shapes_of([shape])
         canvas.paint(value, organ, SOFT)
-        for where, at in canvas.slabs(organ.low, organ.high):
+        for index, points in canvas.slabs(organ.low, organ.high):
             # a node belongs to the organ it is deepest in, so overlapping organs meet in a smooth face
-            distance = organ.distance(*at)
-            nearer = distance < deepest[where]
-            np.copyto(labels[where], label, where=nearer)
-            np.copyto(deepest[where], distance, where=nearer)
+            distance = organ.distance(*points)
+            nearer = distance < deepest[index]
+            np.copyto(labels[index], label, where=nearer)
+            np.copyto(deepest[index], distance, where=nearer)
     return labels
 
 

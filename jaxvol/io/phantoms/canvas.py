@@ -1,6 +1,5 @@
-"""Rasterises shapes at the nodes of the cube [-1, 1]³, near their boxes, in slabs for the cache; and
-textures. A *field* holds signed distances, `FAR` where nothing is; a canvas of values is painted, later
-layers over earlier ones."""
+"""Rasterisation of shapes at the nodes of the cube [-1, 1]³, near their boxes and slab by slab for the cache;
+and textures. A *field* is a canvas of signed distances, `FAR` in empty space."""
 
 from collections.abc import Callable, Iterable, Iterator
 
@@ -11,7 +10,7 @@ from .shapes import Block, Point, Shape
 
 
 SLAB = 2**18  # nodes evaluated at once: a handful of float32 temporaries stay in the cache
-RAMP = 2.0  # voxels over which a boundary falls from full to none; narrower ones show terraces when shaded
+RAMP = 2.0  # width of a boundary's ramp, voxels; narrower ones show terraces when shaded
 FAR = 10.0  # world units; more than any distance in the cube
 
 
@@ -24,7 +23,7 @@ class Canvas:
         self.values = np.full((resolution,) * 3, fill, np.float32)
 
     def field(self, build: Callable[..., None]) -> "Canvas":
-        """A field of distances at the same nodes, to which `build` joins shapes."""
+        """Field of distances at the same nodes, to which `build` joins shapes."""
         field = Canvas(len(self.axis), FAR)
         build(field)
         return field
@@ -32,7 +31,7 @@ class Canvas:
     def slabs(
         self, low: Point = (-1.0,) * 3, high: Point = (1.0,) * 3, reach: float = 0.0
     ) -> Iterator[tuple[tuple[slice, slice, slice], tuple[Block, Block, Block]]]:
-        """Index and world coordinates (an open mesh) of the nodes within `reach` of a box, slab by slab."""
+        """Indices and world coordinates (an open mesh) of the nodes within `reach` of a box, by slabs."""
         first = np.searchsorted(self.axis, np.array(low, np.float32) - reach)
         last = np.searchsorted(self.axis, np.array(high, np.float32) + reach, side="right")
         if np.any(last <= first):
@@ -41,18 +40,19 @@ class Canvas:
         thick = max(1, SLAB // (len(y) * len(z)))
         for start in range(first[0], last[0], thick):
             stop = min(start + thick, last[0])
-            where = (slice(start, stop), slice(first[1], last[1]), slice(first[2], last[2]))
-            yield where, (self.axis[start:stop, None, None], y[None, :, None], z[None, None, :])
+            index = (slice(start, stop), slice(first[1], last[1]), slice(first[2], last[2]))
+            yield index, (self.axis[start:stop, None, None], y[None, :, None], z[None, None, :])
 
     def join(self, shapes: Shape | Iterable[Shape], blend: float = 0.0, sign: int = 1) -> None:
-        """Union with a field of distances, seams rounded over `blend`, evaluated up to 2 `blend` outside the
-        box: give the first shape the widest blend that follows."""
+        """Add shapes to a field of distances, seams rounded over `blend`. Shapes are evaluated up to 2
+        `blend` outside their boxes: the first needs the widest blend of all."""
         for shape in [shapes] if isinstance(shapes, Shape) else shapes:
-            for where, at in self.slabs(shape.low, shape.high, 2 * blend + 2 * self.spacing):
-                self.values[where] = sign * smooth_min(sign * self.values[where], shape.distance(*at), blend)
+            for index, points in self.slabs(shape.low, shape.high, 2 * blend + 2 * self.spacing):
+                distance = shape.distance(*points)
+                self.values[index] = sign * smooth_min(sign * self.values[index], distance, blend)
 
     def carve(self, shapes: Shape | Iterable[Shape], blend: float = 0.0) -> None:
-        """Difference from a field of distances; edges are rounded over a distance `blend`."""
+        """Subtract shapes from a field of distances, edges rounded over `blend`."""
         self.join(shapes, blend, -1)
 
     def paint(
@@ -62,15 +62,15 @@ class Canvas:
         width: float | None = None,
         grown: float = 0.0,
     ) -> None:
-        """Paint a number or function of (x, y, z, distance) within a `grown` shape; `width`: of its ramp."""
+        """Paint a number or function of (x, y, z, distance) on a `grown` shape, with a ramp of a width."""
         width = RAMP * self.spacing if width is None else width
         field = isinstance(shape, Canvas)
-        for where, at in self.slabs() if field else self.slabs(shape.low, shape.high, width + grown):
-            distance = (shape.values[where] if field else shape.distance(*at)) - grown
+        for index, points in self.slabs() if field else self.slabs(shape.low, shape.high, width + grown):
+            distance = (shape.values[index] if field else shape.distance(*points)) - grown
             cover = np.clip(0.5 - distance / width, 0, 1)
             if cover.any():
-                below = self.values[where]
-                below += cover * ((value(*at, distance) if callable(value) else value) - below)
+                values = self.values[index]
+                values += cover * ((value(*points, distance) if callable(value) else value) - values)
 
     def as_uint8(self) -> np.ndarray:
         return np.rint(np.clip(self.values, 0, 255, out=self.values), out=self.values).astype(np.uint8)
@@ -84,7 +84,7 @@ def smooth_min(a: Block, b: Block, blend: float) -> Block:
 
 
 def plane_waves(rng: np.random.Generator, shortest: float, longest: float) -> Callable[..., Block]:
-    """A random texture, the same at every resolution: 32 plane waves between two wavelengths, variance 1."""
+    """Random texture of variance 1, independent of the resolution: 32 plane waves between two wavelengths."""
     direction = rng.normal(size=(32, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     wave_vector = 2 * np.pi * direction / rng.uniform(shortest, longest, (32, 1))

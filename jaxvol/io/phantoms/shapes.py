@@ -1,4 +1,4 @@
-"""Shapes, as signed distances (negative inside, exact if round, else to first order) with bounding boxes."""
+"""Shapes: signed distances (negative inside, exact for round ones, else to first order) and their boxes."""
 
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -26,7 +26,7 @@ def _around(distance: Callable[[Block, Block, Block], Block], center: Point, hal
 
 
 def ellipsoid(center: Point, radii: Point, yaw: float = 0.0) -> Shape:
-    """`yaw`: rotation about the z axis through the centre, radians."""
+    """Ellipsoid, rotated by `yaw` (radians) about the z axis through its centre."""
     (cx, cy, cz), (rx, ry, rz) = center, radii
     c, s, small = float(np.cos(yaw)), float(np.sin(yaw)), min(radii)
 
@@ -48,7 +48,7 @@ def ball(center: Point, radius: float) -> Shape:
 
 
 def to_segment(x: Block, y: Block, z: Block, a: Point, b: Point) -> tuple[Block, Block]:
-    """Distance to the segment a b, and the nearest point's position along it, 0 to 1."""
+    """Distance to the segment a b, and the position of the nearest point on it, 0 to 1."""
     dx, dy, dz = (float(q - p) for p, q in zip(a, b, strict=True))
     x, y, z = x - float(a[0]), y - float(a[1]), z - float(a[2])
     square = dx * dx + dy * dy + dz * dz
@@ -57,12 +57,12 @@ def to_segment(x: Block, y: Block, z: Block, a: Point, b: Point) -> tuple[Block,
 
 
 def capsule(a: Point, b: Point, radius: float, end_radius: float | None = None) -> Shape:
-    """A capsule along the segment a b, its radius linear from `radius` to `end_radius`."""
+    """Capsule along the segment a b, its radius linear from `radius` to `end_radius`."""
     end = radius if end_radius is None else end_radius
 
     def distance(x: Block, y: Block, z: Block) -> Block:
-        away, t = to_segment(x, y, z, a, b)
-        return away - (radius + t * (end - radius))
+        to_axis, t = to_segment(x, y, z, a, b)
+        return to_axis - (radius + t * (end - radius))
 
     wide = max(radius, end)
     return Shape(distance, np.minimum(a, b) - wide, np.maximum(a, b) + wide)
@@ -82,13 +82,13 @@ def box(center: Point, half: Point, rounding: float = 0.02) -> Shape:
 
 
 def cylinder(axis: int, center: Point, radius: float, half: float, sides: int = 0, wave: int = 0) -> Shape:
-    """Along a coordinate axis. `sides`: of a prism instead. `wave`: number of gear teeth around it."""
+    """Cylinder along a coordinate axis, or prism with `sides`; `wave`: number of gear teeth around it."""
     tooth = 0.012 if wave else 0.0
     turns = (np.arange(sides) * (2 * np.pi / max(sides, 1))).tolist()
 
     def distance(x: Block, y: Block, z: Block) -> Block:
         p = [v - float(c) for v, c in zip((x, y, z), center, strict=True)]
-        along = p.pop(axis)
+        height = p.pop(axis)
         u, v = p
         if sides:
             side = reduce(np.maximum, (float(np.cos(t)) * u + float(np.sin(t)) * v for t in turns)) - radius
@@ -96,14 +96,14 @@ def cylinder(axis: int, center: Point, radius: float, half: float, sides: int = 
             side = np.sqrt(u * u + v * v) - radius
         if wave:
             side = side + tooth * np.sin(wave * np.arctan2(u, v))
-        return np.maximum(side, abs(along) - half)
+        return np.maximum(side, abs(height) - half)
 
     wide = radius / float(np.cos(np.pi / sides)) if sides else radius + tooth
     return _around(distance, center, tuple(half if i == axis else wide for i in range(3)))
 
 
 def ring(center: Point, radius: float, thickness: float) -> Shape:
-    """A torus about the z direction."""
+    """Torus about the z direction."""
     cx, cy, cz = center
 
     def distance(x: Block, y: Block, z: Block) -> Block:
@@ -114,7 +114,7 @@ def ring(center: Point, radius: float, thickness: float) -> Shape:
 
 
 def pair(*shapes: Shape) -> list[Shape]:
-    """Every shape and its mirror image in the plane x = 0."""
+    """Shapes and their mirror images in the plane x = 0."""
 
     def mirrored(shape: Shape) -> Shape:
         low, high = (-shape.high[0], *shape.low[1:]), (-shape.low[0], *shape.high[1:])
@@ -124,18 +124,18 @@ def pair(*shapes: Shape) -> list[Shape]:
 
 
 def lengths(line: Float[np.ndarray, "points axes"]) -> Float[np.ndarray, " points"]:
-    """Length of a polyline from its first point up to each of its points."""
+    """Lengths of a polyline from its first point to all of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
 
 
 KINDS: dict[str, Callable[..., Shape]] = {
-    each.__name__: each for each in (ellipsoid, ball, capsule, box, cylinder, ring)
+    kind.__name__: kind for kind in (ellipsoid, ball, capsule, box, cylinder, ring)
 }
 
 
 def shapes_of(specs: Sequence[Any]) -> list[Shape]:
-    """Shapes from their kinds and arguments, as JSON holds them; `pair` has shapes as its arguments."""
-    found = []
+    """Shapes from JSON: their kinds and arguments; the arguments of `pair` are shapes."""
+    shapes = []
     for kind, *args in specs:
-        found += pair(*shapes_of(args)) if kind == "pair" else [KINDS[kind](*args)]
-    return found
+        shapes += pair(*shapes_of(args)) if kind == "pair" else [KINDS[kind](*args)]
+    return shapes

@@ -1,14 +1,13 @@
-"""Synthetic ultrasound volumes of scenes in mm, sampled with speckle at the nodes of a swept probe, whose
-motor axis is the x axis and whose middle beam points along z."""
+"""Synthetic ultrasound volumes of scenes in mm, sampled with speckle at the nodes of a swept probe: its motor
+axis is the x axis, and its middle beam points along z."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import reduce
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import flag, integer
+from ..._util.checks import Checked, flag, integer
 from ...march.transforms.toroidal_map import ToroidalMap
 from ...scene.volume import Volume
 from .bodies import parts
@@ -16,24 +15,25 @@ from .canvas import SLAB, smooth_min
 from .shapes import Block, ellipsoid, shapes_of
 
 
-SOFT = 1.2  # mm over which a boundary falls from full to none
-GRAIN = 0.35  # mm along a beam over which speckle is correlated: half the pulse length
+SOFT = 1.2  # width of a boundary's ramp, mm
+GRAIN = 0.35  # correlation length of speckle along a beam, mm: half the pulse length
 
 
 def toroidal_phantom(
     name: str,
-    shape: tuple[int, int, int] | Any = (64, 96, 160),
+    shape: Checked[Sequence[int]] = (64, 96, 160),
     *,
-    probe: ToroidalMap | Any | None = None,
-    speckle: bool | Any = True,
-    seed: int | Any = 0,
+    probe: Checked[ToroidalMap] | None = None,
+    speckle: Checked[bool] = True,
+    seed: Checked[int] = 0,
 ) -> tuple[Volume, ToroidalMap]:
-    """A synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the world.
+    """Make a synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the
+    world.
 
-    | name | what | mean echo |
+    | name | content | mean echo |
     |---|---|---|
-    | `shells` | reverberation: echoes 2 mm thick, 12 mm apart along every beam, each weaker than the one \
-    before | 220, falling by 15 % each; 8 between |
+    | `shells` | reverberation: echoes 2 mm thick, 12 mm apart along every beam | 220, falling by 15 % from \
+    shell to shell; 8 between |
     | `spheres` | rows of spheres in tissue: cysts (y < 0) and targets (y > 0), of radius 6, 9 and 12 mm | \
     tissue 60; cysts 4; targets 130, 160, 190 |
     | `wires` | the spheres, and between them wires 3 mm thick, along x, along y and obliquely in depth | as \
@@ -41,22 +41,21 @@ def toroidal_phantom(
     | `fetus` | a fetus on its back in amniotic fluid: crown to rump along x, head at -x, face to the probe, \
     90 mm long | fluid 4, uterus 30, body 70, skin 120, skull and long bones 170 |
 
-    Boundaries are ramps 1.2 mm wide. The scene does not depend on the shape or the probe; the grains of the
-    speckle do.
+    Boundaries are ramps 1.2 mm wide. The speckle depends on the shape and the probe; the scene does not.
 
     Args:
         name: of the table.
-        shape: nodes along (β, σ, γ), at least 8 each.
+        shape: numbers of nodes along (β, σ, γ), at least 8.
         probe: by default a = 20 mm, b = 30 mm, β within 90° ± 35°, σ within 90° ± 40°, γ from 0 to 100 mm.
         speckle: multiply the echo by fully developed speckle, of mean 1: the modulus of a complex Gaussian
             (Rayleigh), correlated over 0.35 mm along each beam and independent from beam to beam.
         seed: of the speckle.
 
     Returns:
-        A uint8 volume as acquired, `data[β, σ, γ]`, whose own spacing has no meaning, and the probe.
+        A uint8 volume as acquired, `data[β, σ, γ]`, whose spacing has no meaning, and the probe.
 
     Raises:
-        ValueError: for an unknown name and for arguments of other kinds.
+        ValueError: for an unknown name and for arguments of other types.
     """
     if name not in SCENES:
         raise ValueError(f"name must be one of {', '.join(SCENES)}; got {name!r}.")
@@ -89,11 +88,11 @@ def _speckle(
     rng: np.random.Generator, shape: tuple[int, ...], grain: float
 ) -> Float[np.ndarray, "beta sigma gamma"]:
     """Rayleigh-distributed numbers of mean 1, correlated over `grain` nodes of the last axis."""
-    from scipy.ndimage import gaussian_filter1d  # here, so that a first image does not wait for it
+    from scipy.ndimage import gaussian_filter1d  # slow to import
 
     impulse = np.zeros(shape[-1])
     impulse[shape[-1] // 2] = 1
-    # standard deviation of white noise of variance 1 after filtering
+    # standard deviation of filtered white noise of variance 1
     deviation = np.float32(np.sqrt(np.sum(gaussian_filter1d(impulse, grain, mode="wrap") ** 2)))
     noise = (rng.standard_normal(shape, np.float32) for _ in range(2))
     re, im = (gaussian_filter1d(white, grain, mode="wrap") / deviation for white in noise)
@@ -101,17 +100,17 @@ def _speckle(
 
 
 def _painted(echo: Block, layers: Iterable[tuple[float, Block]]) -> Block:
-    """Paint materials over the echo, one over the other, where the distance to each is negative."""
+    """Paint layers (value, signed distance) over the echo, later ones over earlier ones."""
     for value, distance in layers:
         echo += np.clip(0.5 - distance / SOFT, 0, 1) * (value - echo)
     return echo
 
 
 def _shells(x: Block, y: Block, z: Block, gamma: Block) -> Block:
-    apart, thick = 12.0, 2.0
-    number = np.maximum(np.rint(gamma / apart), 1)
+    period, thickness = 12.0, 2.0
+    number = np.maximum(np.rint(gamma / period), 1)
     echo = 220 * 0.85 ** (number - 1)
-    return 8 + (echo - 8) * np.exp(-(((gamma - apart * number) / (thick / 2)) ** 2))
+    return 8 + (echo - 8) * np.exp(-(((gamma - period * number) / (thickness / 2)) ** 2))
 
 
 def _spheres(x: Block, y: Block, z: Block, gamma: Block) -> Block:
@@ -126,24 +125,24 @@ def _wires(x: Block, y: Block, z: Block, gamma: Block) -> Block:
 
 def _fetus(x: Block, y: Block, z: Block, gamma: Block) -> Block:
     # origin at the navel; x from crown to rump, y from right to left, z from back to front
-    at = x, y, 100 - z
-    either_side = x, abs(y), at[2]
-    head, limbs = _joined("head", at, 4), _joined("limbs", either_side, 2)
-    body = _joined("trunk", at, 8)
-    face = smooth_min(_joined("face", either_side, 1), _joined("ears", either_side, 1), 1)
+    points = x, y, 100 - z
+    mirrored = x, abs(y), points[2]
+    head, limbs = _joined("head", points, 4), _joined("limbs", mirrored, 2)
+    body = _joined("trunk", points, 8)
+    face = smooth_min(_joined("face", mirrored, 1), _joined("ears", mirrored, 1), 1)
     body = smooth_min(smooth_min(face, head, 2), body, 4)
-    body = smooth_min(smooth_min(limbs, body, 4), _joined("cord", at, 0), 2)
-    fluid = ellipsoid((0, 0, 0), (60, 40, 34)).distance(*at)
+    body = smooth_min(smooth_min(limbs, body, 4), _joined("cord", points, 0), 2)
+    fluid = ellipsoid((0, 0, 0), (60, 40, 34)).distance(*points)
     skull = (170, head + 2.5), (40, head + 4.5)
-    bones = (170, _joined("spine", at, 0)), (170, _joined("bones", either_side, 0))
+    bones = (170, _joined("spine", points, 0)), (170, _joined("bones", mirrored, 0))
     return _painted(np.full_like(x, 30), [(4, fluid), (120, body), (70, body + 2), *skull, *bones])
 
 
-def _joined(part: str, at: tuple[Block, Block, Block], blend: float) -> Block:
-    """Distance to a part of the fetus, its shapes blended; of pairs, those at y > 0 are listed."""
-    distances = (shape.distance(*at) for shape in shapes_of(parts()[f"fetus {part}"]))
+def _joined(part: str, points: tuple[Block, Block, Block], blend: float) -> Block:
+    """Distance to the blended shapes of a part of the fetus; for pairs, only those at y > 0 are listed."""
+    distances = (shape.distance(*points) for shape in shapes_of(parts()[f"fetus {part}"]))
     return reduce(lambda a, b: smooth_min(a, b, blend), distances)
 
 
 SCENES = {"shells": _shells, "spheres": _spheres, "wires": _wires, "fetus": _fetus}
-"""Functions from world points x, y, z of depth γ, all in mm, to the mean echo there, 0 to 255."""
+"""Functions from world points x, y, z and depths γ, all in mm, to the mean echo, 0 to 255."""

@@ -1,24 +1,23 @@
-"""The `colon`, a winding tube with folds and polyps, and `vessels`, a tree that feeds points in a crown:
-branches cover part of the way, and split the points between two children of radii by Murray's law."""
+"""Phantoms `colon`, a winding tube with folds and polyps, and `vessels`, a tree that supplies random points:
+a branch covers part of the way, and splits the points between two children (radii by Murray's law)."""
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import integer
+from ..._util.checks import Checked, integer
 from .canvas import Canvas, plane_waves
 from .shapes import ball, box, capsule, lengths, to_segment
 
 
-def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
-    """World points evenly spaced along the centre line of the `colon` lumen, end to end.
+def colon_path(points: Checked[int] = 400) -> Float[np.ndarray, "points 3"]:
+    """Compute evenly spaced points of the centre line of the `colon` lumen, end to end.
 
-    The path for a fly-through camera. It is the same for every seed and resolution.
+    The line is a path for a fly-through camera, the same for every seed and resolution.
 
     Args:
-        points: their number.
+        points: number of points.
 
     Returns:
         The points, in world coordinates.
@@ -26,7 +25,7 @@ def colon_path(points: int | Any = 400) -> Float[np.ndarray, "points 3"]:
     Raises:
         ValueError: for fewer than 2 points.
     """
-    from scipy.interpolate import CubicSpline  # here, so that a first image does not wait for it
+    from scipy.interpolate import CubicSpline  # slow to import
 
     points = integer("points", points, 2)
     turns = [(-0.6, -0.6, -0.66), (-0.64, -0.5, -0.1), (-0.6, -0.55, 0.45), (-0.3, -0.3, 0.68)]
@@ -46,28 +45,28 @@ def draw_colon(canvas: Canvas, rng: np.random.Generator) -> None:
     tissue, uneven = plane_waves(rng, 0.15, 0.6), plane_waves(rng, 0.25, 0.5)
     polyps = []
     for place in np.linspace(0.08, 0.94, 7) + rng.uniform(-0.04, 0.04, 7):
-        along, out, i = rng.normal(size=3), 0.155, int(place * 160)
-        ahead = bend[i + 1] - bend[i - 1]
-        out *= np.cross(ahead, along) / np.linalg.norm(np.cross(ahead, along))
-        polyps.append(ball(tuple((bend[i] + out).tolist()), float(rng.uniform(0.035, 0.06))))
+        random_vector, i = rng.normal(size=3), int(place * 160)
+        normal = np.cross(bend[i + 1] - bend[i - 1], random_vector)
+        center = bend[i] + 0.155 * (normal / np.linalg.norm(normal))
+        polyps.append(ball(tuple(center.tolist()), float(rng.uniform(0.035, 0.06))))
 
     def lumen(field: Canvas) -> None:
-        along = np.zeros_like(field.values)
+        arc_length = np.zeros_like(field.values)
         for i, (a, b) in enumerate(pairwise(bend.tolist())):
             stretch = capsule(a, b, deepest)
-            for where, at in field.slabs(stretch.low, stretch.high, wall + 2 * field.spacing):
-                away, t = to_segment(*at, a, b)
-                nearer = away < field.values[where]
-                np.copyto(field.values[where], away, where=nearer)
-                np.copyto(along[where], (i + t) * (length / 160), where=nearer)
-        for where, at in field.slabs():
-            away, s = field.values[where], along[where]
-            if away.min() < 1:
+            for index, points in field.slabs(stretch.low, stretch.high, wall + 2 * field.spacing):
+                distance, t = to_segment(*points, a, b)
+                nearer = distance < field.values[index]
+                np.copyto(field.values[index], distance, where=nearer)
+                np.copyto(arc_length[index], (i + t) * (length / 160), where=nearer)
+        for index, points in field.slabs():
+            distance, s = field.values[index], arc_length[index]
+            if distance.min() < 1:
                 # pouches between crescent folds, 0.17 apart, deeper on one side than on the other
                 fold = np.exp(-((np.abs(np.sin(np.pi * s / 0.17)) / 0.42) ** 2))
-                bumps = uneven(*at)
+                bumps = uneven(*points)
                 radius = 0.165 + 0.012 * bumps - fold * np.clip(0.045 + 0.035 * bumps, 0, 0.09)
-                away -= np.clip(radius, 0.07, deepest)
+                distance -= np.clip(radius, 0.07, deepest)
         field.carve(polyps, 0.03)
 
     inside = canvas.field(lumen)
@@ -97,8 +96,8 @@ def _grow(
     cloud: Float[np.ndarray, "points 3"],
     generation: int = 1,
 ) -> None:
-    """Join a branch to the field, and its children."""
-    # the last branch reaches the centroid of its points, the others go half of the way
+    """Join a branch and its children to the field."""
+    # the last generation reaches the centroid of its points, the others go half of the way
     middle = cloud.mean(axis=0)
     end = start + (middle - start) * (0.5 if generation < GENERATIONS else 1)
     bend = start + heading * (0.45 * np.linalg.norm(end - start))

@@ -227,7 +227,7 @@ BAD = {
     ),
     "a slice is there twice": (
         lambda folder, paths: (folder / "copy.dcm").write_bytes(paths[1].read_bytes()),
-        r"evenly spaced.*; 0 mm for 2\.5: one is there twice, or shifted, between .*\.dcm",
+        r"evenly spaced.*; 0 mm for 2\.5: a slice is repeated or shifted between .*\.dcm",
     ),
     "two series": (
         lambda folder, paths: write_slice(paths[0], DATA[:, :, 0], ORIGIN, tags=OTHER),
