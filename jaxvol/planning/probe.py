@@ -146,7 +146,7 @@ class Probe(NamedTuple):
         return cls(candidates.rays(column, row), strata, likely, inside, width * height)
 
     def mean(self, values: np.ndarray | Array) -> float:
-        """Estimate of the mean over the image, from the values of the probe's pixels; 0 outside of strata."""
+        """Estimate of a mean over the image by values of pixels; patches that miss the volume count as 0."""
         return float(self.strata @ self._totals(values) / self.pixels)
 
     def _totals(self, values: np.ndarray | Array) -> Float[np.ndarray, " patches"]:

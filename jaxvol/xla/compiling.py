@@ -12,7 +12,6 @@ from jaxtyping import Array
 from .differentiation import transformations
 from .kept_programs import kept
 from .platform import is_traced
-from .trees import PyTree
 
 
 OPTIONS = {
@@ -45,7 +44,9 @@ def compiled(
     def run(*args: Any) -> Any:
         if not in_program(*args):  # JAX allows compiler options only for an outermost program
             return outermost(*args)
-        batched = not in_turn or (has_jvp and not _only_vmapped(args)) or (by_jvp and _is_pushed(args))
+        kinds = {kind for leaf in jax.tree.leaves(args) for kind in transformations(leaf)[:1]}
+        pushed = by_jvp and not kinds.isdisjoint({"JVPTracer", "LinearizeTracer"})
+        batched = not in_turn or pushed or (has_jvp and kinds != {"BatchTracer"})
         return nested(*args) if batched else looped(*args)
 
     return run
@@ -69,18 +70,6 @@ def computed_now(function: Callable[..., Any], *args: Any) -> Any:
     # not by `jax.ensure_compile_time_eval`, inside which jax 0.7 cannot compile a loop
     jitted: Any = eqx.filter_jit(function)
     return jitted.lower(*args).compile()(*args)
-
-
-def _only_vmapped(args: PyTree) -> bool:
-    """Tests whether `jax.vmap` is the innermost transformation of every traced argument."""
-    kinds = {transformations(leaf)[0] for leaf in jax.tree.leaves(args) if is_traced(leaf)}
-    return kinds == {"BatchTracer"}
-
-
-def _is_pushed(args: PyTree) -> bool:
-    """Tests whether a tangent is pushed through the arguments."""
-    kinds = [kind for leaf in jax.tree.leaves(args) for kind in transformations(leaf)[:1]]
-    return any(kind in ("JVPTracer", "LinearizeTracer") for kind in kinds)
 
 
 def _is_array(leaf: Any) -> bool:

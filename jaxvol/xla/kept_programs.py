@@ -189,8 +189,7 @@ mlir.register_lowering(
 )
 
 
-ARRAY: Any = object()
-"""Placeholder of an array in a tree."""
+ARRAY: Any = object()  # placeholder of an array in a tree
 
 
 def described(part: PyTree) -> Any:
