@@ -50,9 +50,7 @@ def check_joins(scene: Scene, method: Method) -> None:
     march, mode = scene.march, scene.compositing
     refused = {
         f"method={method!r}": method != "overlap",
-        f"compositing by {type(mode).__name__}, which does not join segments of a ray": not isinstance(
-            mode, Over
-        ),
+        f"compositing by {type(mode).__name__}, which joins no segments": not isinstance(mode, Over),
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
     }

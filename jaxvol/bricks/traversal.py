@@ -96,9 +96,7 @@ class Traversal:
         # shape of the boxes that are read, and the least for any single brick
         self.stored = self.min_stored = self.margin.stored(self.grid)
         if math.prod(self.stored) > MOST_VOXELS:
-            raise ValueError(
-                f"bricks must be so many that each has fewer than 2**31 voxels; got {self.stored}."
-            )
+            raise ValueError(f"bricks must have fewer than 2**31 voxels each; got {self.stored}. Use more.")
         if not self.margin.straight and not callable(request.method):
             # the boxes to read follow from the rays: begin with small ones
             middle = (np.asarray(shape) - 1) / 2
@@ -159,7 +157,7 @@ class Traversal:
         return cells if bool(cells.any) else None
 
     def box_of(self, cells: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
-        """Box to read for cells, and enlarges `stored` to hold it; None if memory does not suffice."""
+        """Box to read for cells, for which `stored` grows; None if memory does not suffice."""
         shape = self.grid.shape
         low, high = np.asarray(cells.low, float), np.asarray(cells.high, float)
         around = self.margin.of_points(self.space, shape, low, high)

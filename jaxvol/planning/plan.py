@@ -132,13 +132,13 @@ def plan(
     Returns:
         A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
         False. If the patches are empty although blocks may be visible, `Plan.parts` reports it, and the
-        predicted error is a bound of the missed pixels.
+        predicted error is a bound for missed pixels.
 
     Raises:
         ValueError: for arguments of another kind, a tolerance out of range, traced arrays (plan outside of
             `jax.jit` and `jax.grad`), and transforms on which the plan decides.
     """
-    begun = time.perf_counter()
+    start = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
     group = isinstance(volume, Volume) and isinstance(volume.field, Several)
     if group or isinstance(volume, list | tuple):
@@ -164,13 +164,12 @@ def plan(
         ending = (EarlyTermination(ends),) if over else ()
         return Search(probe, scene, goal, tolerance, voxel, (*fixed, *proven, *ending), known)
 
-    # The plan drops EarlyTermination if few rays become opaque. Trials always keep it, so that they share
-    # programs.
+    # The plan drops EarlyTermination if few rays become opaque. Trials keep it, so that they share programs.
     probe = Probe.of(candidates, seed)
     first = search(ends, tolerance, {})
     coarse = first.render(COARSEST, "midpoint").image
     shows = bool(visible.any())
-    if shows and is_empty(coarse):  # what is visible lies in other patches, or between samples
+    if shows and is_empty(coarse):  # visible parts lie in other patches, or between samples
         quadrature = "preintegrated" if first.integrable else "midpoint"
         march = March(COARSEST * voxel, first.transforms, quadrature)
         probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, march)), seed)
@@ -197,7 +196,7 @@ def plan(
         error=max(chosen.error + share, unseen),
         samples=chosen.samples,
         parts=tuple(parts),
-        probed=time.perf_counter() - begun,
+        probed=time.perf_counter() - start,
     )
 
 
