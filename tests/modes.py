@@ -25,8 +25,8 @@ class Additive(jv.Weighting):
     def weight(self, alpha, before):
         return self.part * alpha
 
-    def slope(self, alpha, after, worth, behind):
-        return self.part * (1 - alpha) * worth
+    def slope(self, alpha, after, weight_bar, sum_behind):
+        return self.part * (1 - alpha) * weight_bar
 
 
 class FoggedSurface(jv.Isosurface):

@@ -1,6 +1,7 @@
 """Errors for wrong arguments in place of a volume, transfer function, camera or march, and their advice."""
 
 import importlib
+import inspect
 import subprocess
 import sys
 from collections.abc import Callable
@@ -127,7 +128,7 @@ FLAGS: dict[str, Callable[[Any], Any]] = {
     "antialias": lambda value: jv.path_trace(VOLUME, TRANSFER, CAMERA, LIGHT, paths=1, antialias=value),
     "blend": lambda value: ScattererTemplates(Material(0.5, 0.1), LIGHT, blend=value).blend,
     "front_residual": lambda value: jv.Jitter(front_residual=value).front_residual,
-    "gradients": lambda value: jv.plan(VOLUME, TRANSFER, CAMERA, 0.9, gradients=value),
+    "gradients": lambda value: inspect.unwrap(jv.plan)(VOLUME, TRANSFER, CAMERA, 0.9, gradients=value),
     "inside_out": lambda value: jv.Clip((0, 1, 0, 1, 0, 1), inside_out=value).inside_out,
     "labels": lambda value: jv.AlphaCorrection(value).labels,
     "parallel": lambda value: jv.Camera.looking_at(VOLUME, parallel=value).parallel_scale,

@@ -1,8 +1,8 @@
-"""Finds the cells of each ray in a brick: those that begin there, if samples were not moved.
+"""Cells of each ray in a brick: those that begin there before any jitter.
 
-A straight ray meets a brick once. A curved one may come back: bricks are visited one after the other, and a
-ray goes on while it is in this one or an earlier one, whose cells are read with it (the overlap of Kim, Kwon
-and Shin 2008).
+A straight ray meets a brick once. A curved one may come back: bricks are visited in turn, and a ray continues
+while it is in the current brick or an earlier one, whose cells are read with it (the overlap of Kim, Kwon and
+Shin 2008).
 """
 
 from typing import NamedTuple, TypeAlias
@@ -23,15 +23,15 @@ from .grid import SLACK, BrickGrid
 CHUNK = 8  # cells of a ray that are tested at a time
 
 Visit: TypeAlias = tuple[Int[Array, ""], Bool[Array, " bricks"], Bool[Array, " bricks"]]
-"""A brick, masks of the bricks through which rays go on from it, itself included, and of empty ones."""
+"""A brick; mask of the bricks through which rays continue from it, itself included; mask of empty bricks."""
 
 CurvedRays: TypeAlias = tuple[Ray, Progress, Int[Array, "*rays"]]
-"""Rays, at their entries but for which are finished, and to which cell of each ray bricks have been found."""
+"""Rays; their progress at the entry, with the current `finished`; the cell up to which bricks are known."""
 
 
 class BrickCells(NamedTuple):
-    """Cells of rays that are marched in a brick; to which cell of each ray bricks have then been found; a box
-    of grid coordinates that holds all points of these cells; and whether there are any."""
+    """Cells of rays in a brick; the cell of each ray up to which bricks are then known; a box of grid
+    coordinates that holds all points of these cells; and whether there are any."""
 
     cells: CellRange
     reached: Int[Array, "*rays"]
@@ -41,16 +41,16 @@ class BrickCells(NamedTuple):
 
 
 def padded(cells: CellRange) -> CellRange:
-    """The cells, and those around them whose samples may be shifted into them."""
-    some = cells.until > cells.first
+    """The cells, and their neighbours whose samples may be shifted into them."""
+    nonempty = cells.until > cells.first
     first, until = jnp.maximum(cells.first - SLACK, 0), cells.until + SLACK
-    return CellRange(jnp.where(some, first, 0), jnp.where(some, until, 0))
+    return CellRange(jnp.where(nonempty, first, 0), jnp.where(nonempty, until, 0))
 
 
 def straight_cells(
     grid: BrickGrid, march: March, rays: Ray, alive: Bool[Array, "*rays"], brick: Int[Array, ""]
 ) -> CellRange:
-    """The cells of `alive` straight rays in a brick, and those whose samples may be shifted into it."""
+    """The cells of `alive` straight rays in a brick, and the neighbours whose samples may shift into it."""
     near, far, hit = _within(grid, march, rays, brick)
     first, until = jnp.ceil(near).astype(jnp.int32) - SLACK, jnp.floor(far).astype(jnp.int32) + 1 + SLACK
     hit &= alive
@@ -60,7 +60,7 @@ def straight_cells(
 def first_behind(
     grid: BrickGrid, march: March, rays: Ray, order: Int[Array, " bricks"], number: Int[Array, ""]
 ) -> Int[Array, "*rays"]:
-    """First cell of straight rays behind the first `number` bricks of an order in which rays meet them."""
+    """First cell of straight rays behind the first `number` bricks of a front-to-back order."""
 
     def more(i: Int[Array, ""], index: Int[Array, "*rays"]) -> Int[Array, "*rays"]:
         _, far, hit = _within(grid, march, rays, order[i])
@@ -72,7 +72,7 @@ def first_behind(
 def _within(
     grid: BrickGrid, march: March, rays: Ray, brick: Int[Array, ""]
 ) -> tuple[Float[Array, "*rays"], Float[Array, "*rays"], Bool[Array, "*rays"]]:
-    """Where straight rays enter and leave a brick, in steps from their entry, and which of them meet it."""
+    """Entry and exit of straight rays in a brick, in steps past the ray's entry, and which rays meet it."""
     path = rays.path
     assert isinstance(path, Straight)
     index = jnp.unravel_index(brick, grid.counts)
@@ -89,18 +89,18 @@ def _within(
 
 
 def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit, beyond: int) -> BrickCells:
-    """The cells of any rays, of shape (groups, rays in a group), found one after the other; `low` and `high`
-    also hold `beyond` steps before and behind these."""
+    """The cells of curved rays, of shape (groups, rays in a group), by a search along each ray. The box also
+    holds `beyond` steps before and behind them."""
     rays, at, reached = curved
     brick, passable, empty = visit
-    # Samples lie at multiples of a step from where the ray begins, or half-way between two; and farther on a
-    # ray may shift. All of these points count, since a ray may be in a brick for less than a step.
+    # Samples lie at multiples of a step past the entry, or half-way between two, and later ones may be
+    # shifted. All of these points count, since a ray may be in a brick for less than a step.
     track = at.track
     fronts = [track.offset] if track.shift is None else [track.offset, track.offset + track.shift]
     offsets = fronts if march.quadrature == "left" else [o + half for o in fronts for half in (0, 0.5)]
-    # A ray may come back into the volume and leave it before the next of these points: this counts, too.
+    # A ray may also come back into the volume and leave it again between two of these points.
     returns = [(back, _located(rays, back)) for _, back in rays.gaps]
-    returns = jax.tree.map(lambda of_rays: of_rays[None, None], returns)
+    returns = jax.tree.map(lambda leaf: leaf[None, None], returns)
     number = jnp.arange(CHUNK, dtype=jnp.int32)[:, None, None]
 
     def depths(index: Int[Array, "cells *rays"]) -> Float[Array, "points cells *rays"]:
@@ -108,12 +108,12 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
 
     def points(index: Int[Array, "cells *rays"]) -> tuple[Vec3, Bool[Array, "points cells *rays"]]:
         depth, end = depths(index), depths(index + 1)
-        found = jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
-        every = [found]
+        samples = jax.vmap(jax.vmap(_located, in_axes=(None, 0)), in_axes=(None, 0))(rays, depth)
+        parts = [samples]
         for back, located in returns:
             within = (depth <= back) & (back < end)
-            every += [jax.tree.map(lambda a, b, within=within: jnp.where(within, a, b), located, found)]
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *every)
+            parts += [jax.tree.map(lambda a, b, within=within: jnp.where(within, a, b), located, samples)]
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *parts)
 
     def bricks(index: Int[Array, "cells *rays"]) -> Int[Array, "points cells *rays"]:
         coordinate, inside = points(index)
@@ -124,15 +124,15 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
         return (front < (rays.length + march.step)[None]) & (index < march.most_samples)
 
     def while_in(allowed: Bool[Array, " bricks"], index: Array, active: Array) -> tuple[Array, Array]:
-        """Moves rays on while in these bricks; also the index behind the last non-empty cell."""
+        """First cell of each ray outside of the allowed bricks, and the end of its last non-empty cell."""
 
         def more(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             index, last, active = state
             at = bricks(index[None] + number)
             stays = jnp.all(allowed[at], axis=0) & ahead(index[None] + number)
             passed = jnp.cumprod(stays.astype(jnp.int32), axis=0) > 0
-            seen = passed & jnp.any(~empty[at], axis=0) & active[None]
-            last = jnp.maximum(last, jnp.max(jnp.where(seen, index[None] + number + 1, 0), axis=0))
+            occupied = passed & jnp.any(~empty[at], axis=0) & active[None]
+            last = jnp.maximum(last, jnp.max(jnp.where(occupied, index[None] + number + 1, 0), axis=0))
             steps = jnp.sum(passed, axis=0, dtype=index.dtype)
             return index + jnp.where(active, steps, 0), last, active & (steps == CHUNK)
 
@@ -141,9 +141,9 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
         return index, last
 
     first, _ = while_in(empty, reached, ~at.finished)
-    here = jnp.any(bricks(first[None])[:, 0] == brick, axis=0)
-    # where its points lie in several bricks, the cell belongs to the first one that is visited
-    enters = ~at.finished & here & ahead(first[None])[0]
+    in_brick = jnp.any(bricks(first[None])[:, 0] == brick, axis=0)
+    # a cell whose points lie in several bricks belongs to the first brick that is visited
+    enters = ~at.finished & in_brick & ahead(first[None])[0]
     _, until = while_in(passable, first + 1, enters)
     until = jnp.maximum(until, first + 1)
 
@@ -152,21 +152,21 @@ def curved_cells(grid: BrickGrid, march: March, curved: CurvedRays, visit: Visit
         index = start[None] + number
         coordinate, inside = points(index)
         counts = inside & (enters[None] & (index <= (until + beyond)[None]) & (index >= 0))[None]
-        point, others = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
-        low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=others))
-        high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=others))
+        point, axes = jnp.stack(coordinate), tuple(range(1, counts.ndim + 1))
+        low = jnp.minimum(low, jnp.min(jnp.where(counts[None], point, jnp.inf), axis=axes))
+        high = jnp.maximum(high, jnp.max(jnp.where(counts[None], point, -jnp.inf), axis=axes))
         return start + CHUNK, low, high
 
-    nothing = jnp.full(3, jnp.inf, rays.length.dtype)
+    infinite = jnp.full(3, jnp.inf, rays.length.dtype)
     _, low, high = jax.lax.while_loop(
         lambda state: jnp.any(enters & (state[0] <= until + beyond)),
         widen,
-        (first - beyond, nothing, -nothing),
+        (first - beyond, infinite, -infinite),
     )
     cells = CellRange(jnp.where(enters, first, 0), jnp.where(enters, until, 0))
     return BrickCells(cells, jnp.where(enters, until, first), low, high, jnp.any(enters))
 
 
 def _located(rays: Ray, depth: Float[Array, "*rays"]) -> tuple[Vec3, Bool[Array, "*rays"]]:
-    """Grid coordinates of points on rays, and whether these lie in the volume."""
+    """Grid coordinates of points on rays, and whether the points lie in the volume."""
     return vmap_rays(lambda ray, s: (ray.path(s), ray.contains(s)))(rays, depth)

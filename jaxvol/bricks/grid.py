@@ -1,15 +1,14 @@
-"""Divides a volume into bricks, orders them, and says how large they may be and what is read around them."""
+"""Division of a volume into bricks: their size, their order, and the margin that is read around them."""
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .._util.checks import integer, shortened
+from .._util.checks import Arrayable, integer, shortened
 from .._util.files import MOST_VOXELS
 from .._util.vec3 import Vec3, apart
 from ..march.march import March
@@ -23,13 +22,12 @@ from ..xla.compiling import compiled
 
 Node = tuple[int, int, int]
 
-SLACK = 3  # steps by which jitter may move samples from where their cells begin, and one more for rounding
-EDGE = 16  # bricks are at least so many cells long, and of a multiple of these, where the volume is
-MOST_BRICKS = 2**16  # that a user may ask for: each is searched for along all rays
+SLACK = 3  # steps by which jitter may move samples from the start of their cells, and one more for rounding
+EDGE = 16  # cells along the side of a brick are a multiple of this, in a volume that is long enough
+MOST_BRICKS = 2**16  # limit of the argument `bricks`: each brick is searched for along all rays
 
-# Of each voxel of a brick: in the device; of the next brick, as read; and what finding the extremes of blocks
-# takes, less than half. Voxels of another type take `sources.AT_ONCE` bytes more, or a layer of chunks, while
-# they are read.
+# Copies of a voxel: in the device, in the next brick, and less than half for the extremes of blocks. Voxels
+# that are converted take `sources.AT_ONCE` bytes more, or a layer of chunks, while they are read.
 COPIES = 2.5
 
 
@@ -64,7 +62,7 @@ class BrickGrid:
         return (x, y, z), (end[0], end[1], end[2])
 
     def brick_of(self, coordinate: Vec3) -> Int[Array, "..."]:
-        """The brick in which a grid coordinate lies, or the nearest one. NaN lies in any."""
+        """The brick nearest to a grid coordinate; any brick for NaN."""
         number = jnp.zeros(jnp.shape(coordinate[0]), jnp.int32)
         for c, size, count in zip(coordinate, self.size, self.counts, strict=True):
             index = jnp.floor(c * (1 / size)).astype(jnp.int32)
@@ -72,16 +70,16 @@ class BrickGrid:
         return number
 
     def order(self, space: Space, camera: Camera) -> list[int]:
-        """All bricks, front to back. In straight grids, depth is the sum of distances along the axes in
-        bricks, none of which falls along a ray, so that no ray meets a brick after one behind it. In curved
-        ones it is the distance from the camera, as in the paper, and a ray may."""
+        """Bricks front to back. In a straight grid, depth is the sum of distances along the axes in bricks,
+        which do not decrease along a ray: rays meet bricks in this order. In a curved grid it is the distance
+        from the camera, as in the paper, and a ray may come back."""
         index = np.stack(np.unravel_index(np.arange(self.number), self.counts), axis=-1)
         centers = (index + 0.5) * self.size
         eye, (_, _, forward) = camera.position, axes_of(camera)
         parallel = camera.parallel_scale is not None
         path = space.path(apart(eye), apart(forward))
         if isinstance(path, Straight):
-            # not from the coordinates of two points, which float32 rounds to the same ones far away
+            # not the difference of two points, which float32 may round to equal coordinates far away
             start, rate = (np.array([float(c) for c in part]) for part in (path.start, path.rate))
             if parallel:
                 depth = index @ np.sign(rate)
@@ -96,23 +94,23 @@ class BrickGrid:
 
 
 def is_straight(space: Space) -> bool:
-    """Whether rays are straight in the grid."""
+    """Tests whether rays are straight in the grid."""
     zero, one = jnp.zeros(()), jnp.ones(())
     return isinstance(space.path((zero, zero, zero), (one, zero, zero)), Straight)
 
 
 def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
-    """By how much bricks must overlap at their curved faces along γ, so that each ray meets each brick once.
+    """Overlap of bricks at their curved faces along γ with which each ray meets each brick once.
 
     A ray may enter a brick, pass through the one nearer to the probe, and come back. If the farther brick
     includes the cap between the curved face and its chord, it need not be rendered again. At a face at the
     distance l from the apex the cap has the height K = l - l cos(θ/2), where θ is the angle of a brick's fan;
     along the sweep, l is measured from the motor axis, and θ is the angle of its sweep. The larger counts.
-    What `render_bricks` reads follows from its rays instead.
+    `render_bricks` instead derives the voxels to read from its rays.
 
     Args:
-        probe: of the volume.
-        grid: how it is divided into bricks.
+        probe: the volume's probe geometry.
+        grid: the division of the volume into bricks.
 
     Returns:
         K* of each face between two bricks, from the probe outwards, voxels.
@@ -134,23 +132,23 @@ def overlap_of(probe: ToroidalMap, grid: BrickGrid) -> list[float]:
 
 @dataclass(frozen=True)
 class Margin:
-    """What is read around a brick."""
+    """Voxels that are read around a brick."""
 
-    cells: Node  # along each axis, on both sides, around any brick
-    steps: int  # how far cells that begin in the brick may reach along a ray
-    length: float  # and in the world
-    light: float  # world length around a sample within which light is looked for
-    around: int  # nodes more, for interpolation and slopes
+    cells: Node  # along each axis, on both sides of any brick
+    steps: int  # reach along a ray of cells that begin in the brick
+    length: float  # the same reach, world length
+    light: float  # radius around a sample within which lighting reads, world length
+    around: int  # additional nodes for interpolation and slopes
     slopes: bool
-    straight: bool = True  # whether rays are straight in the grid
-    probe: ToroidalMap | None = None  # whose bricks overlap, if they do
+    straight: bool = True  # rays are straight in the grid
+    probe: ToroidalMap | None = None  # set if bricks overlap by `overlap_of`
 
     @classmethod
     def of(cls, march: March, space: Space, shape: Node, segment: int, shown: Scene) -> "Margin":
-        """Margin of a march that takes `segment` cells at a time. `shown`: what is measured and lit."""
+        """Margin of a march of `segment` cells at a time. `shown`: the scene that is measured and lit."""
         transfer, lighting, straight = shown.transfer, shown.lighting, is_straight(space)
         steps = SLACK + segment
-        # where rays are curved, a brick's own cells are found by points that may lie four steps apart
+        # on curved rays, a brick's cells are found by points that may lie four steps apart
         length = (steps + (0 if straight else 4)) * float(march.step)
         slopes = transfer.reads_gradient or (lighting is not None and lighting.reads_gradient)
         around = 2 if slopes else 1
@@ -161,35 +159,35 @@ class Margin:
         return replace(margin, cells=margin.of_box(space, shape, np.zeros(3), np.asarray(shape) - 1))
 
     def of_box(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> Node:
-        """Nodes along each axis that are read around the cells that begin in a box."""
+        """Nodes along each axis to read around the cells that begin in a box."""
         far = nodes_within(space, shape, low, high, self.length)
         low, high = np.maximum(low - far, 0), np.minimum(high + far, np.asarray(shape) - 1)
         x, y, z = far + self.of_points(space, shape, low, high) + (0 if self.straight else 1)
         return int(x), int(y), int(z)
 
     def of_points(self, space: Space, shape: Node, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Nodes along each axis that are read around points in a box."""
+        """Nodes along each axis to read around points in a box."""
         return nodes_within(space, shape, low, high, self.light) + self.around
 
     def stored(self, grid: BrickGrid) -> Node:
-        """Nodes that are read at a time for the bricks of a grid."""
+        """Shape of the boxes of nodes that are read for the bricks of a grid."""
         overlap = 0 if self.probe is None else math.ceil(max(overlap_of(self.probe, grid), default=0.0))
         x, y, z = (size + 1 + 2 * around for size, around in zip(grid.size, self.cells, strict=True))
         return stored_shape(grid.shape, (x, y, z + overlap))
 
     def bytes(self, stored: Node, dtype: np.dtype) -> int:
-        """Memory that such bricks take: the one that is rendered, what is made of it, and the next one."""
+        """Memory of bricks of this shape: the rendered brick, its derived arrays, and the next brick."""
         packed = (8 if dtype.itemsize == 1 else 4) if self.slopes and dtype.kind in "ui" else 0
         return math.ceil(math.prod(stored) * (COPIES * dtype.itemsize + packed))
 
     def fits(self, stored: Node, dtype: np.dtype, memory: int) -> bool:
-        """Whether such bricks can be volumes, and take no more than so many bytes."""
+        """Tests whether bricks of this shape can be volumes and take at most `memory` bytes."""
         return math.prod(stored) <= MOST_VOXELS and self.bytes(stored, dtype) <= memory
 
 
 def nodes_within(space: Space, shape: Node, low: np.ndarray, high: np.ndarray, length: float) -> np.ndarray:
-    """Nodes along each axis, on both sides of a box, that hold everything within a world length of it, by the
-    least distances between nodes in both, also beyond the grid, where a ray may return to it."""
+    """Nodes along each axis, on both sides of a box, that cover a world length around it: a bound by the
+    least distances between nodes, also beyond the grid, as rays may return to it."""
     nodes = np.zeros(3)
     while length > 0:
         box = (low - nodes).tolist(), (high + nodes).tolist()
@@ -207,14 +205,14 @@ _least_distances = compiled(lambda space, low, high: space.least_distances(low, 
 
 
 def stored_shape(shape: Node, wanted: tuple[int, int, int]) -> Node:
-    """Nodes that are read at a time, at least so many. Such a box can begin at a multiple of BLOCK wherever
-    it lies, so that its blocks are those of the whole."""
+    """Shape of the boxes to read, at least `wanted`. Any such box can begin at a multiple of BLOCK, so that
+    its blocks coincide with the volume's."""
     x, y, z = (n - BLOCK * max((n - w - BLOCK + 1) // BLOCK, 0) for n, w in zip(shape, wanted, strict=True))
     return x, y, z
 
 
-def divided(shape: Node, counts: Any) -> BrickGrid:
-    """So many bricks along each axis, or fewer along one of too few voxels."""
+def divided(shape: Node, counts: Arrayable) -> BrickGrid:
+    """Grid of `counts` bricks along each axis, fewer along an axis of too few voxels."""
     try:
         x, y, z = (-(-(n - 1) // integer("bricks", c, 1)) for n, c in zip(shape, counts, strict=True))
     except (TypeError, ValueError) as fault:
@@ -228,8 +226,9 @@ def divided(shape: Node, counts: Any) -> BrickGrid:
 
 
 def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: int = 1) -> BrickGrid:
-    """The fewest about cubic bricks, `devices` if not too small, that fit into memory: one more along the
-    longest side until they do; axes along which the smallest would be read whole are split last."""
+    """Grid of the fewest nearly cubic bricks that fit into memory, and at least `devices` if they are not too
+    small: the longest side is split until they fit. Axes that the smallest bricks would read completely are
+    split last."""
     cells = [n - 1 for n in shape]
     x, y, z = (min(EDGE, c) for c in cells)
     short = np.less(margin.stored(BrickGrid(shape, (x, y, z))), shape).tolist()
@@ -243,7 +242,7 @@ def split(shape: Node, dtype: np.dtype, memory: int, margin: Margin, devices: in
             return grid
         if not divisible:
             raise ValueError(
-                f"memory must be at least {margin.bytes(stored, dtype)} bytes, for bricks of {grid.size} "
-                f"cells and what is read around them, less for a shorter step; got {memory}."
+                f"memory must be at least {margin.bytes(stored, dtype)} bytes for bricks of {grid.size} "
+                f"cells with their margins; got {memory}. Raise it, or shorten the step."
             )
         counts[max(divisible, key=lambda axis: (short[axis], grid.size[axis]))] += 1

@@ -1,6 +1,6 @@
 """Opens arrays, files and folders as sources (Zarr by tensorstore), and chooses the level of detail. yaozarrs
-checks OME-Zarr 0.4 and 0.5 (https://ngff.openmicroscopy.org/0.5/), whose positions are of centres;
-`orientation` (RFC 4) is as ngff-zarr writes it."""
+validates OME-Zarr 0.4 and 0.5 (https://ngff.openmicroscopy.org/0.5/), whose positions are those of voxel
+centres; `orientation` (RFC 4) is read as ngff-zarr writes it."""
 
 import json
 import math
@@ -26,16 +26,17 @@ from ..scene.volume import Volume, check_one_channel
 from .sources import SPACE, VoxelSource, voxel_type
 
 
-Openable: TypeAlias = VoxelSource | Volume | os.PathLike[str] | str | Any
+Openable: TypeAlias = Any
+"""A `VoxelSource`, a `Volume`, a path, or an array or image: see `levels_of`."""
 
 METADATA = ("zarr.json", ".zarray", ".zgroup", ".zattrs")  # a Zarr array or group has at least one of them
-LARGE, BEYOND = 2**26, 8  # bytes that a chunk may always have, and how many times those of its array
+LARGE, BEYOND = 2**26, 8  # a chunk has at most LARGE bytes, or BEYOND times the bytes of its array
 READ_IN_BOXES = (".raw", ".npy", *MRC, *HDF5)
-CACHE = 2**24  # bytes of decoded chunks and indices of shards that are kept, for boxes that share them
+CACHE = 2**24  # bytes of decoded chunks and shard indices in memory, for boxes that share them
 
 
 def source_of(thing: Openable, **options: Any) -> VoxelSource:
-    """The finest level of what `levels_of` opens.
+    """Opens the finest level of a volume.
 
     Args:
         thing: as for `levels_of`.
@@ -54,7 +55,7 @@ def source_of(thing: Openable, **options: Any) -> VoxelSource:
 def levels_of(
     thing: Openable, *, spacing: Arrayable | None = None, origin: Arrayable | None = None, **options: Any
 ) -> tuple[VoxelSource, ...]:
-    """The levels of detail of a volume, finest first; only that of an OME-Zarr image may have several.
+    """Opens the levels of detail of a volume, finest first; only an OME-Zarr image has several.
 
     | `thing` | read |
     |---|---|
@@ -65,21 +66,20 @@ def levels_of(
     | a `Volume` without labels and field, or a `VoxelSource` | as it is |
 
     Args:
-        thing: what holds the voxels.
-        spacing: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
-        origin: as in `Volume`; by default what the source says. Not of an OME-Zarr image or a `VoxelSource`.
-        **options: `nan`, see `VoxelSource`; `time` and `channel` of what has names of axes, and `shape`,
-            `dtype` and `offset` of a raw file, as in `jv.load`. The axes of Zarr are its own
-            (`dimension_names`, or xarray's `_ARRAY_DIMENSIONS` in version 2); a chunk that is not there has
-            the fill value.
+        thing: the object or path that holds the voxels.
+        spacing: as in `Volume`; by default that of the source. Not for an OME-Zarr image or a `VoxelSource`.
+        origin: as in `Volume`; by default that of the source. Not for an OME-Zarr image or a `VoxelSource`.
+        **options: `nan`, see `VoxelSource`; `time` and `channel` of an array with named axes; and `shape`,
+            `dtype` and `offset` of a raw file, as in `jv.load`. Zarr names its axes by `dimension_names`, or
+            xarray's `_ARRAY_DIMENSIONS` in version 2; a missing chunk has the fill value.
 
     Returns:
         A source for each level.
 
     Raises:
-        ValueError: for anything else, for a file that is missing, damaged or cut short, and for shapes and
+        ValueError: for anything else, for a file that is missing, damaged or truncated, and for shapes and
             types that no volume has.
-        TypeError: for options that do not belong to it.
+        TypeError: for options that do not apply to `thing`.
         ImportError: for Zarr without tensorstore and yaozarrs.
     """
     place = {"spacing": spacing, "origin": origin}
@@ -94,8 +94,8 @@ def levels_of(
         if thing.labels is not None or thing.field is not None:
             raise ValueError("source must be a Volume without labels and field. Use jv.render.")
         check_one_channel(thing, "bricks")
-        own = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
-        return (VoxelSource(thing.data, **(own | place), **options, name="volume"),)
+        stored = {"spacing": thing.spacing, "origin": thing.origin, "direction": thing.direction}
+        return (VoxelSource(thing.data, **(stored | place), **options, name="volume"),)
     if (record := record_of(thing)) is not None:
         return (_source(record, place, **options),)
     if not isinstance(thing, str | os.PathLike):
@@ -104,15 +104,15 @@ def levels_of(
     if is_zarr(path):
         is_image = not _is_zarr_array(path)
         if is_image and place:
-            raise TypeError(f"{', '.join(place)}: the OME-Zarr image {path} has its own.")
+            raise TypeError(f"{', '.join(place)}: the OME-Zarr image {path} has its own. Leave them out.")
         records = _ome_records(path) if is_image else [_zarr_record(path)]
         return tuple(_source(record, place, **options) for record in records)
     name = path.name.lower()
     if path.exists() and (name.endswith(".gz") or not (name.endswith(READ_IN_BOXES) or "shape" in options)):
         raise ValueError(
             f"path: {path} is not of a kind that is read box by box: .raw (uncompressed: gunzip -k), .npy, "
-            "MRC, HDF5, or the folder of a Zarr array or OME-Zarr image. Pass what fits into memory, such as "
-            "DICOM slices, as jv.load(path) or jv.load_ultrasound(path)."
+            "MRC, HDF5, or the folder of a Zarr array or OME-Zarr image. For a volume that fits into memory, "
+            "such as DICOM slices, pass jv.load(path) or jv.load_ultrasound(path)."
         )
     header = {key: options.pop(key) for key in ("shape", "dtype", "offset") if key in options}
     record = read_record(path, **header)
@@ -126,7 +126,7 @@ def _source(
     channel: int | None = None,
     nan: float | None = None,
 ) -> VoxelSource:
-    """Source of a record: axes along the world's, lengths in mm. `place`: given by the caller."""
+    """Source of a record: axes along the world's, lengths in mm. `place`: the caller's arguments."""
     name, array = record.what.removeprefix("path: "), record.data
     if not record.axes:
         raise ValueError(
@@ -136,27 +136,27 @@ def _source(
     index, letters = choose(record, time, channel)
     if "s" in letters:
         at = record.letters.index("s")
-        raise ValueError(f"channel must be given, from 0 to {array.shape[at] - 1}, of {name}.")
+        raise ValueError(f"channel must be given, from 0 to {array.shape[at] - 1}, for {name}.")
     shape = [n for n, part in zip(array.shape, index, strict=True) if isinstance(part, slice)]
     if not {*SPACE} <= {*letters}:
         check_shape(tuple(shape[:2]))
-    order, signs, own = record.oriented([shape[letters.index(letter)] for letter in SPACE])
+    order, signs, stored = record.oriented([shape[letters.index(letter)] for letter in SPACE])
     for text in record.assumed:
         warn_caller(f"{name}: {text}")
     at = [record.letters.index("xyz"[axis]) for axis in order]
     reverse = [axis for axis, sign in zip(at, signs, strict=True) if sign < 0]
     if reverse or record.missing or record.unsigned or record.is_scaled:
         array = DecodedArray(record, reverse, nan)
-    return VoxelSource(array, **(own | place), space=at, index=index, nan=nan, name=name)
+    return VoxelSource(array, **(stored | place), space=at, index=index, nan=nan, name=name)
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether a folder is a Zarr array or group."""
+    """Tests whether a folder is a Zarr array or group."""
     return any((path / name).is_file() for name in METADATA)
 
 
 def read_zarr(path: Path) -> ImageRecord:
-    """Reader of `jv.load`, for the finest level of which an image takes at most a quarter of the memory."""
+    """Record of the finest level that takes at most a quarter of the memory; the reader of `jv.load`."""
     records = [_zarr_record(path)] if _is_zarr_array(path) else _ome_records(path)
     room, sizes = memory_of_device() // 4, []
     for record in records:
@@ -181,7 +181,7 @@ def _is_zarr_array(path: Path) -> bool:
 
 
 def _zarr_record(path: Path) -> ImageRecord:
-    """Record of an array, as xarray keeps it; without names, `axes` is empty, or x, y, z of three."""
+    """Record of an array, with xarray's metadata. Unnamed axes are x, y, z of three; else `axes` is empty."""
     try:
         import tensorstore
     except ImportError as fault:
@@ -196,15 +196,15 @@ def _zarr_record(path: Path) -> ImageRecord:
         store: Any = tensorstore.open(spec, open=True, read=True).result()
     except ValueError as fault:
         raise ValueError(f"path: {path} cannot be opened as a Zarr array (tensorstore: {fault}).") from fault
-    # a chunk is decoded as a whole, even beyond the array
+    # a chunk is decoded completely, even beyond the array
     chunk = [c or n for c, n in zip(store.chunk_layout.read_chunk.shape, store.shape, strict=True)]
-    of_chunk, whole = (math.prod(shape) * store.dtype.numpy_dtype.itemsize for shape in (chunk, store.shape))
-    if of_chunk > max(LARGE, BEYOND * whole):
+    chunk_bytes, total = (math.prod(n) * store.dtype.numpy_dtype.itemsize for n in (chunk, store.shape))
+    if chunk_bytes > max(LARGE, BEYOND * total):
         raise ValueError(
             f"path: {path} must have chunks that are not much larger than it; got chunks of {tuple(chunk)} "
-            f"voxels, {of_chunk} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
+            f"voxels, {chunk_bytes} bytes, for an array of {tuple(store.shape)}. Its metadata may be damaged."
         )
-    require_room(of_chunk, f"path: {path}: a chunk of {tuple(chunk)} voxels")  # tensorstore ends the process
+    require_room(chunk_bytes, f"path: {path}: a chunk of {tuple(chunk)} voxels")  # tensorstore would abort
     attributes = _attributes(path)
     names: Any = list(store.domain.labels)  # Zarr 3
     if not any(names):  # xarray's in Zarr 2
@@ -218,10 +218,10 @@ def _zarr_record(path: Path) -> ImageRecord:
             setattr(record, name, value)
         units, steps, origin = dict[str, Any](), dict[str, float](), np.zeros(3)
         for letter, name in zip(record.letters if names else "", names, strict=True):
-            beside = path.parent / name  # a coordinate of xarray
-            known = letter in "xyz" and Path(name).name == name and beside != path
-            if known and is_zarr(beside) and _is_zarr_array(beside):
-                at, units[letter] = _zarr_record(beside).data, _attributes(beside).get("units")
+            coordinate = path.parent / name  # of xarray
+            known = letter in "xyz" and Path(name).name == name and coordinate != path
+            if known and is_zarr(coordinate) and _is_zarr_array(coordinate):
+                at, units[letter] = _zarr_record(coordinate).data, _attributes(coordinate).get("units")
                 if len(at.shape) != 1 or at.shape[0] > 2**20:
                     raise ValueError(f"the coordinate {name} must have one axis; got shape {at.shape}.")
                 steps[letter], origin["xyz".index(letter)] = even_step(np.asarray(at), name)
@@ -251,10 +251,10 @@ def _ome_records(path: Path) -> list[ImageRecord]:
         model, content = (v05.Image, metadata["attributes"]["ome"]) if zarr3 else (v04.Image, metadata)
         image: Any = model.model_validate(content).multiscales[0]
     except (KeyError, TypeError, ValueError) as fault:
-        version, said = "0.5" if zarr3 else "0.4", " ".join(str(fault).split())
+        version, reason = "0.5" if zarr3 else "0.4", " ".join(str(fault).split())
         raise ValueError(
-            f"path: {path} does not follow OME-Zarr {version} ({said}). Give the path of an image, or of an "
-            "array in it, such as its folder 0."
+            f"path: {path} does not follow OME-Zarr {version} ({reason}). Pass the path of an image, or of "
+            "an array in it, such as its folder 0."
         ) from fault
     names = [axis.name for axis in image.axes]
     unknown: list[str] = []
@@ -262,22 +262,22 @@ def _ome_records(path: Path) -> list[ImageRecord]:
     if unknown or not {*SPACE} <= {*letters}:
         raise ValueError(f"path: {path} must have axes x, y and z; got {names}.")
     units = {letter: getattr(axis, "unit", None) for letter, axis in zip(letters, image.axes, strict=True)}
-    told = [axis.get("orientation") for axis in content["multiscales"][0]["axes"]]
-    sides = [str(each.get("value")) if isinstance(each, dict) else "" for each in told]
+    orientations = [axis.get("orientation") for axis in content["multiscales"][0]["axes"]]
+    sides = [str(entry.get("value")) if isinstance(entry, dict) else "" for entry in orientations]
     ends = [side.partition("-to-")[2][:1].upper() for side in sides]
     at = [letters.index(letter) for letter in SPACE if letter in letters]
     turn = np.array(
-        [[(ends[k] == end) - (ends[k] == other) for k in at] for end, other in ("LR", "PA", "SI")]
+        [[(ends[k] == end) - (ends[k] == start) for k in at] for end, start in ("LR", "PA", "SI")]
     )
     placed, records = np.abs(turn).sum() == len(at) == 3, []
     for dataset in image.datasets:
         scale, offset = np.ones(len(names)), np.zeros(len(names))
-        for described_by in (dataset, image):  # those of all levels come last
-            for each in described_by.coordinateTransformations or ():
-                if each.type == "scale":
-                    scale, offset = scale * each.scale, offset * each.scale
+        for owner in (dataset, image):  # transformations of all levels come last
+            for transformation in owner.coordinateTransformations or ():
+                if transformation.type == "scale":
+                    scale, offset = scale * transformation.scale, offset * transformation.scale
                 else:
-                    offset = offset + each.translation
+                    offset = offset + transformation.translation
         if not _is_zarr_array(path / dataset.path):
             raise ValueError(f"path: {path}: {dataset.path} is no Zarr array within the group.")
         record = _zarr_record(path / dataset.path)
@@ -303,24 +303,24 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def level_for(levels: Sequence[VoxelSource], camera: Camera) -> int:
-    """The coarsest level whose voxels are no larger than a pixel at the volume's corner nearest to the image
-    plane. An axis along which a level is as fine as the finest does not count against it.
+    """Finds the coarsest level whose voxels are no larger than a pixel at the volume's corner nearest to the
+    image plane. Axes along which a level is as fine as the finest are ignored.
 
     Args:
-        levels: of the same volume, finest first (`levels_of`).
+        levels: levels of one volume, finest first (`levels_of`).
         camera: the view.
 
     Returns:
-        Its index, 0 for the finest; also where the camera is within the volume.
+        The level's index; 0, the finest, where the camera is within the volume.
     """
     finest = levels[0]
     width, height = camera.size
-    left, right, low, high = np.asarray(camera.window, float)
-    pixel = min(abs(right - left) / width, (high - low) / height)  # mirrored if `right` is the lesser
+    window = np.asarray(camera.window, float)
+    pixel = min(abs(window[1] - window[0]) / width, (window[3] - window[2]) / height)  # may be mirrored
     if camera.parallel_scale is not None:
         pixel *= float(camera.parallel_scale)
     else:
-        forward, position = (np.asarray(each, float) for each in (axes_of(camera, np)[2], camera.position))
+        forward, position = (np.asarray(v, float) for v in (axes_of(camera, np)[2], camera.position))
         size = np.array(finest.spacing) * (np.array(finest.shape) - 1)
         corners = np.array(finest.origin) + np.array(list(product((0, 1), repeat=3))) * size
         nearest = max(float(np.min((corners - position) @ forward)), 0.0)

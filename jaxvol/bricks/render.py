@@ -1,6 +1,6 @@
 """Renders a volume that need not fit into memory, brick by brick."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
 import jax
@@ -32,87 +32,84 @@ from ..xla.compiling import compiled
 from ..xla.platform import is_traced
 from ..xla.trees import strong
 from .distributed import check_joins, render_distributed
-from .opening import level_for, levels_of
+from .opening import Openable, level_for, levels_of
 from .sources import VoxelSource
 from .traversal import METHODS, Method, Request, Traversal
 
 
 def render_bricks(
-    source: VoxelSource | Volume | str | Any,
-    transfer: Transfer | Any,
-    camera: Camera | Any,
-    march: March | Any,
+    source: Openable,
+    transfer: Transfer,
+    camera: Camera,
+    march: March,
     *,
     spacing: Arrayable | None = None,
     origin: Arrayable | None = None,
-    memory: int | Any | None = None,
-    bricks: tuple[int, int, int] | Any | None = None,
-    method: Method | Any = "overlap",
-    compositing: Mode | Compositing[Any] | Any = "over",
-    lighting: Lighting | Any | None = None,
-    outputs: RenderOutputs | Any = "all",
-    level: int | Literal["auto"] | Any = "auto",
-    progress: Callable[[int, int], Any] | Any | None = None,
-    devices: Devices | Any | None = None,
+    memory: int | None = None,
+    bricks: Sequence[int] | None = None,
+    method: Method = "overlap",
+    compositing: Mode | Compositing[Any] = "over",
+    lighting: Lighting | None = None,
+    outputs: RenderOutputs = "all",
+    level: int | Literal["auto"] = "auto",
+    progress: Callable[[int, int], object] | None = None,
+    devices: Devices | None = None,
     **options: Any,
 ) -> Rendering:
     """Renders an image of a volume that need not fit into memory: on disk, or in the memory of the host.
 
-    The volume is split into bricks, which are read, rendered and dropped, front to back, while the next one
-    is read. A brick that no ray needs is not read: one in which nothing is visible, outside of the view, or
-    behind what is opaque. The image is that of `render`, whatever the bricks: in float32, colours, opacity
-    and the components of a normal agree to 2e-5, and depth to 1e-6 of itself (by `Maximum`, under a transfer
-    function that rises within an eightieth of the values, 3e-5). `samples`, `error`, and `exhausted` where a
-    `max_samples` is too small, may differ.
+    The volume is split into bricks, which are read, rendered and dropped front to back, while the next one is
+    read. Bricks in which nothing is visible, outside of the view, or hidden by opaque material are not read.
+    The image is that of `render`, for any bricks: in float32, colours, opacity and the components of a normal
+    agree to 2e-5, and depth to a relative 1e-6 (3e-5 for `Maximum` under a transfer function that rises
+    within an eightieth of the values). `samples` and `error` may differ, and `exhausted` if `max_samples` is
+    too small.
 
     Args:
-        source: see `bricks.levels_of`. One pass over all voxels finds their ranges before the first image. A
-            `bricks.VoxelSource` keeps them for the next: open it once, by `bricks.source_of`.
+        source: see `bricks.levels_of`. The first image takes one pass over all voxels to find their ranges. A
+            `bricks.VoxelSource` keeps the ranges for later images: open it once, by `bricks.source_of`.
         transfer: as for `render`.
         camera: as for `render`.
-        march: as for `render`; all transforms but `SpaceLeaping("min_distance")`, and with the default
-            `block`.
-        spacing: as in `Volume`; by default what the source says.
-        origin: as in `Volume`; by default what the source says.
-        memory: bytes for voxels and what is made of them: the brick that is rendered and the next one; by
-            default a quarter of the device's. In addition an image takes some 550 bytes for each pixel, and
-            compiled programs some 300 MiB.
-        bricks: number of bricks along x, y and z, in place of the fewest that fit into `memory`, which these
-            may exceed. There are fewer along an axis of too few voxels, and no more than 65 536 in all.
-        method: where rays are curved in the grid (`ToroidalMap`), a ray may come back to a brick that it has
-            left. `"overlap"`: bricks are read larger than they are, so that each is read once, as far as
-            `memory` goes. `"reload"`: bricks are read again. Or a function that chooses the next brick
-            (`bricks.traversal.Schedule`).
+        march: as for `render`, without `SpaceLeaping("min_distance")` and with the default `block`.
+        spacing: as in `Volume`; by default that of the source.
+        origin: as in `Volume`; by default that of the source.
+        memory: bytes for the rendered brick and the next one, with derived arrays; by default a quarter of
+            the device's. An image takes some 550 bytes for each pixel in addition, and compiled programs some
+            300 MiB.
+        bricks: number of bricks along x, y and z, at most 65 536 in all; these may exceed `memory`. An axis
+            of too few voxels has fewer. By default the fewest bricks that fit into `memory`.
+        method: treatment of curved rays (`ToroidalMap`), which may come back to a brick. `"overlap"`: bricks
+            are read with a margin, so that each is read once, if `memory` suffices. `"reload"`: bricks are
+            read again. A function: a custom schedule (`bricks.traversal.Schedule`).
         compositing: as for `render`.
-        lighting: `Phong`, `ScattererTemplates` as published, or another one that says how far it reads
-            (`Lighting.farthest_read`).
+        lighting: `Phong`, `ScattererTemplates` as published, or any lighting with a finite
+            `Lighting.farthest_read`.
         outputs: as for `render`.
-        level: of a source with several levels of detail, which one, or `"auto"`: the coarsest whose voxels
-            are no larger than a pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
-        progress: called after each brick, with the numbers of bricks rendered so far and of those that hold
-            anything visible, some of which may not be needed, or be read again.
-        devices: as for `render`, each of which has `memory`, but bricks are dealt out to them, not rays: each
-            reads its own bricks, marches all rays through them, and the partial images are combined front to
-            back. Rays must be straight in the grid, and what a ray shows must not depend on what lies in
-            front but by its transmittance (no `EmptySpaceJitter`; compositing by `"over"`). An
-            `EarlyTermination` sees only what is in front on the same device: up to `opacity_left` of the
-            colours behind are added, and depth changes with them; without it, depth agrees to 1e-5 of itself.
-        **options: for the source (`shape`, `dtype`, `time`, `channel`, `nan`), see `bricks.levels_of`.
+        level: index of a level of detail, or `"auto"`: the coarsest level whose voxels are no larger than a
+            pixel (`bricks.level_for`); under a `ToroidalMap` the finest, 0.
+        progress: called after each brick with the number of bricks rendered so far and the number of bricks
+            with visible blocks. Some of these may be hidden, or be read again.
+        devices: as for `render`, with `memory` bytes each. Bricks are distributed over the devices instead of
+            rays: a device reads its bricks, marches all rays through them, and the partial images are joined
+            front to back. This needs rays that are straight in the grid, compositing by `"over"`, and no
+            `EmptySpaceJitter`. `EarlyTermination` acts per device: up to `opacity_left` of the colours behind
+            are added, and depth changes with them; without it, depth agrees to a relative 1e-5.
+        **options: of the source (`shape`, `dtype`, `time`, `channel`, `nan`), see `bricks.levels_of`.
 
     Returns:
-        As `render`, and in `Rendering.bricks` what it took.
+        As `render`; `Rendering.bricks` reports the bricks that were read.
 
     Raises:
         ValueError: naming the argument, as `render`; for a source that is truncated, damaged or unknown, or
-            whose file changed; for less memory than the smallest bricks take; for what needs the whole volume
-            at once (labels, light by transport); and for what several devices cannot render.
+            whose file changed; if the smallest bricks exceed `memory`; for features that need the complete
+            volume (labels, light by transport); and for scenes that several devices cannot render.
 
-    It has no gradients, since it reads its source while it runs; nor can it be called inside `jax.jit` or
-    `jax.vmap`. Fit with `render` to a copy that fits (`VoxelSource.subsampled`).
+    There are no gradients, `jax.jit` or `jax.vmap`, since the source is read while the function runs. Fit
+    with `render` to a copy that fits into memory (`VoxelSource.subsampled`).
 
-    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3; their future work are ranges of values,
-    by which empty bricks are not read. Unlike there, how far bricks overlap follows from the rays of the
-    image; `bricks.overlap_of` has their formula. Where it fails: `experiments/stability.py`, "wrong order".
+    Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3, who left skipping empty bricks by ranges
+    of values to future work. Here the overlap follows from the rays of the image; `bricks.overlap_of` is
+    their formula. Where it fails: `experiments/stability.py`, "wrong order".
     """
     if isinstance(source, list | tuple) or isinstance(transfer, list | tuple):
         raise ValueError(
@@ -122,9 +119,9 @@ def render_bricks(
     check_arguments(order, transfer=transfer, camera=camera, march=march, lighting=lighting)
     words = [("outputs", outputs, get_args(RenderOutputs))]
     words += [] if callable(method) else [("method", method, tuple(METHODS))]
-    for name, given, known in words:
-        if not isinstance(given, str) or given not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}; got {given!r}.")
+    for name, word, known in words:
+        if not isinstance(word, str) or word not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}; got {word!r}.")
     if progress is not None and not callable(progress):
         raise ValueError(f"progress must be a function of two numbers, or None; got {described(progress)}.")
     mesh = mesh_of(devices)
@@ -134,9 +131,12 @@ def render_bricks(
             "Gradients are those of jv.render, of a copy that fits (VoxelSource.subsampled)."
         )
     levels = levels_of(source, spacing=spacing, origin=origin, **options)
-    room, chosen = budget(memory), _level(levels, level, camera, march)
+    room = memory_of_device() // 4
+    if memory is not None:
+        room = integer("memory", memory, 1, otherwise=", a number of bytes")
+    chosen = _level(levels, level, camera, march)
     if len(levels) > 1:
-        transfer = sized(transfer, levels[0])  # so that all levels are equally opaque
+        transfer = sized(transfer, levels[0])  # all levels are equally opaque
     scene = on_all(mesh, scene_of(chosen, transfer, camera, march, compositing, lighting))
     request = Request(chosen, room, bricks, method, progress, outputs, mesh)
     if mesh is not None:
@@ -147,24 +147,17 @@ def render_bricks(
     return Rendering(rendering.rgba, rendering.exhausted, details)
 
 
-def budget(memory: int | Any | None) -> int:
-    """Bytes that bricks may take: by default a quarter of the device's memory."""
-    if memory is None:
-        return memory_of_device() // 4
-    return integer("memory", memory, 1, otherwise=", a number of bytes")
-
-
 def scene_of(
     source: VoxelSource,
     transfer: Transfer,
     camera: Camera,
     march: March,
-    compositing: Mode | Compositing[Any] | Any,
+    compositing: object,
     lighting: Lighting | None,
 ) -> Scene:
     """The scene of a source, without its voxels."""
     if isinstance(transfer, LabelTransferFunction):
-        raise ValueError("transfer must be of values: bricks have no labels, which jv.render shows.")
+        raise ValueError("transfer must not be of labels: bricks have no labels. Use jv.render.")
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
         raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
     if march.block_side != BLOCK:
@@ -172,11 +165,13 @@ def scene_of(
             f"march: SpaceLeaping(block={march.block_side}) needs the whole volume; use {BLOCK}."
         )
     if lighting is not None and lighting.farthest_read is None:
-        needs = f"{type(lighting).__name__}, which needs the whole volume"
-        raise ValueError(f"lighting must say how far it reads (Lighting.farthest_read); got {needs}.")
+        raise ValueError(
+            "lighting must read up to a finite distance (Lighting.farthest_read); got "
+            f"{type(lighting).__name__}, which needs the whole volume. Use jv.render."
+        )
     place = source.spacing, source.origin
     volume = Volume(np.zeros((2, 2, 2), source.dtype), *place, direction=source.direction)
-    # its voxels are kept as they are stored, so that none is moved
+    # in the axes' storage order, so that no voxel is moved
     volume = part_of(volume, jnp.zeros(3, jnp.int32), source.shape, source.order)
     bands_of(transfer, volume, lighting)
     return strong(
@@ -223,10 +218,10 @@ def _on(
 
 
 def _level(
-    levels: tuple[VoxelSource, ...], level: int | Literal["auto"] | Any, camera: Camera, march: March
+    levels: tuple[VoxelSource, ...], level: int | Literal["auto"], camera: Camera, march: March
 ) -> VoxelSource:
     mapped = any(isinstance(transform, ToroidalMap) for transform in march.transforms)
-    most = 0 if mapped else len(levels) - 1  # a map's ranges are those of the finest level
+    last = 0 if mapped else len(levels) - 1  # a map's ranges are those of the finest level
     if level != "auto":
-        return levels[integer("level", level, 0, most, otherwise=', or "auto"')]
-    return levels[level_for(levels, camera) if most else 0]
+        return levels[integer("level", level, 0, last, otherwise=', or "auto"')]
+    return levels[level_for(levels, camera) if last else 0]

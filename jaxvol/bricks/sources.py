@@ -1,4 +1,4 @@
-"""Reads boxes of voxels from anything with `shape`, `dtype` and `array[box]`."""
+"""Sources of boxes of voxels: any array with `shape`, `dtype` and `array[box]`."""
 
 import math
 import mmap
@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import pairwise, product
-from typing import Any, TypeAlias
+from typing import Any, SupportsIndex, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,8 @@ from ..xla.memory import zeros_in_reserve
 from ..xla.platform import is_traced
 
 
-Corner: TypeAlias = Sequence[int] | np.ndarray | Any  # three voxel indices along x, y, z
-Box: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]  # the first voxel, and the one behind the last
+Corner: TypeAlias = Sequence[SupportsIndex] | np.ndarray  # three voxel indices along x, y, z
+Box: TypeAlias = tuple[tuple[int, ...], tuple[int, ...]]  # first voxel, and the end (exclusive)
 
 SPACE = ("x", "y", "z")
 AT_ONCE = 2**23  # bytes of voxels that are read at a time: a larger box is read in several steps
@@ -31,26 +31,26 @@ READERS = ThreadPoolExecutor(max_workers=4, thread_name_prefix="jaxvol-read")
 
 
 class VoxelSource:
-    """A volume of which boxes are read, so that it need not be in memory.
+    """A volume that is read box by box, so that it need not be in memory.
 
-    It keeps its `Summary` once that is found: make another source after writing to the array.
+    It keeps the `Summary` of its voxels: make another source after writing to the array.
 
     Args:
-        array: anything with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for each
-            axis, such as an array of NumPy, zarr, h5py, dask or tensorstore. Several threads read it at once.
-            `source_of` takes data[x, y, z]; `dask.array` and xarray transpose and index others lazily.
+        array: an object with `shape`, `dtype` and `array[box]`, where `box` has a slice or an integer for
+            each axis, such as an array of NumPy, zarr, h5py, dask or tensorstore. Several threads read it at
+            once. `source_of` takes data[x, y, z]; `dask.array` and xarray transpose and index lazily.
         spacing: as in `Volume`.
         origin: as in `Volume`.
         direction: as in `Volume`.
         space: the axes of the array that are x, y and z.
-        index: what is read along each axis: a number, and a slice along these three.
-        nan: the value of voxels that are NaN or infinite; by default they are refused where they are read.
-        name: what it is called in errors.
+        index: an integer for each other axis, and a slice for each axis in `space`.
+        nan: value that replaces NaN and infinite voxels; by default reading them raises an error.
+        name: name of the source in errors.
 
     Attributes:
         shape: number of voxels along x, y, z.
-        dtype: of the voxels that `read` returns.
-        chunks: voxels along x, y, z of the chunks in which it is stored, or of a row if it has none.
+        dtype: type of the voxels that `read` returns.
+        chunks: voxels along x, y, z of a stored chunk, or of a row if the array has no chunks.
         order: axes in the order of storage, the slowest first, 0 for x.
 
     Raises:
@@ -63,7 +63,7 @@ class VoxelSource:
         spacing: Arrayable | None = None,
         origin: Arrayable | None = None,
         *,
-        direction: Any = None,
+        direction: Arrayable | None = None,
         space: Sequence[int] = XYZ,
         index: Sequence[int | slice] | None = None,
         nan: float | None = None,
@@ -76,7 +76,7 @@ class VoxelSource:
             )
         try:
             is_array = all(hasattr(array, attribute) for attribute in ("shape", "dtype", "__getitem__"))
-        except Exception as fault:  # of whatever library, such as h5py where the file is closed
+        except Exception as fault:  # of any library, such as h5py if the file is closed
             raise ValueError(
                 f"source must be an array that can be read; got {described(array)} ({fault}). Keep its file "
                 "open."
@@ -88,7 +88,7 @@ class VoxelSource:
         if isinstance(array, jax.Array):
             array = np.asarray(array)  # JAX would compile a program for each box
         elif hasattr(array, "translate_to"):
-            array = array.translate_to[0]  # views of tensorstore count from where they begin in the whole
+            array = array.translate_to[0]  # indices of a view of tensorstore begin at its origin
         self.array, self.name, self.direction = array, name, direction
         self._nan = None if nan is None else np.float64(finite_array("nan", nan, ()))
         self.spacing = _triple("spacing", (1.0, 1.0, 1.0) if spacing is None else spacing)
@@ -113,42 +113,42 @@ class VoxelSource:
         self.chunks: tuple[int, int, int] = permuted(sizes, XYZ)
         while isinstance(array, np.ndarray) and not isinstance(array.base, mmap.mmap):
             array = array.base
-        self._map = array if isinstance(array, np.memmap) else None  # of which the array is a part
+        self._map = array if isinstance(array, np.memmap) else None  # the array is a part of it
         self._file = self._file_state()
         self._in_memory = isinstance(self.array, np.ndarray) and self._map is None
-        self._summary: Any = None  # found by `summary.summary_of`
+        self._summary: Any = None  # set by `summary.summary_of`
 
     def _file_state(self) -> tuple[int, int] | None:
         """Size of the file under a memory map, and the time of the last change where the map is read-only."""
         if self._map is not None:
-            with suppress(OSError, TypeError):  # the file was removed, or has no name: only the map has it
-                found = os.stat(self._map.filename)  # pyright: ignore[reportArgumentType]
-                return found.st_size, found.st_mtime_ns if self._map.mode == "r" else 0
+            with suppress(OSError, TypeError):  # the file was removed or has no name: the map still holds it
+                status = os.stat(self._map.filename)  # pyright: ignore[reportArgumentType]
+                return status.st_size, status.st_mtime_ns if self._map.mode == "r" else 0
         return None
 
     def check_unchanged(self) -> None:
-        """Raises if the mapped file changed: to read a shorter one would end the process."""
+        """Raises if the mapped file changed: reading a truncated map would end the process."""
         now = self._file_state()
         if now is not None and now != self._file:
             raise ValueError(f"{self.name} changed after it was opened as a source. Open it again.")
 
     def read(self, low: Corner, high: Corner, axes: Axes = XYZ) -> np.ndarray:
-        """Voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
+        """Reads the voxels data[x, y, z] with `low` <= (x, y, z) < `high`.
 
         Args:
             low: first voxel along x, y, z.
-            high: the one behind the last.
-            axes: order of the axes of what is returned, data[z, y, x] for (2, 1, 0); in the `order` of
-                storage, voxels are read fastest.
+            high: end along x, y, z, exclusive.
+            axes: order of the axes of the result, data[z, y, x] for (2, 1, 0). Reading is fastest in the
+                `order` of storage.
 
         Returns:
-            A C-contiguous array of type `dtype` in native byte order, which may be a view of the source: do
-            not write to it.
+            A C-contiguous array of type `dtype` in native byte order. It may be a view of the source: do not
+            write to it.
 
         Raises:
             ValueError: for a box that is empty or exceeds the volume; for voxels that are NaN, infinite, or
-                whole numbers that float32 does not hold; where the array raises anything or returns another
-                shape; and if the file under a memory map was written to since the source was made.
+                integers that float32 does not represent exactly; if the array raises any error or returns
+                another shape; and if the file under a memory map changed since the source was made.
         """
         box, within = ((), ()), False
         with suppress(TypeError, ValueError):
@@ -169,22 +169,22 @@ class VoxelSource:
             voxels[permuted(place, axes)] = self._read_at_once((low, high), axes)
         if self._map is not None and self._map.mode == "r" and hasattr(mmap, "MADV_DONTNEED"):
             mapped: Any = self._map.base
-            mapped.madvise(mmap.MADV_DONTNEED)  # or what was read would count as the process's memory
+            mapped.madvise(mmap.MADV_DONTNEED)  # else the pages would count as the process's memory
         return voxels
 
     def subsampled(self, stride: int) -> Volume:
-        """Every `stride`-th voxel."""
-        found = np.empty([-(-n // stride) for n in self.shape], self.dtype)
+        """Copies every `stride`-th voxel to a volume."""
+        voxels = np.empty([-(-n // stride) for n in self.shape], self.dtype)
         for low, high in self.boxes(((0, 0, 0), self.shape), AT_ONCE):
             place = tuple(slice(-(-a // stride), -(-b // stride)) for a, b in zip(low, high, strict=True))
-            found[place] = self.read(low, high)[tuple(slice(-a % stride, None, stride) for a in low)]
-        return Volume(found, [stride * s for s in self.spacing], self.origin)
+            voxels[place] = self.read(low, high)[tuple(slice(-a % stride, None, stride) for a in low)]
+        return Volume(voxels, [stride * s for s in self.spacing], self.origin)
 
-    def boxes(self, box: Box, most: int) -> Iterator[Box]:
-        """Cuts a box between chunks, into boxes of one chunk or `most` bytes, in the order of storage."""
+    def boxes(self, box: Box, limit: int) -> Iterator[Box]:
+        """Cuts a box at faces of chunks into boxes of one chunk or up to `limit` bytes, in storage order."""
         extent, item = list(self.chunks), self.dtype.itemsize
         for axis in reversed(self.order):  # rows first
-            while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= most:
+            while extent[axis] < self.shape[axis] and 2 * math.prod(extent) * item <= limit:
                 extent[axis] = min(2 * extent[axis], self.shape[axis])
         pieces = []
         for low, high, chunk, size in zip(*box, self.chunks, extent, strict=True):
@@ -200,43 +200,43 @@ class VoxelSource:
             index[axis], size[axis] = slice(a, b), b - a
         where = f"from {box[0]} to {box[1]}"
         try:
-            given = self.array[tuple(index)]
-            found = np.asarray(given)
-        except Exception as fault:  # of whatever library
+            stored = self.array[tuple(index)]
+            voxels = np.asarray(stored)
+        except Exception as fault:  # of any library
             raise ValueError(
                 f"{self.name}: the voxels {where} cannot be read ({fault}). Fetch it again."
             ) from fault
         expected = tuple(size[axis] for axis in sorted(size))
-        if found.shape != expected:
+        if voxels.shape != expected:
             raise ValueError(
                 f"{self.name}: the voxels {where} must have the shape {expected}; its array returns "
-                f"{found.shape}."
+                f"{voxels.shape}."
             )
-        if isinstance(given, np.ma.MaskedArray) and np.any(given.mask):
+        if isinstance(stored, np.ma.MaskedArray) and np.any(stored.mask):
             raise ValueError(f"{self.name}: voxels {where} are masked. Fill them first.")
-        if self._nan is not None and found.dtype.kind not in "biu":
-            found = np.where(np.isfinite(found), found, found.dtype.type(self._nan))
-        if self.dtype == np.float32 and found.dtype.kind in "iu":
-            (least, most), (low, high) = WHOLE["float32"], (int(found.min()), int(found.max()))
-            if low < least or high > most:
+        if self._nan is not None and voxels.dtype.kind not in "biu":
+            voxels = np.where(np.isfinite(voxels), voxels, voxels.dtype.type(self._nan))
+        if self.dtype == np.float32 and voxels.dtype.kind in "iu":
+            (lowest, highest), (low, high) = WHOLE["float32"], (int(voxels.min()), int(voxels.max()))
+            if low < lowest or high > highest:
                 raise ValueError(
                     f"{self.name}: voxels must be whole numbers from -2**24 to 2**24, which float32 holds "
-                    f"exactly; got {found.dtype} from {low} to {high} {where}."
+                    f"exactly; got {voxels.dtype} from {low} to {high} {where}."
                 )
         rank = [sorted(self._place).index(axis) for axis in self._place]
         with np.errstate(over="ignore"):  # overflow to infinity is rejected below
-            voxels = np.ascontiguousarray(found.transpose(permuted(rank, axes)), self.dtype)
+            voxels = np.ascontiguousarray(voxels.transpose(permuted(rank, axes)), self.dtype)
         if self.dtype.kind not in "iu" and not np.isfinite(voxels).all():
             raise ValueError(
-                f"{self.name}: voxels must be finite in {self.dtype}; got some that are NaN or infinite "
-                f"{where}. Replace them first, or give nan=VALUE."
+                f"{self.name}: voxels must be finite in {self.dtype}; got NaN or infinite ones {where}. "
+                "Replace them first, or pass nan=VALUE."
             )
         return voxels
 
 
 def voxel_type(stored: np.dtype) -> np.dtype:
-    """The type in which voxels are read: one of `Volume`'s, in native byte order. Booleans become uint8,
-    integers of 32 and 64 bits float32; float64 stays where JAX's 64-bit types are enabled."""
+    """Type in which voxels are read, one of `Volume`'s, in native byte order. Booleans become uint8, integers
+    of 32 and 64 bits float32; float64 is kept if JAX's 64-bit types are enabled."""
     check_type(stored)
     if stored.kind == "b":
         return np.dtype(np.uint8)

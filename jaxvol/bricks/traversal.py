@@ -1,4 +1,4 @@
-"""Marches an image's rays through all bricks, while the next brick is read."""
+"""Marches an image's rays through the bricks, while the next brick is read."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int
 
 from .._util.files import MOST_VOXELS
 from .._util.memory import give_back
+from ..engine.image import RenderOutputs
 from ..engine.tiling import RenderOptions, Tiling
 from ..engine.wavefront import CellRange
 from ..march.march import March
@@ -34,14 +35,14 @@ from .summary import summary_of
 
 
 Schedule: TypeAlias = Callable[["Traversal"], Iterator["Load"]]
-"""Which brick is read next, and for which cells of each ray. Bricks are planned one ahead of the march:
-`Traversal.at` tells how far it has come."""
+"""Generator of the bricks to read, with the cells of each ray. It runs one brick ahead of the march, whose
+progress is `Traversal.at`."""
 
 Method: TypeAlias = Literal["overlap", "reload"] | Schedule
 
-BEAMS = 32  # of curved rays, searched at a time on a GPU: it takes as long as the longest of these
-BATCH = 72  # groups at a time on a CPU: few rays meet a brick, and a batch lasts as long as its longest
-KEPT = 64 * 2**20  # bytes that are read before freed memory is given back to the system, which takes 8 ms
+BEAMS = 32  # beams of curved rays that a GPU searches at a time; a batch takes as long as its longest beam
+BATCH = 72  # groups that a CPU marches at a time; few rays meet a brick, so that small batches are faster
+KEPT = 64 * 2**20  # bytes read before freed memory is returned to the system, which takes 8 ms
 
 
 class Load(NamedTuple):
@@ -55,30 +56,29 @@ class Load(NamedTuple):
 
 @dataclass(frozen=True)
 class Request:
-    """What `render_bricks` was asked for."""
+    """Arguments of `render_bricks`."""
 
     source: VoxelSource
     memory: int
-    counts: Any = None  # bricks along x, y and z, in place of those chosen to fit into `memory`
-    method: Method | Any = "overlap"
+    counts: Any = None  # bricks along x, y and z; by default chosen to fit into `memory`
+    method: Method = "overlap"
     progress: Callable[[int, int], Any] | None = None
-    outputs: Any = "all"
-    mesh: Mesh | None = None  # devices to which bricks are dealt out
+    outputs: RenderOutputs = "all"
+    mesh: Mesh | None = None  # devices over which bricks are distributed
 
 
 class Traversal:
-    """An image's rays through all bricks. `scene`: as rays are marched, without voxels."""
+    """Traversal of the bricks by an image's rays. `scene`: as it is marched, without voxels."""
 
     rays: Ray
-    start: Progress  # at their entries
-    at: Progress  # how far they have been marched
+    start: Progress  # at the entries
+    at: Progress  # of the march so far
 
     def __init__(self, request: Request, shown: Scene):
-        marched, outputs = shown.marched, request.outputs
-        outputs = "depth" if shown.resolves and outputs == "rgba" else outputs
+        marched, source, shape = shown.marched, request.source, request.source.shape
+        outputs = "depth" if shown.resolves and request.outputs == "rgba" else request.outputs
         assert isinstance(marched.source, Camera)
-        self.request, self.source, self.scene = request, request.source, marched
-        source, shape, counts = request.source, request.source.shape, request.counts
+        self.request, self.source, self.scene = request, source, marched
         tiling = Tiling.of_backend()
         if not tiling.turns:  # on a CPU
             tiling = tiling._replace(batch=BATCH)
@@ -87,20 +87,18 @@ class Traversal:
         self.loads: list[int] = []  # bricks whose reading has begun
         self.space = marched.march.locate(marched.volume)
         margin = Margin.of(marched.march, self.space, shape, tiling.cells, shown)
-        least = 1 if request.mesh is None else request.mesh.size
-        if counts is None:
-            self.grid = split(shape, source.dtype, request.memory, margin, least)
+        if request.counts is None:
+            devices = 1 if request.mesh is None else request.mesh.size
+            self.grid = split(shape, source.dtype, request.memory, margin, devices)
         else:
-            self.grid = divided(shape, counts)
+            self.grid = divided(shape, request.counts)
         self.margin = margin if request.method == "overlap" else replace(margin, probe=None)
-        # nodes along each axis that are read at a time, and that any single brick needs
+        # shape of the boxes that are read, and the least for any single brick
         self.stored = self.min_stored = self.margin.stored(self.grid)
         if math.prod(self.stored) > MOST_VOXELS:
-            raise ValueError(
-                f"bricks must be so many that each has fewer than 2**31 voxels; got {self.stored}."
-            )
+            raise ValueError(f"bricks must have fewer than 2**31 voxels each; got {self.stored}. Use more.")
         if not self.margin.straight and not callable(request.method):
-            # what is read follows from the rays: begin with less
+            # the boxes to read follow from the rays: begin with small ones
             middle = (np.asarray(shape) - 1) / 2
             cells = self.margin.of_box(self.space, shape, middle, middle)
             self.stored = replace(self.margin, cells=cells).stored(self.grid)
@@ -111,42 +109,40 @@ class Traversal:
         self.visible = summary_of(source, memory=request.memory).bricks_where(occupied, self.grid)
 
     def bricks(self, rays: Ray, at: Progress) -> Iterator[tuple[Volume, CellRange]]:
-        """Yields the needed bricks and their cells. Before the next, the caller drops it and sets `at`."""
-        self.rays, self.start, self.at, given_back = rays, at, at, self.bytes_read
+        """Yields the needed bricks and their cells. The caller then drops the brick and sets `at`."""
+        self.rays, self.start, self.at, returned = rays, at, at, self.bytes_read
         method = self.request.method
         if not callable(method):
             method = in_order if self.margin.straight else METHODS[method]
         schedule = cast(Schedule, method)(self)
         load = next(schedule, None)
         while load is not None:
-            jax.block_until_ready(self.at)  # or two bricks, and what is made of both, would be in memory
-            if self.bytes_read - given_back >= KEPT:
+            jax.block_until_ready(self.at)  # else two bricks and their derived arrays would be in memory
+            if self.bytes_read - returned >= KEPT:
                 give_back()
-                given_back = self.bytes_read
+                returned = self.bytes_read
             # on a CPU, aligned voxels are not copied
             brick = with_voxels(self.scene.volume, [jax.device_put(load.voxels.result())])
             brick = part_of(brick, jnp.asarray(load.first, jnp.int32), self.grid.shape)
             cells = load.cells
             assert cells is not None
-            del load  # and with it the voxels as they were read
+            del load  # and with it the voxels in the host's memory
             load = next(schedule, None)
             yield brick, cells
             del brick, cells
             self.finish(1, int(self.visible.sum()))
 
-    def finish(self, bricks: int, of: int) -> None:
-        """Reports that so many more bricks are rendered, `of` all that hold anything visible."""
+    def finish(self, bricks: int, total: int) -> None:
+        """Reports `bricks` more rendered bricks of `total` visible ones."""
         self.done += bricks
         if self.request.progress is not None:
-            self.request.progress(self.done, of)
+            self.request.progress(self.done, total)
 
     def report(self) -> BrickReport:
-        """What the bricks so far took."""
-        needed, loads, distinct = int(self.visible.sum()), len(self.loads), len(set(self.loads))
-        held = self.margin.bytes(self.stored, self.source.dtype)
-        return BrickReport(
-            self.grid.counts, needed, loads, loads - distinct, self.bytes_read, self.stored, held
-        )
+        """Report of the bricks read so far."""
+        needed, loads = int(self.visible.sum()), len(self.loads)
+        reloads, held = loads - len(set(self.loads)), self.margin.bytes(self.stored, self.source.dtype)
+        return BrickReport(self.grid.counts, needed, loads, reloads, self.bytes_read, self.stored, held)
 
     def cells_of(
         self, brick: int, passable: np.ndarray, empty: np.ndarray, reached: Array, beyond: int = 0
@@ -154,16 +150,16 @@ class Traversal:
         """The cells of curved rays in a brick, None if there are none. `passable`, `empty`: as in `Visit`."""
         visit = jnp.asarray(brick, jnp.int32), jnp.asarray(passable), jnp.asarray(empty)
         march = self.scene.march
-        # with their shift still ahead, or a cell that waits for a brick would leave it when its ray shifts
+        # from the start, before any shift, else a shift would move a waiting cell out of its brick
         at = with_fields(self.start, finished=self.at.finished)
         beams = BEAMS if self.options.tiling.turns else 1  # on a CPU
-        found = _curved(beams, self.grid, beyond, march, (self.rays, at, reached), visit)
-        return found if bool(found.any) else None
+        cells = _curved(beams, self.grid, beyond, march, (self.rays, at, reached), visit)
+        return cells if bool(cells.any) else None
 
-    def box_of(self, found: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
-        """Box to read for these cells, which enlarges `stored`; None if memory does not suffice."""
+    def box_of(self, cells: BrickCells) -> tuple[np.ndarray, np.ndarray] | None:
+        """Box to read for cells, for which `stored` grows; None if memory does not suffice."""
         shape = self.grid.shape
-        low, high = np.asarray(found.low, float), np.asarray(found.high, float)
+        low, high = np.asarray(cells.low, float), np.asarray(cells.high, float)
         around = self.margin.of_points(self.space, shape, low, high)
         low, high = np.floor(low - 1e-2).astype(int) - around, np.ceil(high + 1e-2).astype(int) + around
         low, high = np.maximum(low, 0), np.minimum(high, np.asarray(shape) - 1)
@@ -177,7 +173,7 @@ class Traversal:
     def load(
         self, brick: int, cells: CellRange | None, box: tuple[np.ndarray, np.ndarray] | None = None
     ) -> Load:
-        """Starts to read a brick, from a multiple of BLOCK on: `box`, or the nodes of all its cells."""
+        """Starts to read a brick from a multiple of BLOCK on: `box`, or the nodes of all its cells."""
         if box is None:
             low, high = (np.asarray(end) for end in self.grid.cells(brick))
             box = low - self.margin.cells, high + self.margin.cells
@@ -193,7 +189,7 @@ class Traversal:
 
 
 def in_order(traversal: Traversal) -> Iterator[Load]:
-    """Where rays are straight: bricks front to back, each of which a ray meets once."""
+    """Schedule for straight rays: front to back. A ray meets each brick once."""
     for brick in traversal.order:
         if traversal.visible[brick]:
             number, march = jnp.asarray(brick, jnp.int32), traversal.scene.march
@@ -203,8 +199,8 @@ def in_order(traversal: Traversal) -> Iterator[Load]:
 
 
 def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
-    """Where rays are curved: bricks front to back, and again as long as rays come back to them. With
-    `overlap`, each is read with what rays come back to of those before it, as far as memory goes."""
+    """Schedule for curved rays: front to back, repeated while rays come back to bricks. With `overlap`, a
+    brick is read with the parts of earlier bricks that its rays come back to, if memory suffices."""
     empty, steps = np.append(~traversal.visible, True), traversal.margin.steps
     reached, unfinished = jnp.zeros(traversal.rays.length.shape, jnp.int32), True
     while unfinished:
@@ -214,14 +210,14 @@ def until_all_left(traversal: Traversal, *, overlap: bool) -> Iterator[Load]:
             passable = empty | this | before if overlap else empty | this
             before |= this
             for through in (passable, this):  # through fewer bricks if memory does not suffice
-                found = traversal.cells_of(brick, through, empty, reached, steps)
-                box = None if found is None else traversal.box_of(found)
-                if found is not None and box is not None:
-                    unfinished, reached = True, found.reached
-                    yield traversal.load(brick, padded(found.cells), box)
-                if found is None or box is not None:
+                cells = traversal.cells_of(brick, through, empty, reached, steps)
+                box = None if cells is None else traversal.box_of(cells)
+                if cells is not None and box is not None:
+                    unfinished, reached = True, cells.reached
+                    yield traversal.load(brick, padded(cells.cells), box)
+                if cells is None or box is not None:
                     break
-            assert found is None or box is not None
+            assert cells is None or box is not None
         unfinished &= not bool(jnp.all(traversal.at.finished))
 
 
@@ -243,12 +239,12 @@ def _straight(
 def _curved(
     beams: int, grid: BrickGrid, beyond: int, march: March, rays: CurvedRays, visit: Visit
 ) -> BrickCells:
-    """By beams of rays, so many of them at a time."""
+    """Cells of curved rays, by batches of `beams` beams."""
     by_beam = jax.tree.map(lambda leaf: leaf.reshape(-1, 4, *leaf.shape[2:]), rays)
-    found: BrickCells = jax.lax.map(
+    result: BrickCells = jax.lax.map(
         lambda beam: curved_cells(grid, march, beam, visit, beyond), by_beam, batch_size=beams
     )
     shape = rays[0].length.shape
-    cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), found.cells)
-    low, high, any_ = jnp.min(found.low, 0), jnp.max(found.high, 0), jnp.any(found.any)
-    return BrickCells(cells=cells, reached=found.reached.reshape(shape), low=low, high=high, any=any_)
+    cells: CellRange = jax.tree.map(lambda leaf: leaf.reshape(shape), result.cells)
+    low, high, nonempty = jnp.min(result.low, 0), jnp.max(result.high, 0), jnp.any(result.any)
+    return BrickCells(cells, result.reached.reshape(shape), low, high, nonempty)

@@ -1,1 +1,1 @@
-"""How the cells of a ray become a pixel."""
+"""Compositing modes: they turn the cells of a ray into a pixel."""

@@ -1,7 +1,7 @@
-"""How do the cells of a ray become a pixel?
+"""Base classes of compositing modes, and the operator "over".
 
-A `Weighting` gives each cell a weight: the pixel is the weighted sum of their colours, and the sum of the
-weights is its opacity. A `Selection` picks one depth on the ray, such as that of the greatest value.
+A `Weighting` gives each cell a weight: the pixel is the weighted sum of the colours, and its opacity is the
+sum of the weights. A `Selection` picks one depth on the ray, such as that of the greatest value.
 """
 
 from abc import abstractmethod
@@ -21,18 +21,19 @@ from ..scene.volume import Volume
 State = TypeVar("State")
 
 Outputs: TypeAlias = Literal["all", "depth", "rgba"]
-"""What is computed besides the image and `Rendering.exhausted`: everything, the depth, or nothing."""
+"""Outputs besides the image and `Rendering.exhausted`: all, the depth, or none."""
 
 
 class Fragment(NamedTuple):
-    """A sample, as compositing sees it.
+    """A sample and its cell, the input of compositing.
 
     Attributes:
-        alpha: opacity of its cell; 0 past the ray's end.
-        depth: of the sample, past the ray's entry.
-        cell: the piece of the ray that it stands for.
-        measured: what was read from the volume, the value first; for a `Weighting`, the rest may be missing.
-        color: as shaded; None for a `Selection`, or where only opacities are computed.
+        alpha: opacity of the cell; 0 past the ray's end.
+        depth: depth of the sample, past the ray's entry.
+        cell: interval of the ray that the sample represents.
+        measured: values read from the volume, the volume's value first; for a `Weighting`, the others may be
+            missing.
+        color: shaded colour; None for a `Selection`, or if only opacities are computed.
         valid: false past the ray's end, in gaps of the volume, and for cells of width 0.
     """
 
@@ -45,18 +46,18 @@ class Fragment(NamedTuple):
 
     @property
     def value(self) -> Scalar:
-        """The volume's value; of a cell that is integrated, the mean of those at its ends."""
+        """The volume's value; for an integrated cell, the mean of the values at its ends."""
         return self.measured[0]
 
 
 class Compositing(eqx.Module, Generic[State]):
-    """A compositing mode: a `Weighting` or a `Selection`. All methods see one ray, whose fragments are added
-    to a `State`, a tree of arrays, front to back."""
+    """A compositing mode: a `Weighting` or a `Selection`. Methods take one ray, whose fragments are added
+    front to back to a `State`, a tree of arrays."""
 
     @abstractmethod
     def begin(self, zero: Scalar, outputs: Outputs | None) -> State:
-        """The state before the first fragment. `zero`: a 0 of the ray's type. `outputs`: what is computed;
-        None for only the opacity."""
+        """The state before the first fragment. `zero`: 0 in the ray's dtype. `outputs`: None for only the
+        opacity."""
 
     @abstractmethod
     def add(self, state: State, fragment: Fragment) -> State:
@@ -64,53 +65,52 @@ class Compositing(eqx.Module, Generic[State]):
 
     @abstractmethod
     def end(self, state: State) -> tuple[Float[Array, " n"], Scalar | None]:
-        """Premultiplied colour and opacity; and the depth past the entry, if it is computed, infinite where
-        nothing is visible."""
+        """Premultiplied colour and opacity; and the depth past the entry, if computed, infinite if nothing is
+        visible."""
 
     @property
     def resolves(self) -> bool:
-        """Whether the pixel is computed after the march, from its final state."""
+        """True if the pixel is computed after the march, from its final state."""
         return False
 
     @property
     def can_be_lit(self) -> bool:
-        """Whether lighting shades what is shown. Not where a `Weighting` has `resolved`: its cells are
-        marched without light, and what it shows lies at no one place."""
+        """True if the mode supports lighting. A `Weighting` with `resolved` does not: its cells are marched
+        without light, and its pixel has no single position."""
         return not self.resolves
 
     @property
     def reads_value(self) -> bool:
-        """Whether it compares or averages values, so that there must be one at a place."""
+        """True if the mode compares or averages values, so that each point must have a single value."""
         return True
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
-        """The transfer function and the march for the cells of a mode that `resolves`; by default those that
-        are given."""
+        """Transfer function and march for the cells of a mode that `resolves`; by default the arguments."""
         return transfer, march
 
     @abstractmethod
     def transmittance(self, state: State) -> Scalar:
-        """Of all cells so far, for `Transform.stop` and for shading."""
+        """Transmittance of all cells so far, for `Transform.stop` and for shading."""
 
     def finished(self, state: State) -> Bool[Array, ""]:
-        """Whether further fragments cannot change the pixel."""
+        """True once further fragments cannot change the pixel; by default never."""
         return jnp.zeros(jnp.shape(self.transmittance(state)), bool)
 
     def occupied(self, transfer: Transfer, blocks: Any) -> Bool[Array, "bx by bz"]:
-        """Which blocks of a volume may change a pixel, from the ranges of their values, `Blocks` (of several
-        volumes, `SeveralBlocks`); rays leap over the others. `transfer`: that of `marched`."""
+        """Mask of the blocks that may change a pixel; rays leap over the others. `transfer`: by `marched`.
+        `blocks`: ranges of values, `Blocks`, or `SeveralBlocks` for several volumes."""
         return transfer.visible(blocks)
 
 
 class Composite(eqx.Module):
-    """Sums of the weights w of a ray's cells so far, of w × colour and of w × depth, if computed."""
+    """Sums of w, and if computed of w × colour and w × depth, over a ray's cells with weights w so far."""
 
     opacity: Scalar
     color: Color | None = None
     moment: Scalar | None = None
 
     def add(self, weight: Scalar, color: Color | None = None, depth: Scalar | None = None) -> "Composite":
-        """With one more cell."""
+        """Adds a cell to the sums."""
         sums = moment = None
         if self.color is not None and color is not None:
             sums = tuple(sum_ + weight * part for sum_, part in zip(self.color, color, strict=True))
@@ -123,35 +123,35 @@ class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
     must override `weight` and `slope`; these, and `transmittance`, work elementwise.
 
-    Weights depend only on the cells' opacities, are at least 0, and sum to at most 1. Where transforms
-    divide cells, each piece has a weight. Parameters are static fields, or, if only `resolved` depends on
-    them, arrays, which have gradients.
+    Weights depend only on the cells' opacities, are at least 0, and sum to at most 1. If transforms divide a
+    cell, each part has a weight. Parameters are static fields, or, if only `resolved` depends on them,
+    arrays, which have gradients.
     """
 
     @abstractmethod
     def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
-        """Weight of a cell of opacity `alpha` behind cells whose weights sum to `before`. It must be 0 where
-        `alpha` is, since engines leave such cells out."""
+        """Weight of a cell of opacity `alpha` behind cells whose weights sum to `before`. It must be 0 if
+        `alpha` is 0, since engines skip such cells."""
 
     @abstractmethod
-    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
+    def slope(self, alpha: Scalar, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
         """Derivative of a loss with respect to the optical depth τ of a cell, for the second march. The
         arguments suffice only for weights f(`alpha`) or (constant - `before`) f(`alpha`).
 
         Args:
-            alpha: opacity of the cell, 1 - exp(-τ), so that its own derivative is 1 - `alpha`.
+            alpha: opacity of the cell, 1 - exp(-τ), with the derivative 1 - `alpha`.
             after: sum of the weights up to and including this cell's.
-            worth: derivative of the loss with respect to the cell's weight.
-            behind: sum over all cells behind this one of weight × worth.
+            weight_bar: derivative of the loss with respect to the cell's weight.
+            sum_behind: sum of weight × weight_bar over all cells behind this one.
         """
 
     def transmittance(self, state: Composite) -> Scalar:
-        """By default 1: what is in front hides nothing."""
+        """Transmittance of the cells so far; by default 1, for a mode without occlusion."""
         return jnp.ones_like(state.opacity)
 
     def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The pixel of a ray that is not transparent, from its Σ w c and Σ w, where it is computed after the
-        march. `classification`: of the transfer function that was given, not of that of `marched`. JAX also
+        """Computes the pixel of a ray that is not transparent from Σ w c and Σ w, after the march.
+        `classification`: of the renderer's transfer function, not of that by `marched`. JAX also
         differentiates it at sums of 0, where neither value nor derivative may be NaN."""
         return sums
 
@@ -161,7 +161,7 @@ class Weighting(Compositing[Composite]):
 
     @property
     def resolves_transparent(self) -> bool:
-        """Whether `resolved` has a derivative to be known where nothing is seen. By default not."""
+        """True if `resolved` has a derivative for transparent rays; by default False."""
         return False
 
     @property
@@ -185,10 +185,10 @@ class Weighting(Compositing[Composite]):
         if state.moment is None:
             return rgba, None
         visible = ~(state.opacity <= 0)  # also NaN
-        # Both are first divided by a constant, so that the denominator is 1: its square, by which the
-        # derivative divides, would underflow where the opacity is very small.
-        whole = jax.lax.stop_gradient(jnp.where(visible, state.opacity, 1))
-        mean = (state.moment / whole) / jnp.where(visible, state.opacity / whole, 1)
+        # Divide both by a constant first, so that the denominator is 1: the derivative divides by its square,
+        # which would underflow for a very small opacity.
+        total = jax.lax.stop_gradient(jnp.where(visible, state.opacity, 1))
+        mean = (state.moment / total) / jnp.where(visible, state.opacity / total, 1)
         return rgba, jnp.where(visible, mean, jnp.inf)
 
 
@@ -208,29 +208,29 @@ class Over(Weighting):
     def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
         return (1 - before) * alpha
 
-    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
+    def slope(self, alpha: Scalar, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
         transmittance = 1 - after
-        # below this transmittance `behind` is only rounding, which a high extinction would amplify
-        nothing = 2 * float(jnp.finfo(behind.dtype).eps)
-        return jnp.where(transmittance <= nothing, 0, transmittance * worth - behind)
+        # below this transmittance `sum_behind` is only rounding, which a high extinction would amplify
+        opaque = transmittance <= 2 * float(jnp.finfo(sum_behind.dtype).eps)
+        return jnp.where(opaque, 0, transmittance * weight_bar - sum_behind)
 
     def transmittance(self, state: Composite) -> Scalar:
         return 1 - state.opacity
 
 
 class OpticalDepths(Weighting):
-    """A mode whose weights are the cells' optical depths: what is in front hides nothing. A subclass scales
-    its sums (`marched`, `resolved`), so that the depth of a cell is known from its opacity in float32."""
+    """A mode whose weights are the cells' optical depths, without occlusion. A subclass scales extinctions
+    (`marched`) and sums (`resolved`), so that float32 resolves a cell's optical depth by its opacity."""
 
     def weight(self, alpha: Scalar, before: Scalar) -> Scalar:
         return -jnp.log1p(-alpha)
 
-    def slope(self, alpha: Scalar, after: Scalar, worth: Scalar, behind: Scalar) -> Scalar:
-        return worth
+    def slope(self, alpha: Scalar, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
+        return weight_bar
 
     @abstractmethod
     def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The pixel, from sums of optical depths."""
+        """Computes the pixel from sums of optical depths."""
 
 
 def joined(front: Composite, back: Composite) -> Composite:

@@ -1,13 +1,13 @@
-"""Where does a ray first meet an isosurface?"""
+"""The first crossing of a ray with an isosurface."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from .._util.checks import number
+from .._util.checks import Arrayable, number
 from .._util.vec3 import Scalar, Vec3
 from ..march.march import March, within
 from ..march.transforms.alpha_correction import AlphaCorrection
@@ -19,7 +19,7 @@ from .selection import RaySampler, Selection
 
 
 class Crossing(NamedTuple):
-    """Ends of the first cell that crosses the value, infinite without one, and whether values rise."""
+    """Ends of the first cell that crosses the value, infinite if there is none; `rises`: towards the back."""
 
     front: Scalar
     back: Scalar
@@ -27,29 +27,29 @@ class Crossing(NamedTuple):
 
 
 class Isosurface(Selection[Crossing]):
-    """The surface on which the volume has a value, where a ray first crosses it: opaque, in the colour that
-    the transfer function has for the value, shaded by the lighting, if there is one.
+    """The first crossing of a ray with an isosurface: opaque, in the transfer function's colour of the value,
+    shaded by the lighting, if there is one.
 
-    A cell holds the surface if the field is below the value at one of its ends, and not at the other. There
-    the root of the interpolated field along the ray is found by bisection, down to the rounding of depths (in
-    float32 and grids of 256³ voxels, some 10⁻⁴ of a voxel). The volume's faces are no surface.
-    `Rendering.depth` is that of the root, `Rendering.normal` the unit vector -∇v / |∇v| there, which points
-    to lower values; ∇v is `Volume.gradient`, with an error of O(spacing²).
+    A cell contains the surface if the field is below the value at exactly one of its ends. Bisection finds
+    the root of the interpolated field along the ray, up to the rounding of depths (some 10⁻⁴ of a voxel in
+    float32 and grids of 256³ voxels). The volume's faces are no surface. `Rendering.depth` is the depth of
+    the root, `Rendering.normal` the unit vector -∇v / |∇v| there, which points to lower values; ∇v is
+    `Volume.gradient`, with an error of O(spacing²).
 
     `March.quadrature` has no effect, and cells are cut at the exit even without `AlphaCorrection`. Cells
-    without a crossing are the empty ones, in which `EmptySpaceJitter` shifts; `SpaceLeaping` leaps over
-    blocks whose range does not hold the value.
+    without a crossing count as empty for `EmptySpaceJitter`; `SpaceLeaping` leaps over blocks whose range
+    does not contain the value.
 
-    **What is missed:** a ray that crosses the value twice within a cell, as in a sheet thinner than a step,
-    sees neither (`experiments/stability.py`, "isosurfaces of thin sheets"); of three crossings within a cell,
-    any may be found. `Jitter` misses what lies before its first cell (not with `front_residual`).
+    **Missed crossings:** two crossings within a cell, as in a sheet thinner than a step, are not seen
+    (`experiments/stability.py`, "isosurfaces of thin sheets"); of three, any may be found. `Jitter` without
+    `front_residual` misses the interval before its first cell.
 
     Gradients of depth and normal follow from the implicit function theorem. They miss the jumps at
-    silhouettes, where a ray loses the surface, and where a ray only touches it, that of depth grows without
-    bound. In a plane of voxels, where the interpolated field has an edge, they are those of one side.
+    silhouettes, and the gradient of the depth grows without bound where a ray only touches the surface. In a
+    plane of voxels, where the interpolated field has an edge, they are one-sided.
 
     Args:
-        value: of the volume, on the surface. It has a gradient.
+        value: the volume's value on the surface. It has a gradient.
 
     Raises:
         ValueError: for a value that is not a finite number.
@@ -57,13 +57,13 @@ class Isosurface(Selection[Crossing]):
 
     value: Float[Array, ""]
 
-    def __init__(self, value: Any):
+    def __init__(self, value: Arrayable):
         self.value = number("value", value)
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
         cut = () if march.ends_at_exit else (AlphaCorrection(),)
         integrated = March(1.0, (*march.transforms, *cut), "preintegrated", max_samples=march.max_samples)
-        # not as an argument, which would be checked once more
+        # replaced, since the constructor would check the step again
         return _Crossings(self.value), eqx.tree_at(lambda march: march.step, integrated, march.step)
 
     def begin(self, zero: Scalar, outputs: Outputs | None) -> Crossing:
@@ -72,9 +72,9 @@ class Isosurface(Selection[Crossing]):
     def add(self, state: Crossing, fragment: Fragment) -> Crossing:
         *_, (before,), (_,) = fragment.measured
         front, back = fragment.cell.front, fragment.cell.front + fragment.cell.width
-        found = Crossing(front, back, before < self.value)
-        first = (state.back == jnp.inf) & ~(fragment.alpha <= 0)  # NaN is a find, too
-        return jax.tree.map(lambda new, old: jnp.where(first, new, old), found, state)
+        crossing = Crossing(front, back, before < self.value)
+        first = (state.back == jnp.inf) & ~(fragment.alpha <= 0)  # NaN counts as a crossing
+        return jax.tree.map(lambda new, old: jnp.where(first, new, old), crossing, state)
 
     def depth(self, state: Crossing) -> Scalar:
         return state.back
@@ -88,7 +88,7 @@ class Isosurface(Selection[Crossing]):
     def pixel(self, sampler: RaySampler, state: Crossing) -> tuple[Float[Array, " n"], Scalar]:
         depth = self._implicit(sampler, jax.lax.stop_gradient(self._root(sampler, state)))
         classification = sampler.classification
-        # the value itself rather than that at the root, which is rounded
+        # the exact value, since the value at the root is rounded
         attributes = classification.attributes(sampler.coordinate(depth))
         measured = classification.searched((self.value, *attributes))
         color = sampler.color(depth, measured, classification.classify(measured), jnp.ones_like(depth))
@@ -99,35 +99,35 @@ class Isosurface(Selection[Crossing]):
         assert sampler.gradient is not None
         slopes = jnp.stack(sampler.gradient(sampler.place(depth)))
         square = jnp.sum(slopes * slopes)
-        # where values do not change, there is no direction
+        # 0 where the gradient vanishes
         return -slopes * jnp.where(square == 0, 0, jax.lax.rsqrt(jnp.where(square == 0, 1, square)))
 
     def _root(self, sampler: RaySampler, state: Crossing) -> Scalar:
-        """Depth at which the value is crossed, to the precision of depths."""
+        """Depth of the crossing, by bisection."""
         front, back = (within(sampler.ray, depth) for depth in (state.front, state.back))
 
-        def halved(_: Any, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
+        def halved(_: object, bracket: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar]:
             near, far = bracket
             middle = (near + far) / 2
-            # not by values at the ends: computed again, they may round to the other side
-            behind = (sampler.value(middle) >= self.value) == state.rises
-            return jnp.where(behind, near, middle), jnp.where(behind, middle, far)
+            # not by the values at the ends, which may now round to the other side
+            past = (sampler.value(middle) >= self.value) == state.rises
+            return jnp.where(past, near, middle), jnp.where(past, middle, far)
 
         near, far = jax.lax.fori_loop(0, jnp.finfo(front.dtype).nmant, halved, (front, back))
-        # the end below the value: around the other one, all values may be equal to it
+        # the end below the value: around the other end, the field may be constant
         return jnp.where(state.rises, near, far)
 
     def _implicit(self, sampler: RaySampler, root: Scalar) -> Scalar:
-        """The same root, with its derivatives: of v(s) = value, ds = (dvalue - dv) / v'."""
-        found, slope = jax.jvp(sampler.value, (root,), (jnp.ones_like(root),))
+        """The root with the derivatives of v(s) = value: ds = (dvalue - dv) / v'."""
+        value, slope = jax.jvp(sampler.value, (root,), (jnp.ones_like(root),))
         slope = jax.lax.stop_gradient(slope)
-        missing = self.value - found
-        missing = missing - jax.lax.stop_gradient(missing)  # 0, since the root is known better than that
+        missing = self.value - value
+        missing = missing - jax.lax.stop_gradient(missing)  # 0 with derivatives: the root is accurate
         return root + jnp.where(slope == 0, 0, missing / jnp.where(slope == 0, 1, slope))
 
 
 class _Crossings(Transfer):
-    """Of positive extinction where the value is crossed between the two ends of a cell, else transparent."""
+    """Extinction 1 in cells whose ends lie on both sides of the value, else 0."""
 
     bands = 3
     value: Float[Array, ""]

@@ -1,4 +1,4 @@
-"""How much matter does a ray pass? X-ray images, digitally reconstructed radiographs, and tomography."""
+"""Line integral of the extinction: X-ray images, digitally reconstructed radiographs, and tomography."""
 
 from collections.abc import Callable
 
@@ -15,24 +15,25 @@ from .blending import OpticalDepths
 
 
 SCALE = 2.0**-20
-"""Factor of the extinction: an opacity near 1 hides the depth in float32; a power of 2 is exact."""
+"""Factor of the extinction: in float32, an opacity near 1 does not resolve the optical depth. Exact, as a
+power of 2."""
 
 
 class LineIntegral(OpticalDepths):
     """The line integral of the extinction along a ray, ∫ μ ds: an X-ray image.
 
-    The colours of `Rendering.rgba` are those of the transfer function, integrated with the extinction: with
-    white, each channel is the line integral itself, without an upper limit. The opacity is the absorbed share
-    of the intensity, 1 - exp(-∫ μ ds), so that `1 - rgba[..., 3]` is I / I₀ of Beer and Lambert. Over black,
-    `Rendering.image` is the line integral. `Rendering.depth` is the mean depth of what attenuates.
+    The colours of `Rendering.rgba` are the transfer function's, integrated with the extinction: for white,
+    each channel is the line integral, without an upper limit, and so is `Rendering.image` over black. The
+    opacity is the absorbed fraction of the intensity, 1 - exp(-∫ μ ds), so that `1 - rgba[..., 3]` is I / I₀
+    of Beer and Lambert. `Rendering.depth` is the mean depth of the attenuation.
 
-    With `AlphaCorrection`, the integral of an extinction that is linear along the ray is exact but for
-    rounding under `"midpoint"`, and gradients are complete, at any optical depth. Rays leap over what is
-    transparent; nothing ends them early. A transfer function of CT: `jaxvol.attenuation`. The camera stands
-    where the source is. X-rays have one energy here, and do not scatter.
+    With `AlphaCorrection`, the integral of an extinction that is linear along the ray is exact up to rounding
+    under `"midpoint"`, and gradients are complete, at any optical depth. Rays leap over transparent blocks;
+    nothing ends them early. `jaxvol.attenuation` is a transfer function for CT. The camera is the X-ray
+    source. X-rays have one energy and do not scatter.
 
-    A volume ends at its outer nodes. Programs whose voxels are boxes see half a voxel more at each face, so
-    that where a face cuts matter, their integrals are larger; with a voxel of air around, they agree.
+    A volume ends at its outer nodes. Programs with box-shaped voxels see half a voxel more at each face, so
+    that their integrals are larger where a face cuts matter; with a voxel of air around, they agree.
 
     Source: Beer and Lambert, as in Siddon 1985, whose voxels are constant; here, values are interpolated.
 
@@ -41,7 +42,7 @@ class LineIntegral(OpticalDepths):
     """
 
     def marched(self, transfer: Transfer, march: March, volume: Volume) -> tuple[Transfer, March]:
-        if isinstance(transfer, Together):  # which knows how to be differentiated where nothing is visible
+        if isinstance(transfer, Together):  # it is differentiable where nothing is visible
             return Together(tuple(map(_Thinner, transfer.transfers)), transfer.counts), march
         return _Thinner(transfer), march
 
@@ -50,13 +51,13 @@ class LineIntegral(OpticalDepths):
         return True
 
     def resolved(self, classification: Classification, sums: Float[Array, " n"]) -> Float[Array, " m"]:
-        whole = sums / SCALE
-        opacity = len(whole) - 1
-        return whole.at[opacity].set(-jnp.expm1(-whole[opacity]))
+        sums = sums / SCALE
+        opacity = len(sums) - 1
+        return sums.at[opacity].set(-jnp.expm1(-sums[opacity]))
 
 
 class _Thinner(Transfer):
-    """A transfer function whose extinction is so much less."""
+    """A transfer function whose extinction is multiplied by `SCALE`."""
 
     transfer: Transfer
 
@@ -98,8 +99,8 @@ class _Thinner(Transfer):
     def vjp(
         self, measured: Measured, color: Color, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
-        of = self.transfer.vjp(measured, color, SCALE * extinction, integrated=integrated)
-        return _Thinner(of[0]), of[1]
+        transfer, values = self.transfer.vjp(measured, color, SCALE * extinction, integrated=integrated)
+        return _Thinner(transfer), values
 
 
 def _thinner(classify: Classify) -> Classify:

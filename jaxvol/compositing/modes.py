@@ -1,4 +1,4 @@
-"""Which compositing mode does `compositing=` name?"""
+"""Names of compositing modes, the values of the argument `compositing`."""
 
 from typing import Any, Literal, TypeAlias
 
@@ -23,34 +23,32 @@ MODES: dict[str, type[Compositing[Any]]] = {
     "integral": LineIntegral,
 }
 
-
 MODES_ELSEWHERE = {"composite": "over", "dvr": "over", "mip": "maximum", "max": "maximum", "minip": "minimum"}
 MODES_ELSEWHERE |= {"min": "minimum", "aip": "average", "mean": "average", "additive": "integral"}
 MODES_ELSEWHERE |= {"xray": "integral", "x-ray": "integral", "drr": "integral", "iso": "isosurface"}
-"""What other programs call them."""
-
+"""Names of the modes in other programs."""
 
 OVER = Over()
-"""The same for all images, since what is kept for a scene is kept for its parts."""
+"""One object for all images, since caches are keyed by a scene's parts."""
 
 
-def compositing_of(given: Mode | Any) -> Compositing[Any]:
-    """The mode of this name, or the mode itself. **Raises** `ValueError` for anything else, and for a
-    `Weighting` whose fields are not all static although its weights may depend on them."""
-    if isinstance(given, Weighting | Selection):
-        if isinstance(given, Weighting) and not given.resolves and jax.tree.leaves(given):
+def compositing_of(mode: object) -> Compositing[Any]:
+    """The mode, or the mode of this name. **Raises** `ValueError` for anything else, and for a `Weighting`
+    with fields that are not static, unless only `resolved` may depend on them."""
+    if isinstance(mode, Weighting | Selection):
+        if isinstance(mode, Weighting) and not mode.resolves and jax.tree.leaves(mode):
             raise ValueError(
                 "compositing must be a Weighting with static fields only, eqx.field(static=True); "
-                f"{described(given)} has others."
+                f"{described(mode)} has others."
             )
-        return given
-    if given == "over":
-        return OVER
-    if isinstance(given, str) and given in MODES:
-        return MODES[given]()
+        return mode
+    hint = ""
+    if isinstance(mode, str):
+        if mode in MODES:
+            return OVER if mode == "over" else MODES[mode]()
+        hint = near(MODES_ELSEWHERE.get(mode.lower(), mode), MODES)
     names = ", ".join(f'"{name}"' for name in MODES)
-    hint = near(MODES_ELSEWHERE.get(given.lower(), given), MODES) if isinstance(given, str) else ""
     raise ValueError(
         f"compositing must be one of {names}, a jaxvol.Isosurface, or another Weighting or Selection; "
-        f"got {described(given)}.{hint}"
+        f"got {described(mode)}.{hint}"
     )

@@ -1,4 +1,4 @@
-"""Which depth of a ray does a pixel show? Modes that pick one, such as that of the greatest value."""
+"""Selections: compositing modes whose pixel shows one depth of a ray, such as that of the greatest value."""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -16,16 +16,15 @@ from .blending import Compositing, Fragment, Outputs, State
 
 
 class RaySampler(NamedTuple):
-    """Measures, classifies and shades what is on a ray. Depths are past the entry.
+    """Measures, classifies and shades samples of a ray. Depths are past the entry.
 
     Attributes:
-        ray: on which it samples.
-        classification: how samples are measured, classified and shaded.
-        depth_scale: 1, with the derivative that depths of a fixed number of steps have by the step.
-        gradient: of the volume's value at a `place`, by that; None during the march.
-        chosen: the depth that the march chose, twice: as a number, and as its sample moves; None during the
-            march.
-        space: of the volume.
+        ray: the ray.
+        classification: measures, classifies and shades samples.
+        depth_scale: 1, with the derivative by the step of depths at a fixed number of steps.
+        gradient: gradient of the volume's value at a `place`; None during the march.
+        chosen: the selected depth, as a constant and as a function of the scene; None during the march.
+        space: the volume's space.
     """
 
     ray: Ray
@@ -44,7 +43,7 @@ class RaySampler(NamedTuple):
         return self.ray.path(self.differentiable_depth(depth))
 
     def place(self, depth: Scalar) -> Vec3:
-        """Where this depth is, from the `anchor` of the space on."""
+        """The world point at this depth, relative to the `anchor` of the space."""
         return along(self.ray.entry, self.ray.direction, self.differentiable_depth(depth))
 
     def point(self, depth: Scalar) -> Vec3:
@@ -52,7 +51,7 @@ class RaySampler(NamedTuple):
         return self.space.world(self.place(depth))
 
     def differentiable_depth(self, depth: Scalar) -> Scalar:
-        """The depth, moving with the step and, if the chosen sample's, with the faces of its cell."""
+        """The depth as a function of the step, and, for the selected sample, of the faces of its cell."""
         if self.chosen is None:
             return depth * self.depth_scale
         number, moving = self.chosen
@@ -61,7 +60,7 @@ class RaySampler(NamedTuple):
     def color(
         self, depth: Scalar, measured: Measured, classified: tuple[Color, Scalar], transmittance: Scalar
     ) -> Color:
-        """Colour of what was classified at this depth, behind this transmittance; lit if there is light."""
+        """Colour of a sample at this depth behind this transmittance; shaded if there is a lighting."""
         color, extinction = classified
         if self.classification.light is None:
             return color
@@ -73,30 +72,30 @@ class RaySampler(NamedTuple):
         return self.classification.light(sample)
 
     def shaded(self, depth: Scalar) -> tuple[Color, Scalar]:
-        """Colour, shaded if there is a lighting, and extinction at this depth; nothing in front hides it."""
+        """Colour, shaded if there is a lighting, and extinction at this depth, without occlusion."""
         measured = self.classification.at(self.coordinate(depth))
         classified = self.classification.classify(measured)
         return self.color(depth, measured, classified, jnp.ones_like(depth)), classified[1]
 
 
 class Selection(Compositing[State]):
-    """A mode that picks one depth on a ray by comparing samples. `pixel` then computes the pixel from what is
-    there, once for each ray, after the march.
+    """A mode that selects one depth on a ray by comparing samples. `pixel` then computes the pixel at this
+    depth, once for each ray, after the march.
 
-    Gradients are those of `pixel`, also of parameters: the chosen sample stays that of the same cell, while
-    the ray, the step, the faces that cut the cell, and what the ray meets change. They miss the jumps of a
-    pixel where the choice changes. The gradient of voxels takes an array of their size for each fetch of
-    `pixel`, for each chunk of 2048 pixels: slow for large volumes.
+    Gradients are those of `pixel`, also for parameters: the sample stays in the same cell, while the ray, the
+    step, the faces that cut the cell, and the scene change. They miss the jumps of a pixel where another cell
+    is selected. The gradient of voxels takes an array of their size for each fetch of `pixel` and chunk of
+    2048 pixels: slow for large volumes.
     """
 
     @abstractmethod
     def depth(self, state: State) -> Scalar:
-        """The chosen depth, past the entry; infinite if there is none."""
+        """The selected depth, past the entry; infinite if there is none."""
 
     @abstractmethod
     def pixel(self, sampler: RaySampler, state: State) -> tuple[Float[Array, " n"], Scalar]:
-        """Premultiplied colour and opacity, and the depth that is reported (infinite where nothing is
-        visible), of a ray for which a depth was chosen. JAX differentiates it. To compute with a depth, use
+        """Premultiplied colour and opacity, and the reported depth (infinite if nothing is visible), of a ray
+        with a selected depth. JAX differentiates it. To compute with a depth, use
         `sampler.differentiable_depth(depth)`."""
 
     def normal(self, sampler: RaySampler, depth: Scalar) -> Float[Array, "3"] | None:
@@ -106,7 +105,7 @@ class Selection(Compositing[State]):
 
     @property
     def has_normal(self) -> bool:
-        """Whether `normal` is overridden."""
+        """True if `normal` is overridden."""
         return type(self).normal is not Selection.normal
 
     @property
@@ -123,11 +122,11 @@ class Selection(Compositing[State]):
         return jnp.stack([none, none, none, chosen]), depth
 
     def transmittance(self, state: State) -> Scalar:
-        """1: what is in front hides nothing."""
+        """Transmittance 1: selections have no occlusion."""
         return jnp.ones_like(self.depth(state))
 
     def occupied(self, transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
-        """All blocks, by default: what is transparent may still be chosen."""
+        """Mask of all blocks, by default, since transparent samples may be selected."""
         return jnp.ones(blocks.shape, bool)
 
 

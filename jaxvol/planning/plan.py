@@ -1,4 +1,4 @@
-"""Which march is the cheapest whose image is accurate enough?"""
+"""Planning: the cheapest march whose image is within a tolerance."""
 
 import math
 import time
@@ -16,7 +16,7 @@ from ..compositing.modes import Mode, compositing_of
 from ..engine.acceleration import visible_in_numpy
 from ..engine.stages import Place
 from ..lighting.shading import Lighting
-from ..march.march import March, Transform
+from ..march.march import March, Quadrature, Transform
 from ..march.transforms import AlphaCorrection, EarlyTermination, SpaceLeaping
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
@@ -27,35 +27,27 @@ from ..scene.transfer import Transfer, sized, with_shared_points
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
 from .probe import UNSEEN, Candidates, Probe, is_empty, rendered
-from .search import COARSEST, Part, Search
+from .search import COARSEST, Part, Search, Trial
 
 
-MARGIN = 0.95
-"""Fraction of the tolerance that is used."""
-
+MARGIN = 0.95  # fraction of the tolerance that a plan uses
+# Fraction of the tolerance for early termination, whose error is at most the transmittance where rays end.
 ENDS = 1 / 16
-"""Fraction of it for rays that end early, whose error is at most the transmittance at which they end."""
-
-GRADIENTS_END = 1e-4
-"""Transmittance at which rays may end where gradients count."""
-
-OPAQUE = 0.01
-"""Fraction of the pixels that become opaque, below which there is nothing to end early."""
-
-EMPTY = 0.05
-"""Fraction of the blocks in which nothing is visible, below which leaps are not worth their look-ups."""
+GRADIENTS_END = 1e-4  # transmittance at which rays may end if gradients are needed
+OPAQUE = 0.01  # least fraction of opaque pixels for which rays end early
+EMPTY = 0.05  # least fraction of empty blocks for which leaps are worth their look-ups
 
 
 class Plan(NamedTuple):
-    """How to render a scene within a tolerance. `print` shows it.
+    """A march that renders a scene within a tolerance. `print` shows it.
 
     Attributes:
-        march: what to pass to `render`, with the same scene.
-        tolerance: as given.
-        error: predicted, on the safe side; above the tolerance where nothing could be proven.
-        samples: predicted for each pixel.
-        parts: what was kept or left out, and why.
-        probed: seconds that planning took, compilation included.
+        march: the march to pass to `render`, with the same scene.
+        tolerance: the requested RMSE.
+        error: predicted RMSE, a safe estimate; above the tolerance if nothing could be proven.
+        samples: predicted samples per pixel.
+        parts: the decisions, and their reasons.
+        probed: planning time in seconds, compilation included.
     """
 
     march: March
@@ -67,11 +59,13 @@ class Plan(NamedTuple):
 
     @property
     def within(self) -> bool:
-        """Whether the predicted error is within the tolerance."""
+        """True if the predicted error is within the tolerance."""
         return self.error <= self.tolerance
 
     def __str__(self) -> str:
-        transforms = ", ".join(type(each).__name__ for each in self.march.transforms) or "no transform"
+        transforms = (
+            ", ".join(type(transform).__name__ for transform in self.march.transforms) or "no transform"
+        )
         missed = "" if self.within else "NOT PROVEN TO BE WITHIN THE TOLERANCE: "
         rmse = f"RMSE {self.error:.2g} predicted" if self.within else "RMSE unknown"
         lines = [
@@ -84,169 +78,161 @@ class Plan(NamedTuple):
 
 
 def plan(
-    volume: Volume | Any,
-    transfer: Transfer | Any,
-    camera: Camera | Any,
-    tolerance: float | Any,
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    tolerance: float,
     *,
-    transforms: tuple[Transform, ...] | Any = (),
-    compositing: Mode | Compositing[Any] | Any = "over",
-    lighting: Lighting | Any | None = None,
-    gradients: bool | Any = False,
-    once: bool | Any = False,
-    seed: int | Any = 0,
+    transforms: tuple[Transform, ...] = (),
+    compositing: Mode | Compositing[Any] = "over",
+    lighting: Lighting | None = None,
+    gradients: bool = False,
+    once: bool = False,
+    seed: int = 0,
 ) -> Plan:
-    """Finds the cheapest way to render a scene within a tolerance, by rendering patches of it.
+    """Finds the cheapest march that renders a scene within a tolerance, by rendering patches of the image.
 
-    At most 128 patches of 8 x 8 pixels (32 of images of fewer than 512) are rendered by the midpoint rule,
-    with steps of two voxels, one, a half, and so on, until some are within the tolerance, compared with steps
-    of half of theirs. Then:
+    At most 128 patches of 8 x 8 pixels (32 if the image has fewer than 512) are rendered by the midpoint
+    rule, with steps of two voxels, one, a half, and so on. Each step is compared with half of it, until one
+    is within the tolerance. The plan then decides on:
 
-    - **step**: the longest within the tolerance, between two of these, or up to four voxels.
-    - **quadrature**: `"preintegrated"` is tried where rays take many samples, or where the midpoint rule is
-      not within the tolerance at an eighth of a voxel, or seems not to get there; it is kept where it is
-      faster, by what a sample costs on CPU.
-    - **`SpaceLeaping`**: kept where blocks are proven empty. It does not change the image; but extinctions of
-      0 have no gradient from what is leapt over.
+    - **step**: the longest within the tolerance, between two of the steps, or up to four voxels.
+    - **quadrature**: `"preintegrated"` is tried if rays take many samples, or if the midpoint rule fails, or
+      seems to fail, to be within the tolerance at an eighth of a voxel. It is kept if it is faster, by the
+      costs of samples on a CPU.
+    - **`SpaceLeaping`**: kept if blocks are proven empty. The image does not change, but extinctions of 0 in
+      the blocks that are leapt over get no gradient.
     - **`AlphaCorrection`**: always kept.
-    - **`EarlyTermination`**: kept where rays end early, at a sixteenth of the tolerance, which bounds its
-      error (over the brightest colour, where that is above 1).
+    - **`EarlyTermination`**: kept if rays become opaque. It ends them at a sixteenth of the tolerance, which
+      bounds its error (divided by the brightest colour, if that is above 1).
 
-    A volume that is rendered in bricks is planned for by a copy of every n-th voxel, `source.subsampled(n)`;
+    Plan a volume that is rendered in bricks with a copy of every n-th voxel, `source.subsampled(n)`, and
     divide the step by n. The error is that of the copy, which does not prove that blocks are empty.
 
     The error is the RMSE of linear colours, over black or over white, whichever is greater: an estimate from
-    some of the pixels, and from how images change with the last halvings of the step. The noise of a lighting
-    counts as an error. `Jitter` and `EmptySpaceJitter` are not chosen: they change the structure of an error,
-    not its size. On other devices than CPUs, the errors hold, but what is cheapest was not measured.
+    the patches' pixels, and from the changes by the last halvings of the step. The noise of a lighting counts
+    as an error. `Jitter` and `EmptySpaceJitter` are not chosen: they change the structure of an error, not
+    its size. The costs were measured on CPUs only; the errors hold on all devices.
 
     Args:
-        volume: a single one.
+        volume: a single volume.
         transfer: as for `render`.
-        camera: as for `render`. An image of another camera needs a plan of its own.
+        camera: as for `render`. Another camera needs another plan.
         tolerance: RMSE of the image's linear colours, above 0 and below 1; 1/255 is one level of 8 bits.
-        transforms: those that belong to the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They are
-            kept.
+        transforms: transforms that are part of the scene, such as a `ToroidalMap`, a `Clip`, or jitter. They
+            are kept.
         compositing: as for `render`.
         lighting: as for `render`.
-        gradients: whether the image is to be differentiated. Rays then end at 1e-4 or less. What is proven
-            (empty space) is proven for this transfer function only.
-        once: whether the march is for a single image. `"preintegrated"`, whose program takes longer to
-            compile than it saves, is then tried only where the midpoint rule is not within the tolerance.
-        seed: of the choice of patches. With it, the plan depends on nothing but the scene.
+        gradients: True for an image that is differentiated. Rays then end at a transmittance of at most 1e-4.
+            Empty space is proven for this transfer function only.
+        once: True for a single image. `"preintegrated"`, whose program takes longer to compile than it saves,
+            is then tried only if the midpoint rule is not within the tolerance.
+        seed: seed of the choice of patches. The plan is a function of the scene and the seed.
 
     Returns:
         A `Plan`. If no step down to 1/64 of a voxel is proven to be within the tolerance, `Plan.within` is
-        False. If nothing is seen although blocks may show something, `Plan.parts` says so, and the predicted
-        error is what may have been missed.
+        False. If the patches are empty although blocks may be visible, `Plan.parts` reports it, and the
+        predicted error is a bound for missed pixels.
 
     Raises:
-        ValueError: for arguments of another kind, a tolerance out of range, arrays that are traced (plan
-            outside of `jax.jit` and `jax.grad`), and transforms on which the plan decides.
+        ValueError: for arguments of another kind, a tolerance out of range, traced arrays (plan outside of
+            `jax.jit` and `jax.grad`), and transforms on which the plan decides.
     """
-    begun = time.perf_counter()
+    start = time.perf_counter()
     order = "plan(volume, transfer, camera, tolerance)"
-    several = isinstance(volume, Volume) and isinstance(volume.field, Several)
-    if several or isinstance(volume, list | tuple):
-        raise ValueError("volume must be a single one to be planned for; got several. Pass a March.")
+    group = isinstance(volume, Volume) and isinstance(volume.field, Several)
+    if group or isinstance(volume, list | tuple):
+        raise ValueError("volume must be a single Volume for a plan; got several. Pass a March.")
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
     gradients, once = flag("gradients", gradients), flag("once", once)
     transfer = sized(transfer, volume)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
-    tolerance, given = _checked(tolerance, transforms, scene)
-    place = Place.of(March(1.0, given), volume)
+    tolerance, fixed = _checked(tolerance, transforms, scene)
+    place = Place.of(March(1.0, fixed), volume)
     shown, mode = transfer, scene.compositing
     if mode.resolves:
-        shown, _ = mode.marched(transfer, March(1.0, given), volume)
+        shown, _ = mode.marched(transfer, March(1.0, fixed), volume)
     visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
     candidates, seed = Candidates.of(camera, place, visible), integer("seed", seed, 0)
-    proven, parts = chosen_transforms(visible, given)
+    proven, parts = chosen_transforms(visible, fixed)
     voxel = place.voxel(visible.shape)
 
-    over = isinstance(scene.compositing, Over)
+    over = isinstance(mode, Over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
 
-    def search(ends: float, goal: float, known: Any) -> Search:
-        own = (EarlyTermination(ends),) if over else ()
-        return Search(probe, scene, goal, tolerance, voxel, (*given, *proven, *own), known)
+    def search(ends: float, goal: float, known: dict[tuple[float, Quadrature], Trial]) -> Search:
+        ending = (EarlyTermination(ends),) if over else ()
+        return Search(probe, scene, goal, tolerance, voxel, (*fixed, *proven, *ending), known)
 
-    # Where few rays become opaque, none ends early in the end. In trials they do, all alike: without that,
-    # programs of another kind would be compiled to learn of a sixteenth of the tolerance in these few.
+    # The plan drops EarlyTermination if few rays become opaque. Trials keep it, so that they share programs.
     probe = Probe.of(candidates, seed)
     first = search(ends, tolerance, {})
-    seen = first.render(COARSEST, "midpoint").image
+    coarse = first.render(COARSEST, "midpoint").image
     shows = bool(visible.any())
-    if shows and is_empty(seen):  # what is visible lies in other patches, or between samples
+    if shows and is_empty(coarse):  # visible parts lie in other patches, or between samples
         quadrature = "preintegrated" if first.integrable else "midpoint"
-        coarse = March(COARSEST * voxel, first.transforms, quadrature)
-        probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, coarse)), seed)
+        march = March(COARSEST * voxel, first.transforms, quadrature)
+        probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, march)), seed)
         first = search(ends, tolerance, {})
-        seen = first.render(COARSEST, "midpoint").image
-    between = shows and is_empty(seen)
-    opaque = probe.mean(np.asarray(seen.opacity) >= 1 - ends) if over else 0.0
+        coarse = first.render(COARSEST, "midpoint").image
+    between = shows and is_empty(coarse)
+    opaque = probe.mean(np.asarray(coarse.opacity) >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
-    brightest = brightest_of(seen)
+    brightest = brightest_of(coarse)
     within = search(ends / brightest, MARGIN * tolerance - share, first.rendered if brightest == 1 else {})
-    chosen, truth, tried = within.cheapest(once=once, between=between)
+    chosen, reference, tried = within.cheapest(once=once, between=between)
     unseen = 0.0
-    if shows and is_empty(truth.image):
+    if shows and is_empty(reference.image):
         unseen = math.sqrt(UNSEEN / probe.source.origins[..., 0].size)
-        tried.append(
-            Part("visible", False, "nothing in the pixels looked at, though some blocks may show any")
-        )
-    ending = EarlyTermination(ends / brightest_of(truth.image))
-    kept = (*given, *proven, *((ending,) if share else ()))
-    march = March(chosen.march.step, kept, chosen.march.quadrature)
+        tried.append(Part("visible", False, "nothing in the probed pixels, though blocks may be visible"))
     parts += tried
+    ending = ()
     if over:
+        ending = (EarlyTermination(ends / brightest_of(reference.image)),) if share else ()
         parts.append(Part("EarlyTermination", bool(share), f"{opaque:.1%} of the pixels become opaque"))
     return Plan(
-        march=march,
+        march=March(chosen.march.step, (*fixed, *proven, *ending), chosen.march.quadrature),
         tolerance=tolerance,
         error=max(chosen.error + share, unseen),
         samples=chosen.samples,
         parts=tuple(parts),
-        probed=time.perf_counter() - begun,
+        probed=time.perf_counter() - start,
     )
 
 
 def _checked(tolerance: Any, transforms: Any, scene: Any) -> tuple[float, tuple[Transform, ...]]:
-    """The tolerance, and the transforms that belong to the scene."""
+    """The tolerance, and the transforms that are part of the scene."""
     if is_traced(jax.tree.leaves((scene, transforms, tolerance))):
         raise ValueError(
-            "plan looks at the numbers of a scene, which are traced here: call it outside of jax.jit, "
-            "jax.vmap and jax.grad, and pass the march that it finds to render."
+            "plan needs concrete numbers of a scene, but they are traced here: call it outside of jax.jit, "
+            "jax.vmap and jax.grad, and pass its march to render."
         )
     number("tolerance", tolerance, above=0, below=1)
-    given = March(1.0, transforms).transforms  # checks them
-    for each in given:
-        decided = isinstance(each, EarlyTermination | SpaceLeaping)
-        if decided or (isinstance(each, AlphaCorrection) and not each.labels):
-            name = type(each).__name__
+    fixed = March(1.0, transforms).transforms  # checks them
+    for transform in fixed:
+        decided = isinstance(transform, EarlyTermination | SpaceLeaping)
+        if decided or (isinstance(transform, AlphaCorrection) and not transform.labels):
+            name = type(transform).__name__
             raise ValueError(f"transforms must be those of the scene; got {name}, on which the plan decides.")
-    return float(tolerance), given
+    return float(tolerance), fixed
 
 
 def chosen_transforms(
-    visible: Bool[np.ndarray, "bx by bz"], given: tuple[Transform, ...]
+    visible: Bool[np.ndarray, "bx by bz"], fixed: tuple[Transform, ...]
 ) -> tuple[tuple[Transform, ...], list[Part]]:
-    """Transforms that do not depend on the step, from the blocks that may hold anything visible."""
-    aligned = any(isinstance(each, AlphaCorrection) for each in given)
-    why = (
-        "part of the scene"
-        if aligned
-        else "the error at faces is left out; costs nothing where there is none"
-    )
-    alpha = Part("AlphaCorrection", True, why)
+    """Transforms that do not depend on the step, by the mask of blocks that may hold anything visible."""
+    aligned = any(isinstance(transform, AlphaCorrection) for transform in fixed)
+    why = "part of the scene" if aligned else "removes the error at faces; free where there is none"
     empty = float(np.mean(~visible))
     leaps = (SpaceLeaping(),) if empty >= EMPTY else ()
-    proof = f"{empty:.1%} of the blocks hold nothing visible"
     added = () if aligned else (AlphaCorrection(),)
-    return (*leaps, *added), [alpha, Part("SpaceLeaping", bool(leaps), proof)]
+    proof = Part("SpaceLeaping", bool(leaps), f"{empty:.1%} of the blocks hold nothing visible")
+    return (*leaps, *added), [Part("AlphaCorrection", True, why), proof]
 
 
 def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:
-    """Which blocks may change a pixel; by JAX in a row, of a length that many volumes share: a power of 8."""
+    """Mask of the blocks that may change a pixel. JAX takes them as a row padded to a power of 8, so that
+    volumes share programs."""
     if (known := visible_in_numpy(mode, transfer, blocks)) is not None:
         return known
     count = math.prod(blocks.shape)
@@ -257,8 +243,8 @@ def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Boo
         row = np.append(row, row[..., -1:].repeat(length - count, axis=-1), axis=-1)
         return jnp.asarray(row[..., None, None], leaf.dtype)
 
-    found = _occupied_in_a_row(mode, with_shared_points(transfer), jax.tree.map(in_a_row, blocks))
-    return np.asarray(found).reshape(-1)[:count].reshape(blocks.shape)
+    row = _occupied_in_a_row(mode, with_shared_points(transfer), jax.tree.map(in_a_row, blocks))
+    return np.asarray(row).reshape(-1)[:count].reshape(blocks.shape)
 
 
 @eqx.filter_jit
@@ -267,7 +253,7 @@ def _occupied_in_a_row(mode: Compositing[Any], transfer: Transfer, blocks: Block
 
 
 def brightest_of(image: Rendering) -> float:
-    """The brightest colour, 1 or more: by so much of what is left of a ray its early end may err."""
+    """The brightest colour, at least 1: factor of the remaining transmittance in the error of early ends."""
     rgba = np.asarray(image.rgba, np.float64)
-    seen = rgba[:, -1] > 1e-3
-    return float(max(1.0, np.max(rgba[seen, :-1] / rgba[seen, -1:], initial=0.0)))
+    rgba = rgba[rgba[:, -1] > 1e-3]
+    return float(max(1.0, np.max(rgba[:, :-1] / rgba[:, -1:], initial=0.0)))

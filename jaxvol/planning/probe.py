@@ -1,4 +1,4 @@
-"""How far is an image from the converged one, and what does it cost? Found out from some of its pixels."""
+"""Estimates of an image's error and cost from the pixels of some patches."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -23,38 +23,31 @@ from ..scene.rendering import Rendering
 from ..xla.kept_programs import kept
 
 
-SIDE = 8
-"""Pixels along the side of a patch, as of the engine's beams, so that its samples are those of the image."""
+SIDE = 8  # pixels along the side of a patch, as of the engine's beams, so that its samples are the image's
 
-PATCHES, SMALL, FEW = 128, 512, 32
-"""Patches that are rendered, a thirty-second of 512 x 512 pixels; of images of fewer than SMALL patches FEW,
-since their plan takes as long as several of them."""
+# Patches that are rendered, a thirty-second of 512 x 512 pixels. Images of fewer than SMALL patches use
+# SMALL_PATCHES, since their plan takes as long as several images.
+PATCHES, SMALL, SMALL_PATCHES = 128, 512, 32
 
+# Fraction of the patches chosen from those with visible blocks on or near their middle ray; the others are
+# chosen from those that meet the volume.
 LIKELY = 7 / 8
-"""Fraction of the patches that are chosen where visible blocks lie on or near their middle ray; the others,
-where a ray meets the volume."""
+POINTS, NEAR = 256, 2  # points of the middle ray that are tested, and blocks around each
 
-POINTS, NEAR = 256, 2
-"""Points of the middle ray that are looked at, and blocks around each."""
-
+# Standard errors added to a mean square of patches. If patches were normally distributed, 93 % of estimates
+# would not be too low; fewer where a few patches hold most of the error.
 CONFIDENT = 1.5
-"""Standard errors that are added to a mean square from some of the pixels. Were those of patches normally
-distributed, 93 % of estimates would not be too low; where a few patches hold most of the error, fewer."""
 
+# Limits of the factor by which an error shrinks with each halving of the step; 0.25 for a method of order 2.
 FASTEST, SLOWEST = 0.25, 0.9
-"""By what errors are taken to shrink for each halving of the step: a quarter where the order is 2; never
-faster, and never standing still."""
 
-UNSEEN = 3.0
-"""Pixels that may show something if none of n does: with a confidence of 95 %, no more than UNSEEN / n of
-them."""
-
-ROUNDING = 1e-6
-"""Differences of images that may be due to rounding."""
+UNSEEN = 3.0  # if n pixels are empty, at most UNSEEN / n of all are not, with a confidence of 95 %
+ROUNDING = 1e-6  # differences of images that may be due to rounding
+RAYS, LINES = 2**15, 2**10  # rays, and lines of POINTS, per call of a program that images of all sizes share
 
 
 class Candidates(NamedTuple):
-    """Patches of a camera's image, which of them meet the volume, and which are likely to show anything."""
+    """Patches of a camera's image: masks of those that meet the volume, and of those likely to be visible."""
 
     camera: Camera
     hit: Bool[np.ndarray, " patches"]
@@ -62,8 +55,8 @@ class Candidates(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, place: Place, visible: Bool[np.ndarray, "bx by bz"]) -> "Candidates":
-        """`visible`: blocks that may hold anything visible."""
-        from scipy.ndimage import maximum_filter  # here, so that a first image does not wait for it
+        """Candidates of a camera. `visible`: mask of the blocks that may hold anything visible."""
+        from scipy.ndimage import maximum_filter  # imported late, so that a first image does not wait for it
 
         (width, height), (across, down) = camera.size, _patches(camera)
 
@@ -82,8 +75,8 @@ class Candidates(NamedTuple):
 
     @property
     def wanted(self) -> int:
-        """Patches of a probe."""
-        return PATCHES if self.hit.size >= SMALL else FEW
+        """Number of patches of a probe."""
+        return PATCHES if self.hit.size >= SMALL else SMALL_PATCHES
 
     def pixels(self, chosen: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n m"]]:
         """Columns and rows of patches' pixels, in the order of the engine's beams."""
@@ -94,20 +87,20 @@ class Candidates(NamedTuple):
         return column[:, None] * SIDE + x, row[:, None] * SIDE + y
 
     def rays(self, column: Int[np.ndarray, "*n"], row: Int[np.ndarray, "*n"]) -> GivenRays:
-        """Those of pixels; past the edges of the image, of the last ones."""
+        """Rays of pixels, clamped to the image."""
         ends = zip((column, row), self.camera.size, strict=True)
-        column, row = (np.minimum(each, n - 1).reshape(-1) for each, n in ends)
+        column, row = (np.minimum(index, n - 1).reshape(-1) for index, n in ends)
         origins, directions = _rays(self.camera, column, row)
         pixels = np.stack([column, row], axis=-1) + np.round(np.asarray(self.camera.corner)).astype(int)
         arrays = origins, directions, pixels.astype(np.int32)
-        return GivenRays(*(jnp.asarray(each, each.dtype) for each in arrays))
+        return GivenRays(*(jnp.asarray(array, array.dtype) for array in arrays))
 
     def narrowed(self, render: Callable[[GivenRays], Rendering]) -> "Candidates":
-        """Likely are those that show anything in pixels which are spread evenly over the likely ones, or else
-        over all, as many as a probe has; if any do."""
+        """Restricts `likely` to patches that are not empty in a rendering of as many pixels as a probe has,
+        spread evenly over the likely patches, or else over `hit`. Unchanged if all are empty."""
         patches = np.flatnonzero(self.likely if self.likely.any() else self.hit)
         spread = np.linspace(0, patches.size * SIDE**2 - 1, self.wanted * SIDE**2).astype(int)
-        column, row = (each.reshape(-1)[spread] for each in self.pixels(patches))
+        column, row = (index.reshape(-1)[spread] for index in self.pixels(patches))
         shown = np.asarray(render(self.rays(column, row)).rgba).any(axis=-1)
         likely = np.zeros_like(self.likely)
         likely[patches[spread[shown] // SIDE**2]] = True
@@ -115,14 +108,14 @@ class Candidates(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Patches of an image: one of each stratum of neighbours, of those that may show anything.
+    """A sample of an image's patches: one of each stratum of neighbours.
 
     Attributes:
-        source: their rays, patch by patch.
-        strata: how many patches of the image each stands for; 0 for those that only fill up the program.
-        likely: which were chosen where something is likely to be visible.
-        inside: 1 for pixels of the image, 0 for those past its edges.
-        pixels: of the whole image.
+        source: rays of the patches, patch by patch.
+        strata: number of the image's patches that a patch represents; 0 for padding.
+        likely: mask of the patches that were chosen as likely to be visible.
+        inside: 1 for pixels of the image, 0 past its edges.
+        pixels: number of pixels of the image.
     """
 
     source: GivenRays
@@ -133,14 +126,13 @@ class Probe(NamedTuple):
 
     @classmethod
     def of(cls, candidates: Candidates, seed: int) -> "Probe":
-        """Some patches of a camera's image; all, if they are few. Without any ray that meets the volume,
-        the first one."""
+        """Random patches of an image; all if they are few, and the first if no ray meets the volume."""
         groups = np.flatnonzero(candidates.likely), np.flatnonzero(candidates.hit & ~candidates.likely)
         reserved = min(groups[1].size, round(candidates.wanted * (1 - LIKELY)))
         first = min(groups[0].size, candidates.wanted - reserved)
-        rest = min(groups[1].size, candidates.wanted - first)
+        second = min(groups[1].size, candidates.wanted - first)
         random, chosen, strata = np.random.default_rng(seed), [], []
-        for group, count in zip(groups, (first, rest), strict=True):
+        for group, count in zip(groups, (first, second), strict=True):
             edges = np.linspace(0, group.size, count + 1).astype(int)
             chosen.append(group[random.integers(edges[:-1], edges[1:])])
             strata.append(np.diff(edges))
@@ -153,20 +145,19 @@ class Probe(NamedTuple):
         inside = ((column < width) & (row < height)).astype(float)
         return cls(candidates.rays(column, row), strata, likely, inside, width * height)
 
-    def mean(self, of_pixels: Any) -> float:
-        """Of a number of each pixel, over the whole image; 0 where nothing can be seen."""
-        return float(self.strata @ self._totals(of_pixels) / self.pixels)
+    def mean(self, values: np.ndarray | Array) -> float:
+        """Estimate of a mean over the image by values of pixels; patches that miss the volume count as 0."""
+        return float(self.strata @ self._totals(values) / self.pixels)
 
-    def _totals(self, of_pixels: Any) -> Float[np.ndarray, " patches"]:
-        return np.sum(np.asarray(of_pixels, np.float64).reshape(self.inside.shape) * self.inside, axis=1)
+    def _totals(self, values: np.ndarray | Array) -> Float[np.ndarray, " patches"]:
+        return np.sum(np.asarray(values, np.float64).reshape(self.inside.shape) * self.inside, axis=1)
 
     def render(self, scene: Scene, march: March) -> Rendering:
-        """These pixels of the scene's image under another march."""
+        """Renders the probe's pixels of the scene's image under another march."""
         return rendered(self.source, scene, march, squares=True)
 
     def mean_square(self, difference: Float[np.ndarray, "pixels 3"]) -> tuple[float, float]:
-        """Over the whole image, and its standard error, since only some pixels are known: of one patch of
-        each stratum."""
+        """Estimate of the mean square over the image, and its standard error."""
         square = np.mean(difference**2, axis=-1)
         totals, error = self._totals(square), 0.0
         for group in (self.likely, ~self.likely & (self.strata > 0)):
@@ -177,7 +168,7 @@ class Probe(NamedTuple):
 
 
 def rendered(rays: GivenRays, scene: Scene, march: March, *, squares: bool = False) -> Rendering:
-    """As many rays as a probe has, of the scene's image under another march. `squares`: as in `Tiling`."""
+    """Renders a probe's number of rays of a scene under another march. `squares`: as in `Tiling`."""
     tiling = Tiling.of_backend()
     if isinstance(scene.source, Camera):  # by the program of its image
         tiling = tiling._replace(least=RayTiles.shared(scene.source, tiling)[0], squares=squares)
@@ -185,110 +176,103 @@ def rendered(rays: GivenRays, scene: Scene, march: March, *, squares: bool = Fal
 
 
 def is_empty(image: Rendering) -> bool:
-    """Whether nothing is visible."""
+    """Tests whether an image is fully transparent."""
     return not np.asarray(image.rgba).any()
 
 
-def differences(image: Rendering, other: Rendering) -> list[Float[np.ndarray, "pixels 3"]]:
-    """Of colours, over black and over white."""
-    a, b = (np.asarray(each.rgba, np.float64) for each in (image, other))
+def differences(first: Rendering, second: Rendering) -> list[Float[np.ndarray, "pixels 3"]]:
+    """Differences of two images' colours, over black and over white."""
+    a, b = (np.asarray(image.rgba, np.float64) for image in (first, second))
     color, opacity = a[:, :3] - b[:, :3], a[:, 3:] - b[:, 3:]
     return [color, color - opacity]
 
 
-class Truth(NamedTuple):
-    """What images are compared with.
+class Reference(NamedTuple):
+    """The most accurate image, with which others are compared.
 
     Attributes:
         probe: the patches.
-        image: the most accurate one.
-        own: its own error, as the last halvings of the step let expect; ten times their difference, where
-            that grew.
-        ratio: by which errors shrink for each halving of the step.
-        alike: correlation of errors of different steps, 0 where it is negative: 1 where all point the same
-            way, as of smooth functions; less where steps miss details at random.
+        image: the image at the probe's pixels.
+        image_error: estimated error of `image`, extrapolated from the last halvings of the step; ten times
+            their difference if that grew.
+        ratio: factor by which the error shrinks with each halving of the step.
+        correlation: correlation of the errors of different steps, at least 0: 1 for smooth functions, less
+            where steps miss details at random.
     """
 
     probe: Probe
     image: Rendering
-    own: float
+    image_error: float
     ratio: float = SLOWEST
-    alike: float = 1.0
+    correlation: float = 1.0
 
     @classmethod
-    def of(cls, probe: Probe, images: list[Rendering]) -> "Truth":
-        """The last of at least three images, each with half the step of the one before."""
+    def of(cls, probe: Probe, images: list[Rendering]) -> "Reference":
+        """Reference from at least three images, sorted by steps that halve."""
         pairs = zip(differences(*images[-3:-1]), differences(*images[-2:]), strict=True)
-        # of both backgrounds: squares of the two differences, and their product
+        # for each background: mean squares of the two differences, and of their product
         means = [[probe.mean(np.mean(a * b, axis=-1)) for a, b in ((x, x), (y, y), (x, y))] for x, y in pairs]
-        before, last = (math.sqrt(max(each)) for each in list(zip(*means, strict=True))[:2])
+        before, last = (math.sqrt(max(squares)) for squares in list(zip(*means, strict=True))[:2])
         if last > max(before, ROUNDING):
-            return cls(probe, images[-1], 10 * last)  # steps pass over something: nothing is known yet
-        ratio = min(max(last / before if before > 0 else 0.0, FASTEST), SLOWEST)
-        turn = max(xy / math.sqrt(xx * yy) if xx * yy > 0 else 1.0 for xx, yy, xy in means)
-        turn = max(turn, -ratio / (1 + ratio**2))
-        # Of errors a, ratio a and ratio² a with the correlation c, differences have the one
-        # turn = (c (1 - ratio + ratio²) - ratio) / (1 + ratio² - 2 c ratio), less than c; solved for c.
-        alike = (turn * (1 + ratio**2) + ratio) / (1 - ratio + ratio**2 + 2 * ratio * turn)
-        alike = min(max(alike, 0.0), 1.0)
-        # last² = e² + (ratio e)² - 2 alike ratio e², where e is the error of the image before the last
-        own = last * ratio / math.sqrt(1 + ratio**2 - 2 * alike * ratio)
-        return cls(probe, images[-1], own, ratio, alike)
+            return cls(probe, images[-1], 10 * last)  # not converging: steps miss some features
+        r = min(max(last / before if before > 0 else 0.0, FASTEST), SLOWEST)
+        cosine = max(xy / math.sqrt(xx * yy) if xx * yy > 0 else 1.0 for xx, yy, xy in means)
+        cosine = max(cosine, -r / (1 + r**2))
+        # If errors a, r a and r² a have the correlation c, the cosine between their differences is
+        # (c (1 - r + r²) - r) / (1 + r² - 2 c r), which is less than c; solved for c.
+        c = min(max((cosine * (1 + r**2) + r) / (1 - r + r**2 + 2 * r * cosine), 0.0), 1.0)
+        # last² = e² + (r e)² - 2 c r e², where e is the error of the last but one image
+        return cls(probe, images[-1], last * r / math.sqrt(1 + r**2 - 2 * c * r), r, c)
 
     def error(self, image: Rendering) -> float:
         """Root mean square error of another image, over black or over white, whichever is greater; infinite
         if either is not finite, or rays used up their samples."""
-        squares = []
-        for square, doubt in map(self.probe.mean_square, differences(image, self.image)):
-            whole = square + self.own**2 + 2 * self.alike * math.sqrt(square) * self.own
-            # `own` is known from the same patches, and as little as the difference
-            squares.append(whole * (1 + CONFIDENT * doubt / square) if square > 0 else whole)
-        ended = any(bool(np.asarray(each.exhausted).any()) for each in (image, self.image))
+        squares, known = [], self.image_error
+        for square, deviation in map(self.probe.mean_square, differences(image, self.image)):
+            total = square + known**2 + 2 * self.correlation * math.sqrt(square) * known
+            # `known` is estimated from the same patches, with the same relative deviation
+            squares.append(total * (1 + CONFIDENT * deviation / square) if square > 0 else total)
+        ended = any(bool(np.asarray(part.exhausted).any()) for part in (image, self.image))
         return math.sqrt(max(squares)) if np.isfinite(squares).all() and not ended else math.inf
 
 
 def _patches(camera: Camera) -> tuple[int, int]:
-    """How many lie across and down an image."""
+    """Number of patches across and down an image."""
     width, height = camera.size
     return -(-width // SIDE), -(-height // SIDE)
 
 
-RAYS, LINES = 2**15, 2**10
-"""Rays, and lines of `POINTS`, that are computed at a time, by programs that images of all sizes share."""
-
-
 def _in_parts(program: Callable[..., Any], size: int, *arrays: np.ndarray) -> Iterator[Any]:
-    """Results, as NumPy arrays, of a program that takes as many elements of arrays at a time."""
+    """Results, as NumPy arrays, of a program of `size` elements of arrays at a time."""
     for begin in range(0, len(arrays[0]), size):
-        given = [each[begin : begin + size] for each in arrays]
-        missing = size - len(given[0])
-        found = program(
-            *(np.pad(each, ((0, missing), *((0, 0),) * (each.ndim - 1)), "edge") for each in given)
-        )
-        yield jax.tree.map(lambda each, count=size - missing: np.asarray(each)[:count], found)
+        parts = [array[begin : begin + size] for array in arrays]
+        count = len(parts[0])
+        padding = [((0, size - count), *((0, 0),) * (part.ndim - 1)) for part in parts]
+        results = program(*map(partial(np.pad, mode="edge"), parts, padding))
+        yield jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], results)
 
 
 def _rays(camera: Camera, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions of the rays of pixels, as of `Camera.ray`, in NumPy."""
+    """Origins and unit directions of pixels' rays, as by `Camera.ray`, in NumPy."""
     known = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), camera)
-    (left, right, bottom, top), (width, height) = known.window, camera.size
-    x = left + (right - left) * (column + 0.5) / width
-    y = top - (top - bottom) * (row + 0.5) / height
+    (x0, x1, y0, y1), (width, height) = known.window, camera.size
+    x = x0 + (x1 - x0) * (column + 0.5) / width
+    y = y1 - (y1 - y0) * (row + 0.5) / height
     across, up, forward = axes_of(known, np)
-    beside = x[:, None] * across + y[:, None] * up
+    offset = x[:, None] * across + y[:, None] * up
     if camera.parallel_scale is not None:
-        origins, directions = known.position + known.parallel_scale * beside, forward + 0 * beside
+        origins, directions = known.position + known.parallel_scale * offset, forward + 0 * offset
     else:
-        directions = forward + np.tan(np.deg2rad(known.view_angle) / 2) * beside
+        directions = forward + np.tan(np.deg2rad(known.view_angle) / 2) * offset
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        origins = known.position + 0 * beside
+        origins = known.position + 0 * offset
     dtype = np.dtype(camera.position.dtype)
     return origins.astype(dtype), directions.astype(dtype)
 
 
 @kept
 def _interval(place: Place, origins: Array, directions: Array) -> tuple[Array, Array]:
-    return place.space.interval(*(tuple(each.T) for each in (origins, directions)))
+    return place.space.interval(tuple(origins.T), tuple(directions.T))
 
 
 def _intervals(place: Place, *rays: np.ndarray) -> list[np.ndarray]:
@@ -300,21 +284,23 @@ def _intervals(place: Place, *rays: np.ndarray) -> list[np.ndarray]:
 def _passes(
     camera: Camera, place: Place, blocks: Bool[np.ndarray, "bx by bz"]
 ) -> Bool[np.ndarray, " patches"]:
-    """Whether the middle ray of each patch passes through one of the blocks."""
+    """Mask of the patches whose middle ray passes through a marked block."""
     across, down = _patches(camera)
-    row, column = (SIDE * each + (SIDE - 1) / 2 for each in np.divmod(np.arange(across * down), across))
+    row, column = (SIDE * index + (SIDE - 1) / 2 for index in np.divmod(np.arange(across * down), across))
     rays = _rays(camera, column, row)
     lines = *rays, *_intervals(place, *rays)
-    last, found = np.array(blocks.shape) - 1, []
-    for at, crosses in _in_parts(partial(_along, place), LINES, *lines):
+    last, masks = np.array(blocks.shape) - 1, []
+    for at, crosses in _in_parts(partial(_line_points, place), LINES, *lines):
         i, j, k = np.clip(np.floor(at / BLOCK).T, 0, last[:, None, None]).astype(int)
-        found.append(crosses & blocks[i, j, k].any(axis=0))
-    return np.concatenate(found)
+        masks.append(crosses & blocks[i, j, k].any(axis=0))
+    return np.concatenate(masks)
 
 
 @kept
-def _along(place: Place, origins: Array, directions: Array, nears: Array, fars: Array) -> tuple[Array, Array]:
-    """Grid coordinates of `POINTS` points along each ray, and whether it meets the volume."""
+def _line_points(
+    place: Place, origins: Array, directions: Array, nears: Array, fars: Array
+) -> tuple[Array, Array]:
+    """Grid coordinates of `POINTS` points along each ray, and whether the ray meets the volume."""
     space, parts = place.space, (jnp.arange(POINTS, dtype=nears.dtype) + 0.5) / POINTS
 
     def at(origin: Array, direction: Array, entry: Scalar, leave: Scalar, part: Scalar) -> Array:

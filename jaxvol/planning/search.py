@@ -1,4 +1,4 @@
-"""Which step and which quadrature are the cheapest within a tolerance?"""
+"""Search for the cheapest step and quadrature within a tolerance."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,31 +12,27 @@ from ..march.march import March, Quadrature, Transform
 from ..ray import Scene
 from ..scene.rendering import Rendering
 from ..scene.transfer import Transfer
-from .probe import Probe, Truth
+from .probe import Probe, Reference
 
 
+# Costs of a sample, and of a pixel without its samples, in samples by the midpoint rule. Fitted to the times
+# of `experiments.accuracy` (two CPU cores), whose ratios they predict within 9 % in the mean, 28 % at most.
 SAMPLE = {"midpoint": 1.0, "preintegrated": 2.5}
-"""Cost of a sample, as a multiple of one by the midpoint rule."""
-
 RAY = 22.0
-"""Cost of a pixel without its samples, in samples by the midpoint rule. Fitted, like `SAMPLE`, to the times
-of `experiments.accuracy` (two CPU cores), whose ratios they predict within 9 % in the mean, 28 % at most."""
 
+# Steps in voxels: the first, the shortest by the midpoint rule if cells can be integrated, and the shortest.
 COARSEST, FINE, FINEST = 2.0, 1 / 16, 1 / 128
-"""Voxels of the step that is tried first, and of the shortest: by the midpoint rule where cells can be
-integrated, too; and otherwise."""
 
+# Refinements between a step within the goal and a longer one, and the fraction of the goal they aim at.
 REFINED, AIM = 2, 0.97
-"""How often a step is sought between one that is within the goal and one that is not, and for which part of
-the goal."""
 
+# With at most WORTHWHILE samples a pixel by the midpoint rule, integrated cells save no more than 16 %, even
+# if they are four times as long. With steps shorter than FAIR voxels they may be longer.
 WORTHWHILE, FAIR = 16, 0.5
-"""Samples of a pixel, by the midpoint rule, below which cells that are integrated save no more than 16 %,
-even if they are four times as long; they may be longer where steps are shorter than FAIR voxels."""
 
 
 class Part(NamedTuple):
-    """What a plan keeps or leaves out, and why."""
+    """A decision of a plan, with its reason."""
 
     name: str
     kept: bool
@@ -46,161 +42,155 @@ class Part(NamedTuple):
 class Trial(NamedTuple):
     """A march and its image of the probe."""
 
-    step: float
-    """Voxels."""
+    step: float  # voxels
     march: March
     image: Rendering
-    samples: float
-    """Per pixel."""
+    samples: float  # per pixel
     error: float = math.inf
 
     @property
     def cost(self) -> float:
-        """Per pixel, in samples by the midpoint rule."""
+        """Cost per pixel, in samples by the midpoint rule."""
         return RAY + SAMPLE[self.march.quadrature] * self.samples
 
 
 @dataclass
 class Search:
-    """Marches of one scene, tried on some of its pixels."""
+    """Trial marches of one scene, rendered at the pixels of a probe."""
 
     probe: Probe
     scene: Scene
-    goal: float
-    """The error that the marches may have."""
-    beyond: float
-    """That of the image, above which the plan fails."""
-    voxel: float
-    """World length that steps are counted in."""
+    goal: float  # tolerance of a march
+    tolerance: float  # tolerance of the image
+    voxel: float  # world length, the unit of steps
     transforms: tuple[Transform, ...]
-    rendered: dict[tuple[float, Quadrature], Trial] = field(default_factory=dict)
-    """By step in voxels and quadrature."""
+    rendered: dict[tuple[float, Quadrature], Trial] = field(default_factory=dict)  # by step in voxels
 
     @property
     def integrable(self) -> bool:
-        """Whether cells can be integrated between their ends."""
+        """True if cells can be integrated between their ends."""
         return isinstance(self.scene.compositing, Over) and integrates(self.scene.transfer)
 
-    def cheapest(self, *, once: bool, between: bool = False) -> tuple[Trial, Truth, list[Part]]:
-        """The cheapest march within the goal, what images were compared with, and what was tried. `once`: as
-        for `plan`. `between`: what is visible may lie between samples, so that cells must be integrated."""
+    def cheapest(self, *, once: bool, between: bool = False) -> tuple[Trial, Reference, list[Part]]:
+        """The cheapest march within the goal, the reference, and the decisions. `once`: as for `plan`.
+        `between`: features may lie between samples, so that cells must be integrated."""
         integrable, between = self.integrable, between and self.integrable
         first: Quadrature = "preintegrated" if between else "midpoint"
-        found, truth = self._longest(first, last=between or not integrable)
-        if first == "midpoint" and found.error > self.goal and integrable and math.isfinite(found.error):
-            found, truth = self._longest("preintegrated", last=True)
-        if found.march.quadrature == "preintegrated" and found.error <= self.goal:
-            found = min(found, self._midpoint(found, truth), key=lambda trial: trial.cost)
-        if not math.isfinite(found.error):
+        trial, reference = self._longest(first, last=between or not integrable)
+        if first == "midpoint" and trial.error > self.goal and integrable and math.isfinite(trial.error):
+            trial, reference = self._longest("preintegrated", last=True)
+        if trial.march.quadrature == "preintegrated" and trial.error <= self.goal:
+            trial = min(trial, self._midpoint(trial, reference), key=lambda trial: trial.cost)
+        if not math.isfinite(trial.error):
             why = "the image is not finite, or rays use up their samples"
-        elif found.error > self.goal:
-            why = f"{found.step:.2g} voxels, the shortest tried: not proven to be within the tolerance"
+        elif trial.error > self.goal:
+            why = f"{trial.step:.2g} voxels, the shortest tried: not proven to be within the tolerance"
         else:
-            why = f"{found.step:.3g} voxels, {found.march.quadrature}: RMSE {found.error:.2g}"
-        step_part = Part(_name(found), True, why)
-        if found.error > self.goal:
-            return found, truth, [step_part]
-        other = None
-        if found.march.quadrature == "preintegrated":
+            why = f"{trial.step:.3g} voxels, {trial.march.quadrature}: RMSE {trial.error:.2g}"
+        step_part = Part(_name(trial), True, why)
+        if trial.error > self.goal:
+            return trial, reference, [step_part]
+        integrated = None
+        if trial.march.quadrature == "preintegrated":
             why = "the midpoint rule would be slower within the tolerance"
-        elif found.samples <= WORTHWHILE and found.step >= FAIR:
-            why = f"{found.samples:.1f} samples a pixel: too few to save any"
+        elif trial.samples <= WORTHWHILE and trial.step >= FAIR:
+            why = f"{trial.samples:.1f} samples a pixel: too few to save any"
         elif once:
-            why = "not tried for one image: a program of its own takes longer to compile than it saves"
+            why = "not tried for one image: an extra program takes longer to compile than it saves"
         elif not integrable:
             why = "these cells cannot be integrated"
-        elif other := self._integrated(found.step, truth):
-            fewer = f"{other.samples:.1f} samples a pixel for {found.samples:.1f}"
-            why = f"{_name(other)}, {fewer}: cost {other.cost / found.cost:.2f}"
+        elif integrated := self._integrated(trial.step, reference):
+            fewer = f"{integrated.samples:.1f} samples a pixel for {trial.samples:.1f}"
+            why = f"{_name(integrated)}, {fewer}: cost {integrated.cost / trial.cost:.2f}"
         else:
             why = "not within the tolerance where it would be faster"
-        chosen = found if other is None or other.cost >= found.cost else other
-        integrated = Part("preintegrated", chosen.march.quadrature == "preintegrated", why)
-        return chosen, truth, [step_part._replace(kept=chosen is found), integrated]
+        chosen = trial if integrated is None or integrated.cost >= trial.cost else integrated
+        quadrature_part = Part("preintegrated", chosen.march.quadrature == "preintegrated", why)
+        return chosen, reference, [step_part._replace(kept=chosen is trial), quadrature_part]
 
     def render(self, step: float, quadrature: Quadrature) -> Trial:
-        """Steps of this length, in voxels."""
+        """Trial of a step, in voxels."""
         if (step, quadrature) not in self.rendered:
             march = March(step * self.voxel, self.transforms, quadrature)
             image = self.probe.render(self.scene, march)
             self.rendered[step, quadrature] = Trial(step, march, image, self.probe.mean(image.samples))
         return self.rendered[step, quadrature]
 
-    def _longest(self, quadrature: Quadrature, *, last: bool) -> tuple[Trial, Truth]:
-        """The longest steps within the goal, compared with steps of half of them or less, and with what these
-        still err by. If there are none, the finest, whose error is not known: just `beyond`, or more. `last`:
-        whether no other quadrature is left, so that no step is given up early."""
+    def _longest(self, quadrature: Quadrature, *, last: bool) -> tuple[Trial, Reference]:
+        """The longest step within the goal, compared with at most half of it and including the reference's
+        error. If there is none, the finest step, with an error just above `tolerance`, or more. `last`: no
+        other quadrature remains, so that the search does not stop early."""
         steps, finest = [COARSEST, COARSEST / 2, COARSEST / 4], FINEST if last else FINE
         while True:
-            truth = Truth.of(self.probe, [self.render(step, quadrature).image for step in steps])
-            tried = [self._trial(step, quadrature, truth) for step in steps[-3:-1]]
-            found = next((each for each in tried if each.error <= self.goal), tried[-1])
-            if found.error <= self.goal:
-                return self._between(found, self._trial(2 * found.step, quadrature, truth), truth), truth
-            left = truth.own * truth.ratio ** math.log2(steps[-1] / finest)  # of the finest steps, likely
-            hopeless = left > self.goal and not last
-            if steps[-1] <= finest or hopeless or not math.isfinite(found.error):
+            reference = Reference.of(self.probe, [self.render(step, quadrature).image for step in steps])
+            tried = [self._trial(step, quadrature, reference) for step in steps[-3:-1]]
+            trial = next((trial for trial in tried if trial.error <= self.goal), tried[-1])
+            if trial.error <= self.goal:
+                longer = self._trial(2 * trial.step, quadrature, reference)
+                return self._between(trial, longer, reference), reference
+            expected = reference.image_error * reference.ratio ** math.log2(steps[-1] / finest)
+            hopeless = expected > self.goal and not last
+            if steps[-1] <= finest or hopeless or not math.isfinite(trial.error):
                 break
             steps.append(steps[-1] / 2)
-        if not math.isfinite(found.error):
-            return found, truth
-        unknown = max(truth.own, math.nextafter(self.beyond, math.inf))
-        return self._trial(steps[-1], quadrature, truth)._replace(error=unknown), truth
+        if not math.isfinite(trial.error):
+            return trial, reference
+        unknown = max(reference.image_error, math.nextafter(self.tolerance, math.inf))
+        return self._trial(steps[-1], quadrature, reference)._replace(error=unknown), reference
 
-    def _midpoint(self, integrated: Trial, truth: Truth) -> Trial:
-        """The longest steps within the goal by the midpoint rule, if some are that take no longer: the truth
-        that integrated cells give is known better than its own."""
+    def _midpoint(self, integrated: Trial, reference: Reference) -> Trial:
+        """The longest step within the goal by the midpoint rule, if it takes no longer; else `integrated`.
+        The reference by integrated cells is more accurate than that by the midpoint rule."""
         steps = sorted(step for step, quadrature in self.rendered if quadrature == "midpoint")
-        tried = [self._trial(step, "midpoint", truth) for step in steps]
-        if all(each.error > self.goal for each in tried):
+        tried = [self._trial(step, "midpoint", reference) for step in steps]
+        if all(trial.error > self.goal for trial in tried):
             as_fast = integrated.step / SAMPLE["preintegrated"]
-            tried.append(self._trial(as_fast, "midpoint", truth))
+            tried.append(self._trial(as_fast, "midpoint", reference))
             tried.sort(key=lambda trial: trial.step)
-        within = [k for k, each in enumerate(tried) if each.error <= self.goal]
+        within = [k for k, trial in enumerate(tried) if trial.error <= self.goal]
         if not within:
             return integrated
-        return self._between(tried[within[-1]], tried[min(within[-1] + 1, len(tried) - 1)], truth)
+        return self._between(tried[within[-1]], tried[min(within[-1] + 1, len(tried) - 1)], reference)
 
-    def _between(self, within: Trial, beyond: Trial, truth: Truth) -> Trial:
-        """The longest steps within the goal that are found between two, of which the first is; the second, if
-        that is, too."""
-        if beyond.error <= self.goal:
-            return beyond
+    def _between(self, short: Trial, long: Trial, reference: Reference) -> Trial:
+        """The longest step within the goal, from `short`, which is within it, to `long`."""
+        if long.error <= self.goal:
+            return long
         for _ in range(REFINED):
-            step = math.sqrt(within.step * beyond.step)
-            if 0 < within.error < beyond.error < math.inf:  # as a power of the step, not too near to either
-                power = math.log(beyond.error / within.error) / math.log(beyond.step / within.step)
-                sought = within.step * (AIM * self.goal / within.error) ** (1 / power)
-                step = min(max(sought, math.sqrt(within.step * step)), math.sqrt(step * beyond.step))
-            trial = self._trial(step, within.march.quadrature, truth)
-            within, beyond = (trial, beyond) if trial.error <= self.goal else (within, trial)
-        return within
+            step = math.sqrt(short.step * long.step)
+            if 0 < short.error < long.error < math.inf:  # the error is a power of the step; keep off the ends
+                power = math.log(long.error / short.error) / math.log(long.step / short.step)
+                estimate = short.step * (AIM * self.goal / short.error) ** (1 / power)
+                step = min(max(estimate, math.sqrt(short.step * step)), math.sqrt(step * long.step))
+            trial = self._trial(step, short.march.quadrature, reference)
+            short, long = (trial, long) if trial.error <= self.goal else (short, trial)
+        return short
 
-    def _trial(self, step: float, quadrature: Quadrature, truth: Truth) -> Trial:
+    def _trial(self, step: float, quadrature: Quadrature, reference: Reference) -> Trial:
         trial = self.render(step, quadrature)
-        return trial._replace(error=truth.error(trial.image))
+        return trial._replace(error=reference.error(trial.image))
 
-    def _integrated(self, step: float, truth: Truth) -> Trial | None:
-        """Pre-integration with the longest steps within the goal, if that may be faster than the midpoint
-        rule with this `step`, in voxels."""
-        found, longer = None, step * SAMPLE["preintegrated"]
+    def _integrated(self, step: float, reference: Reference) -> Trial | None:
+        """Pre-integration with the longest step within the goal that may be faster than the midpoint rule
+        with `step`, in voxels."""
+        longest, longer = None, step * SAMPLE["preintegrated"]
         while longer <= 2 * COARSEST:
-            trial = self._trial(longer, "preintegrated", truth)
+            trial = self._trial(longer, "preintegrated", reference)
             if trial.error > self.goal:
                 break
-            found, longer = trial, longer * 1.5
-        return found
+            longest, longer = trial, longer * 1.5
+        return longest
 
 
 def integrates(transfer: Transfer) -> bool:
-    """Whether a transfer function's cells can be integrated between their ends."""
+    """Tests whether a transfer function's cells can be integrated between their ends."""
     leaves, structure = jax.tree.flatten(transfer)
     return _integrates(structure, *map(jax.typeof, leaves))
 
 
 @cache
 def _integrates(structure: Any, *types: Any) -> bool:
-    # as shapes: its tables take seconds to compile, operation by operation
+    # by shapes: compiling its tables operation by operation would take seconds
     known: list[bool] = []
     jax.eval_shape(
         lambda transfer: known.append(transfer.integrator() is not None), jax.tree.unflatten(structure, types)

@@ -1,1 +1,1 @@
-"""What XLA needs to be told, or told in a certain way: memory, loops, devices, kept programs."""
+"""Control of XLA: memory, loops, devices, differentiation, and programs kept in files."""

@@ -1,4 +1,4 @@
-"""Gathers some entries of arrays, and processes them in chunks of fixed size."""
+"""Compaction: selected entries of arrays, processed in chunks of fixed size."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,22 +11,18 @@ from .sharding import varying
 from .trees import PyTree
 
 
-CHUNK = 2048
-"""Entries processed at a time, if nothing else is asked for."""
-
-
-ROW = 128
-"""Entries that are counted by one product."""
+CHUNK = 2048  # entries processed at a time by default
+ROW = 128  # entries that are counted by one product
 
 
 class Chosen(NamedTuple):
-    """Chosen entries of arrays (rows, columns), of which there may be several, stacked along the rows.
+    """Chosen entries of one or more arrays (rows, columns), stacked along the rows.
 
     Attributes:
         indices: flat indices of the chosen entries, padded with indices past the end.
-        number: how many are chosen.
-        columns: of the arrays.
-        chunk: entries processed at a time; all, chosen or not, if 0.
+        number: number of chosen entries.
+        columns: number of columns of the arrays.
+        chunk: entries processed at a time; 0 for all entries, chosen or not.
     """
 
     indices: Int[Array, " entries"]
@@ -36,47 +32,46 @@ class Chosen(NamedTuple):
 
     @classmethod
     def of(cls, chosen: list[Bool[Array, "rows columns"]], chunk: int = CHUNK) -> "Chosen":
-        """The entries where these are true."""
-        whole = jnp.concatenate(chosen)
-        number = jnp.sum(whole, dtype=jnp.int32)
-        flat = whole.reshape(-1)
+        """The entries where the masks are true."""
+        stacked = jnp.concatenate(chosen)
+        number, flat = jnp.sum(stacked, dtype=jnp.int32), stacked.reshape(-1)
         indices = in_front(flat, chunk) if chunk > 0 else in_place(flat)
-        return cls(indices, number, whole.shape[1], chunk)
+        return cls(indices, number, stacked.shape[1], chunk)
 
-    def fold(self, one: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
-        """Folds `one(indices, carry)` over the chunks of indices."""
+    def fold(self, step: Callable[[Int[Array, " chunk"], PyTree], PyTree], start: PyTree) -> PyTree:
+        """Folds `step(indices, carry)` over the chunks of indices."""
         if self.chunk == 0:
-            return one(self.indices, start)
+            return step(self.indices, start)
 
         def body(state: tuple[Int[Array, ""], PyTree]) -> tuple[Int[Array, ""], PyTree]:
             i, carry = state
-            return i + 1, one(jax.lax.dynamic_slice_in_dim(self.indices, i * self.chunk, self.chunk), carry)
+            return i + 1, step(jax.lax.dynamic_slice_in_dim(self.indices, i * self.chunk, self.chunk), carry)
 
         begin = varying((jnp.zeros((), jnp.int32), start), self.number)
         return jax.lax.while_loop(lambda state: state[0] * self.chunk < self.number, body, begin)[1]
 
     def take(self, arrays: list[PyTree], indices: Int[Array, " chunk"]) -> PyTree:
-        """The entries at these flat indices."""
+        """Gathers the entries at flat indices."""
 
         def entries(*leaves: Array) -> Array:
             return jnp.concatenate(leaves).reshape(-1).at[indices].get(mode="clip")
 
         return jax.tree.map(entries, *arrays)
 
-    def put(self, whole: PyTree, indices: Int[Array, " chunk"], part: PyTree) -> PyTree:
-        """Flat arrays with these entries at these indices."""
-        return jax.tree.map(lambda leaf, new: leaf.at[indices].set(new, mode="drop"), whole, part)
+    def put(self, flat: PyTree, indices: Int[Array, " chunk"], entries: PyTree) -> PyTree:
+        """Scatters entries to flat arrays."""
+        return jax.tree.map(lambda leaf, new: leaf.at[indices].set(new, mode="drop"), flat, entries)
 
-    def split(self, whole: PyTree, arrays: int) -> list[PyTree]:
-        """Flat arrays, split into so many arrays (rows, columns) again."""
-        leaves, tree = jax.tree.flatten(whole)
-        each = (leaf.reshape(arrays, -1, self.columns) for leaf in leaves)
-        return [jax.tree.unflatten(tree, part) for part in zip(*each, strict=True)]
+    def split(self, flat: PyTree, number: int) -> list[PyTree]:
+        """Splits flat arrays into `number` arrays (rows, columns)."""
+        leaves, tree = jax.tree.flatten(flat)
+        parts = (leaf.reshape(number, -1, self.columns) for leaf in leaves)
+        return [jax.tree.unflatten(tree, part) for part in zip(*parts, strict=True)]
 
 
 def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, " padded"]:
     """Indices of the chosen entries, in order, then indices past the end, up to a multiple of `chunk` (itself
-    one of 128). Faster than `jnp.nonzero`: counts are products of rows of 128 with a triangular matrix."""
+    a multiple of 128). Counts by products with a triangular matrix are faster than `jnp.nonzero`."""
     padded = jnp.pad(chosen, (0, -chosen.size % chunk))
     last = padded.size
     # exact: numbers of entries are below 2²⁴
@@ -89,12 +84,12 @@ def in_front(chosen: Bool[Array, " entries"], chunk: int = CHUNK) -> Int[Array, 
 
 
 def in_place(chosen: Bool[Array, " entries"]) -> Int[Array, " entries"]:
-    """Indices of the chosen entries, where these are; past the end for all others."""
+    """Index of each chosen entry at its own position; past the end for all others."""
     return jnp.where(chosen, jnp.arange(chosen.size, dtype=jnp.int32), chosen.size)
 
 
 def _sums_before(counts: Float[Array, " entries"]) -> Float[Array, " entries"]:
-    """Of each entry, the sum of those before it."""
+    """Exclusive prefix sums."""
     rows = jnp.pad(counts, (0, -counts.size % ROW)).reshape(-1, ROW)
     entry = jnp.arange(ROW)
     earlier = (entry[:, None] < entry[None]).astype(counts.dtype)

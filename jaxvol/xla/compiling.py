@@ -1,4 +1,4 @@
-"""Compiles functions to programs, with rules by which JAX batches and differentiates these as a whole."""
+"""Compilation of functions to programs, with rules by which JAX batches and differentiates them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,38 +12,41 @@ from jaxtyping import Array
 from .differentiation import transformations
 from .kept_programs import kept
 from .platform import is_traced
-from .trees import PyTree
 
 
 OPTIONS = {
-    # 16 lanes where the processor has them; XLA's default is 8
+    # 16 lanes on processors that have them; XLA's default is 8
     "xla_cpu_prefer_vector_width": 512,
-    # kernels one after the other, each on all threads, rather than several at once on one thread each
+    # one kernel at a time on all threads, instead of several on one thread each
     "xla_cpu_enable_concurrency_optimized_scheduler": False,
 }
-"""Compiler options: programs are 10 to 20 % faster on CPU. They mean nothing on other backends."""
+"""Compiler options: programs are 10 to 20 % faster on CPU. Other backends ignore them."""
 
 
 def compiled(
     function: Callable[..., Any], *, has_jvp: bool = False, by_jvp: bool = False, in_turn: bool = True
 ) -> Callable[..., Any]:
-    """The function under jit, compiled with `OPTIONS` where it is not part of a larger program. `jax.vmap`
-    runs it for one element after the other, in one program: batched, both sides of branches would run, and
-    loops until the last element is finished, 3 to 18 times slower.
+    """The function under jit, compiled with `OPTIONS` unless it is part of a larger program. `jax.vmap` loops
+    over the elements in one program: batching would run both sides of branches, and loops until the last
+    element is finished, 3 to 18 times slower.
 
-    `has_jvp`: JAX differentiates it, and cannot linearize a batching rule: operations are batched unless
-    `jax.vmap` is the innermost transformation. `by_jvp`: JAX differentiates it in forward mode alone, through
-    the rule, also under another `jax.jit`. `in_turn`: False to batch always, as for tangents, on which no
-    branch and no loop depends.
+    Args:
+        function: the function.
+        has_jvp: JAX differentiates the function. It cannot linearize a batching rule, so `jax.vmap` loops
+            only if it is the innermost transformation; otherwise operations are batched.
+        by_jvp: JAX differentiates the function in forward mode only, through the rule, also under another
+            `jax.jit`.
+        in_turn: False to batch always, as for tangents, on which no branch and no loop depends.
     """
     nested, outermost = eqx.filter_jit(function), kept(function, compiler_options=OPTIONS)
-    looped = _in_turn(function, nested)
+    looped = _with_loop_rule(function, nested)
 
     def run(*args: Any) -> Any:
-        # inside a larger program or a transformation, compiler options are not allowed
-        if not is_traced(args, _probe()):
+        if not in_program(*args):  # JAX allows compiler options only for an outermost program
             return outermost(*args)
-        batched = not in_turn or (has_jvp and not _only_vmapped(args)) or (by_jvp and _is_pushed(args))
+        kinds = {kind for leaf in jax.tree.leaves(args) for kind in transformations(leaf)[:1]}
+        pushed = by_jvp and not kinds.isdisjoint({"JVPTracer", "LinearizeTracer"})
+        batched = not in_turn or pushed or (has_jvp and kinds != {"BatchTracer"})
         return nested(*args) if batched else looped(*args)
 
     return run
@@ -51,17 +54,17 @@ def compiled(
 
 @jax.jit
 def _probe() -> Array:
-    """A tracer wherever a program is being traced; compiled, since this is asked for each image."""
+    """A tracer while a program is traced. Compiled, since each image calls it."""
     return jnp.zeros(())
 
 
 def in_program(*args: Any) -> bool:
-    """Whether arguments are traced, or a program is being traced around this call."""
+    """Tests whether arguments are traced, or a program is traced around this call."""
     return is_traced(args, _probe())
 
 
 def computed_now(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)` of concrete arrays, computed at once also where a larger program is being traced."""
+    """`function(*args)` of concrete arrays, computed immediately even while a larger program is traced."""
     if not is_traced(_probe()):
         return function(*args)
     # not by `jax.ensure_compile_time_eval`, inside which jax 0.7 cannot compile a loop
@@ -69,55 +72,43 @@ def computed_now(function: Callable[..., Any], *args: Any) -> Any:
     return jitted.lower(*args).compile()(*args)
 
 
-def _only_vmapped(args: PyTree) -> bool:
-    """Whether `jax.vmap` is the innermost transformation of every traced argument."""
-    kinds = {transformations(leaf)[0] for leaf in jax.tree.leaves(args) if is_traced(leaf)}
-    return kinds == {"BatchTracer"}
-
-
-def _is_pushed(args: PyTree) -> bool:
-    """Whether a tangent is pushed through the arguments."""
-    kinds = [kind for leaf in jax.tree.leaves(args) for kind in transformations(leaf)[:1]]
-    return any(kind in ("JVPTracer", "LinearizeTracer") for kind in kinds)
-
-
 def _is_array(leaf: Any) -> bool:
     return eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.generic)
 
 
-def _in_turn(function: Callable[..., Any], nested: Callable[..., Any]) -> Callable[..., Any]:
+def _with_loop_rule(function: Callable[..., Any], nested: Callable[..., Any]) -> Callable[..., Any]:
     """`nested`, which is `function` under jit, with a batching rule: a loop over the batch."""
 
     def run(*args: Any) -> Any:
-        arrays, rest = eqx.partition(args, _is_array)
+        arrays, static = eqx.partition(args, _is_array)
         leaves, tree = jax.tree.flatten(arrays)
 
         @jax.custom_batching.custom_vmap
-        def one(*leaves: Array) -> Any:
-            return nested(*eqx.combine(jax.tree.unflatten(tree, leaves), rest))
+        def element(*leaves: Array) -> Any:
+            return nested(*eqx.combine(jax.tree.unflatten(tree, leaves), static))
 
-        @one.def_vmap
+        @element.def_vmap
         def _(size: int, batched: Any, *leaves: Array) -> Any:
-            args = eqx.combine(jax.tree.unflatten(tree, leaves), rest)
-            found = _batch(function, tuple(batched), args)
-            return found, jax.tree.map(lambda _: True, found)
+            args = eqx.combine(jax.tree.unflatten(tree, leaves), static)
+            results = _batch(function, tuple(batched), args)
+            return results, jax.tree.map(lambda _: True, results)
 
-        return one(*leaves)
+        return element(*leaves)
 
     return run
 
 
-def _each(function: Callable[..., Any], batched: tuple[bool, ...], args: tuple[Any, ...]) -> Any:
-    """`function` of each element of the batch. `batched`: which arrays have a batch axis."""
-    arrays, rest = eqx.partition(args, _is_array)
+def _loop(function: Callable[..., Any], batched: tuple[bool, ...], args: tuple[Any, ...]) -> Any:
+    """Loop of `function` over a batch. `batched`: mask of the arrays with a batch axis."""
+    arrays, static = eqx.partition(args, _is_array)
     leaves, tree = jax.tree.flatten(arrays)
 
-    def one(moving: list[Array]) -> Any:
-        remaining = iter(moving)
-        own = [next(remaining) if moves else leaf for leaf, moves in zip(leaves, batched, strict=True)]
-        return function(*eqx.combine(jax.tree.unflatten(tree, own), rest))
+    def element(parts: list[Array]) -> Any:
+        part = iter(parts)
+        leaves_ = [next(part) if moves else leaf for leaf, moves in zip(leaves, batched, strict=True)]
+        return function(*eqx.combine(jax.tree.unflatten(tree, leaves_), static))
 
-    return jax.lax.map(one, [leaf for leaf, moves in zip(leaves, batched, strict=True) if moves])
+    return jax.lax.map(element, [leaf for leaf, moves in zip(leaves, batched, strict=True) if moves])
 
 
-_batch = compiled(_each)
+_batch = compiled(_loop)

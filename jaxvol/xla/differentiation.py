@@ -1,4 +1,4 @@
-"""Which of JAX's transformations does an array undergo, and which modes of differentiation are refused?"""
+"""Detection of JAX's transformations, and errors for modes of differentiation that are not supported."""
 
 from collections.abc import Iterator
 from itertools import chain
@@ -15,8 +15,8 @@ from .platform import is_traced
 from .trees import PyTree
 
 
-def tracers(leaf: Any) -> Iterator[Any]:
-    """JAX's tracers around an array, the innermost first. Those outside of a `jax.jit` cannot be seen."""
+def tracers(leaf: object) -> Iterator[Any]:
+    """JAX's tracers around an array, the innermost first. Those outside of a `jax.jit` are invisible."""
     while is_traced(leaf):
         yield leaf
         leaf = getattr(leaf, "primal", getattr(leaf, "val", None))
@@ -36,50 +36,50 @@ def refuse_reverse_mode(tree: PyTree, message: str) -> None:
             raise ValueError(message)
 
 
-def check_captured(what: str, function: Any) -> None:
-    """Raises `ValueError` for a function that captures a value to be differentiated in reverse mode, which no
-    primitive with a derivative of its own would see."""
+def check_captured(name: str, function: object) -> None:
+    """Raises `ValueError` for a closure over a value that is differentiated in reverse mode: a primitive with
+    a custom derivative would miss it."""
     cells = getattr(function, "__closure__", None) or ()
     captured = jax.tree.leaves([cell.cell_contents for cell in cells])
     if any("LinearizeTracer" in transformations(leaf) for leaf in captured):
         raise ValueError(
-            f"{what} captures a value that is differentiated: hold it as an array of an eqx.Module that has "
+            f"{name} captures a value that is differentiated: hold it as an array of an eqx.Module that has "
             "a __call__, or of the field or transfer function itself."
         )
 
 
 def forward_only(tree: PyTree, message: str) -> PyTree:
-    """The tree, unchanged. Under reverse mode it raises `ValueError` with this message."""
+    """Identity. Under reverse mode it raises `ValueError` with `message`."""
 
     @jax.custom_jvp
-    def same(leaf: Array) -> Array:
+    def identity(leaf: Array) -> Array:
         return leaf
 
-    @same.defjvp
+    @identity.defjvp
     def _(primal: tuple[Array], tangent: tuple[Array]) -> tuple[Array, Array]:
         return primal[0], not_transposed(*tangent, message)
 
-    return jax.tree.map(lambda leaf: same(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
+    return jax.tree.map(lambda leaf: identity(leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 def nan_derivatives(tree: PyTree, fault: Array) -> PyTree:
-    """The tree; where `fault` is true, its derivatives are NaN in either mode, even if they would be 0."""
+    """Identity whose derivatives are NaN in both modes where `fault` is true, even if they would be 0."""
 
     @jax.custom_jvp
-    def same(leaf: Array, factor: Array) -> Array:
+    def identity(leaf: Array, factor: Array) -> Array:
         return leaf
 
-    @same.defjvp
+    @identity.defjvp
     def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
         leaf, factor = primals
         return leaf, tangents[0] * factor.astype(leaf.dtype)
 
     factor = jnp.where(fault, jnp.nan, 1.0)
-    return jax.tree.map(lambda leaf: same(leaf, factor) if eqx.is_inexact_array(leaf) else leaf, tree)
+    return jax.tree.map(lambda leaf: identity(leaf, factor) if eqx.is_inexact_array(leaf) else leaf, tree)
 
 
 def not_transposed(tangents: PyTree, message: str) -> PyTree:
-    """Tangents, unchanged. To transpose them raises `ValueError` with this message."""
+    """Identity of tangents. Its transpose raises `ValueError` with `message`."""
     return jax.tree.map(lambda tangent: _TANGENT.bind(tangent, message=message), tangents)
 
 
@@ -87,7 +87,7 @@ def _refuse(cotangent: Any, tangent: Any, *, message: str) -> Any:
     raise ValueError(message)
 
 
-# The identity, whose transpose is an error. (`jax.custom_derivatives.linear_call` cannot be batched.)
+# Identity whose transpose is an error. (`jax.custom_derivatives.linear_call` cannot be batched.)
 _TANGENT = Primitive("forward_only")
 _TANGENT.def_impl(lambda tangent, *, message: tangent)
 _TANGENT.def_abstract_eval(lambda tangent, *, message: tangent)

@@ -1,9 +1,9 @@
-"""Keeps lowered programs in files, so that the next process neither traces nor lowers them again.
+"""Keeps lowered programs in files, so that later processes neither trace nor lower them.
 
-JAX's persistent cache keeps what XLA compiles, under a hash of the lowered program: to find it, a process
-traces and lowers first, which takes four times as long as to read it. `kept` also stores the lowered program
-(`jax.export`), under a key of its own. Files are JSON and flatbuffers behind a checksum, never unpickled. As
-JAX's cache, the folder is trusted: who may write to it may run code.
+JAX's persistent cache keeps compiled programs under a hash of the lowered program: a look-up requires tracing
+and lowering, which take four times as long as reading the file. `kept` also stores the lowered program
+(`jax.export`) under a separate key. Files are JSON and flatbuffers behind a checksum, never unpickled. As for
+JAX's cache, the folder is trusted: whoever may write to it may run code.
 """
 
 import hashlib
@@ -28,12 +28,11 @@ from jax.interpreters import mlir
 
 from .persistent_cache import kept_folder
 from .platform import gathers_are_fast, platform
+from .trees import PyTree
 
 
 MAGIC = b"jaxvol program 2\n"
-
-MOST_BYTES = 2**28
-"""Of a file that is read."""
+MAX_BYTES = 2**28  # of a file
 
 CONFIG = (
     "jax_enable_x64",
@@ -41,7 +40,7 @@ CONFIG = (
     "jax_threefry_partitionable",
     "jax_numpy_dtype_promotion",
 )
-"""Settings of JAX that change what is traced."""
+"""Settings of JAX that change the traced program."""
 
 ARRAYS = jax.Array, np.ndarray, np.generic
 
@@ -49,144 +48,137 @@ PACKAGE = Path(__file__).parents[1]
 
 
 class NotKept(Exception):
-    """Raised for what means something else in another process."""
+    """Raised for an object that may differ in another process."""
 
 
 def kept(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`equinox.filter_jit(function, **options)`, whose lowered programs are kept where `keep_programs` keeps
-    compiled ones.
-
-    Args:
-        function: of concrete arguments. It depends on nothing but these and the code of jaxvol. Where they
-            hold anything else, such as a user's class, whose code may change, its programs are not kept.
-    """
+    """`equinox.filter_jit(function, **options)`, whose lowered programs are kept in the folder of
+    `keep_programs`. The function must depend only on its arguments, which are concrete, and on the code of
+    jaxvol. Programs of arguments with other code, such as a user's class, are not kept."""
     programs: dict[Any, Callable[..., Any]] = {}
 
     def run(*args: Any) -> Any:
-        arrays, rest = _apart(args)
-        key = *rest, None
-        # arrays on devices of a user's choice may be spread over several
+        arrays, static = _split(args)
+        key = *static, None
+        # committed arrays may be sharded over several devices
         keeps = kept_folder() is not None and not any(getattr(leaf, "committed", False) for leaf in arrays)
         if keeps:
             types = tuple(getattr(leaf, "aval", None) or jax.typeof(leaf) for leaf in arrays)
-            key = (
-                *rest,
-                (types, platform(), gathers_are_fast(), *(getattr(jax.config, name) for name in CONFIG)),
-            )
+            settings = platform(), gathers_are_fast(), *(getattr(jax.config, name) for name in CONFIG)
+            key = *static, (types, *settings)
         if key not in programs:
-            flat = _flat(function, rest)
-            found = _exported(function, args, flat, key[-1], options) if keeps else None
-            programs[key] = jax.jit(flat, **options) if found is None else found
-        return _together(*programs[key](*arrays))
+            flat = _flat(function, static)
+            program = _exported(function, args, flat, key[-1], options) if keeps else None
+            programs[key] = jax.jit(flat, **options) if program is None else program
+        return _merge(*programs[key](*arrays))
 
     return run
 
 
-class Rest(NamedTuple):
+class Static(NamedTuple):
     """A tree without its arrays."""
 
     structure: Any
-    leaves: tuple[Any, ...]
+    leaves: tuple[Any, ...]  # None in place of arrays
 
 
-# a node without children: `jax.jit` returns it as it is for arguments of these types
-jax.tree_util.register_pytree_node(Rest, lambda rest: ((), tuple(rest)), lambda rest, _: Rest(*rest))
+# a node without children: `jax.jit` returns it unchanged for arguments of these types
+jax.tree_util.register_pytree_node(Static, lambda tree: ((), tuple(tree)), lambda data, _: Static(*data))
 
 
-def _apart(tree: Any) -> tuple[list[Any], Rest]:
+def _split(tree: Any) -> tuple[list[Any], Static]:
     leaves, structure = jax.tree.flatten(tree)
     dynamic = [isinstance(leaf, ARRAYS) for leaf in leaves]
-    rest = (None if is_array else leaf for leaf, is_array in zip(leaves, dynamic, strict=True))
-    return list(itertools.compress(leaves, dynamic)), Rest(structure, tuple(rest))
+    static = (None if is_array else leaf for leaf, is_array in zip(leaves, dynamic, strict=True))
+    return list(itertools.compress(leaves, dynamic)), Static(structure, tuple(static))
 
 
-def _together(arrays: Sequence[Any], rest: Rest) -> Any:
-    if len(arrays) < len(rest.leaves):
-        remaining = iter(arrays)
-        arrays = [next(remaining) if leaf is None else leaf for leaf in rest.leaves]
-    return jax.tree.unflatten(rest.structure, arrays)
+def _merge(arrays: Sequence[Any], static: Static) -> Any:
+    if len(arrays) < len(static.leaves):
+        array = iter(arrays)
+        arrays = [next(array) if leaf is None else leaf for leaf in static.leaves]
+    return jax.tree.unflatten(static.structure, arrays)
 
 
-def _flat(function: Callable[..., Any], rest: Rest) -> Callable[..., Any]:
-    """The function of arrays, which returns arrays, and a `Rest`."""
+def _flat(function: Callable[..., Any], static: Static) -> Callable[..., Any]:
+    """The function of arrays, which returns arrays and a `Static`."""
 
-    def flat(*arrays: Any) -> tuple[list[Any], Rest]:
-        return _apart(function(*_together(arrays, rest)))
+    def flat(*arrays: Any) -> tuple[list[Any], Static]:
+        return _split(function(*_merge(arrays, static)))
 
     flat.__name__ = getattr(function, "__name__", "program")
     return flat
 
 
 def _exported(
-    function: Callable[..., Any], args: Any, flat: Callable[..., Any], how: Any, options: Any
+    function: Callable[..., Any], args: Any, flat: Callable[..., Any], key: Any, options: Any
 ) -> Callable[..., Any] | None:
-    """The program of arguments like these: from its file, if that is there, else into it; None where it
-    cannot be kept."""
-    types, *settings = how
+    """The program of a key, read from its file, or exported to it; None if it cannot be kept."""
+    types, *settings = key
     try:
         called = described(function), described(args), list(map(repr, types)), list(map(repr, settings))
         text = json.dumps([*_versions(), jax.devices()[0].device_kind, repr(options), *called])
         file = Path(kept_folder() or "") / f"{hashlib.sha256(text.encode()).hexdigest()}.exported"
-        if (found := _read(file)) is None:
-            rest = []
+        if (content := _read(file)) is None:
+            statics = []
 
             def arrays(*leaves: Any) -> list[Any]:
-                results, other = flat(*leaves)
-                rest.append(other)
+                results, static = flat(*leaves)
+                statics.append(static)
                 return results
 
             arrays.__name__ = flat.__name__
             exported = export.export(jax.jit(arrays))(*types)
-            found = json.dumps(described(rest[0])).encode(), exported
-            _write(file, found[0], bytes(exported.serialize()))
-    # what cannot be exported: a callback of the host
+            content = json.dumps(described(statics[0])).encode(), exported
+            _write(file, content[0], bytes(exported.serialize()))
+    # callbacks of the host cannot be exported
     except (NotKept, OSError, ValueError, NotImplementedError):
         return None
-    rest, exported = rebuilt(json.loads(found[0])), found[1]
+    static, exported = rebuilt(json.loads(content[0])), content[1]
 
     def call(*leaves: Any) -> Any:
-        return _CALL.bind(*leaves, exported=exported), rest
+        return _CALL.bind(*leaves, exported=exported), static
 
     call.__name__ = flat.__name__
     return jax.jit(call, **options)
 
 
 def _read(file: Path) -> tuple[bytes, export.Exported] | None:
-    """What `described` tells of a program's result, and the program; None if the file is damaged."""
+    """Description of a program's result, and the program; None if the file is missing or damaged."""
     try:
-        if file.stat().st_size > MOST_BYTES:
+        if file.stat().st_size > MAX_BYTES:
             return None
         content = file.read_bytes()
     except OSError:
         return None
-    checksum, rest = content[len(MAGIC) : len(MAGIC) + 32], content[len(MAGIC) + 32 :]
-    if not content.startswith(MAGIC) or hashlib.sha256(rest).digest() != checksum:
+    checksum, body = content[len(MAGIC) : len(MAGIC) + 32], content[len(MAGIC) + 32 :]
+    if not content.startswith(MAGIC) or hashlib.sha256(body).digest() != checksum:
         return None
-    result, _, program = rest.partition(b"\n")
+    result, _, program = body.partition(b"\n")
     return result, export.deserialize(bytearray(program))
 
 
 def _write(file: Path, result: bytes, program: bytes) -> None:
-    rest = result + b"\n" + program
+    body = result + b"\n" + program
     with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".part", delete=False) as part:
         try:
-            part.write(MAGIC + hashlib.sha256(rest).digest() + rest)
+            part.write(MAGIC + hashlib.sha256(body).digest() + body)
             part.close()
-            os.replace(part.name, file)  # appears whole, also for processes that write it at the same time
+            os.replace(part.name, file)  # atomic, also if several processes write the file
         finally:
             Path(part.name).unlink(missing_ok=True)
 
 
 @cache
 def _versions() -> tuple[str, ...]:
-    """Versions of what traces, and a hash of jaxvol's code."""
+    """Versions of JAX and equinox, and a hash of jaxvol's code."""
     code = hashlib.sha256()
     for file in sorted(PACKAGE.rglob("*.py")):
         code.update(str(file.relative_to(PACKAGE)).encode() + b"\0" + file.read_bytes() + b"\0")
     return *(f"{name} {version(name)}" for name in ("jax", "jaxlib", "equinox")), code.hexdigest()
 
 
-# by `Exported.call` itself, results would be committed to a device
+# a primitive, since `Exported.call` alone would commit its results to a device
 _CALL = Primitive("kept_program")
 _CALL.multiple_results = True
 _CALL.def_impl(lambda *args, exported: exported.call(*args))  # under `jax.disable_jit`
@@ -197,17 +189,12 @@ mlir.register_lowering(
 )
 
 
-ARRAY: Any = object()
-"""Stands for an array in a tree of which only the rest is known."""
+ARRAY: Any = object()  # placeholder of an array in a tree
 
 
-def described(part: Any) -> Any:
-    """A tree in terms of JSON: the same for the same tree in every process, and another for another. Arrays
-    are all alike.
-
-    Raises:
-        NotKept: for what cannot be told by names and numbers.
-    """
+def described(part: PyTree) -> Any:
+    """Description of a tree in terms of JSON, equal in all processes, and different for different trees.
+    Arrays are not distinguished. Raises `NotKept` for an object that names and numbers do not describe."""
     if part is None or isinstance(part, bool | int | str):
         return part
     if isinstance(part, float):
@@ -219,17 +206,17 @@ def described(part: Any) -> Any:
     if isinstance(part, type | FunctionType):
         return {"name": _name(part)}
     if isinstance(part, partial):
-        return {"partial": [described(each) for each in (part.func, part.args, part.keywords)]}
+        return {"partial": list(map(described, (part.func, part.args, part.keywords)))}
     if isinstance(part, jax.tree_util.PyTreeDef):
         return {"structure": described(jax.tree.unflatten(part, [ARRAY] * part.num_leaves))}
     if isinstance(part, dict):
-        return {"dict": [[described(key), described(each)] for key, each in part.items()]}
-    if type(part) in (tuple, list):
+        return {"dict": [[described(key), described(value)] for key, value in part.items()]}
+    if type(part) is tuple or type(part) is list:
         return {type(part).__name__: list(map(described, part))}
     if isinstance(part, tuple):
         return {"fields": [_name(type(part)), list(map(described, part))]}
     if isinstance(part, eqx.Module):
-        fields = [[name, described(each)] for name, each in vars(part).items()]
+        fields = [[name, described(value)] for name, value in vars(part).items()]
         return {"module": [_name(type(part)), fields]}
     raise NotKept(type(part).__name__)
 
@@ -241,11 +228,11 @@ def _name(part: Any) -> str:
     return f"{module}:{part.__qualname__}"
 
 
-def rebuilt(told: Any) -> Any:
-    """The tree that `described` tells, with `ARRAY` for each array."""
-    if not isinstance(told, dict):
-        return told
-    ((kind, content),) = told.items()
+def rebuilt(description: PyTree) -> Any:
+    """The tree of a `described` result, with `ARRAY` in place of arrays."""
+    if not isinstance(description, dict):
+        return description
+    ((kind, content),) = description.items()
     match kind:
         case "float":
             return float.fromhex(content)
@@ -258,23 +245,22 @@ def rebuilt(told: Any) -> Any:
         case "structure":
             return jax.tree.structure(rebuilt(content))
         case "dict":
-            return {rebuilt(key): rebuilt(each) for key, each in content}
+            return {rebuilt(key): rebuilt(value) for key, value in content}
         case "tuple" | "list":
-            found = map(rebuilt, content)
-            return tuple(found) if kind == "tuple" else list(found)
+            return (tuple if kind == "tuple" else list)(map(rebuilt, content))
         case "fields":
             return _named(content[0])(*map(rebuilt, content[1]))
         case "module":
             module = object.__new__(_named(content[0]))
-            for name, each in content[1]:
-                object.__setattr__(module, name, rebuilt(each))
+            for name, value in content[1]:
+                object.__setattr__(module, name, rebuilt(value))
             return module
-    raise ValueError(f"results of a kept program hold no {kind!r}.")
+    raise ValueError(f"a description of a kept program must not have a {kind!r}.")
 
 
 def _named(name: str) -> Any:
     module, _, path = name.partition(":")
-    found: Any = import_module(module)
+    value: Any = import_module(module)
     for part in path.split("."):
-        found = getattr(found, part)
-    return found
+        value = getattr(value, part)
+    return value

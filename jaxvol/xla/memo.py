@@ -1,4 +1,4 @@
-"""Memoizes results computed from arrays, which are immutable, as long as these live: nothing goes stale."""
+"""Memoizes results computed from immutable arrays for the arrays' lifetime, so that none becomes stale."""
 
 import weakref
 from collections.abc import Callable, Hashable, Sequence
@@ -20,8 +20,8 @@ T = TypeVar("T")
 def memoized(
     array: Array | np.ndarray, compute: Callable[[Any], T], in_numpy: Callable[[Any], Any] | None = None
 ) -> T:
-    """`compute(array)`, once in the lifetime of a concrete array (under `jax.vmap`, of the batch), without a
-    gradient. `in_numpy`: the same in NumPy, without a program, unless the array was put on a device."""
+    """`compute(array)`, computed once in the lifetime of a concrete array (under `jax.vmap`, of the batch),
+    without a gradient. `in_numpy`: the function in NumPy, used unless the array is committed to a device."""
     if not isinstance(array, jax.Array):  # NumPy arrays are mutable
         return compute(array)
     if is_traced(array):
@@ -38,7 +38,7 @@ def memoized(
 
 
 def memoized_of(tree: PyTree, compute: Callable[[Any], T]) -> T:
-    """`compute(tree)`, computed once in the lifetime of all of the tree's arrays, which must be concrete."""
+    """`compute(tree)`, computed once in the lifetime of the tree's arrays, which must be concrete."""
     leaves, structure = jax.tree.flatten(tree)
     key = tuple(map(id, leaves)), structure, compute
     if key not in _MEMORY:
@@ -48,28 +48,28 @@ def memoized_of(tree: PyTree, compute: Callable[[Any], T]) -> T:
 
 
 def when_any_dies(parts: Sequence[Any], forget: Callable[[], Any]) -> None:
-    """Calls `forget` once, when the first of these parts is freed; the others are watched no longer."""
-    watched: list[Any] = []
+    """Calls `forget` once, when the first of the parts is freed."""
+    finalizers: list[Any] = []
 
     def first() -> None:
         forget()
-        for other in watched:
-            other.detach()
+        for finalizer in finalizers:
+            finalizer.detach()
 
-    watched += [weakref.finalize(part, first) for part in parts]
+    finalizers += [weakref.finalize(part, first) for part in parts]
 
 
 @cache
 def _of_batch(compute: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """`compute` of one array, with a batching rule that memoizes the results of a batch."""
-    one, several = jax.custom_batching.custom_vmap(compute), jax.vmap(compute)
+    single, batch = jax.custom_batching.custom_vmap(compute), jax.vmap(compute)
 
-    @one.def_vmap
+    @single.def_vmap
     def _(size: int, batched: list[bool], arrays: Array) -> Any:
-        results = memoized(arrays, several)
+        results = memoized(arrays, batch)
         return results, jax.tree.map(lambda _: True, results)
 
-    return one
+    return single
 
 
 _MEMORY: dict[Hashable, Any] = {}

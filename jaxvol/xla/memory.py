@@ -1,5 +1,5 @@
-"""Fetches values, keeps them in memory, and adds them up. GPUs add rows of one index one after the other: so
-zeros, which most samples of an ended march give, are left out there, and shared tables summed in copies."""
+"""Gathers, stores and sums values. A GPU adds rows of equal index sequentially: zeros, which come from most
+samples of finished rays, are skipped there, and shared tables are summed in copies."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,17 +13,14 @@ from .platform import on_gpu
 from .sharding import varying
 
 
-ALIGNED = 64
-"""Bytes. JAX does not copy a NumPy array to the CPU that begins at a multiple of it."""
-
-COPIES, ROWS = 128, 2**15
-"""On a GPU, the most copies of a table, and the most rows of all its copies."""
+ALIGNED = 64  # bytes; JAX on CPU does not copy a NumPy array that begins at a multiple of it
+COPIES, ROWS = 128, 2**15  # limits, on a GPU, of the copies of a table, and of the rows of all copies
 
 
 def row_sums(
     number: int, index: Int[Array, "*batch"], rows: Float[Array, "*batch columns"]
 ) -> Float[Array, "{number} columns"]:
-    """The sum of the rows of each index from 0 to before `number`, in which all indices lie."""
+    """Sums of the rows of equal index, for the indices 0 to `number` - 1; there must be no others."""
     if not on_gpu():
         zeros = jnp.zeros((number, rows.shape[-1]), rows.dtype)
         return zeros.at[index].add(rows, mode="promise_in_bounds")
@@ -38,17 +35,17 @@ def row_sums(
 def without_zeros(
     index: Int[Array, " rows"], rows: Float[Array, "rows columns"], end: int
 ) -> Int[Array, " rows"]:
-    """The indices of rows, but `end`, which is none, where nothing is to be added."""
+    """The indices of rows, with `end`, which is out of range, in place of those of zero rows."""
     return jnp.where(jnp.any(rows != 0, axis=-1), index, end)
 
 
 def gather(array: Array, index: Array) -> Array:
-    """`array[index]` along the first axis, for indices known to be in range: no check is compiled."""
+    """`array[index]` along the first axis, for indices known to be in range, without a check."""
     return array.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def zeros_in_reserve(length: int, dtype: Any) -> np.ndarray:
-    """NumPy zeros that `jax.device_put` does not copy, so that unwritten ones take no memory."""
+def zeros_in_reserve(length: int, dtype: np.dtype | type) -> np.ndarray:
+    """NumPy zeros that `jax.device_put` does not copy, so that unwritten pages take no memory."""
     size = length * np.dtype(dtype).itemsize
     reserved = np.zeros(size + ALIGNED, np.uint8)
     first = -reserved.ctypes.data % ALIGNED
@@ -56,7 +53,7 @@ def zeros_in_reserve(length: int, dtype: Any) -> np.ndarray:
 
 
 def packed_pair(a: Array, b: Array, factor: Array) -> Array:
-    """(a · factor, b · factor) in one array and kernel: of two arrays, XLA computes what they share twice."""
+    """(a · factor, b · factor) in one complex array: XLA would compute shared terms of two arrays twice."""
     return jax.lax.complex(a, b) * jax.lax.complex(factor, jnp.zeros_like(factor))
 
 
@@ -66,9 +63,9 @@ def unpacked_pair(pair: Array) -> tuple[Array, Array]:
 
 
 def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> Any:
-    """`f(*arguments)`, stored in memory as the result of a branch: XLA recomputes what it fuses for each use.
-    `live` must be true, unknown to XLA; if not, floats are NaN. On a GPU, where a branch waits for the host,
-    by an `optimization_barrier`, which has no such effect on CPU."""
+    """`f(*arguments)`, stored in memory as the result of a branch, since XLA recomputes a fused value for
+    each use. `live` must be true, but unknown to XLA; otherwise floats are NaN. On a GPU, where a branch
+    waits for the host, an `optimization_barrier` has this effect, which it lacks on CPU."""
     if on_gpu():
         return jax.lax.optimization_barrier(f(*arguments))
     plain = jax.jit(f, inline=True)  # traced once, for its shapes and as a branch
@@ -77,7 +74,7 @@ def in_memory(live: Bool[Array, ""], f: Callable[..., Any], *arguments: Any) -> 
         return varying(plain(*arguments), live, arguments)
 
     def never(*arguments: Any) -> Any:
-        def filled(leaf: Any) -> Array:
+        def filled(leaf: jax.ShapeDtypeStruct) -> Array:
             fill = jnp.nan if jnp.issubdtype(leaf.dtype, jnp.inexact) else 0
             return jnp.full(leaf.shape, fill, leaf.dtype)
 

@@ -1,4 +1,4 @@
-"""Holds the arrays of rays as rows of a few: XLA compiles a kernel for each array that is gathered."""
+"""Packs arrays of rays to rows of a few arrays, since XLA compiles a kernel for each gathered array."""
 
 import math
 from collections.abc import Callable
@@ -13,8 +13,8 @@ from .trees import PyTree
 
 
 class Row(NamedTuple):
-    """Where a leaf, of a dtype and a shape for each ray, lies in a packed tree: rows from `first` on of the
-    array of `kind`. Integers of 32 bits and truth values lie in float32, with the same bits."""
+    """Place of a leaf, with its dtype and shape per ray, in a packed tree: the rows from `first` on of the
+    array of `kind`. 32-bit integers and booleans are stored bitwise in float32."""
 
     kind: str
     first: int
@@ -35,7 +35,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, tree: PyTree) -> "Layout":
-        """That of a tree of arrays (groups, rays in a group, ...)."""
+        """Layout of a tree of arrays (groups, rays in a group, ...)."""
         leaves, structure = jax.tree.flatten(tree)
         rows, used = [], dict[str, int]()
         for leaf in leaves:
@@ -46,7 +46,7 @@ class Layout(NamedTuple):
         return cls(structure, tuple(rows))
 
     def pack(self, tree: PyTree) -> "Packed":
-        """The rows (rows, groups, rays in a group) of a tree."""
+        """Packs a tree to rows (rows, groups, rays in a group)."""
         rows = self._joined(tree, lambda leaf: leaf.reshape(*leaf.shape[:2], -1).transpose(2, 0, 1))
         return Packed(rows, self)
 
@@ -60,14 +60,14 @@ class Layout(NamedTuple):
 
 
 class Packed(eqx.Module):
-    """A tree of arrays as rows of a few arrays, by kind: a branch then need not store each leaf."""
+    """A tree of arrays as rows of one array per kind, so that a branch need not store each leaf."""
 
     rows: dict[str, Array]
     layout: Layout = eqx.field(static=True)
 
     @property
     def tree(self) -> PyTree:
-        """The tree, of arrays (groups, rays in a group, ...), or of what was taken, (lanes, ...)."""
+        """The unpacked tree, of arrays (groups, rays in a group, ...), or (lanes, ...) after `take`."""
         leaves = []
         for row in self.layout.rows:
             array = self.rows[row.kind]
@@ -83,16 +83,16 @@ class Packed(eqx.Module):
         return jax.tree.unflatten(self.layout.structure, leaves)
 
     def take(self, groups: Int[Array, " batch"]) -> "Packed":
-        """The rays of these groups, one after the other: lanes."""
+        """Gathers the rays of groups, flattened to lanes."""
 
-        def taken(array: Array) -> Array:
+        def gathered(array: Array) -> Array:
             part = array.at[:, groups].get(mode="promise_in_bounds", wrap_negative_indices=False)
             return part.reshape(array.shape[0], -1)
 
-        return Packed({kind: taken(array) for kind, array in self.rows.items()}, self.layout)
+        return Packed({kind: gathered(array) for kind, array in self.rows.items()}, self.layout)
 
     def put(self, groups: Int[Array, " batch"], tree: PyTree) -> "Packed":
-        """The same with a tree of lanes in these groups; groups past the end are dropped."""
+        """Replaces groups by a tree of lanes; groups past the end are dropped."""
         lanes = self.layout._joined(tree, lambda leaf: leaf.reshape(leaf.shape[0], -1).T)
 
         def replaced(array: Array, rows: Array) -> Array:

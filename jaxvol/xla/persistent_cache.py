@@ -1,4 +1,4 @@
-"""Where are compiled programs kept, so that the next process need not compile them again?"""
+"""Folder of compiled programs, so that later processes need not compile them."""
 
 import os
 from contextlib import suppress
@@ -7,12 +7,8 @@ from pathlib import Path
 import jax
 
 
-SHORTEST = 0.02
-"""Seconds of compilation from which on a program is kept: what is faster to compile than to read is not."""
-
-
-_CHOSEN: set[str] = set()
-"""Folders that `keep_programs` was told of."""
+SHORTEST = 0.02  # least compile time of a kept program, seconds: faster ones take longer to read
+_CHOSEN: set[str] = set()  # folders chosen by `keep_programs`
 
 
 def default_programs() -> Path:
@@ -27,28 +23,28 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
 
     XLA compiles a few programs for each kind of scene (transforms, light, size of the image), which takes
     some 4 s. Call this before the first image of a script: it turns on JAX's persistent compilation cache for
-    this process, and keeps traced programs beside it (`kept_programs`), unless code of one's own is a part of
-    them, or a `jax.jit` is around them. The command `jaxvol` does so by itself, and so do notebooks, `show`,
-    `view` and the page of `jaxvol view`, unless JAX has a folder already; `jaxvol warm` fills it. Programs
-    are those of this machine, this version of jaxvol and of JAX; others are added. To be rid of them, delete
-    the folder. Keep it where nobody else can write: programs in it are executed.
+    this process, and keeps traced programs in the same folder (`kept_programs`), except programs that contain
+    custom code or run inside a `jax.jit`. The command `jaxvol`, notebooks, `show`, `view` and the page of
+    `jaxvol view` call it, unless JAX already has a folder; `jaxvol warm` fills it. Programs are specific to
+    the machine and the versions of jaxvol and JAX. Delete the folder to remove them. Nobody else should have
+    write access: programs in it are executed.
 
     Args:
-        folder: made if it does not exist. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
+        folder: a folder, created if missing. By default the folder that `JAX_COMPILATION_CACHE_DIR` names, or
             else `jaxvol/programs` in `$XDG_CACHE_HOME` or `~/.cache`.
 
     Returns:
         The folder.
 
     Raises:
-        OSError: for a folder that cannot be made.
+        OSError: for a folder that cannot be created.
     """
     path = default_programs() if folder is None else Path(folder)
     path.mkdir(parents=True, exist_ok=True)
     if _folder() != str(path):
         jax.config.update("jax_compilation_cache_dir", str(path))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", SHORTEST)
-        # JAX decides once, at the first program, whether there is a cache; in a notebook that may be long ago
+        # JAX checks for a cache once, at the first program, which a notebook may already have compiled
         from jax.experimental.compilation_cache import compilation_cache
 
         compilation_cache.reset_cache()
@@ -57,14 +53,14 @@ def keep_programs(folder: str | os.PathLike[str] | None = None) -> Path:
 
 
 def keep_programs_by_default() -> None:
-    """`keep_programs()`, unless JAX keeps them somewhere already, or the folder cannot be made."""
+    """Calls `keep_programs()`, unless JAX already has a folder. Ignores a folder that cannot be created."""
     if not _folder():
         with suppress(OSError):
             keep_programs()
 
 
 def kept_folder() -> str | None:
-    """Where lowered programs are kept, too (`kept_programs`); None where they are not."""
+    """Folder of lowered programs (`kept_programs`), or None if they are not kept."""
     folder = _folder()
     on = folder in _CHOSEN and getattr(jax.config, "jax_enable_compilation_cache", True)
     return folder if on else None

@@ -1,4 +1,4 @@
-"""What `jax.shard_map` needs to know: over which mesh axes an array varies."""
+"""Mesh axes over which an array varies inside `jax.shard_map`."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from .trees import PyTree
 
 
-def varies_over(leaf: Any) -> frozenset[Any]:
+def varies_over(leaf: object) -> frozenset[Any]:
     """Mesh axes over which an array varies inside `jax.shard_map`; none under `check_vma=False`."""
     if not isinstance(leaf, jax.core.Tracer):
         return frozenset()
@@ -22,13 +22,13 @@ def varies_over(leaf: Any) -> frozenset[Any]:
 
 
 def varying(tree: PyTree, *like: PyTree) -> PyTree:
-    """The tree, with arrays that vary over all mesh axes of `like` or itself, which are part of their types:
-    loops must keep these, and zeros do not vary. Nothing changes outside of `jax.shard_map`."""
+    """The tree with arrays that vary over all mesh axes of `like` and itself. These axes are part of an
+    array's type, which a loop must keep, and zeros vary over none. Identity outside of `jax.shard_map`."""
     axes = frozenset().union(*(varies_over(leaf) for leaf in jax.tree.leaves((tree, like))))
     if not axes:
         return tree
 
-    def one(leaf: Any) -> Any:
+    def cast(leaf: PyTree) -> PyTree:
         missing = tuple(sorted(axes - varies_over(leaf))) if eqx.is_array(leaf) else ()
         if not missing:
             return leaf
@@ -36,7 +36,7 @@ def varying(tree: PyTree, *like: PyTree) -> PyTree:
             return jax.lax.pcast(leaf, missing, to="varying")
         return jax.lax.pvary(leaf, missing)  # pyright: ignore[reportAttributeAccessIssue]  (up to jax 0.8)
 
-    return jax.tree.map(one, tree)
+    return jax.tree.map(cast, tree)
 
 
 def shard_number(*arrays: Any) -> Int[Array, ""]:
@@ -44,6 +44,6 @@ def shard_number(*arrays: Any) -> Int[Array, ""]:
     axes = frozenset().union(*map(varies_over, arrays))
     if not axes:
         return jnp.zeros((), jnp.int32)
-    # of an array with several mesh axes, JAX does not tell their order
+    # JAX does not report the order of several mesh axes of an array
     names = tuple(name for name in jax.sharding.get_abstract_mesh().axis_names if name in axes)
     return jax.lax.axis_index(names).astype(jnp.int32)

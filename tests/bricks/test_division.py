@@ -116,7 +116,7 @@ def test_a_brick_has_fewer_voxels_than_a_volume_may_have():
     assert grid.counts == (2, 1, 1)  # and no more than that takes
     with pytest.raises(
         ValueError,
-        match=r"bricks must be so many that each has fewer than 2\*\*31 voxels; got \(1600, 1600",
+        match=r"bricks must have fewer than 2\*\*31 voxels each; got \(1600, 1600",
     ):
         jv.render_bricks(nothing(shape), TRANSFER, CAMERA, PLAIN, bricks=(1, 1, 1))
     # no axis is split along which bricks would be read whole

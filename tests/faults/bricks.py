@@ -22,7 +22,7 @@ def _all_of_its_cells(of_brick: Callable[..., Any]) -> Callable[..., Any]:
     """A device marches from where its brick begins, also where those before it have been."""
 
     def faulty(self: Any, grid: Any, scene: Any, brick: Any) -> Any:
-        everything = self.own._replace(first=jnp.zeros_like(self.own.first))
+        everything = self.owned._replace(first=jnp.zeros_like(self.owned.first))
         return of_brick(type(self)(self.underway, everything), grid, scene, brick)
 
     return faulty

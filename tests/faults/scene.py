@@ -57,7 +57,7 @@ FAULTS: list[Fault] = [
     Fault(
         "replay: wrong sign of what is behind a sample",
         "compositing.blending:Over.slope",
-        lambda f: lambda self, alpha, after, worth, behind: f(self, alpha, after, worth, -behind),
+        lambda f: lambda self, alpha, after, bar, behind: f(self, alpha, after, bar, -behind),
         ("compositing/test_compositing.py::test_slopes_are_those_of_jax",),
     ),
     Fault(

@@ -8,7 +8,7 @@ import pytest
 
 import jaxvol as jv
 from jaxvol.engine.stages import Place
-from jaxvol.planning.probe import FEW, PATCHES, SIDE, Candidates, Probe, Truth
+from jaxvol.planning.probe import PATCHES, SIDE, SMALL_PATCHES, Candidates, Probe, Reference
 
 from ..scenes import scaled_phantom
 
@@ -33,7 +33,7 @@ def probe_of(camera: jv.Camera, seed: int = 0) -> Probe:
 
 def error_of(probe: Probe, image: jv.Rendering, truth: jv.Rendering) -> float:
     """Compared with an image that is known to be the truth."""
-    return Truth(probe, truth, 0.0).error(image)
+    return Reference(probe, truth, 0.0).error(image)
 
 
 def share_of(probe: Probe) -> float:
@@ -65,7 +65,7 @@ def distance(a, b) -> float:
 @pytest.mark.parametrize("size", [(40, 48), (20, 13)])
 def test_an_image_of_few_patches_is_known_whole(size):
     probe = probe_of(camera_of(size, zoom=3))
-    assert probe.strata.size == FEW  # as of all small images
+    assert probe.strata.size == SMALL_PATCHES  # as of all small images
     a, b = np.random.default_rng(0).random((2, *size[::-1], 4))
     assert share_of(probe) == pytest.approx(1)
     assert error_of(probe, at_pixels(probe, a), at_pixels(probe, b)) == pytest.approx(
@@ -102,7 +102,7 @@ def test_from_a_part_the_error_is_a_bound_in_most_cases():
         below += found < true
         assert 0.8 < found / true < 1.6
         # and compared with a step of half, whose own error is known from the same patches
-        truth = Truth.of(probe, [at_pixels(probe, scale * error) for scale in (1, 0.5, 0.25)])
+        truth = Reference.of(probe, [at_pixels(probe, scale * error) for scale in (1, 0.5, 0.25)])
         below += truth.error(at_pixels(probe, error)) < true
     assert below <= 12
 
@@ -152,8 +152,8 @@ def test_the_error_of_the_last_image_follows_from_the_halvings(probe, order, ali
     own = np.random.default_rng(1).normal(size=(3, *PATTERN.shape))
     patterns = np.sqrt(alike) * PATTERN + np.sqrt(1 - alike) * own
     images = [at_pixels(probe, 0.01 * 2.0 ** (-order * k) * each) for k, each in enumerate(patterns)]
-    truth, true = Truth.of(probe, images), [error_of(probe, each, limit) for each in images]
-    found = truth.own, truth.error(images[0]), truth.error(images[1])
+    truth, true = Reference.of(probe, images), [error_of(probe, each, limit) for each in images]
+    found = truth.image_error, truth.error(images[0]), truth.error(images[1])
     for each, least in zip(found, (true[2], true[0], true[1]), strict=True):
         assert each == pytest.approx(least, rel=1e-3) if alike == 1 else least * 0.96 < each < least * 1.6
 
@@ -162,14 +162,14 @@ def test_differences_that_grow_say_that_nothing_is_known(probe):
     """Two images that miss what the third one shows, and ones that differ by rounding alone."""
     for first in (0.0, 1e-3):
         images = [at_pixels(probe, scale * PATTERN) for scale in (first, 0.0, 0.01)]
-        truth = Truth.of(probe, images)
-        assert truth.own == pytest.approx(10 * error_of(probe, images[1], images[2]))
+        truth = Reference.of(probe, images)
+        assert truth.image_error == pytest.approx(10 * error_of(probe, images[1], images[2]))
     images = [at_pixels(probe, scale * PATTERN) for scale in (0.0, 1e-8, -1e-7)]
-    assert Truth.of(probe, images).own < 1e-6
+    assert Reference.of(probe, images).image_error < 1e-6
 
 
 def test_images_of_ended_rays_or_that_are_not_finite_have_an_infinite_error(probe):
     image, ended = at_pixels(probe, 0 * PATTERN), at_pixels(probe, 0 * PATTERN, ended=7)
-    assert Truth(probe, image, 0.0).error(ended) == np.inf
-    assert Truth(probe, ended, 0.0).error(image) == np.inf
-    assert Truth(probe, image, 0.0).error(at_pixels(probe, np.nan * PATTERN)) == np.inf
+    assert Reference(probe, image, 0.0).error(ended) == np.inf
+    assert Reference(probe, ended, 0.0).error(image) == np.inf
+    assert Reference(probe, image, 0.0).error(at_pixels(probe, np.nan * PATTERN)) == np.inf

@@ -83,7 +83,7 @@ def test_the_longest_step_within_the_goal_is_found(exponent, power):
     if math.isfinite(found.error) and found.error <= goal:
         assert factor * step**power <= found.error * (1 + 1e-4) + 1e-6
         assert step == 4 if longest > 4.4 else step >= 0.85 * min(longest, 4)
-        assert truth.own <= goal
+        assert truth.image_error <= goal
     else:
         assert longest < 4 * search.FINEST
 
