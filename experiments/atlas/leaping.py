@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxvol as jv
+from jaxvol.march.transforms.space_leaping import Method
 
 from ..ray_leaps import Marcher, grid_of
 from ..scenes import Scene, on_cube
@@ -34,7 +35,7 @@ def _sheet_and_wall() -> jv.Volume:
     return on_cube(np.maximum(sheet, np.where(z > 0.7, 0.3, 0.0)).astype(np.float32))
 
 
-def sheet_image(width: float, size: int, method: str | None, cell: int = 8) -> np.ndarray:
+def sheet_image(width: float, size: int, method: Method | None, cell: int = 8) -> np.ndarray:
     """The sheet, so many pixels wide. `method`: of leaping, or None."""
     values, extinction = [0.199, 0.2, 0.35, 0.4], [0.0, 200.0, 200.0, 200.0]
     transfer = jv.TransferFunction(values, [BLUE, BLUE, BLUE, RED], extinction)

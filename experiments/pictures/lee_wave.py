@@ -5,14 +5,14 @@ Each photon is moved by the library itself, as an image has it: `PhotonShading.r
 the plane between a medium A and a medium B. Wave fronts are photons evenly around the sample.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxvol as jv
-from jaxvol._util.vec3 import apart
+from jaxvol._util.vec3 import Vec3, apart
 from jaxvol.lighting import DirectionalLight, ScattererTemplate, ScattererTemplates, scatterer_template
 from jaxvol.lighting.photons import PhotonShading
 from jaxvol.lighting.shading import Sample, Surroundings
@@ -57,7 +57,8 @@ def moved(offset: np.ndarray) -> np.ndarray:
     assert isinstance(shading, PhotonShading)
     origin, zero = apart(jnp.zeros(3)), jnp.zeros((), jnp.int32)
     measured = around.classification.at(around.space.coordinate(origin))
-    color, extinction = around.classification.classify(measured)
+    classified, extinction = around.classification.classify(measured)
+    color = cast(Vec3, classified)
     sample = Sample(origin, origin, measured, color, extinction, jnp.ones(()), (zero, zero))
     shared = shading.begin(around, sample)
 

@@ -4,7 +4,7 @@ costs much; or, by a shader of one cheap term, all of them inline."""
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import jax
 import jax.numpy as jnp
@@ -123,7 +123,8 @@ def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: 
     transmittance = scene.compositing.transmittance(Composite(opacity))
     place = along(entry, direction, depth)
     point = scene.space.world(place)
-    return Sample(point, direction, measured, color, extinction, transmittance, pixel, place)
+    shown = cast(Vec3, color)  # light needs three
+    return Sample(point, direction, measured, shown, extinction, transmittance, pixel, place)
 
 
 def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, seen: Seen) -> Sample:

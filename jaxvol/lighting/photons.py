@@ -3,7 +3,7 @@
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -129,7 +129,7 @@ class PhotonShading(Shading):
         seen, shows = around.stored(weights)
         brightness = tuple(seen * self.lit_side(offset, light) for light in shared.lights)
         color, _ = around.classification.classify(read[0])
-        return brightness, scaled(color, shows)
+        return brightness, scaled(cast(Vec3, color), shows)
 
     def color(self, sample: Sample, shared: PhotonsOfSample, sums: Any) -> Vec3:
         brightness, inner = sums
