@@ -35,7 +35,7 @@ it depends on. Of a cell
 that is integrated (`Classification.spanned`): the mean of the values at its ends, then what else is read in
 its middle, and last two tuples, `front` and `back`: the value at each end, and what `search` found for it."""
 
-Classify: TypeAlias = Callable[[Measured], tuple[Color, Scalar]]
+Classify: TypeAlias = Callable[[Measured], tuple[Any, Scalar]]
 """From `Measured` to colour (r, g, b), or as many numbers as there are `bands`, and extinction (1/length)."""
 
 

@@ -244,8 +244,7 @@ def test_what_is_a_direction():
             jv.Volume(np.zeros((2, 2, 2)), direction=wrong)
     bounds = jax.jit(lambda turn: jv.Volume(np.zeros((2, 2, 2), np.float32), direction=turn).bounds)
     np.testing.assert_allclose(bounds(np.eye(3, dtype=np.float32)), (0, 1, 0, 1, 0, 1))
-    with pytest.raises(Exception, match="direction must be a 3 x 3 matrix"):
-        jax.block_until_ready(bounds(2 * np.eye(3, dtype=np.float32)))
+    assert np.isnan(bounds(2 * np.eye(3, dtype=np.float32))).all()
 
 
 SLOPE, CENTER, BOX = np.array([0.3, -0.5, 0.4]), np.array([3.0, -2.0, 5.0]), np.array([1.0, 0.8, 0.9])

@@ -106,8 +106,10 @@ def test_nine_colours_are_those_of_closed_forms_in_both_engines_and_so_is_their_
                 seen = jv.render_rays(volume, transfer, origins, directions, march, compositing=mode).rgba
                 return jnp.sum(weights * seen), seen
 
-            def reference(*ray):
-                return jv.render_ray_reference(volume, transfer, *ray, march, compositing=mode).rgba
+            def reference(origin, direction):
+                return jv.render_ray_reference(
+                    volume, transfer, origin, direction, march, compositing=mode
+                ).rgba
 
             gradient, seen = jax.grad(loss, has_aux=True)(transfer)
             return gradient, seen, jax.vmap(reference)(origins, directions)
