@@ -82,7 +82,7 @@ def path_traced_view(
     return image, np.maximum(deviations / traced.paths + background_variance, 0) / (traced.paths - 1)
 
 
-def of_pixels(
+def pixel_values(
     name: str, value: PyTree, shapes: Sequence[tuple[int, ...]]
 ) -> list[Float[np.ndarray, "height width channels"] | None]:
     """Numbers of at least 0, such as noise or weights, for the pixels of each view; None where missing."""
@@ -92,10 +92,10 @@ def of_pixels(
         raise ValueError(f"{name} must be {expected}; got {described(value)}.")
     values = list(value) if several else [value] * len(shapes)
     names = [f"{name}[{view}]" if several else name for view in range(len(shapes))]
-    return [_of_view(*view) for view in zip(names, values, shapes, strict=True)]
+    return [_view_values(*view) for view in zip(names, values, shapes, strict=True)]
 
 
-def _of_view(name: str, value: Arrayable | None, shape: tuple[int, ...]) -> np.ndarray | None:
+def _view_values(name: str, value: Arrayable | None, shape: tuple[int, ...]) -> np.ndarray | None:
     if value is None:
         return None
     array = np.asarray(not_negative(name, value, (None,) * np.ndim(value)), np.float64)

@@ -14,7 +14,7 @@ from .._util.checks import Arrayable, described, finite_array
 from ..path_tracing import PathTraced
 from ..scene.camera import Camera
 from ..xla.trees import PyTree
-from .noise import Noise, of_pixels, path_traced_view
+from .noise import Noise, path_traced_view, pixel_values
 
 
 class References(eqx.Module):
@@ -51,7 +51,7 @@ class References(eqx.Module):
             None if counted is None else jax.device_put(np.stack([counted[number] for number in kind]))
             for kind in kinds.values()
         ]
-        sigmas = zip(of_pixels("noise", noise, shapes), read, strict=True)
+        sigmas = zip(pixel_values("noise", noise, shapes), read, strict=True)
         known = [traced if sigma is None else sigma**2 for sigma, (*_, traced) in sigmas]
         variances = [variance for variance in known if variance is not None]
         if counted is not None:
@@ -73,7 +73,7 @@ class References(eqx.Module):
 
 def _weights(value: PyTree, shapes: list[tuple[int, ...]]) -> list[np.ndarray] | None:
     """Weights of all entries, with mean 1 over positive ones; None without weights."""
-    weights = of_pixels("weights", value, shapes)
+    weights = pixel_values("weights", value, shapes)
     if all(weight is None for weight in weights):
         return None
     full = [np.ones(s) if w is None else w for w, s in zip(weights, shapes, strict=True)]

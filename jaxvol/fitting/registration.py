@@ -28,7 +28,7 @@ from .bijections import RigidMotion
 from .constraints import Free
 from .damping import LevenbergMarquardt
 from .driver import allow_promotion
-from .noise import of_pixels
+from .noise import pixel_values
 from .references import camera_and_image
 from .residuals import Problem
 
@@ -121,7 +121,7 @@ def register(
     images = [finite_array(f"views[{at}]: the image", image, shape) for at, (_, image) in enumerate(read)]
     counted = [
         np.ones(shape) if weight is None else weight[..., 0]
-        for weight in of_pixels("weights", weights, [(*shape, 1)] * len(read))
+        for weight in pixel_values("weights", weights, [(*shape, 1)] * len(read))
     ]
     for number, (image, weight) in enumerate(zip(images, counted, strict=True)):
         if len(np.unique(np.asarray(image)[weight > 0])) < 2:
@@ -185,14 +185,14 @@ class _Level(eqx.Module):
         volume, transfer, march = self.scene
         moved = RigidMotion(motion[:3], motion[3:] * self.radius, self.center)
 
-        def of_view(view: tuple[Camera, Array, Array]) -> Array:
+        def view_residual(view: tuple[Camera, Array, Array]) -> Array:
             camera, image, weight = view
             options: Any = {"compositing": "integral", "outputs": "rgba", "adjoint": adjoint}
             rendered = render(volume, transfer, moved.camera(camera), march, **options).rgba[..., 0]
             standard = partial(standardized, weights=weight, gradient=self.gradient)
             return standard(rendered) - standard(image)
 
-        difference = jax.lax.map(of_view, self.views)
+        difference = jax.lax.map(view_residual, self.views)
         return difference / math.sqrt(len(self.views[1]))
 
 
@@ -201,13 +201,13 @@ def _search(level: _Level, starts: Arrayable, max_steps: int) -> Float[Array, "n
     """Ends of the searches from the starts, one in each row."""
     free, _ = Free.of(np.zeros(6), None, None)
 
-    def of_start(start: Float[Array, "6"]) -> Float[Array, "6"]:
+    def search(start: Float[Array, "6"]) -> Float[Array, "6"]:
         problem = Problem.of(level, free, (start,), 2**30, True)
         solver = eqx.tree_at(lambda s: s.atol, LevenbergMarquardt(1e-3, 0.0), level.near)
         options: Any = {"has_aux": True, "max_steps": max_steps, "throw": False}
         return optx.least_squares(problem, solver, (start,), **options).value[0]
 
-    return jax.lax.map(of_start, starts)
+    return jax.lax.map(search, starts)
 
 
 @eqx.filter_jit
