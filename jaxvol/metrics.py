@@ -1,26 +1,28 @@
-"""How far is an image from a reference, and what kind of error is it?
+"""Differences of an image from a reference, and measures of errors by kind.
 
 Images are (height, width) or (height, width, channels), and are analysed in float64. Energies are mean
 squares per pixel, summed over channels: scaling an error by k scales them by k². Frequencies are (x, y)
-in cycles per pixel. This is NumPy, not JAX, since it analyses finished images. Similarities, `ncc` and
-`gradient_ncc`, are JAX, since they are maximised: of images of one channel, in the images' own type.
+in cycles per pixel. Functions are NumPy, not JAX, since they analyse finished images. Similarities, `ncc` and
+`gradient_ncc`, are JAX, since they are maximised: they take images of one channel, and keep their type.
 """
 
 import math
-from typing import Any, TypeAlias, cast
+from functools import partial
+from typing import TypeAlias, cast
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
 
 from ._util import checks
+from ._util.checks import Arrayable
 
 
 Image: TypeAlias = Float64[np.ndarray, "height width channels"]
 Plane: TypeAlias = Float64[np.ndarray, "height width"]
 
 BLOCK = 32
-"""Side of blocks searched for wood grain: rings are straight in one, and frequencies still apart."""
+"""Side of blocks searched for wood grain, in which rings are straight, and frequencies still separate."""
 
 SLOWEST = 3
 """Cycles per block below which an error counts as shading, not wood grain: a period of 10.7 pixels."""
@@ -29,7 +31,7 @@ PEAKS = 16
 """Number of frequencies that count as a block's peaks: the main lobe of a wave between bins is 4 x 4."""
 
 
-def rmse(image: Any, reference: Any) -> float:
+def rmse(image: Arrayable, reference: Arrayable) -> float:
     """Root-mean-square difference over pixels and channels.
 
     Args:
@@ -46,7 +48,7 @@ def rmse(image: Any, reference: Any) -> float:
     return float(np.sqrt(np.mean((image - reference) ** 2)))
 
 
-def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
+def psnr(image: Arrayable, reference: Arrayable, data_range: float = 1.0) -> float:
     """Peak signal-to-noise ratio in dB, `20 log10(data_range / rmse)`; infinite for equal images.
 
     Args:
@@ -65,7 +67,7 @@ def psnr(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     return 20 * math.log10(data_range / error) if error > 0 else math.inf
 
 
-def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
+def ssim(image: Arrayable, reference: Arrayable, data_range: float = 1.0) -> float:
     """Mean structural similarity over windows of 7 x 7 pixels, then over channels; 1 for equal images.
 
     Args:
@@ -90,14 +92,14 @@ def ssim(image: Any, reference: Any, data_range: float | Any = 1.0) -> float:
     return float(cast(float, mean))  # a tuple only if more outputs are requested
 
 
-def ncc(image: Any, reference: Any, weights: Any | None = None) -> Float[Array, ""]:
+def ncc(image: Arrayable, reference: Arrayable, weights: Arrayable | None = None) -> Float[Array, ""]:
     """Normalised cross-correlation: Pearson's correlation of two images over their pixels, in [-1, 1]. It
-    does not change with brightness or contrast, is differentiable, and is 0 where an image is constant.
+    does not change with brightness or contrast, is differentiable, and is 0 if an image is constant.
 
     Args:
         image: (height, width).
         reference: an image of the same shape.
-        weights: of the pixels, (height, width), at least 0; a pixel of weight 0 does not count.
+        weights: weights of the pixels, (height, width), at least 0; a pixel of weight 0 does not count.
 
     Returns:
         The correlation, a scalar.
@@ -109,14 +111,16 @@ def ncc(image: Any, reference: Any, weights: Any | None = None) -> Float[Array, 
     return jnp.sum(standardized(image, weights) * standardized(reference, weights))
 
 
-def gradient_ncc(image: Any, reference: Any, weights: Any | None = None) -> Float[Array, ""]:
-    """Gradient correlation: the mean of the normalised cross-correlations of both derivatives of two images,
-    across and down, by Sobel's masks. It attends to edges, and is otherwise as `ncc`.
+def gradient_ncc(
+    image: Arrayable, reference: Arrayable, weights: Arrayable | None = None
+) -> Float[Array, ""]:
+    """Gradient correlation: the mean of the normalised cross-correlations of the two derivatives, along x and
+    y, of two images, by Sobel's masks. It compares edges, and is otherwise as `ncc`.
 
     Args:
         image: (height, width), at least 3 x 3 pixels.
         reference: as for `ncc`.
-        weights: as for `ncc`. A derivative has the least weight of the 3 x 3 pixels that it is taken from.
+        weights: as for `ncc`. A derivative has the smallest weight of its 3 x 3 pixels.
 
     Returns:
         The correlation, a scalar.
@@ -128,14 +132,16 @@ def gradient_ncc(image: Any, reference: Any, weights: Any | None = None) -> Floa
     registration", IEEE TMI 17(4), 1998.
     """
     _same_shape(image, reference)
-    how = {"gradient": True}
-    return jnp.sum(standardized(image, weights, **how) * standardized(reference, weights, **how))
+    standard = partial(standardized, weights=weights, gradient=True)
+    return jnp.sum(standard(image) * standard(reference))
 
 
-def standardized(image: Any, weights: Any | None = None, *, gradient: bool = False) -> Float[Array, "..."]:
-    """An image, or its derivatives, of weighted mean 0 and length 1: the sum of the products of two is their
-    `ncc`, or `gradient_ncc`. Half the sum of the squares of their difference is 1 minus that, so `fit`
-    maximises it with the residual `standardized(rendered) - standardized(reference)`.
+def standardized(
+    image: Arrayable, weights: Arrayable | None = None, *, gradient: bool = False
+) -> Float[Array, "..."]:
+    """Scale an image, or its derivatives, to weighted mean 0 and length 1. The sum of the products of two
+    such images is their `ncc`, or `gradient_ncc`; half the sum of the squares of their difference is 1 minus
+    that. So `fit` maximises it with the residual `standardized(rendered) - standardized(reference)`.
 
     Args:
         image: (height, width).
@@ -143,7 +149,7 @@ def standardized(image: Any, weights: Any | None = None, *, gradient: bool = Fal
         gradient: whether to take Sobel's derivatives, as for `gradient_ncc`.
 
     Returns:
-        (height, width), or (2, height - 2, width - 2). Of a constant image, 0.
+        (height, width), or (2, height - 2, width - 2); 0 for a constant image.
 
     Raises:
         ValueError: as `ncc` and `gradient_ncc`.
@@ -152,8 +158,8 @@ def standardized(image: Any, weights: Any | None = None, *, gradient: bool = Fal
     if image.dtype not in (jnp.float32, jnp.float64):  # sums overflow in 16 bits
         image = image.astype(jnp.float32)
     if image.ndim != 2 or min(image.shape) < (3 if gradient else 1):
-        least = ", of at least 3 x 3 pixels" if gradient else ""
-        raise ValueError(f"image must have shape (height, width){least}; got {image.shape}.")
+        size = ", of at least 3 x 3 pixels" if gradient else ""
+        raise ValueError(f"image must have shape (height, width){size}; got {image.shape}.")
     weights = jnp.ones_like(image) if weights is None else jnp.asarray(weights, image.dtype)
     if weights.shape != image.shape:
         raise ValueError(f"weights must have the shape of the image, {image.shape}; got {weights.shape}.")
@@ -163,32 +169,32 @@ def standardized(image: Any, weights: Any | None = None, *, gradient: bool = Fal
         return _unit(image, weights)
     last = image.shape[0] - 2, image.shape[1] - 2
     shifted = [[(slice(y, last[0] + y), slice(x, last[1] + x)) for x in range(3)] for y in range(3)]
-    least = jnp.min(jnp.stack([weights[at] for row in shifted for at in row]), axis=0)
-    found = []
-    for lines in (shifted, list(zip(*shifted, strict=True))):  # across, and down
+    smallest = jnp.min(jnp.stack([weights[at] for row in shifted for at in row]), axis=0)
+    derivatives = []
+    for lines in (shifted, list(zip(*shifted, strict=True))):  # along x, and along y
         slopes = [image[after] - image[before] for before, _, after in lines]
-        found.append(_unit(slopes[0] + 2 * slopes[1] + slopes[2], least))
-    return jnp.stack(found) * 0.5**0.5
+        derivatives.append(_unit(slopes[0] + 2 * slopes[1] + slopes[2], smallest))
+    return jnp.stack(derivatives) * 0.5**0.5
 
 
 def _unit(image: Array, weights: Array) -> Array:
-    """Of weighted mean 0, times the square roots of the weights, of length 1; a constant image gives 0."""
+    """Shift an image to weighted mean 0, and scale it by √weights to length 1; a constant image gives 0."""
     total = jnp.sum(weights)
-    away = image - jnp.sum(weights * image) / jnp.where(total > 0, total, 1)
-    square = jnp.sum(weights * away**2)
-    # rounding of the mean leaves so much of a constant image
-    varies = square > image.size * jnp.finfo(away.dtype).eps ** 2 * jnp.sum(weights * image**2)
-    return jnp.where(varies, jnp.sqrt(weights) * away / jnp.sqrt(jnp.where(varies, square, 1)), 0)
+    centered = image - jnp.sum(weights * image) / jnp.where(total > 0, total, 1)
+    square = jnp.sum(weights * centered**2)
+    # a constant image has only this much left, by rounding of its mean
+    varies = square > image.size * jnp.finfo(centered.dtype).eps ** 2 * jnp.sum(weights * image**2)
+    return jnp.where(varies, jnp.sqrt(weights) * centered / jnp.sqrt(jnp.where(varies, square, 1)), 0)
 
 
 def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: float) -> tuple[float, float]:
-    """Frequency of the wood grain on an inclined plane seen by an orthographic camera, cycles per pixel.
+    """Frequency of the wood grain on an inclined plane in an orthographic camera, cycles per pixel.
 
     The plane's depth grows by one step, and the rings repeat, every `step / (pixel_size depth_slope)` pixels.
 
     Args:
         step: distance between samples, world length, > 0.
-        depth_slope: world depth gained per world length to the right and downwards in the image.
+        depth_slope: increase of world depth per world length to the right and downwards in the image.
         pixel_size: world length of a pixel, > 0.
 
     Returns:
@@ -204,29 +210,31 @@ def comb_frequency(step: float, depth_slope: tuple[float, float], pixel_size: fl
     return pixel_size * along_x / step, pixel_size * along_y / step
 
 
-def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, harmonics: int = 3) -> float:
+def wood_grain_energy(
+    error: Arrayable, frequency: tuple[float, float] | None = None, harmonics: int = 3
+) -> float:
     """Energy of the wood grain in an error: mean square per pixel, summed over channels.
 
-    With `frequency` (the fundamental of the rings, see `comb_frequency`): the energy of the waves at it and
-    its harmonics, each measured by its Fourier coefficient under a Hann window w over the image,
+    With `frequency` (the fundamental of the rings, see `comb_frequency`): the energy of the waves at the
+    fundamental and its harmonics, by their Fourier coefficients under a Hann window w over the image,
 
         a_h = Σ w (e - mean_w(e)) exp(-2πi h f·x) / Σ w,    energy = Σ_h 2 |a_h|²,  h = 1 … harmonics.
 
-    Harmonics above Nyquist are measured at their aliases; those within two bins (2/width, 2/height) of 0, of
-    their own mirror image, or of an earlier harmonic are left out. White noise of variance v adds
+    Harmonics above Nyquist are measured at their aliases; harmonics within two bins (2/width, 2/height) of 0,
+    of their mirror image, or of an earlier harmonic are omitted. White noise of variance v adds
     2.25 v · 2 harmonics / pixels. A `frequency` that is wrong by half a bin loses 28 %.
 
-    Without `frequency`, for any scene: the energy in the peaks of local spectra, beyond what noise has there
-    by chance. Of each block of `BLOCK` pixels under a Hann window, E is the energy over frequencies of at
-    least `SLOWEST` cycles per block (slower errors are shading), T that of its `PEAKS` largest values, and q
-    their share on average in white noise. The result is the mean over blocks of (T - q E) / (1 - q): E for
-    waves, 0 on average for white noise. Noise added to waves lowers it by up to 0.13 of its own energy. An
-    edge counts as structure, a single pixel does not.
+    Without `frequency`, for any scene: the energy in the peaks of local spectra, minus the expected energy of
+    noise there. In a block of `BLOCK` pixels under a Hann window, E is the energy over frequencies of at
+    least `SLOWEST` cycles per block (slower errors are shading), T the energy of the `PEAKS` largest values,
+    and q the mean T / E of white noise. The result is the mean over blocks of (T - q E) / (1 - q): E for
+    waves, 0 on average for white noise. Noise added to waves lowers it by up to 0.13 of the noise's energy.
+    An edge counts as structure, a single pixel does not.
 
     Args:
         error: an image minus its reference, (height, width) or (height, width, channels).
-        frequency: to the right and downwards, cycles per pixel; None where it is not known.
-        harmonics: how many are summed, with `frequency`.
+        frequency: frequency to the right and downwards, cycles per pixel; None if unknown.
+        harmonics: number of harmonics that are summed, with `frequency`.
 
     Returns:
         The energy, in squared units of the error.
@@ -243,7 +251,7 @@ def wood_grain_energy(error: Any, frequency: tuple[float, float] | None = None, 
     return _comb(error, frequency, checks.integer("harmonics", harmonics, 1))
 
 
-def boundary_noise(image: Any, region: Any) -> float:
+def boundary_noise(image: Arrayable, region: Arrayable) -> float:
     """Noise in part of an image, without its shading: variance per pixel, summed over channels.
 
     Mean of (M * image)² / 36 over the pixels whose 3 x 3 neighbours all lie in `region`, with the mask
@@ -253,7 +261,7 @@ def boundary_noise(image: Any, region: Any) -> float:
 
     Args:
         image: an image, or an error, (height, width) or (height, width, channels).
-        region: (height, width) booleans, for example where the bounds cut through material.
+        region: (height, width) booleans of the part, such as the pixels where the bounds cut material.
 
     Returns:
         The variance, in squared units of the image.
@@ -285,9 +293,9 @@ def _comb(error: Image, frequency: tuple[float, float], harmonics: int) -> float
     earlier, energy = [np.zeros(2)], 0.0
     for harmonic in range(1, harmonics + 1):
         wave = harmonic * np.array(frequency)
-        others = [*earlier, -wave]
-        apart = [np.abs(wave - other - np.round(wave - other)) for other in others]  # of their aliases
-        if any(np.all(each < 2 / np.array([width, height])) for each in apart):
+        differences = wave - np.array([*earlier, -wave])
+        distances = np.abs(differences - np.round(differences))  # of their aliases
+        if np.any(np.all(distances < 2 / np.array([width, height]), axis=1)):
             if harmonic > 1:
                 continue
             raise ValueError(
@@ -320,7 +328,7 @@ def _peaks(error: Plane) -> float:
 
 
 def _share_of_largest(m: int, n: int) -> float:
-    """Average share of the m largest of n exponentially distributed numbers in their sum."""
+    """Expected share of the m largest of n exponentially distributed numbers in their sum."""
     tails = np.cumsum(1 / np.arange(n, 0, -1))[::-1]  # the i-th largest has mean Σ_{i ≤ j ≤ n} 1/j
     return float(tails[:m].sum() / n)
 
@@ -333,19 +341,19 @@ def _windowed(error: Image) -> tuple[Image, Plane]:
     return (error - mean) * window[..., None], window
 
 
-def _pair(image: Any, reference: Any) -> tuple[Image, Image]:
+def _pair(image: Arrayable, reference: Arrayable) -> tuple[Image, Image]:
     _same_shape(image, reference)
     return _image("image", image), _image("reference", reference)
 
 
-def _same_shape(image: Any, reference: Any) -> None:
+def _same_shape(image: Arrayable, reference: Arrayable) -> None:
     shapes = np.shape(image), np.shape(reference)
     if shapes[0] != shapes[1]:
         raise ValueError(f"image and reference must agree in shape; got {shapes[0]} and {shapes[1]}.")
 
 
-def _image(name: str, value: Any) -> Image:
-    """`value` as (height, width, channels), in float64."""
+def _image(name: str, value: Arrayable) -> Image:
+    """Convert `value` to (height, width, channels), in float64."""
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError) as fault:

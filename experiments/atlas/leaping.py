@@ -68,7 +68,13 @@ def sheets_thinner_than_a_cell_of_rays(ratio: float, size: int) -> dict[str, flo
     Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R no larger
     than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which lose nothing."""
     found = {}
-    for method, cell in (*(("min_distance", cell) for cell in (4, 8, 16)), ("beam", 16)):
+    methods: list[tuple[Method, int]] = [
+        ("min_distance", 4),
+        ("min_distance", 8),
+        ("min_distance", 16),
+        ("beam", 16),
+    ]
+    for method, cell in methods:
         truth = sheet_image(ratio * cell, size, None)
         x, y, _ = np.moveaxis(np.asarray(_above(ratio * cell, size).rays()[0]), -1, 0)
         sheet = (np.abs(x - TILT * y) < 0.45 * THICK) & (np.maximum(np.abs(x), np.abs(y)) < 1)

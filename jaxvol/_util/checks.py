@@ -5,11 +5,10 @@ import contextlib
 import operator
 import os
 import tempfile
-from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
 from types import EllipsisType
-from typing import TYPE_CHECKING, Annotated, Any, SupportsIndex, TypeAlias, TypeVar
+from typing import Any, SupportsIndex, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
@@ -25,12 +24,6 @@ T = TypeVar("T")
 
 Arrayable: TypeAlias = Any
 """Argument that is converted to an array. `Any`: checked at run time, by errors that name the argument."""
-
-if TYPE_CHECKING:
-    Checked: TypeAlias = Annotated[T, "checked at run time"]
-else:
-    Checked = defaultdict(lambda: Any)
-"""`Checked[T]`: T for static checkers, `Any` for run-time ones, so that our own errors come first."""
 
 
 def described(value: object) -> str:

@@ -1,5 +1,5 @@
-"""Smooth bijections from free variables, real numbers of order 1 that a solver moves, onto allowed values:
-what is rendered is `forward(free)`, so no step can leave the allowed range."""
+"""Smooth bijections from free variables, real numbers of order 1 that a solver moves, onto allowed values.
+The scene is rendered at `forward(free)`, so no step can leave the allowed range."""
 
 from abc import abstractmethod
 from typing import Any, NamedTuple
@@ -14,19 +14,20 @@ from jaxtyping import Array, Float
 from .._util.checks import Arrayable, described, finite_array, number, require
 from ..march.transforms import ToroidalMap
 from ..scene.camera import Camera, axes_of
+from ..xla.trees import PyTree
 
 
 MARGIN = 1e-3
-"""Least distance of a start from an open end, relative to the scale: the map is flat at the end."""
+"""Minimum distance of a start from an open end, relative to the scale: the map is flat at the end."""
 
 
 class RigidMotion(NamedTuple):
     """A rotation about a point, and a translation after it: p becomes R (p - center) + center + translation.
 
     Attributes:
-        rotation: rotation vector (exponential map), (3,) radians; of many motions, (n, 3).
-        translation: (3,), in world length; of many motions, (n, 3).
-        center: the point, (3,), of all.
+        rotation: rotation vector (exponential map), (3,) radians; (n, 3) for n motions.
+        translation: (3,), in world length; (n, 3) for n motions.
+        center: the point, (3,), shared by all motions.
     """
 
     rotation: Arrayable
@@ -34,52 +35,49 @@ class RigidMotion(NamedTuple):
     center: Arrayable
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera, moved by a single motion. The volume that it sees moves the other way."""
+        """The camera, moved by a single motion. The volume moves the opposite way in its image."""
         turn, shift, center = (jnp.asarray(part, camera.position.dtype) for part in self)
-
-        def moved(point: Array) -> Array:
-            return rotate(turn, point - center) + center + shift
-
-        places = moved(camera.position), moved(camera.focal_point), rotate(turn, camera.view_up)
-        return eqx.tree_at(lambda c: (c.position, c.focal_point, c.view_up), camera, places)
+        points = camera.position, camera.focal_point
+        moved = *(rotate(turn, p - center) + center + shift for p in points), rotate(turn, camera.view_up)
+        return eqx.tree_at(lambda c: (c.position, c.focal_point, c.view_up), camera, moved)
 
 
 class Bijection(eqx.Module):
     """A smooth map from free variables, any real numbers, onto the allowed values."""
 
-    whole: bool = eqx.field(static=True, default=False, init=False)
-    """Whether it maps a whole object, such as a camera, rather than each array separately."""
+    per_object: bool = eqx.field(static=True, default=False, init=False)
+    """Whether the bijection maps an object, such as a camera, rather than a single array."""
 
     @abstractmethod
-    def forward(self, free: Any) -> Any:
-        """Value for these free variables."""
+    def forward(self, free: PyTree) -> PyTree:
+        """Value at the free variables."""
 
     @abstractmethod
-    def inverse(self, value: Any, name: str = "value") -> Any:
-        """Free variables for a value. A value that is not allowed raises a `ValueError` that names `name`."""
+    def inverse(self, value: PyTree, name: str = "value") -> PyTree:
+        """Free variables of a value. **Raises** `ValueError` with `name` for a value that is not allowed."""
 
-    def moved(self, value: Any) -> Any:
-        """What of a value the free variables change."""
+    def moved(self, value: PyTree) -> PyTree:
+        """Part of a value that the free variables change."""
         return value
 
 
 class Fixed(Bijection):
-    """No free variables: the value stays as it was at the start."""
+    """Bijection without free variables: the value stays as it was at the start."""
 
-    start: Any = None
+    start: PyTree = None
 
-    def forward(self, free: None) -> Any:
+    def forward(self, free: None) -> PyTree:
         return self.start
 
-    def inverse(self, value: Any, name: str = "value") -> None:
+    def inverse(self, value: PyTree, name: str = "value") -> None:
         return None
 
-    def moved(self, value: Any) -> None:
+    def moved(self, value: PyTree) -> None:
         return None
 
 
 class Unconstrained(Bijection):
-    """Any real number: the value is the free variable itself."""
+    """Identity: the value, any real number, is the free variable."""
 
     def forward(self, free: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         return free
@@ -89,7 +87,8 @@ class Unconstrained(Bijection):
 
 
 class Positive(Bijection):
-    """Positive numbers: `scale` · log(1 + exp(free)). A start below `scale` / 1000 is raised to that.
+    """Positive numbers: `scale` · log(1 + exp(free)). A start below `scale` / 1000 is raised to
+    `scale` / 1000.
 
     Args:
         scale: a typical value, in the value's unit, > 0. The map is linear far above it and exponential far
@@ -133,19 +132,19 @@ class UnitInterval(Bijection):
 class Pose(Bijection):
     """Position and orientation of a camera, as a rigid motion of the camera `start`.
 
-    The free variables are `rotation` (3,), the rotation vector (exponential map) in radians, about the
-    camera's focal point, and `translation` (3,), of both camera and focal point, in units of the distance
-    between the two. Everything else (field of view, size) stays fixed. Rotating about the focal point, rather
-    than about the camera itself, keeps rotation and translation from imitating each other.
+    The free variables are `rotation` (3,), the rotation vector (exponential map) in radians about the
+    camera's focal point, and `translation` (3,) of the camera and its focal point, in units of the distance
+    between the two. Field of view and size stay fixed. Rotation about the focal point, rather than about the
+    camera's position, keeps rotation and translation from imitating each other.
 
     Args:
-        start: the camera at which both are 0.
+        start: the camera at which rotation and translation are 0.
 
     Raises:
         ValueError: for a camera that is not a rigid motion of `start`.
     """
 
-    whole: bool = eqx.field(static=True, default=True, init=False)
+    per_object: bool = eqx.field(static=True, default=True, init=False)
     start: Camera
 
     def forward(self, free: dict[str, Float[Array, "3"]]) -> Camera:
@@ -158,18 +157,15 @@ class Pose(Bijection):
 
         start = self.start
         invariants = [(c.view_angle, c.parallel_scale, c.window, _distance(c)) for c in (start, value)]
-        same = jax.tree.structure(value) == jax.tree.structure(start) and all(
+        if jax.tree.structure(value) != jax.tree.structure(start) or not all(
             np.allclose(a, b, rtol=1e-5) for a, b in zip(*map(jax.tree.leaves, invariants), strict=True)
-        )
-        if not same:
+        ):
             raise ValueError(
                 f"{name} must be a camera that differs from the pose's start only in position and "
                 f"orientation, at the same distance from its focal point; got {value} for the start {start}."
             )
-        axes = [
-            np.stack([np.asarray(axis, float) for axis in axes_of(c, np)], axis=1) for c in (start, value)
-        ]
-        rotation = Rotation.from_matrix(axes[1] @ axes[0].T).as_rotvec()
+        before, after = (np.stack(axes_of(c, np), axis=1).astype(float) for c in (start, value))
+        rotation = Rotation.from_matrix(after @ before.T).as_rotvec()
         shift = (value.focal_point - start.focal_point) / _distance(start)
         return {"rotation": jnp.asarray(rotation, shift.dtype), "translation": shift}
 
@@ -182,8 +178,7 @@ def _distance(camera: Camera) -> Float[Array, ""]:
 
 
 def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """`vector` rotated about `turn` by its length in radians (Rodrigues' formula); the slope of JAX's own
-    `Rotation` is NaN at 0, where every fit of a pose starts."""
+    """Rotate `vector` by a rotation vector (Rodrigues' formula), differentiably also at 0."""
     square = jnp.sum(turn**2)
     small = square < 1e-6
     angle = jnp.sqrt(jnp.where(small, 1, square))  # never at 0, where the slope of sqrt is infinite
@@ -194,29 +189,28 @@ def rotate(turn: Float[Array, "3"], vector: Float[Array, "3"]) -> Float[Array, "
 
 
 class ProbeGeometry(Bijection):
-    """The geometry of a swept probe: `a`, `b`, both ranges of angles, and the last depth of a `ToroidalMap`.
+    """Geometry of a swept probe: `a`, `b`, both ranges of angles, and the last depth of a `ToroidalMap`.
 
-    The first depth, `gamma_range[0]`, stays that of `start`: adding a length to `b` while subtracting it from
-    both ends of `gamma_range` moves nothing. Images determine the seven others if their cameras are known in
-    world units, the scene has edges in all directions, and its ends are in view. From cameras known up to
-    scale, so are the lengths; where the camera's position is free, so is the probe's. `Fit.uncertainty` says
-    what is not determined.
+    The first depth, `gamma_range[0]`, stays that of `start`, since a length that is added to `b` and
+    subtracted from both ends of `gamma_range` has no effect. Images determine the seven other numbers, up to
+    scale and position if those of the cameras are unknown, where the scene has edges in all directions and
+    its ends are in view. `Fit.uncertainty` names undetermined directions.
 
-    The free variables, of order 1, are the distances of the first sample from the apex and from the motor
-    axis (of the outermost beam, the nearest one), the length of a beam, and the logarithms of the ratios in
-    which a range of angles divides [0, π]. So every step is a valid probe: no sample lies behind the apex or
-    the motor axis, ranges increase, and angles stay within [0, π]. Starts keep a distance of 1/1000 from
-    these limits, relative to π or the size of the probe.
+    The free variables, of order 1, are the distances of the first sample from the apex and, on the beam
+    nearest to it, from the motor axis; the length of a beam; and the logarithms of the ratios in which a
+    range of angles divides [0, π]. So every step is a valid probe: no sample lies behind the apex or the
+    motor axis, ranges increase, and angles stay within [0, π]. Starts keep a distance of 1/1000 from these
+    limits, relative to π or the size of the probe.
 
     Args:
-        start: sets the typical lengths, and the first depth.
+        start: the probe that sets the typical lengths, and the first depth.
 
     Raises:
-        ValueError: for what is not a `ToroidalMap`, for one that begins at another depth, and for one with
-            samples behind the motor axis.
+        ValueError: for a value that is not a `ToroidalMap`, that begins at another depth, or that has samples
+            behind the motor axis.
     """
 
-    whole: bool = eqx.field(static=True, default=True, init=False)
+    per_object: bool = eqx.field(static=True, default=True, init=False)
     start: ToroidalMap
     length: Positive
 
@@ -238,13 +232,13 @@ class ProbeGeometry(Bijection):
         )
         return eqx.tree_at(lambda p: p.a, probe, axis - probe.nearest_to_axis)
 
-    def inverse(self, value: ToroidalMap | Any, name: str = "value") -> dict[str, Any]:
+    def inverse(self, value: PyTree, name: str = "value") -> dict[str, Any]:
         if not isinstance(value, ToroidalMap):
             raise ValueError(f"{name} must be a ToroidalMap; got {described(value)}.")
-        first, found = float(self.start.gamma_range[0]), float(value.gamma_range[0])
-        if not np.isclose(found, first, atol=1e-5 * float(self.length.scale)):
+        first, depth = float(self.start.gamma_range[0]), float(value.gamma_range[0])
+        if not np.isclose(depth, first, atol=1e-5 * float(self.length.scale)):
             raise ValueError(
-                f"{name} must begin at the same depth as the start, gamma_range[0] = {first}; got {found}. "
+                f"{name} must begin at the same depth as the start, gamma_range[0] = {first}; got {depth}. "
                 "Add the difference to b."
             )
         nearest = require(
@@ -260,12 +254,12 @@ class ProbeGeometry(Bijection):
         return free | {"beta": _ratios(value.beta_range), "sigma": _ratios(value.sigma_range)}
 
     def moved(self, value: ToroidalMap) -> ToroidalMap:
-        """The map, with the last depth, which is fitted, in place of both."""
+        """The map with its last depth, which is fitted, in place of `gamma_range`."""
         return eqx.tree_at(lambda probe: probe.gamma_range, value, value.gamma_range[1])
 
 
 def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Logarithms of what lies below and above a range of angles, relative to the range."""
+    """Logarithms of the angles below and above a range of angles, relative to its width."""
     gaps = jnp.stack([angles[0], angles[1] - angles[0], jnp.pi - angles[1]])
     gaps = jnp.maximum(gaps, MARGIN * jnp.pi)
     return jnp.log(gaps[::2] / gaps[1])

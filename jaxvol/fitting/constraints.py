@@ -1,4 +1,4 @@
-"""Which parameters are free, and within which bounds? Assigns a bijection to each."""
+"""Constraints of a fit: a bijection for each parameter, which says whether it is free, and its bounds."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -23,7 +23,7 @@ from .bijections import Bijection, Fixed, Pose, Positive, ProbeGeometry, Unconst
 TRANSFERS = TransferFunction, TransferFunction2D
 
 KNOWN = *TRANSFERS, LabelTransferFunction, Camera, ToroidalMap, Volume, March, Material
-"""Types with constraints of their own."""
+"""Types that have default constraints."""
 
 Where = Callable[[Any], Any]
 
@@ -40,29 +40,27 @@ class Free(eqx.Module):
 
     @classmethod
     def of(cls, parameters: PyTree, constraints: PyTree, where: Where | None) -> tuple["Free", FreeVariables]:
-        """The mapping from free variables to parameters, and those for `parameters`. **Raises** `ValueError`
-        for constraints or a `where` that do not match, parameters out of bounds, and if nothing is free."""
+        """The map from free variables to parameters, and the free variables of `parameters`."""
         parameters = jax.tree.map(lambda p: jnp.asarray(p) if isinstance(p, float) else p, parameters)
         tree = _select(_resolve(parameters, constraints), where)
-        found, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
+        leaves, structure = jax.tree_util.tree_flatten_with_path(tree, is_leaf=_is_bijection)
         nodes = structure.flatten_up_to(parameters)
-        pairs = zip(found, nodes, strict=True)
+        pairs = zip(leaves, nodes, strict=True)
         bijections: list[Bijection] = [Fixed(node) if isinstance(b, Fixed) else b for (_, b), node in pairs]
-        paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in found]
+        paths = ["parameters" + jax.tree_util.keystr(path) for path, _ in leaves]
         start = tuple(b.inverse(*at) for b, *at in zip(bijections, nodes, paths, strict=True))
         if not jax.tree.leaves(start):
-            raise ValueError("parameters must hold a float array that is free; everything given is fixed.")
+            raise ValueError("parameters must hold a float array that is free; got only fixed ones.")
         return cls(bijections, paths, structure), start
 
     def forward(self, free: FreeVariables) -> PyTree:
-        """Parameters for these free variables."""
+        """Parameters at the free variables."""
         nodes = [b.forward(variables) for b, variables in zip(self.bijections, free, strict=True)]
         return jax.tree.unflatten(self.structure, nodes)
 
     def moved(self, free: FreeVariables) -> list[Any]:
-        """What of the parameters is fitted."""
-        each = zip(self.bijections, free, strict=True)
-        return [b.moved(b.forward(variables)) for b, variables in each]
+        """Parts of the parameters that are fitted."""
+        return [b.moved(b.forward(variables)) for b, variables in zip(self.bijections, free, strict=True)]
 
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
@@ -76,7 +74,7 @@ class Free(eqx.Module):
 def unconstrain(
     parameters: PyTree, *, constraints: PyTree = None, where: Where | None = None
 ) -> tuple[FreeVariables, Callable[[FreeVariables], PyTree]]:
-    """Parameters as free variables, any real numbers, for a loop of one's own: what `fit` does inside.
+    """Convert parameters to free variables, any real numbers, as `fit` does, for a custom training loop.
 
         free, constrain = jv.unconstrain(transfer)
         optimizer = optax.adam(0.03)
@@ -87,17 +85,16 @@ def unconstrain(
             free = optax.apply_updates(free, updates)
 
     Whatever the steps, `constrain(free)` is within its bounds: extinctions stay positive, colours in [0, 1].
-    What lies on a bound begins a thousandth of its scale away from it.
+    A parameter on a bound begins a thousandth of its scale away from it.
 
     Args:
         parameters: any tree, as for `fit`.
         constraints: as for `fit`: bijections, such as `Positive()`, or None for the defaults.
-        where: what is free, as for `fit`.
+        where: the free parameters, as for `fit`.
 
     Returns:
-        The free variables, a tree of arrays of order 1 (None where nothing is free), and the function from
-        such a tree to the parameters, which `jax.jit`, `jax.grad` and `jax.vmap` take. What is fixed is held
-        by the function.
+        The free variables, a tree of arrays of order 1 (None where fixed), and the function from such a tree
+        to the parameters, which `jax.jit`, `jax.grad` and `jax.vmap` accept, and which holds fixed values.
 
     Raises:
         ValueError: for parameters outside their bounds or not finite, and constraints or a `where` that do
@@ -117,14 +114,14 @@ def _is_bijection(node: Any) -> bool:
 
 
 def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
-    """A bijection for every leaf, and for every object that is fitted as a whole."""
+    """Assign a bijection to every leaf, or to an object, such as a camera, that has a single one."""
 
-    def expand(constraint: Any, node: Any) -> PyTree:
+    def expand(constraint: PyTree, node: PyTree) -> PyTree:
         if constraint is None:
             return jax.tree.map(_default, node, is_leaf=lambda n: isinstance(n, KNOWN))
         if not _is_bijection(constraint):
             raise ValueError(f"constraints must hold bijections, such as Positive(); got {constraint!r}.")
-        if constraint.whole:
+        if constraint.per_object:
             return constraint
         return jax.tree.map(lambda leaf: constraint if eqx.is_inexact_array(leaf) else Fixed(), node)
 
@@ -140,7 +137,7 @@ def _resolve(parameters: PyTree, constraints: PyTree) -> PyTree:
 
 
 def _default(node: Any) -> PyTree:
-    """The constraints of an object, or of a leaf, unless others are given."""
+    """Default constraints of an object, or of a leaf."""
     if isinstance(node, Camera):
         return Pose(node)
     if isinstance(node, ToroidalMap):
@@ -153,9 +150,9 @@ def _default(node: Any) -> PyTree:
     if isinstance(node, LabelTransferFunction):  # factors of its extinctions are free in `stacked`
         return eqx.tree_at(lambda t: t.stacked, fixed, _default(node.stacked))
     if isinstance(node, Volume):
-        own = jax.tree.map(_default, node.field, is_leaf=lambda n: isinstance(n, KNOWN))
-        if any(not isinstance(b, Fixed) for b in jax.tree.leaves(own, is_leaf=_is_bijection)):
-            return eqx.tree_at(lambda v: v.field, fixed, own)  # most fields read no voxels
+        field = jax.tree.map(_default, node.field, is_leaf=lambda n: isinstance(n, KNOWN))
+        if any(not isinstance(b, Fixed) for b in jax.tree.leaves(field, is_leaf=_is_bijection)):
+            return eqx.tree_at(lambda v: v.field, fixed, field)  # most fields read no voxels
         return eqx.tree_at(lambda v: v.data, fixed, _default(node.data))
     if isinstance(node, Material):
         return eqx.tree_at(lambda m: m.mean_free_path, fixed, Positive(node.mean_free_path))

@@ -1,6 +1,5 @@
 """Levenberg–Marquardt steps damped by λ Σ Dᵢ² dᵢ² with Dᵢ² = (JᵀJ)ᵢᵢ (Marquardt 1963), whatever the units:
-Optimistix's step, damped by λ |d|², in the parameters D d. By itself, that comes to a standstill where
-residuals are small, as for images."""
+Optimistix's step, damped by λ |d|², in the parameters D d. Unscaled, fits stall where residuals are small."""
 
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +21,7 @@ FLOOR = 0.1
 class ScaledDescent(optx.DampedNewtonDescent[Any]):
     """The step d that minimises |J d + r|² + λ |D d|², with λ = 1 / step size."""
 
-    def step(self, step_size: Float[Array, ""], state: Any) -> tuple[PyTree, optx.RESULTS]:
+    def step(self, step_size: Float[Array, ""], state: PyTree) -> tuple[PyTree, optx.RESULTS]:
         info = state.f_info
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), info.jac.in_structure())
         scale = jnp.linalg.norm(info.jac.as_matrix(), axis=0)

@@ -1,5 +1,5 @@
-"""Fits parameters by minimising a residual with a solver of Optimistix, step by step rather than by
-`least_squares`: for callbacks, checkpoints, interruption, and the best point seen."""
+"""Fits parameters by minimising a residual with a solver of Optimistix. The solver is stepped here, rather
+than by `optimistix.least_squares`, for callbacks, checkpoints, interruption and the best point."""
 
 import math
 import time
@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
-from typing import Any, ClassVar
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from .uncertainty import Uncertainty, uncertainty, warn_of_misfit
 
 
 UNDETERMINED = ".*directions are not determined"
-"""Pattern of the warning that names such directions, for those who tell it otherwise."""
+"""Pattern of the warning that names such directions, for callers that filter it."""
 
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
@@ -36,14 +36,21 @@ LEARNING_RATE = 0.03
 CHECKPOINTS = 1 / 10
 """Fraction of the time that a fit spends on writing checkpoints."""
 
+Solver: TypeAlias = (
+    optx.AbstractLeastSquaresSolver[Any, Any, Any, Any] | optx.AbstractMinimiser[Any, Any, Any]
+)
+
+GradientTransformation: TypeAlias = tuple[Callable[..., Any], Callable[..., Any]]
+"""Pair of `init` and `update`: the type of Optax, which may not be installed."""
+
 
 class Fit(eqx.Module):
     """Result of a fit.
 
     Attributes:
-        parameters: the best ones found, as a tree like the starting parameters.
-        solution: optimistix's, with `value` (the free variables), `result`, `state` and `stats`.
-        losses: half the sum of squared residuals at the solver's point after each step; of a
+        parameters: the best parameters so far, as a tree like the starting parameters.
+        solution: Optimistix's `Solution`: `value` (the free variables), `result`, `state` and `stats`.
+        losses: half the sum of squared residuals at the solver's point after each step; for a
             `PathTracedResidual`, samples of it, which may be negative.
         uncertainty: an `Uncertainty`, for a least-squares solver; else None.
     """
@@ -60,12 +67,12 @@ class Fit(eqx.Module):
 
     @property
     def success(self) -> bool:
-        """Whether the solver converged to its tolerances."""
+        """True if the solver converged to its tolerances."""
         return bool(self.solution.result == Outcome.successful)
 
     @property
     def message(self) -> str:
-        """How the fit ended, in words."""
+        """Outcome of the fit, in words."""
         if self.solution.stats["message"] is not None:
             return self.solution.stats["message"]
         if self.success:
@@ -79,65 +86,63 @@ def fit(
     residual: ImageResidual | PathTracedResidual | Callable[[Any], PyTree] | Any,
     parameters: PyTree,
     *,
-    solver: str | Any | None = None,
+    solver: str | Solver | GradientTransformation | None = None,
     constraints: PyTree = None,
     where: Where | None = None,
     rtol: float = 1e-4,
     atol: float = 1e-6,
-    max_steps: int | Any = 100,
-    patience: int | Any | None = None,
-    max_jacobian: int | Any = 2**30,
+    max_steps: int = 100,
+    patience: int | None = None,
+    max_jacobian: int = 2**30,
     callback: Callable[[int, PyTree, float], Any] | None = None,
     checkpoint: str | PathLike[str] | None = None,
 ) -> Fit:
     """Fit parameters to make a residual small: the loss is half the sum of its squares.
 
-    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Where fits fail, and
-    where not: `experiments/stability.py`, "fits of what images do not show", "fits from opaque starts",
+    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Failures of fits are
+    measured by `experiments/stability.py`: "fits of what images do not show", "fits from opaque starts",
     "fits under noise".
 
     Args:
         residual: an `ImageResidual`, a `PathTracedResidual`, or a function from parameters to arrays. A
-            function that renders must use `adjoint="forward"` for the first two solvers and `"replay"` for
+            function that renders must use `adjoint="forward"` for a least-squares solver and `"replay"` for
             the others.
         parameters: the starting point: any tree, such as a `TransferFunction`, a `Camera` or a dict. Its
             float arrays are fitted.
         solver: `"levenberg_marquardt"` (the default) or `"gauss_newton"`: least squares, up to a few hundred
-            parameters; start with the first. `"bfgs"` needs only the gradient, and a matrix of parameters ×
-            parameters.
-            `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for large arrays. Or a solver
-            of Optimistix, with its own tolerances; or a transformation of Optax. A `PathTracedResidual` has
-            one of its own: Gauss–Newton steps from means over the last half to three quarters of all steps.
+            parameters; start with Levenberg–Marquardt. `"bfgs"` needs only the gradient, and a matrix of
+            parameters × parameters. `"adam"`: gradient descent with Optax (`pip install "jaxvol[fit]"`), for
+            large arrays. Or a solver of Optimistix, with its own tolerances; or a gradient transformation of
+            Optax. None for a `PathTracedResidual`, whose solver takes Gauss–Newton steps from means over the
+            last half to three quarters of all steps.
         constraints: a tree like the parameters, or a prefix of one, with a bijection at each leaf: `Fixed()`,
             `Unconstrained()`, `Positive()`, `UnitInterval()`, `Pose(camera)`, `ProbeGeometry(probe)`, or None
-            for the default: of a transfer function, positive extinction, colours in [0, 1] and fixed values;
-            of a camera, its pose; of a `ToroidalMap`, its geometry; of a volume, the arrays of its field
-            if it has any, or else its data if they are float;
-            of a material, a positive mean free path; of a march, nothing is free; any other float array is
-            unconstrained.
-        where: what is free, `where(parameters)` as for `equinox.tree_at`; everything else stays fixed. For
-            example `lambda transfer: transfer.extinction`, or a tuple of such.
-        rtol: a fit has converged when neither the free variables nor the residual change in a step by more
-            than `atol` plus this, relatively. With a `PathTracedResidual`, it has when the standard error
-            that is due to its own paths is within these limits, or at most half of what the references leave.
-        atol: see `rtol`.
+            for the default. By default, a transfer function has positive extinction, colours in [0, 1] and
+            fixed values; a camera its pose; a `ToroidalMap` its geometry; a volume the arrays of its field if
+            it has any, or else its data if they are float; a material a positive mean free path; a march is
+            fixed; any other float array is unconstrained.
+        where: free parameters, `where(parameters)` as for `equinox.tree_at`; all others stay fixed. For
+            example `lambda transfer: transfer.extinction`, or a function that returns a tuple.
+        rtol: relative tolerance. A fit has converged when neither the free variables nor the residual change
+            in a step by more than `atol + rtol * size`; with a `PathTracedResidual`, when the standard error
+            due to its paths is within this limit, or at most half of that due to noise of the references.
+        atol: absolute tolerance: see `rtol`.
         max_steps: maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
-        patience: number of steps after which a fit has stalled if the loss has not fallen by more than
-            `rtol`, relatively; by default 10, or 100 for Optax. A `PathTracedResidual` has none.
+        patience: number of steps after which a fit has stalled if the loss has not fallen by a fraction of
+            more than `rtol`; by default 10, or 100 for Optax. Unused for a `PathTracedResidual`.
         max_jacobian: bytes. A least-squares solver holds only as many rows of the Jacobian at once as fit
             (m rows of n parameters need 4 m (n + 1) bytes), and no more than those of one image.
         callback: `callback(step, parameters, loss)` after each step but the first, which evaluates the start.
-        checkpoint: a file to which the state is written after steps, as often as takes a tenth of the time,
-            and when the fit ends or is interrupted. If it exists, the fit continues from it and ends with the
-            same bits as an uninterrupted one (on the same machine).
+        checkpoint: a file for the state, which is written between steps, in a tenth of the time, and when the
+            fit ends or is interrupted. If the file exists, the fit continues from it, with the same bits as
+            without interruption (on the same machine).
 
     Returns:
         A `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success` and `Fit.message` say so, and
-        the parameters are the best ones found. A warning names directions that the residual does not
-        determine. If the noise of the references is known (`ImageResidual`), another one says that the model
-        does not fit them: that the residual is larger than noise is once in 741 fits, even if the noise of
-        neighbouring pixels is correlated. Standard errors don't cover the bias of such a fit. If the noise is
-        unknown, so is whether the model fits. A fit of a `PathTracedResidual` only reports χ².
+        the parameters are the best so far. A warning names directions that the residual does not
+        determine. If the noise of an `ImageResidual` is known, another warning says if the model does not
+        fit: noise exceeds its limit once in 741 fits, even if neighbouring pixels are correlated. Standard
+        errors don't cover the bias of such a fit. A fit of a `PathTracedResidual` only reports χ².
 
     Raises:
         ValueError: for incompatible arguments, parameters that are not finite or out of bounds, a residual
@@ -150,7 +155,7 @@ def fit(
         check_residual(residual)
     file = None if checkpoint is None else output_file("checkpoint", checkpoint)
     max_steps, max_jacobian = integer("max_steps", max_steps, 1), integer("max_jacobian", max_jacobian, 1)
-    solver, default_patience = _solver(solver, residual, rtol, atol)
+    method, default_patience = _solver(solver, residual, rtol, atol)
     patience = default_patience if patience is None else integer("patience", patience, 1)
     limits = Limits(max_steps, patience, rtol, atol)
     free, y = Free.of(parameters, constraints, where)
@@ -159,35 +164,35 @@ def fit(
         problem = SampledProblem.of(residual, free, y, max_jacobian)
         run: Any = SampledRun.of(problem, y)
     else:
-        least_squares = isinstance(solver, optx.AbstractLeastSquaresSolver)
+        least_squares = isinstance(method, optx.AbstractLeastSquaresSolver)
         problem = Problem.of(residual, free, y, max_jacobian, least_squares)
-        run = _Run.of(solver, problem, y)
-    run, loss = run.step(solver, problem)
+        run = _Run.of(method, problem, y)
+    run, loss = run.step(method, problem)
     losses = [loss]
     if not math.isfinite(loss):
         raise ValueError(f"residual must be finite at the parameters that the fit starts from; loss {loss}.")
     bounds = zip(free.paths, free.bijections, strict=True)
-    about = {
-        "solver": solver if isinstance(solver, str) else type(solver).__name__,
+    description = {
+        "solver": method if isinstance(method, str) else type(method).__name__,
         "parameters": [f"{path}: {type(bijection).__name__}" for path, bijection in bounds],
         "number of residuals": problem.count,
         "loss at the start": f"{loss:.3g}",  # other machines round differently
     }
-    if file is not None and (found := checkpoints.load(file, run, about)) is not None:
-        run, losses = found[0], found[1]["losses"]
+    if file is not None and (saved := checkpoints.load(file, run, description)) is not None:
+        run, losses = saved[0], saved[1]["losses"]
     due = 0.0
     try:
         while (result := run.ended(problem, losses, limits)) is None:
-            run, loss = run.step(solver, problem)
+            run, loss = run.step(method, problem)
             losses.append(loss)
             if callback is not None:
                 callback(len(losses), free.forward(run.evaluated), loss)
             if file is not None and (begun := time.monotonic()) >= due:
-                checkpoints.save(file, run, {**about, "losses": losses})
+                checkpoints.save(file, run, {**description, "losses": losses})
                 due = time.monotonic() + (time.monotonic() - begun) / CHECKPOINTS
     finally:
         if file is not None:
-            checkpoints.save(file, run, {**about, "losses": losses})
+            checkpoints.save(file, run, {**description, "losses": losses})
     return _report(run, problem, losses, limits, result)
 
 
@@ -215,7 +220,7 @@ def _solver(solver: Any, residual: Any, rtol: float, atol: float) -> tuple[Any, 
 
 
 class _Run(eqx.Module):
-    """State of a fit: everything that the next step depends on."""
+    """State of a fit between steps."""
 
     y: FreeVariables
     state: Any
@@ -223,30 +228,24 @@ class _Run(eqx.Module):
     """The solver's point whose loss is known."""
     best: FreeVariables
     loss: Float[np.ndarray, ""]
-    """At the best point."""
+    """Loss at the best point."""
     triangles: Triangles | None
-    """At the best point."""
+    """Triangles at the best point."""
     done: Array
     result: Any
 
-    own: ClassVar[None] = None
-    """The fit is not random."""
-
     @classmethod
-    def of(cls, solver: Any, problem: Problem, y: FreeVariables) -> "_Run":
+    def of(cls, solver: Solver, problem: Problem, y: FreeVariables) -> "_Run":
         """The state before any step."""
         state, done = _init_state(solver, problem, y), jnp.zeros((), bool)
         return cls(y, state, y, y, np.asarray(np.inf), None, done, optx.RESULTS.successful)
 
-    def step(self, solver: Any, problem: Problem) -> tuple["_Run", float]:
+    def step(self, solver: Solver, problem: Problem) -> tuple["_Run", float]:
         """The state after a step, and the loss at the solver's point."""
         y, state, (loss, evaluated, triangles), done, result = _advance(solver, problem, self.y, self.state)
         loss = np.asarray(loss, np.float64)
         known = (evaluated, loss, triangles) if loss < self.loss else (self.best, self.loss, self.triangles)
         return _Run(y, state, evaluated, *known, done, result), float(loss)
-
-    def message(self, problem: Problem, limits: Limits, result: Any) -> None:
-        """Nothing more than the result says."""
 
     def ended(self, problem: Problem, losses: list[float], limits: Limits) -> Any:
         """The result if the fit has ended, else None."""
@@ -264,35 +263,40 @@ class _Run(eqx.Module):
 
 
 @eqx.filter_jit
-def _init_state(solver: Any, problem: Problem, y: FreeVariables) -> Any:
+def _init_state(solver: Solver, problem: Problem, y: FreeVariables) -> Any:
     with allow_promotion():
-        return solver.init(problem, y, None, {}, *eqx.filter_eval_shape(problem, y), frozenset())
+        f_struct, aux_struct = eqx.filter_eval_shape(problem, y)
+        return solver.init(problem, y, None, {}, f_struct, aux_struct, frozenset())
 
 
 @eqx.filter_jit
-def _advance(solver: Any, problem: Problem, y: FreeVariables, state: Any) -> Any:
+def _advance(solver: Solver, problem: Problem, y: FreeVariables, state: Any) -> Any:
     with allow_promotion():
         y, state, previous_aux = solver.step(problem, y, None, {}, state, frozenset())
         done, result = solver.terminate(problem, y, None, {}, state, frozenset())
-    # `previous_aux` is that of the previous point in solvers with trial points; their state has the new one's
+    # solvers with trial points return `aux` of the previous point; their state has that of the new one
     return y, state, getattr(state, "aux", previous_aux), done, result
 
 
 @contextmanager
 def allow_promotion() -> Iterator[None]:
-    """Allow promotion of types and ranks, which solvers need, even if the user has forbidden it."""
+    """Allow JAX's promotion of types and ranks, which solvers need, even if the user has forbidden it."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
-def _report(run: Any, problem: Any, losses: list[float], limits: Limits, result: Any) -> Fit:
-    """The result of a run, a `_Run` or `SampledRun`, and its problem."""
+def _report(run: _Run | SampledRun, problem: Any, losses: list[float], limits: Limits, result: Any) -> Fit:
+    """Result of a run: parameters, uncertainty and warnings."""
     estimate, chi_squared, loss = None, None, float(run.loss)
-    if problem.noise is not None:  # of Σ r², as the loss is half the mean square
+    message = path_covariance = None
+    if isinstance(run, SampledRun):
+        message, path_covariance = run.message(problem, limits, result), run.path_covariance
+    if problem.noise is not None:  # χ² is of Σ r²; the loss is half the mean square
         chi_squared = problem.noise.reduced_chi_squared(2 * problem.count * loss, size(run.best))
     if run.triangles is not None:
-        about = problem.free, run.best, problem.scale, chi_squared
-        estimate = uncertainty(run.triangles, problem.count, *about, run.own)
+        estimate = uncertainty(
+            run.triangles, problem.count, problem.free, run.best, problem.scale, chi_squared, path_covariance
+        )
         if estimate.undetermined:
             moved = "; ".join(", ".join(names[:6]) or "none" for names in estimate.undetermined[:6])
             warnings.warn(
@@ -300,10 +304,9 @@ def _report(run: Any, problem: Any, losses: list[float], limits: Limits, result:
                 f"by the residual; parameters they change most: {moved}.",
                 stacklevel=3,
             )
-    stats = {"num_steps": len(losses), "max_steps": limits.max_steps, "loss": loss}
-    stats["message"] = run.message(problem, limits, result)
+    stats = {"num_steps": len(losses), "max_steps": limits.max_steps, "loss": loss, "message": message}
     solution = optx.Solution(run.best, result, None, stats, getattr(run, "state", run))
-    found = Fit(problem.free.forward(run.best), solution, np.asarray(losses), estimate)
-    if problem.noise is not None and chi_squared is not None and run.own is None:
-        warn_of_misfit(problem.noise, chi_squared, None if found.success else found.message)
-    return found
+    report = Fit(problem.free.forward(run.best), solution, np.asarray(losses), estimate)
+    if problem.noise is not None and chi_squared is not None and path_covariance is None:
+        warn_of_misfit(problem.noise, chi_squared, None if report.success else report.message)
+    return report

@@ -14,7 +14,7 @@ from .._util.checks import described
 from .._util.srgb import from_srgb
 from .._util.whole_files import whole_file
 from ..scene.camera import Camera
-from ..scene.transfer import TransferFunction
+from ..scene.transfer import Transfer, TransferFunction
 
 
 CAMERA = "position", "focal_point", "view_up", "view_angle", "parallel_scale", "window"
@@ -36,7 +36,7 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
         A pair for each image: its `Camera`, and the picture, linear RGB.
 
     Raises:
-        ValueError: naming the file, if it is missing or holds anything else.
+        ValueError: with the file's name, if it is missing or has another content.
     """
     entries = _json(cameras)
     if not isinstance(entries, list) or len(entries) != len(images):
@@ -46,8 +46,8 @@ def read_views(images: Sequence[File], cameras: File) -> list[tuple[Camera, Floa
         )
     views = []
     for number, (fields, path) in enumerate(zip(entries, images, strict=True)):
-        picture, what = _picture(path), f"{cameras}: camera {number}"
-        views.append((_made(Camera, what, CAMERA, fields, size=picture.shape[1::-1]), picture))
+        picture, place = _picture(path), f"{cameras}: camera {number}"
+        views.append((_build(Camera, place, CAMERA, fields, size=picture.shape[1::-1]), picture))
     return views
 
 
@@ -61,27 +61,27 @@ def read_transfer(path: File) -> TransferFunction:
         The `TransferFunction`.
 
     Raises:
-        ValueError: naming the file, if it is missing or holds anything else.
+        ValueError: with the file's name, if it is missing or has another content.
     """
     return transfer_of_fields(str(path), _json(path))
 
 
-def transfer_of_fields(what: str, content: Any) -> TransferFunction:
-    """The transfer function that `transfer_fields` wrote; `what` names its place in errors."""
-    return _made(TransferFunction, what, TRANSFER, content)
+def transfer_of_fields(place: str, content: object) -> TransferFunction:
+    """The transfer function of the fields that `transfer_fields` returned. Errors begin with `place`."""
+    return _build(TransferFunction, place, TRANSFER, content)
 
 
 def transfer_fields(transfer: TransferFunction) -> dict[str, Any]:
-    """Its values, colours and extinctions, as JSON holds them."""
+    """Values, colours and extinctions of a transfer function, for JSON."""
     if transfer.per_voxel:
         raise ValueError(
-            "transfer counts lengths in voxels, and a file holds world lengths; give it a unit_distance, "
-            "such as the volume."
+            "transfer counts lengths in voxels, and a file holds world lengths. Pass the transfer function a "
+            "unit_distance, such as the volume."
         )
     return {name: np.asarray(getattr(transfer, name), float).tolist() for name in TRANSFER}
 
 
-def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
+def write_transfer(path: File, transfer: Transfer) -> Path:
     """Write a transfer function in the format that `read_transfer` reads.
 
     Args:
@@ -92,7 +92,7 @@ def write_transfer(path: File, transfer: TransferFunction | Any) -> Path:
         The path.
 
     Raises:
-        ValueError: for other kinds of them, which that format does not hold.
+        ValueError: for other kinds of transfer functions, which the format does not represent.
     """
     if not isinstance(transfer, TransferFunction):
         raise ValueError(f"transfer must be a TransferFunction; got {described(transfer)}.")
@@ -107,19 +107,19 @@ def _json(path: File) -> Any:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as fault:
         raise ValueError(f"{path} cannot be read ({fault.strerror}).") from fault
-    except (ValueError, RecursionError) as fault:  # of text that is not UTF-8, too
+    except (ValueError, RecursionError) as fault:  # includes text that is not UTF-8
         raise ValueError(f"{path} is not JSON: {fault}.") from fault
 
 
-def _made(kind: Callable[..., Any], what: str, allowed: Sequence[str], content: Any, **more: Any) -> Any:
-    """What `kind` makes of the fields of a JSON object."""
+def _build(kind: Callable[..., Any], place: str, allowed: Sequence[str], content: Any, **extra: Any) -> Any:
+    """Call `kind` with the fields of a JSON object."""
     if not isinstance(content, dict) or not set(content) <= set(allowed):
         got = ", ".join(content) if isinstance(content, dict) else f"a {type(content).__name__}"
-        raise ValueError(f"{what} must be an object with fields of {', '.join(allowed)}; got {got}.")
+        raise ValueError(f"{place} must be an object with fields of {', '.join(allowed)}; got {got}.")
     try:
-        return kind(**content, **more)
-    except (TypeError, ValueError) as fault:  # TypeError: a field that is needed is missing
-        raise ValueError(f"{what}: {fault}") from fault
+        return kind(**content, **extra)
+    except (TypeError, ValueError) as fault:  # TypeError: a required field is missing
+        raise ValueError(f"{place}: {fault}") from fault
 
 
 def _picture(path: File) -> Float[Array, "h w 3"]:
@@ -127,10 +127,10 @@ def _picture(path: File) -> Float[Array, "h w 3"]:
     from skimage.util import img_as_float32
 
     if not Path(path).is_file():
-        raise ValueError(f"there is no file {path}.")
+        raise ValueError(f"images must be files; there is no file {path}.")
     try:
         picture = imread(path)
-    except Exception as fault:  # each of the many readers raises errors of its own
+    except Exception as fault:  # readers of pictures raise errors of many kinds
         raise ValueError(f"{path} cannot be read as a picture: {fault}") from fault
     if picture.ndim != 3 or picture.shape[-1] != 3 or picture.dtype not in (np.uint8, np.uint16):
         got = f"shape {picture.shape} of {picture.dtype}"

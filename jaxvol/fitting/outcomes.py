@@ -1,4 +1,4 @@
-"""How does a fit end?"""
+"""Outcomes of a fit, and the limits that end it."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import optimistix as optx
 
 
 class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
-    """How a fit ended: Optimistix's results, and `stalled`."""
+    """Outcome of a fit: Optimistix's results, and `stalled`."""
 
     stalled = (
         "No step lowered the loss by more than rtol any more: either a minimum, to the precision of the "
@@ -15,7 +15,7 @@ class Outcome(optx.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
 
 class Limits(NamedTuple):
-    """When a fit ends: see `fit`."""
+    """Limits at which a fit ends: see `fit`."""
 
     max_steps: int
     patience: int

@@ -1,6 +1,4 @@
-"""Where fits of transfer functions start: from flat grey."""
-
-from typing import Any
+"""Starting points for fits of transfer functions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,16 +8,16 @@ from ..scene.transfer import TransferFunction
 from ..scene.volume import Volume
 
 
-def flat_grey(volume: Volume, points: int | Any = 8, clim: Arrayable | None = None) -> TransferFunction:
+def flat_grey(volume: Volume, points: int = 8, clim: Arrayable | None = None) -> TransferFunction:
     """A transfer function to start a fit from: middle grey, with the same extinction everywhere.
 
     Args:
-        volume: its optical depth becomes about 1, so that the back is visible as well as the front.
+        volume: the volume, whose optical depth becomes about 1: its back is visible as well as its front.
         points: number of control points, at least 2, evenly spaced.
-        clim: their range (low, high), in value units; by default that of the volume's values.
+        clim: range (low, high) of the control points, in value units; by default that of the volume.
 
     Returns:
-        The `TransferFunction`, of colours 0.5.
+        The `TransferFunction`, with colours 0.5.
 
     Raises:
         ValueError: for fewer than two points, and for a range that does not increase.

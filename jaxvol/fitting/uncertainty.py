@@ -1,4 +1,4 @@
-"""How well do the images determine the parameters? Covariance from the triangles of a least-squares fit.
+"""Uncertainty of fitted parameters: covariance from the triangles of a least-squares fit.
 
 To first order, a fit errs by (JᵀJ)⁻¹ Jᵀ e if the references err by e. So its covariance is
 (JᵀJ)⁻¹ Jᵀ cov(e) J (JᵀJ)⁻¹, with JᵀJ = RᵀR. For noise that is independent from pixel to pixel, Jᵀ cov(e) J is
@@ -23,36 +23,35 @@ from .residuals import Triangles
 
 
 SHARE = 0.5
-"""A parameter is named for a direction if its share in it is at least this fraction of the largest."""
+"""Minimum share of a parameter that is named for a direction, relative to the largest share in it."""
 
 TOUCHED = 0.01
-"""A variance is infinite if the parameter's share in an undetermined direction of length 1 exceeds this."""
-
+"""Share in an undetermined direction of length 1 beyond which a parameter's variance is infinite."""
 
 MISFIT = "The model does not fit"
-"""How the warning of a misfit begins, for those who tell it otherwise."""
+"""Beginning of the warning of a misfit, for callers that filter it."""
 
 
 class Uncertainty(NamedTuple):
     """Uncertainty of fitted parameters that is due to noise of the references, and of the paths of a
     `PathTracedResidual` (which counts twice, so that errors are at most 1.4 times too large).
 
-    If the model cannot make the references, the parameters are biased, and neither covariance knows by how
-    much. A misfit whose norm is k times the standard deviation of (equal) noise may shift a parameter by up
-    to k standard errors. So what is too small to show in χ² of m entries, a k of (2 m)^¼, may still do harm.
+    If the model cannot reproduce the references, the parameters are biased, and neither covariance includes
+    the bias. A misfit whose norm is k times the standard deviation of (equal) noise may shift a parameter by
+    up to k standard errors. So a misfit of k = (2 m)^¼, too small to show in χ² of m entries, may matter.
 
     Attributes:
-        covariance: in the order of `names`, for noise that is independent from pixel to pixel, whatever its
-            variance in each ("sandwich", Huber–White). If a direction that the residual does not determine
-            changes a parameter, its variance is infinite and its covariances are NaN.
-        names: such as `.extinction[3]`.
-        undetermined: for each such direction, the parameters that it changes most.
-        covariance_of_equal_noise: if all entries of the residual have independent noise of equal variance;
-            otherwise wrong: too small where only some pixels are noisy, and these show the parameters.
-        reduced_chi_squared: how many times larger the mean square of the residual is than the noise,
-            Σ r² / Σ σ² · m / (m - n) with m entries of σ > 0 and n parameters, so that pixels without noise,
-            such as the background of a path-traced image, don't count: about 1 if the model fits. None if the
-            noise of the references is unknown, and then nothing is known about misfit, either.
+        covariance: covariance in the order of `names`, for noise that is independent from pixel to pixel,
+            of any variance in each ("sandwich", Huber–White). If a direction that the residual does not
+            determine changes a parameter, its variance is infinite and its covariances are NaN.
+        names: names of the numbers, such as `.extinction[3]`.
+        undetermined: for each undetermined direction, the parameters that it changes most.
+        covariance_of_equal_noise: covariance if all entries of the residual have independent noise of equal
+            variance; too small where only some pixels are noisy, and these determine the parameters.
+        reduced_chi_squared: ratio of the mean squares of the residual and of the noise, Σ r² / Σ σ² ·
+            m / (m - n), with m entries of σ > 0 and n parameters: about 1 if the model fits. Pixels without
+            noise, such as the background of a path-traced image, don't count. None if the noise of the
+            references, and so any misfit, is unknown.
     """
 
     covariance: Float[np.ndarray, "parameters parameters"]
@@ -68,31 +67,31 @@ class Uncertainty(NamedTuple):
 
 
 class Spreads(NamedTuple):
-    """How noise of the references moves the free variables.
+    """Effect of noise of the references on the free variables.
 
     Attributes:
-        each: F, with covariance F Fᵀ, for noise of any variance in each pixel.
-        equal: for noise of equal variance in all entries.
+        unequal: F, with covariance F Fᵀ, for noise of any variance in each pixel.
+        equal: F for noise of equal variance in all entries.
         undetermined: directions, of length 1, that the residual does not determine, in rows.
     """
 
-    each: Float[np.ndarray, "free numbers"]
+    unequal: Float[np.ndarray, "free numbers"]
     equal: Float[np.ndarray, "free determined"]
     undetermined: Float[np.ndarray, "directions free"]
 
 
 def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
-    """Spreads, where `scale` is the norm of the data. A direction is undetermined within rounding: its
-    singular value is below n ε times the largest one, or times that norm."""
+    """Spreads by the triangles of `count` entries. `scale`: norm of the data."""
     factor, scores = (np.asarray(triangle, np.float64) for triangle in triangles)
     n = scores.shape[1]
     _, singular, directions = np.linalg.svd(factor[:n, :n])
+    # a singular value within rounding of the largest one, or of the data, determines nothing
     determined = singular > n * np.finfo(triangles.residual.dtype).eps * singular.max(initial=scale)
     inverse = directions[determined].T / singular[determined]
-    left = max(count - n, 1)
-    each = (inverse / singular[determined]) @ (directions[determined] @ scores.T) * np.sqrt(count / left)
-    equal = inverse * np.sqrt(np.sum(factor[:, -1] ** 2) / left)
-    return Spreads(each, equal, directions[~determined])
+    freedom = max(count - n, 1)
+    unequal = (inverse / singular[determined]) @ (directions[determined] @ scores.T)
+    equal = inverse * np.sqrt(np.sum(factor[:, -1] ** 2) / freedom)
+    return Spreads(unequal * np.sqrt(count / freedom), equal, directions[~determined])
 
 
 def uncertainty(
@@ -102,12 +101,12 @@ def uncertainty(
     at: FreeVariables,
     scale: float,
     chi_squared: float | None,
-    own: Float[Array, "free free"] | None = None,
+    path_covariance: Float[Array, "free free"] | None = None,
 ) -> Uncertainty:
-    """Uncertainty of `free.forward(at)`. `own`: the fit's covariance, if it is random."""
+    """Uncertainty of `free.forward(at)`. `path_covariance`: part due to noise of the fit's paths."""
     flat, unravel = ravel_pytree(at)
     jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
-    each, equal, undetermined = spreads(triangles, count, scale)
+    unequal, equal, undetermined = spreads(triangles, count, scale)
     names = free.names(at)
     # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
     # the parameter is undetermined
@@ -115,21 +114,21 @@ def uncertainty(
     share = np.abs((jac / np.where(norm > 0, norm, 1)) @ undetermined.T)
     moved = [[names[i] for i in np.flatnonzero(row >= SHARE * row.max())] for row in share.T]
     touched = np.any(share > TOUCHED, axis=1)
-    more = 0.0 if own is None else jac @ np.asarray(own, np.float64) @ jac.T
+    by_paths = 0.0 if path_covariance is None else jac @ np.asarray(path_covariance, np.float64) @ jac.T
 
     def covariance(spread: np.ndarray) -> np.ndarray:
         if count <= flat.size:  # no entries are left to estimate variances from
             return np.full((len(jac),) * 2, np.inf)
-        found = (jac @ spread) @ (jac @ spread).T + more
-        found[touched] = found[:, touched] = np.nan
-        found[touched, touched] = np.inf
-        return found
+        matrix = (jac @ spread) @ (jac @ spread).T + by_paths
+        matrix[touched] = matrix[:, touched] = np.nan
+        matrix[touched, touched] = np.inf
+        return matrix
 
-    return Uncertainty(covariance(each), names, moved, covariance(equal), chi_squared)
+    return Uncertainty(covariance(unequal), names, moved, covariance(equal), chi_squared)
 
 
 def warn_of_misfit(noise: Noise, chi_squared: float, message: str | None) -> None:
-    """Warn if noise does not explain the residual. `message`: how the fit ended, if it did not converge."""
+    """Warn if noise does not explain the residual. `message`: outcome of a fit that did not converge."""
     if not chi_squared > noise.largest_by_chance:
         return
     because = "" if message is None else f", or the fit is not at its minimum ({message})"
@@ -137,5 +136,5 @@ def warn_of_misfit(noise: Noise, chi_squared: float, message: str | None) -> Non
         f"{MISFIT} the references{because}: the residual is {chi_squared**0.5:.3g} times as large as "
         f"noise (reduced chi-squared {chi_squared:.4g}; of noise alone below {noise.largest_by_chance:.3g}). "
         "Standard errors do not cover the bias that this causes.",
-        stacklevel=4,  # whoever calls `fit`
+        stacklevel=4,  # the caller of `fit`
     )

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from .._util.checks import Arrayable, Checked, described, integer, output_file
+from .._util.checks import Arrayable, described, integer, output_file
 from .._util.srgb import displayed, png_of, to_srgb, warn_of_8_bits
 from .._util.whole_files import whole_file
 
 
 def save_image(
-    path: Checked[str | os.PathLike[str]], linear: Arrayable, *, text: Mapping[str, str] | None = None
+    path: str | os.PathLike[str], linear: Arrayable, *, text: Mapping[str, str] | None = None
 ) -> Path:
     """Write an image in the format of the file extension:
 
@@ -70,7 +70,7 @@ def save_image(
     return path
 
 
-def save_png(path: Checked[str | os.PathLike[str]], linear: Arrayable) -> Path:
+def save_png(path: str | os.PathLike[str], linear: Arrayable) -> Path:
     """Write an image as PNG: `save_image` for a path that must end in `.png`.
 
     Args:
@@ -95,7 +95,7 @@ INSET = 1e-3
 """Inset of an image in pixels: at a pixel's edge, matplotlib below 3.11 may draw one row more or less."""
 
 
-def show_images(images: Checked[Mapping[str, Arrayable]], columns: Checked[int] = 3) -> None:
+def show_images(images: Mapping[str, Arrayable], columns: int = 3) -> None:
     """Draw linear images side by side under their names, with matplotlib, for notebooks. They are not
     resampled, which would hide sampling artifacts: one pixel of an image is one pixel of the page.
 

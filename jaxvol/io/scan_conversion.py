@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 
-from .._util.checks import Arrayable, Checked, described, finite_array, integer, require
+from .._util.checks import Arrayable, described, finite_array, integer, require
 from .._util.files import MOST_VOXELS
 from .._util.image_record import holds
 from .._util.memory import require_room
@@ -16,13 +16,13 @@ from ..scene.volume import Volume, check_one_channel
 
 
 def scan_convert(
-    volume: Checked[Volume],
-    probe: Checked[ToroidalMap],
+    volume: Volume,
+    probe: ToroidalMap,
     spacing: Arrayable | None = None,
     *,
-    shape: Checked[Sequence[int]] | None = None,
+    shape: Sequence[int] | None = None,
     origin: Arrayable | None = None,
-    fill_value: Checked[float] = 0,
+    fill_value: float = 0,
 ) -> Volume:
     """Resample an ultrasound volume as acquired onto a Cartesian grid in the world of its probe.
 

@@ -1,4 +1,4 @@
-"""Which inputs have no derivative, since they move paths, or the places where the medium jumps?"""
+"""Errors for derivatives by inputs that have none, since they move paths, or the medium's discontinuities."""
 
 from operator import attrgetter
 from typing import Any, TypeVar
@@ -21,13 +21,13 @@ from ..xla.trees import is_none
 T = TypeVar("T")
 
 REMEDY = (
-    "Keep constant what is not to be differentiated by jax.lax.stop_gradient; for a derivative, take "
-    "differences of images of the same key, or differentiate render with lighting.ScattererTemplates."
+    "Make that input constant by jax.lax.stop_gradient; for a derivative, take differences of images of the "
+    "same key, or differentiate render with lighting.ScattererTemplates."
 )
 
 
 def constant(name: str, tree: T, reason: str = "it moves the paths") -> T:
-    """The tree. Raises `RuntimeError` where it is differentiated."""
+    """The tree. **Raises** `RuntimeError` where it is differentiated."""
     message = f"path_trace has no derivative with respect to {name}, since {reason}. {REMEDY}"
     return eqxi.nondifferentiable(tree, msg=message)
 
@@ -35,10 +35,10 @@ def constant(name: str, tree: T, reason: str = "it moves the paths") -> T:
 def with_constant_paths(
     volume: Volume, transfer: Transfer, camera: Camera, materials: tuple[Material, ...]
 ) -> tuple[Volume, Transfer, Camera, tuple[Material, ...]]:
-    """The same. Raises `RuntimeError` where what moves paths or jumps of the medium is differentiated."""
-    place = "the volume's spacing, origin and direction"
+    """The arguments. **Raises** `RuntimeError` where an input that moves paths or jumps is differentiated."""
+    name = "the volume's spacing, origin and direction"
     data, field, field_of = volume.data, volume.field, attrgetter("field")
-    volume = constant(place, without_voxels(eqx.tree_at(field_of, volume, None, is_leaf=is_none)))
+    volume = constant(name, without_voxels(eqx.tree_at(field_of, volume, None, is_leaf=is_none)))
     volume = eqx.tree_at(field_of, with_voxels(volume, [data]), field, is_leaf=is_none)
 
     lines = constant("the control points' values of transfer", _lines_of(transfer), "they are constants")
@@ -52,24 +52,24 @@ def with_constant_paths(
 
 
 def check_voxels(transfer: Transfer, materials: tuple[Material, ...]) -> None:
-    """Raises `RuntimeError` if jumps of the medium move with the voxels."""
-    what = "path_trace has no derivative with respect to voxels"
+    """Raise `RuntimeError` if jumps of the medium move with the voxels."""
+    message = "path_trace has no derivative with respect to voxels"
     if materials:
         reason = "which end at values of the volume, or where the transfer function shows nothing"
-        raise RuntimeError(f"{what} where there are materials, {reason}. {REMEDY}")
+        raise RuntimeError(f"{message} where there are materials, {reason}. {REMEDY}")
     if not is_traced(transfer) and has_step(transfer):
-        raise RuntimeError(f"{what} under a transfer function with a step (two equal values). {REMEDY}")
+        raise RuntimeError(f"{message} under a transfer function with a step (two equal values). {REMEDY}")
 
 
 def has_step(transfer: Transfer) -> Bool[Array, ""]:
-    """Whether two neighbouring control points have the same value."""
+    """True if two neighbouring control points have the same value."""
     equal = [jnp.any(line[..., 1:] == line[..., :-1]) for line in _lines_of(transfer)]
     return jnp.any(jnp.stack(equal)) if equal else jnp.zeros((), bool)
 
 
 def _lines_of(transfer: Transfer) -> list[Any]:
-    """Control points' values, and magnitudes, of all tables in a transfer function."""
+    """Values, and magnitudes, of the control points of all tables in a transfer function."""
     tables = TransferFunction | TransferFunction2D
     parts = jax.tree.leaves(transfer, is_leaf=lambda part: isinstance(part, tables))
-    found: list[Any] = [part.values for part in parts if isinstance(part, tables)]
-    return found + [part.magnitudes for part in parts if isinstance(part, TransferFunction2D)]
+    values: list[Any] = [part.values for part in parts if isinstance(part, tables)]
+    return values + [part.magnitudes for part in parts if isinstance(part, TransferFunction2D)]

@@ -1,4 +1,4 @@
-"""Path regeneration: walks of a queue begin in idle lanes; at its end, the remaining ones are compacted."""
+"""Path regeneration: walks of a queue begin in idle lanes; the last walks are compacted into fewer lanes."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -17,11 +17,11 @@ FEWER = 8
 """Divisor of the number of lanes once the queue is empty."""
 
 Index: TypeAlias = Int[Array, " lanes"]
-"""The index in the queue of each lane's walk."""
+"""Index in the queue of the walk in each lane."""
 
 
 class _Lanes(NamedTuple):
-    """The walks in their lanes, their indices in the queue, how many have begun, and the results so far."""
+    """Walks in their lanes, their indices in the queue, the number of walks begun, and the results so far."""
 
     walks: Walk
     queue_index: Index
@@ -32,7 +32,7 @@ class _Lanes(NamedTuple):
 def walk_all(
     begin: Callable[[Index], Walk], step: Callable[[Walk], Walk], count: int, lanes: int
 ) -> WalkResult:
-    """Results of a queue. `begin`: walks by indices, not alive from `count` on. `step`: of all lanes."""
+    """Results of `count` walks. `begin`: walks by index, not alive from `count` on; `step`: advances all."""
     lanes = min(lanes, count)
     fewer = -(-lanes // FEWER)
     none = jnp.full(lanes, count, jnp.int32)
@@ -55,9 +55,9 @@ def walk_all(
 
 
 def _stored(state: _Lanes, index: Index) -> WalkResult:
-    """The results with those of the lanes' walks at these indices; one past the last stores nothing."""
+    """The results after storing those of the lanes at `index`; an index past the end stores nothing."""
     return jax.tree.map(
-        lambda all_, some: all_.at[index].set(some, mode="drop"), state.results, state.walks.result
+        lambda results, lanes: results.at[index].set(lanes, mode="drop"), state.results, state.walks.result
     )
 
 

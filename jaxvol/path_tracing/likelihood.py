@@ -1,9 +1,9 @@
-"""Derivatives of detached sampling: paths are drawn as if the parameters were constants, and each probability
-p of what was drawn enters as the weight p / q, q its constant. The mean over paths is then the image as a
-function of the parameters.
+"""Derivatives of detached sampling: paths are drawn as if the parameters were constants, and the probability
+p of each decision enters as the weight p / q, where the constant q equals p. The mean over paths is then the
+image as a function of the parameters.
 
 Where the extinction is 0, nothing collides, although the derivative is not 0; near 0 or a majorant, p / q has
-a derivative of unbounded variance. So derivatives have paths by a `Sampling` of their own.
+a derivative of unbounded variance. So paths for derivatives are drawn by another `Sampling`.
 
 Sources: Vicini, Speierer and Jakob, "Path Replay Backpropagation", 2021; Nimier-David et al., "Unbiased
 Inverse Volume Rendering with Differential Trackers", 2022.
@@ -19,13 +19,13 @@ from .._util.vec3 import Scalar
 
 
 class Sampling(NamedTuple):
-    """How collisions are drawn.
+    """Sampling of collisions.
 
     Attributes:
         margin: factor of the majorants.
-        collisions: a path collides at least so often along the volume's diagonal, also in empty space.
-        importance: least factor of a path's importance at a collision, however dark it is. None: a path's
-            importance is its throughput, so that it ends where it carries no light.
+        collisions: minimum mean number of collisions along the volume's diagonal, also in empty space.
+        importance: minimum factor of a path's importance at a collision, however dark the collision is. None:
+            a path's importance is its throughput, so that it ends where it carries no light.
     """
 
     margin: float
@@ -36,13 +36,13 @@ class Sampling(NamedTuple):
 OF_IMAGES = Sampling(1, 0, None)
 
 # With the margin m, the derivative of the logarithm of a path's probability has a variance proportional to
-# m / (m - 1), and takes m times as many candidates: least work for m = 2.
+# m / (m - 1), and takes m times as many candidates: m = 2 minimises the work.
 OF_DERIVATIVES = Sampling(2, 0.5, 0.25)
 
 
 @jax.custom_jvp
 def likelihood(probability: Scalar) -> Scalar:
-    """1, with the derivative of `probability / q`, of a probability and the constant q equal to it."""
+    """1, with the derivative of `probability / q`, where the constant q equals the probability."""
     # JAX 0.10 fails to compile a batch of this where the derivative has a batch axis and the value none
     one = jnp.ones_like(probability)
     return jnp.where(probability > 0, one, one)
@@ -56,12 +56,12 @@ def _(primals: tuple[Scalar], tangents: tuple[Scalar]) -> tuple[Scalar, Scalar]:
 
 
 @jax.custom_jvp
-def jumping(number: Scalar, where: Bool[Array, "..."]) -> Scalar:
-    """The number itself; `where` it is at a jump, any change of it has the derivative NaN."""
+def jumping(number: Scalar, jump: Bool[Array, "..."]) -> Scalar:
+    """The number, with the derivative NaN where it is at a jump and changes."""
     return number
 
 
 @jumping.defjvp
 def _(primals: tuple[Scalar, Array], tangents: tuple[Scalar, Any]) -> tuple[Scalar, Scalar]:
-    (number, where), (tangent, _) = primals, tangents
-    return jumping(number, where), jnp.where(where & (tangent != 0), jnp.nan, tangent)
+    (number, jump), (tangent, _) = primals, tangents
+    return jumping(number, jump), jnp.where(jump & (tangent != 0), jnp.nan, tangent)

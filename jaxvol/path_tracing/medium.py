@@ -24,21 +24,21 @@ Block: TypeAlias = tuple[Int[Array, "..."], Int[Array, "..."], Int[Array, "..."]
 
 
 class Majorants(eqx.Module):
-    """The majorant of each block, and how far empty space reaches around each empty block.
+    """Majorants of blocks, and distances from empty blocks to the nearest others.
 
     Attributes:
         table: for each block, its majorant (1/length) if it may have extinction; else minus the chessboard
             distance, in blocks, to the nearest block that may.
         last: grid coordinate of the last node along each axis.
         empty: majorant of empty blocks (1/length).
-        least: least rate at which collisions are drawn (1/length), with weights where it exceeds the
-            extinction; None: all are drawn as they are.
+        floor: minimum rate at which collisions are drawn (1/length), with weights where it exceeds the
+            extinction; None: collisions are drawn at the rate of the extinction.
     """
 
     table: Float[Array, "bx by bz"]
     last: Vec3
     empty: Scalar | float = 0.0
-    least: Scalar | None = None
+    floor: Scalar | None = None
 
     @classmethod
     def of(
@@ -49,15 +49,14 @@ class Majorants(eqx.Module):
         materials: tuple[Material, ...],
         sampling: Sampling,
     ) -> "Majorants":
-        """Those of the medium that `Medium.of` makes of a volume. **Raises** `ValueError` for a transfer
-        function without a majorant."""
+        """Majorants of the medium of a volume. **Raises** `ValueError` for a transfer without majorant."""
         if type(transfer).majorant is Transfer.majorant:
             name = type(transfer).__name__
             raise ValueError(f"transfer must have a majorant; {name} does not override Transfer.majorant.")
         blocks, transfer, materials = jax.lax.stop_gradient((blocks, transfer, materials))
-        own, none = transfer.majorant(blocks), jnp.zeros(blocks.shape, bool)
+        majorant, none = transfer.majorant(blocks), jnp.zeros(blocks.shape, bool)
         bound, open_ = jnp.zeros_like(blocks.low), ~none
-        for material in materials:  # what comes after a material that fills the block is ignored
+        for material in materials:  # a material that fills the block hides the next ones
             if material.label is not None:
                 may, fills = blocks.may_hold(material.label), none
             elif material.values is None:
@@ -68,17 +67,17 @@ class Majorants(eqx.Module):
                 fills = (blocks.low >= low) & (blocks.high <= high)
             bound = jnp.where(open_ & may, jnp.maximum(bound, 1 / material.mean_free_path), bound)
             open_ &= ~fills
-        bound = jnp.where(open_, jnp.maximum(bound, own), bound)
-        bound = jnp.where(own > 0, bound, 0)
+        bound = jnp.where(open_, jnp.maximum(bound, majorant), bound)
+        bound = jnp.where(majorant > 0, bound, 0)
         distance = Affine(volume).occupancy(bound > 0).distance().astype(bound.dtype)
         x, y, z = (jnp.asarray(n - 1, bound.dtype) for n in volume.shape)
         last, distance = (x, y, z), distance.reshape(bound.shape)
         if not sampling.collisions:
             return cls(jnp.where(bound > 0, sampling.margin * bound, -distance), last)
         sides = [n * step for n, step in zip(last, volume.spacing, strict=True)]
-        least = sampling.collisions / jnp.sqrt(sum(side * side for side in sides))
-        table = jnp.where(bound > 0, sampling.margin * jnp.maximum(bound, least), -distance)
-        return cls(table, last, sampling.margin * least, least)
+        floor = sampling.collisions / jnp.sqrt(sum(side * side for side in sides))
+        table = jnp.where(bound > 0, sampling.margin * jnp.maximum(bound, floor), -distance)
+        return cls(table, last, sampling.margin * floor, floor)
 
     def at(self, block: Block) -> Scalar:
         (x, y, z), (_, ny, nz) = block, self.table.shape
@@ -89,7 +88,7 @@ class Majorants(eqx.Module):
         return jnp.maximum(entry, self.empty)
 
     def holding(self, coordinate: Vec3) -> Block:
-        """The block that holds a grid coordinate, or the nearest one."""
+        """The block nearest to a grid coordinate."""
         x, y, z = (
             jnp.clip(jnp.floor(c / BLOCK).astype(jnp.int32), 0, n - 1)
             for c, n in zip(coordinate, self.table.shape, strict=True)
@@ -97,7 +96,7 @@ class Majorants(eqx.Module):
         return x, y, z
 
     def within(self, coordinate: Vec3, block: Block) -> Vec3:
-        """Clamp the coordinate to a block that rounding may have moved it out of."""
+        """Clamp a coordinate to its block, beyond which rounding may have moved it."""
         x, y, z = (
             jnp.clip(c, BLOCK * i.astype(c.dtype), jnp.minimum(BLOCK * (i + 1).astype(c.dtype), last))
             for c, i, last in zip(coordinate, block, self.last, strict=True)
@@ -109,8 +108,8 @@ class Medium(NamedTuple):
     """A volume as a medium that scatters and absorbs light.
 
     Attributes:
-        measure: reads from memory what is needed at a grid coordinate.
-        classify: maps that to extinction (1/length) and single-scattering albedo (r, g, b) in [0, 1].
+        measure: reads the measurements at a grid coordinate from memory.
+        classify: maps measurements to extinction (1/length) and single-scattering albedo (r, g, b) in [0, 1].
         majorants: upper bounds of the extinction.
     """
 
@@ -142,10 +141,10 @@ class Medium(NamedTuple):
             kept = jnp.ones_like(extinction)
             visible = extinction > 0
             for share, material in zip(fractions, materials, strict=True):
-                here = visible & (share > 0)
+                inside = visible & (share > 0)
                 extinction = jumping(extinction, ~visible & (share > 0))
-                extinction = jnp.where(here, 1 / material.mean_free_path, extinction)
-                kept = jnp.where(here, 1 - material.opacity, kept)
+                extinction = jnp.where(inside, 1 / material.mean_free_path, extinction)
+                kept = jnp.where(inside, 1 - material.opacity, kept)
             r, g, b = (clipped(c) * kept for c in color)
             return extinction, (r, g, b)
 

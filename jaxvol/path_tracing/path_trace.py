@@ -1,5 +1,6 @@
 """Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
@@ -24,7 +25,7 @@ from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
 from ..xla.differentiation import forward_only, refuse_reverse_mode
 from ..xla.platform import is_traced
-from ..xla.trees import constant, is_none
+from ..xla.trees import PyTree, constant, is_none
 from .fixed_paths import check_voxels, has_step, with_constant_paths
 from .lanes import walk_all
 from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
@@ -36,29 +37,28 @@ LANES = 2**13
 """Walks that run side by side by default on a CPU; 32 times as many on a GPU."""
 
 WALKS_PER_LANE = 128
-"""Walks that each lane of a batch runs, one after the other."""
+"""Mean number of walks that a lane of a batch runs, one after the other."""
 
 FORWARD_ONLY = (
     "path_trace has derivatives in forward mode only; take jax.jacfwd or jax.jvp in place of jax.grad, "
     "jax.vjp or jax.jacrev."
 )
-"""Error message: a reverse pass would have to keep or repeat all that happens along each path."""
+"""Error message: a reverse pass would have to keep or repeat every step of each path."""
 
 
 class PathTraced(eqx.Module):
-    """A path-traced image, from the paths traced so far.
+    """A path-traced image.
 
     Attributes:
         radiance: linear RGB of the light that the volume scatters into the camera, mean over all paths,
             without the background.
-        opacity: the fraction of camera rays that met anything.
-        deviations: sums of the squared deviations of each path's radiance from the mean.
-        exhausted: whether any path was cut off by `max_scatterings`; the pixel lacks what it would have
-            contributed.
-        paths: per pixel.
-        seed: of the last paths' random numbers.
-        groups: of each group of paths, the mean radiance and, last, opacity; None for one group, and where
-            groups of different sizes were joined.
+        opacity: fraction of paths that collide.
+        deviations: sum over paths of the squared deviation of their radiance from the mean.
+        exhausted: True where `max_scatterings` cut off a path, whose further light is missing.
+        paths: number of paths of a pixel.
+        seed: seed of the random numbers of the last paths.
+        groups: mean radiance and, as last channel, opacity of each group of paths; None for one group, and
+            where groups of different sizes were joined.
     """
 
     radiance: Float[Array, "height width 3"]
@@ -79,7 +79,7 @@ class PathTraced(eqx.Module):
             return jnp.full_like(self.deviations, jnp.inf)
         return jnp.sqrt(self.deviations / (self.paths * (self.paths - 1)))
 
-    def image(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
+    def image(self, background: Arrayable = (1.0, 1.0, 1.0)) -> Float[Array, "height width 3"]:
         """Linear RGB over a background.
 
         Args:
@@ -90,7 +90,7 @@ class PathTraced(eqx.Module):
         """
         return self.radiance + (1 - self.opacity[..., None]) * _background(background, self.radiance)
 
-    def images(self, background: Any = (1.0, 1.0, 1.0)) -> Float[Array, "groups height width 3"]:
+    def images(self, background: Arrayable = (1.0, 1.0, 1.0)) -> Float[Array, "groups height width 3"]:
         """Linear RGB over a background, by each group of paths: independent images, whose mean is `image`.
 
         Args:
@@ -108,13 +108,13 @@ class PathTraced(eqx.Module):
         return self.groups[..., :3] + (1 - self.groups[..., 3:]) * background[None]
 
     def joined(self, other: "PathTraced") -> "PathTraced":
-        """The image by the paths of both, of the same scene and different keys.
+        """Image by the paths of two images of a scene.
 
         Args:
-            other: by another key.
+            other: an image of the same scene by another key.
 
         Returns:
-            The image.
+            The image by all paths.
 
         Raises:
             ValueError: for the same key, whose paths would count twice, and for another size.
@@ -133,19 +133,18 @@ class PathTraced(eqx.Module):
         opacity = self.opacity + (other.opacity - self.opacity) * share
         deviations = self.deviations + other.deviations + between
         exhausted = self.exhausted | other.exhausted
-        return PathTraced(
-            radiance, opacity, deviations, exhausted, paths, other.seed, self._all_groups(other)
-        )
-
-    def _all_groups(self, other: "PathTraced") -> Array | None:
-        """The groups of both, if they are of the same size."""
-        if self.groups is None or other.groups is None:
-            return None
-        same = self.paths * len(other.groups) == other.paths * len(self.groups)
-        return jnp.concatenate([self.groups, other.groups]) if same else None
+        groups = _all_groups(self, other)
+        return PathTraced(radiance, opacity, deviations, exhausted, paths, other.seed, groups)
 
 
-def _background(background: Any, image: Float[Array, "height width 3"]) -> Float[Array, "height width 3"]:
+def _all_groups(a: PathTraced, b: PathTraced) -> Array | None:
+    """The groups of two images, if they are of the same size."""
+    if a.groups is None or b.groups is None or a.paths * len(b.groups) != b.paths * len(a.groups):
+        return None
+    return jnp.concatenate([a.groups, b.groups])
+
+
+def _background(background: Arrayable, image: Array) -> Float[Array, "height width 3"]:
     background = jnp.asarray(background, image.dtype)
     if background.shape not in ((3,), image.shape):
         raise ValueError(f"background must have shape (3,) or {image.shape}; got {background.shape}.")
@@ -153,83 +152,79 @@ def _background(background: Any, image: Float[Array, "height width 3"]) -> Float
 
 
 def path_trace(
-    volume: Volume | Any,
+    volume: Volume,
     transfer: Transfer | Any,
     camera: Camera | Any,
-    lights: Light | tuple[Light, ...] | Any,
+    lights: Light | Sequence[Light],
     *,
     paths: int | Any = 16,
-    key: Any = 0,
+    key: Arrayable = 0,
     materials: Material | tuple[Material, ...] | None = None,
     anisotropy: Arrayable = 0.0,
-    max_scatterings: int | Any = 2**20,
+    max_scatterings: int = 2**20,
     antialias: bool | Any = False,
-    lanes: int | Any = None,
-    groups: int | Any = 1,
+    lanes: int | None = None,
+    groups: int = 1,
 ) -> PathTraced:
-    """Image of a volume that scatters light any number of times.
+    """Render a volume that scatters light any number of times by path tracing.
 
     The extinction is the transfer function's, at the trilinear value, and the single-scattering albedo is its
     colour, clipped to [0, 1]: an image corresponds to one by Mitsuba's `volpath` with a heterogeneous medium.
     (`render` treats the colour as light that the medium emits.)
 
     The image is radiance, in the unit of `lights`, as that of `ScattererTemplates`: in a white furnace
-    (albedo 1 under a `ConstantLight` of radiance L) it is L times the opacity.
-
-    NaN or infinity in any input makes the whole image NaN, since any path may reach it (what has a range,
-    such as a mean free path, is an error then). Images are float32, also of float64 scenes.
-
-    Random numbers have 24 bits, so free paths longer than 16.6 mean free paths within a block of voxels, of
-    probability 6e-8, are never drawn.
+    (albedo 1 under a `ConstantLight` of radiance L) it is L times the opacity. Images are float32, also of
+    float64 scenes. NaN or infinity in any input makes every pixel NaN, since any path may reach it (arguments
+    with a range, such as a mean free path, raise an error instead). Random numbers have 24 bits, so free
+    paths longer than 16.6 mean free paths within a block of voxels, of probability 6e-8, are never drawn.
 
     **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
-    colours and extinction, the opacity and mean free path of materials, the anisotropy, what lights emit,
-    and, without materials, voxels. They are unbiased: decisions stay as drawn, and their probabilities enter
-    as weights. The image is the same as without. `jax.jacfwd` takes the same paths for all its columns; with
-    `groups`, a derivative has a standard error, too: that of the mean over groups.
+    colours and extinction, the opacity and mean free path of materials, the anisotropy, the emission of
+    lights, and, without materials, voxels. They are unbiased: decisions stay as drawn, and their
+    probabilities enter as weights, so that the image does not change. `jax.jacfwd` takes the same paths for
+    all its columns; with `groups`, a derivative has the standard error of the mean over groups.
 
-    Their noise is greater than that of the image, and grows with the number of collisions of a path: in very
-    thick media of high albedo, take many paths. At a colour of 0 or 1, where the albedo is clipped, and an
+    Derivatives have more noise than the image, which grows with the number of collisions of a path: take many
+    paths in very thick media of high albedo. At a colour of 0 or 1, where the albedo is clipped, and at an
     extinction of 0, derivatives are one-sided. They are NaN with respect to an extinction of 0 inside a
-    material, which would appear all at once. `deviations` and the `standard_error` count as constants.
+    material, which would appear all at once. `deviations` and `standard_error` count as constants.
 
-    Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`. Of derivatives: Vicini, Speierer
+    Sources: Kajiya and Von Herzen 1984; Novák et al. 2018; see `tracking`. For derivatives: Vicini, Speierer
     and Jakob 2021; Nimier-David et al. 2022; see `likelihood`.
 
     Args:
-        volume: on its own grid; curved grids (`ToroidalMap`) are not supported.
+        volume: a volume without a curved grid (`ToroidalMap`).
         transfer: a `TransferFunction`, a `LabelTransferFunction`, or another one with a `majorant`.
-        camera: its rays pass through the centres of pixels, as in `render`.
-        lights: those with a position or a direction are sampled at every scattering, one of them at random; a
-            `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a medium is also
-            unbiased, but has infinite variance: its inverse square makes a few pixels far too bright.
-        paths: per pixel, ≥ 1. A pixel's paths take 64 bytes each at once, and 16 for each derivative. More
-            paths of another key are added by `PathTraced.joined`.
-        key: a seed, or a key of `jax.random`. The random numbers along a path depend only on it, on the pixel
-            and on the path's number.
+        camera: a camera, whose rays pass through the centres of pixels, as in `render`.
+        lights: a light, or several. At every scattering, a random one of those with a position or a direction
+            is sampled; a `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a
+            medium is also unbiased, but has infinite variance: a few pixels are far too bright.
+        paths: number of paths of a pixel, ≥ 1. A path takes 64 bytes, and 16 for each derivative.
+            `PathTraced.joined` adds more paths of another key.
+        key: a seed, or a key of `jax.random`. The random numbers along a path depend only on the key, the
+            pixel and the path's number.
         materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
             is colour · (1 - opacity). Where materials overlap, the first counts.
         anisotropy: g in (-1, 1), the mean cosine of a scattering (Henyey and Greenstein).
-        max_scatterings: after which a path ends, ≥ 1. By default 2²⁰, so that only Russian roulette ends a
-            path, with a probability that depends on its throughput. A smaller number gives an image of light
-            scattered at most that many times, and `exhausted` marks the pixels that lack some.
+        max_scatterings: number of scatterings after which a path ends, ≥ 1. By default 2²⁰, so that only
+            Russian roulette ends a path, with a probability that depends on its throughput. A smaller number
+            renders light scattered at most that many times; `exhausted` marks the pixels that lack some.
         antialias: let rays pass through random points of their pixels.
-        lanes: paths that are traced side by side. Memory grows with it; the result does not change.
-        groups: that paths are split into, a divisor of `paths`. Of several, each keeps an image,
-            16 bytes a pixel, and as much for each derivative; so whatever is computed of images has a
-            standard error, `std(axis=0, ddof=1) / sqrt(groups)` over `PathTraced.images`.
+        lanes: number of paths that are traced side by side. Memory grows with it; the result does not change.
+        groups: number of groups of paths, a divisor of `paths`. Each of several groups keeps an image, 16
+            bytes a pixel, and as much for each derivative; so any function of images has a standard error,
+            `std(axis=0, ddof=1) / sqrt(groups)` over `PathTraced.images`.
 
     Returns:
         A `PathTraced`, with the standard error of each pixel.
 
     Raises:
-        ValueError: for arguments out of these ranges, no lights, a transfer function without a majorant, and
-            labels where the volume has none.
-            Also if it is differentiated in reverse mode (`jax.grad`).
-        RuntimeError: if it is differentiated with respect to what moves paths or jumps of the medium: the
+        ValueError: for arguments out of range, no lights, a transfer function without a majorant, labels
+            where the volume has none, and reverse-mode differentiation (`jax.grad`).
+        RuntimeError: for differentiation with respect to inputs that move paths or jumps of the medium: the
             camera, the volume's place, directions and positions of lights, the control points' values of the
             transfer function, the values of materials, and voxels where there are materials or a transfer
-            function has a step (if it is traced, the derivative is NaN).
+            function has a step (the derivative is NaN if the transfer function is traced).
     """
     order = "path_trace(volume, transfer, camera, lights)"
     given = volume, transfer, camera, lights, materials, anisotropy
@@ -257,12 +252,12 @@ def path_trace(
     volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials)
     blocks = Blocks.of(constant(volume), slopes=transfer.reads_gradient)
     inputs = Inputs(volume, transfer, materials, lights, anisotropy)
-    how = How(paths, groups, lanes, pixels, antialias)
-    limit = jnp.asarray(limit, jnp.int32)
-    return forward_only(_traced(inputs, (camera, blocks, words_of(volume), limit, seed), how), FORWARD_ONLY)
+    options = TraceOptions(paths, groups, lanes, pixels, antialias)
+    constants = camera, blocks, words_of(volume), jnp.asarray(limit, jnp.int32), seed
+    return forward_only(_traced(inputs, constants, options), FORWARD_ONLY)
 
 
-def _seed(key: Any) -> UInt32[Array, ""]:
+def _seed(key: Arrayable) -> UInt32[Array, ""]:
     """Random word from a seed, or from a key of `jax.random`."""
     if not is_key(key):
         if not is_traced(key):
@@ -274,7 +269,7 @@ def _seed(key: Any) -> UInt32[Array, ""]:
 
 
 class Inputs(NamedTuple):
-    """What an image may be differentiated with respect to, at least in part."""
+    """Inputs of an image that have derivatives, at least in part."""
 
     volume: Volume
     transfer: Transfer
@@ -284,8 +279,8 @@ class Inputs(NamedTuple):
 
 
 @dataclass(frozen=True)
-class How:
-    """Static arguments. `pixels`: of a batch."""
+class TraceOptions:
+    """Static arguments. `pixels`: number of pixels of a batch."""
 
     paths: int
     groups: int
@@ -302,44 +297,45 @@ Constants: TypeAlias = tuple[
 
 
 @eqx.filter_custom_jvp
-def _traced(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
-    return _trace(inputs, constants, how)
+def _traced(inputs: Inputs, constants: Constants, options: TraceOptions) -> PathTraced:
+    return _trace(inputs, constants, options)
 
 
 @_traced.def_jvp
-def _(primals: tuple[Inputs, Constants, How], tangents: tuple[Any, Any, Any]) -> tuple[PathTraced, Any]:
-    inputs, constants, how = primals
+def _(
+    primals: tuple[Inputs, Constants, TraceOptions], tangents: tuple[Any, Any, Any]
+) -> tuple[PathTraced, Any]:
+    inputs, constants, options = primals
     traced, moving = _traced(*primals), tangents[0]
     constant = jax.tree.map(lambda _: None, traced)
     if not jax.tree.leaves(moving):
         return traced, constant
     if jax.tree.leaves(moving.volume):
         check_voxels(inputs.transfer, inputs.materials)
-    how = replace(how, sampling=OF_DERIVATIVES)
-    found = _derivative(inputs, moving, constants, how)
-    return traced, eqx.tree_at(_estimates, constant, found, is_leaf=is_none)
+    derivative = _derivative(inputs, moving, constants, replace(options, sampling=OF_DERIVATIVES))
+    return traced, eqx.tree_at(_estimates, constant, derivative, is_leaf=is_none)
 
 
 def _estimates(traced: PathTraced) -> tuple[Any, ...]:
-    """What has a derivative."""
+    """Outputs that have a derivative."""
     return traced.radiance, traced.opacity, traced.groups
 
 
-def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, how: How) -> tuple[Any, ...]:
+def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, options: TraceOptions) -> PyTree:
     """Derivatives of the `_estimates` along tangents, which are None where they are 0."""
     perturbed = jax.tree.map(lambda _, tangent: tangent is not None, inputs, tangents)
     moving, fixed = eqx.partition(inputs, perturbed)
 
     def image(moving: Inputs) -> tuple[Any, ...]:
-        return _estimates(_traced_by(eqx.combine(moving, fixed), constants, how))
+        return _estimates(_traced_by(eqx.combine(moving, fixed), constants, options))
 
-    _, found = jax.jvp(image, (moving,), (tangents,))
+    _, derivative = jax.jvp(image, (moving,), (tangents,))
     if jax.tree.leaves(moving.volume):  # a transfer function that is traced was not checked
-        found = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), found)
-    return found
+        derivative = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), derivative)
+    return derivative
 
 
-def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
+def _traced_by(inputs: Inputs, constants: Constants, options: TraceOptions) -> PathTraced:
     """Trace the image in batches of pixels."""
     # float64 becomes float32, whose rounding is far below the noise
     (volume, transfer, materials, lights, anisotropy), (camera, blocks, words, max_scatterings, seed) = (
@@ -348,14 +344,14 @@ def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
         )
     )
     packed, (width, height) = with_words(volume, [words]), camera.size
-    medium = Medium.of(packed, blocks, transfer, materials, how.sampling)
-    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings, how.sampling)
-    # Checked here, since comparisons in the walks would hide a NaN. The values of a volume with its own field
-    # are unknown and its ranges infinite, which is not an error.
+    medium = Medium.of(packed, blocks, transfer, materials, options.sampling)
+    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings, options.sampling)
+    # Checked here, since comparisons in the walks would hide a NaN. The values of a custom field are unknown
+    # and their ranges infinite, which is not an error.
     ranges = blocks if volume.field is None else None
     valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
     valid &= all_finite((materials, lights, anisotropy, camera)) & transfer.valid & camera.valid
-    paths, pixels = how.paths, how.pixels
+    paths, pixels = options.paths, options.pixels
     batches, count = -(-width * height // pixels), pixels * paths
 
     def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
@@ -363,28 +359,27 @@ def _traced_by(inputs: Inputs, constants: Constants, how: How) -> PathTraced:
             pixel, path = number * pixels + index // paths, index % paths
             alive = valid & (index < count) & (pixel < width * height)
             words = pixel.astype(jnp.uint32), path.astype(jnp.uint32), jnp.broadcast_to(seed, index.shape)
-            return jax.vmap(partial(_begin, scene, camera, how.antialias))(words, alive)
+            return jax.vmap(partial(_begin, scene, camera, options.antialias))(words, alive)
 
-        results = walk_all(begin, partial(step, scene), count, how.lanes)
+        results = walk_all(begin, partial(step, scene), count, options.lanes)
         results = jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results)
         radiance = jnp.stack(results.radiance, axis=-1)
         mean = radiance.mean(axis=1)
-        opacity = results.opacity.mean(axis=1)
         deviations = jnp.square(radiance - mean[:, None]).sum(axis=1)
-        numbers = mean, opacity, deviations, results.exhausted.any(axis=1)
-        if how.groups == 1:
+        numbers = mean, results.opacity.mean(axis=1), deviations, results.exhausted.any(axis=1)
+        if options.groups == 1:
             return numbers
-        each = jnp.concatenate([radiance, results.opacity[..., None]], axis=-1)
-        return *numbers, each.reshape(pixels, how.groups, -1, 4).mean(axis=2)
+        rgba = jnp.concatenate([radiance, results.opacity[..., None]], axis=-1)
+        return *numbers, rgba.reshape(pixels, options.groups, -1, 4).mean(axis=2)
 
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
-    found = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
-    radiance, opacity, deviations, exhausted, *groups = found
-    numbers = radiance, opacity, deviations, *(jnp.moveaxis(each, 2, 0) for each in groups)
-    # also of a derivative all numbers
-    radiance, opacity, deviations, *groups = (jnp.where(valid, each, jnp.nan * each) for each in numbers)
+    outputs = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
+    radiance, opacity, deviations, exhausted, *groups = outputs
+    numbers = radiance, opacity, deviations, *(jnp.moveaxis(group, 2, 0) for group in groups)
+    # by nan * array, the derivative becomes NaN, too
+    radiance, opacity, deviations, *groups = (jnp.where(valid, array, jnp.nan * array) for array in numbers)
     return PathTraced(radiance, opacity, deviations, exhausted, paths, seed, *groups)
 
 
@@ -392,7 +387,7 @@ _trace, _derivative = compiled(_traced_by), compiled(_derivative_of, in_turn=Fal
 
 
 def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
-    """Start a walk where the camera's ray enters the volume."""
+    """Start a walk at the entry of the camera's ray into the volume."""
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
     if antialias:

@@ -34,10 +34,10 @@ class Flight(NamedTuple):
     Attributes:
         start: grid coordinate.
         rate: change of the grid coordinate per world length; no component is 0.
-        depth: world length from the start, so far.
+        depth: world length flown so far.
         end: depth at which the flight ends.
-        block: the current one.
-        entry: of the block, in the table of majorants.
+        block: indices of the current block.
+        entry: entry of the block in the table of majorants.
     """
 
     start: Vec3
@@ -62,22 +62,22 @@ class Flight(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Where a flight stopped: at a collision candidate (`found`), its end (`over`), or on its way."""
+    """Point where a flight stopped: a collision candidate (`hit`), its end (`ended`), or one on its way."""
 
-    found: Bool[Array, "..."]
-    over: Bool[Array, "..."]
+    hit: Bool[Array, "..."]
+    ended: Bool[Array, "..."]
     coordinate: Vec3
     majorant: Scalar
 
 
 class Decision(NamedTuple):
-    """Whether light collides at a candidate.
+    """Probability and weights of a collision at a candidate.
 
     Attributes:
         chance: probability with which a collision is drawn, a constant for derivatives.
-        collided: weight of a collision.
-        passed: weight of none.
-        share: the true probability.
+        collided: weight of a path that collides.
+        passed: weight of a path that passes.
+        share: true probability of a collision.
     """
 
     chance: Scalar
@@ -88,9 +88,9 @@ class Decision(NamedTuple):
     @classmethod
     def at(cls, majorants: Majorants, candidate: Candidate, extinction: Scalar) -> "Decision":
         share = extinction / jnp.maximum(candidate.majorant, jnp.finfo(extinction.dtype).tiny)
-        if majorants.least is None:
+        if majorants.floor is None:
             return cls(jax.lax.stop_gradient(share), likelihood(share), likelihood(1 - share), share)
-        chance = jax.lax.stop_gradient(jnp.maximum(share, majorants.least / candidate.majorant))
+        chance = jax.lax.stop_gradient(jnp.maximum(share, majorants.floor / candidate.majorant))
         return cls(chance, share / chance, (1 - share) / (1 - chance), share)
 
 
@@ -98,22 +98,21 @@ def fly(majorants: Majorants, flight: Flight, uniform: Scalar) -> tuple[Flight, 
     """Advance a flight to its next candidate, to its end, or across CROSSINGS block borders."""
 
     def cross(_: object, state: tuple[Flight, Scalar, Array, Array]) -> tuple[Flight, Scalar, Array, Array]:
-        flight, optical, found, over = state
-        there, optical, collides, ends = _cross(majorants, flight, optical)
-        done = found | over
-        there = jax.tree.map(lambda new, old: jnp.where(done, old, new), there, flight)
-        return there, optical, found | (~done & collides), over | (~done & ends)
+        flight, optical, hit, ended = state
+        moved, optical, collides, ends = _cross(majorants, flight, optical)
+        done = hit | ended
+        moved = jax.tree.map(lambda new, old: jnp.where(done, old, new), moved, flight)
+        return moved, optical, hit | (~done & collides), ended | (~done & ends)
 
     no = jnp.zeros((), bool)
     start = flight, -jnp.log1p(-uniform), no, no
-    flight, _, found, over = jax.lax.fori_loop(0, CROSSINGS, cross, start)
+    flight, _, hit, ended = jax.lax.fori_loop(0, CROSSINGS, cross, start)
     coordinate = majorants.within(along(flight.start, flight.rate, flight.depth), flight.block)
-    return flight, Candidate(found, over, coordinate, majorants.majorant(flight.entry))
+    return flight, Candidate(hit, ended, coordinate, majorants.majorant(flight.entry))
 
 
 def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Flight, Scalar, Array, Array]:
-    """Advance a flight by an optical depth, or to the border of the box in which its majorant holds. Also
-    returns the remaining optical depth, whether it is used up (a candidate), and whether the flight ends."""
+    """The flight at its candidate, its end or the next border; the optical depth left; and which of these."""
     majorant, reach = majorants.majorant(flight.entry), jnp.maximum(-flight.entry - 1, 0).astype(jnp.int32)
     axes = list(zip(flight.start, flight.rate, flight.block, majorants.table.shape, strict=True))
     walls = [_wall(start, rate, index, reach, count) for start, rate, index, count in axes]
@@ -129,8 +128,8 @@ def _cross(majorants: Majorants, flight: Flight, optical: Scalar) -> tuple[Fligh
         )
         for (start, rate, index, count), wall in zip(axes, walls, strict=True)
     )
-    there = flight._replace(depth=depth, block=(x, y, z), entry=majorants.at((x, y, z)))
-    return there, optical - thickness, collides, ~collides & ends
+    moved = flight._replace(depth=depth, block=(x, y, z), entry=majorants.at((x, y, z)))
+    return moved, optical - thickness, collides, ~collides & ends
 
 
 def _wall(start: Scalar, rate: Scalar, index: Array, reach: Array, count: int) -> Scalar:

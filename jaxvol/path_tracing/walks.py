@@ -1,6 +1,5 @@
-"""Random walks of light, from the camera: flights, scatterings, next-event estimation. A walk is on its own
-flight or on one towards a light; both query the volume alike, so that walks run side by side, a step at a
-time."""
+"""Random walks of light, from the camera: flights, scatterings, next-event estimation. A walk flies either
+along its path or towards a light; both flights query the volume alike, so that walks step side by side."""
 
 from collections.abc import Callable
 from functools import partial
@@ -35,7 +34,7 @@ Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Arra
 
 
 class WalkResult(NamedTuple):
-    """A path's radiance, opacity (0 or 1), number of scatterings, and whether it was cut."""
+    """Radiance of a path, opacity (0 or 1), number of scatterings, and `exhausted` if it was cut off."""
 
     radiance: Vec3
     opacity: Scalar
@@ -52,17 +51,17 @@ class Walk(NamedTuple):
     """The state of one path.
 
     Attributes:
-        words: key of all its random numbers.
+        words: key of all random numbers along the path.
         steps: number of steps so far.
-        flight: the current one: towards a light if `to_light`, else its own.
-        to_light: whether it is on the way to a light.
-        direction: of its own flight, world, unit; on the way to a light, that of its next own flight.
-        throughput: fraction of the light at its end that arrives at the camera; (r, g, b).
-        importance: by which Russian roulette ends it, a constant for derivatives; None: of its throughput.
-        unoccluded: what the light adds without occlusion.
-        transmittance: towards the light, so far.
-        result: of the path, so far.
-        alive: whether it continues.
+        flight: the current flight: towards a light if `to_light`, else along the path.
+        to_light: True on the way to a light.
+        direction: world direction of the path, unit; on the way to a light, the one after it.
+        throughput: fraction of the light at the path's end that arrives at the camera; (r, g, b).
+        importance: importance for Russian roulette, a constant for derivatives; None: that of the throughput.
+        unoccluded: radiance that the light adds without occlusion.
+        transmittance: transmittance towards the light, so far.
+        result: result of the path, so far.
+        alive: True if the path continues.
     """
 
     words: Words
@@ -101,16 +100,18 @@ class WalkScene(NamedTuple):
         """Light at a grid coordinate from a random located light, weighted by their number."""
         x, y, z = self.space.point(coordinate)
         count = len(lights := located(self.lights))
-        chosen = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
-        each = [light.at((x, y, z), direction) for light in lights]
-        one = jax.tree.map(lambda *parts: jnp.select([chosen == i for i in range(count)], parts), *each)
-        r, g, b = one.irradiance
-        toward, distance = constant(LIGHTS, (one.toward, one.distance))
+        number = jnp.minimum((uniform * count).astype(jnp.int32), count - 1)
+        arriving = [light.at((x, y, z), direction) for light in lights]
+        chosen = jax.tree.map(
+            lambda *leaves: jnp.select([number == i for i in range(count)], leaves), *arriving
+        )
+        r, g, b = chosen.irradiance
+        toward, distance = constant(LIGHTS, (chosen.toward, chosen.distance))
         return Arriving(toward, distance, (r * count, g * count, b * count))
 
 
 class Scattering(NamedTuple):
-    """What a walk is after a scattering: see `Walk`. `toward` and `end`: of its next flight."""
+    """State of a walk after a scattering: see `Walk`. `toward` and `end` are those of the next flight."""
 
     direction: Vec3
     throughput: Vec3
@@ -129,19 +130,19 @@ def step(scene: WalkScene, walks: Walk) -> Walk:
         pixel, path, seed = walk.words
         return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
 
-    def each(f: Callable[..., Any], *arguments: Any) -> Any:
+    def stored(f: Callable[..., Any], *arguments: Any) -> Any:
         return in_memory(live, jax.vmap(f), *arguments)
 
-    first, second = (each(partial(uniforms, stage=stage), walks) for stage in (0, 1))
+    first, second = (stored(partial(uniforms, stage=stage), walks) for stage in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
-    turn = each(partial(sample_phase, jax.lax.stop_gradient(scene.anisotropy)), first_turn, second_turn)
+    turn = stored(partial(sample_phase, jax.lax.stop_gradient(scene.anisotropy)), first_turn, second_turn)
     majorants = scene.medium.majorants
-    flight, candidate = each(partial(fly, majorants), walks.flight, draw)
-    extinction, albedo = each(scene.medium.classify, each(scene.medium.measure, candidate.coordinate))
+    flight, candidate = stored(partial(fly, majorants), walks.flight, draw)
+    extinction, albedo = stored(scene.medium.classify, stored(scene.medium.measure, candidate.coordinate))
     decision = jax.vmap(partial(Decision.at, majorants))(candidate, extinction)
-    at = candidate.coordinate
-    scattering = each(partial(_scatter, scene), walks, at, albedo, decision.collided, turn, choose, survive)
-    candidate = candidate._replace(found=candidate.found & walks.alive, over=candidate.over & walks.alive)
+    inputs = walks, candidate.coordinate, albedo, decision.collided, turn, choose, survive
+    scattering = stored(partial(_scatter, scene), *inputs)
+    candidate = candidate._replace(hit=candidate.hit & walks.alive, ended=candidate.ended & walks.alive)
     walks = walks._replace(flight=flight, steps=walks.steps + 1)
 
     def advance(
@@ -165,14 +166,14 @@ def _scatter(
     choose: Scalar,
     survive: Scalar,
 ) -> Scattering:
-    """Outcome of a scattering. `collided`: the collision's weight; `turn`: direction around z."""
+    """Scatter a walk. `collided`: weight of the collision; `turn`: new direction in the frame of the old."""
     kept = scaled(albedo, collided)
     before_roulette = times(walk.throughput, kept)
-    least = scene.sampling.importance
-    if walk.importance is None or least is None:
+    floor = scene.sampling.importance
+    if walk.importance is None or floor is None:
         importance = greatest(before_roulette)
     else:
-        importance = walk.importance * jnp.maximum(jax.lax.stop_gradient(greatest(kept)), least)
+        importance = walk.importance * jnp.maximum(jax.lax.stop_gradient(greatest(kept)), floor)
     weight, importance = _roulette(importance, survive)
     weight = weight * likelihood(phase(turn[2], scene.anisotropy))
     throughput = scaled(before_roulette, weight)
@@ -198,15 +199,15 @@ def _delta_tracking(
     scattering: Scattering,
     decide: Scalar,
 ) -> Walk:
-    """Advance a walk on its own flight. A collision scatters it; at the end it gathers the constant light."""
+    """Advance a walk along its path. A collision scatters it; at the end it gathers the constant light."""
     before, (direction, throughput, importance, unoccluded, to_light, toward, end) = walk.result, scattering
-    collides = candidate.found & (decide < decision.chance)
+    collides = candidate.hit & (decide < decision.chance)
     capped = collides & (before.scatterings >= scene.max_scatterings)
     scatters, met = collides & ~capped, before.scatterings > 0
     gathered = times(walk.throughput, sky_of(scene.lights, jnp.float32))
-    gathered = scaled(gathered, (candidate.over & met).astype(decision.share.dtype))
-    passed = jnp.where(candidate.found & ~collides, decision.passed, 1)
-    opacity = jnp.where(candidate.over & ~met, 1 - walk.throughput[0], before.opacity)
+    gathered = scaled(gathered, (candidate.ended & met).astype(decision.share.dtype))
+    passed = jnp.where(candidate.hit & ~collides, decision.passed, 1)
+    opacity = jnp.where(candidate.ended & ~met, 1 - walk.throughput[0], before.opacity)
     goes_on = to_light | (importance > 0)
     return walk._replace(
         flight=_where(scatters, scene.flight(candidate.coordinate, toward, end), walk.flight),
@@ -222,23 +223,23 @@ def _delta_tracking(
             before.scatterings + scatters.astype(jnp.int32),
             before.exhausted | capped,
         ),
-        alive=walk.alive & ~candidate.over & ~capped & (~scatters | goes_on),
+        alive=walk.alive & ~candidate.ended & ~capped & (~scatters | goes_on),
     )
 
 
 def _ratio_tracking(
     scene: WalkScene, walk: Walk, candidate: Candidate, decision: Decision, survive: Scalar
 ) -> Walk:
-    """Advance a walk on its way to a light. At the end it continues from where it was scattered."""
-    transmittance = walk.transmittance * jnp.where(candidate.found, jnp.maximum(1 - decision.share, 0), 1)
+    """Advance a walk on its way to a light. At the end it continues from its last scattering."""
+    transmittance = walk.transmittance * jnp.where(candidate.hit, jnp.maximum(1 - decision.share, 0), 1)
     survivor = jnp.where(survive * ROULETTE < transmittance, ROULETTE * likelihood(transmittance), 0)
-    transmittance = jnp.where(candidate.found & (transmittance < ROULETTE), survivor, transmittance)
-    done = candidate.over | (transmittance == 0)
-    gathered = scaled(walk.unoccluded, jnp.where(candidate.over, transmittance, 0))
-    own_flight = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
+    transmittance = jnp.where(candidate.hit & (transmittance < ROULETTE), survivor, transmittance)
+    done = candidate.ended | (transmittance == 0)
+    gathered = scaled(walk.unoccluded, jnp.where(candidate.ended, transmittance, 0))
+    next_flight = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
     importance = greatest(walk.throughput) if walk.importance is None else walk.importance
     return walk._replace(
-        flight=_where(done, own_flight, walk.flight),
+        flight=_where(done, next_flight, walk.flight),
         to_light=~done,
         transmittance=transmittance,
         result=walk.result._replace(radiance=plus(walk.result.radiance, gathered)),
@@ -247,11 +248,11 @@ def _ratio_tracking(
 
 
 def _where(condition: Bool[Array, ""], a: T, b: T) -> T:
-    return jax.tree.map(lambda one, other: jnp.where(condition, one, other), a, b)
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 
 def _roulette(importance: Scalar, uniform: Scalar) -> tuple[Scalar, Scalar]:
-    """Russian roulette: weight by the importance, a constant for derivatives; and importance then."""
+    """Russian roulette: the weight, and the importance after it, both constants for derivatives."""
     importance = jax.lax.stop_gradient(importance)
     small = importance < ROULETTE
     survives = uniform * ROULETTE < importance

@@ -54,7 +54,7 @@ def fits(seeds: Any, off: Any, unit: Any) -> tuple[jax.Array, ...]:
 
         def step(state, _):
             state = state.advanced(problem)
-            error = jnp.sqrt(jnp.diagonal(state.own))
+            error = jnp.sqrt(jnp.diagonal(state.path_covariance))
             return state, (state.best[0] / unit, error / unit, state.loss, state.window.cut)
 
         start = (jnp.asarray([2.0, 0.5]) * unit,)

@@ -166,9 +166,9 @@ def tracked(volume, transfer, start, direction, length):
             candidate.coordinate
         )
         share = extinction / jnp.maximum(candidate.majorant, 1e-30)
-        counts = candidate.found & ~done
+        counts = candidate.hit & ~done
         left = jnp.where(counts, left * (1 - share), left)
-        return flights, left, passes & ~(counts & (decide < share)), done | candidate.over, step + 1
+        return flights, left, passes & ~(counts & (decide < share)), done | candidate.ended, step + 1
 
     no = jnp.zeros(COUNT, bool)
     state = flights, jnp.ones(COUNT), ~no, no, jnp.zeros((), jnp.int32)

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..._util.checks import Checked, described
+from ..._util.checks import described
 from ..._util.files import MOST_VOXELS, check_size, refusing
 from ..._util.texts import near
 from ...scene.volume import Volume
@@ -83,7 +83,7 @@ def names() -> list[str]:
     return sorted(registry())
 
 
-def info(name: Checked[str]) -> Dataset:
+def info(name: str) -> Dataset:
     """Look up the metadata of a dataset, without fetching it.
 
     Args:
@@ -103,7 +103,7 @@ def info(name: Checked[str]) -> Dataset:
     raise ValueError(f"name must be one of {', '.join(names())}; got {described(name)}.{hint}")
 
 
-def fetch(name: Checked[str], *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Path:
+def fetch(name: str, *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Path:
     """Return the path of a dataset's raw file, after downloading it if it is not on this machine.
 
     The file is searched in the folder of the environment variable `JAXVOL_DATA`, as `.raw` or `.raw.gz`, then
@@ -159,9 +159,7 @@ def _of_right_size(path: Path, dataset: Dataset) -> Path:
     return path
 
 
-def load(
-    name: Checked[str], *, folder: str | os.PathLike[str] | None = None, progress: bool = True
-) -> Volume:
+def load(name: str, *, folder: str | os.PathLike[str] | None = None, progress: bool = True) -> Volume:
     """Load a dataset, after downloading it if it is not on this machine.
 
     Args:

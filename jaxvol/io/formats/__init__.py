@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jax.typing import DTypeLike
 
-from ..._util.checks import Arrayable, Checked, described
+from ..._util.checks import Arrayable, described
 from ..._util.files import ensure, file_size, refusing
 from ..._util.image_record import ImageRecord, numbered, volume_arguments
 from ..._util.voxels import WHOLE, within
@@ -38,10 +38,10 @@ FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
 
 
 def load(
-    path: Checked[str | os.PathLike[str]],
+    path: str | os.PathLike[str],
     *,
-    shape: Checked[Sequence[int]] | None = None,
-    dtype: Checked[DTypeLike] | None = None,
+    shape: Sequence[int] | None = None,
+    dtype: DTypeLike | None = None,
     spacing: Arrayable | None = None,
     origin: Arrayable | None = None,
     direction: Arrayable | None = None,
@@ -105,9 +105,9 @@ def load(
 
 
 def read_record(
-    path: Checked[str | os.PathLike[str]],
-    shape: Checked[Sequence[int]] | None = None,
-    dtype: Checked[DTypeLike] | None = None,
+    path: str | os.PathLike[str],
+    shape: Sequence[int] | None = None,
+    dtype: DTypeLike | None = None,
     spacing: Arrayable | None = None,
     time: int | None = None,
     offset: int | None = None,
@@ -216,7 +216,7 @@ def files_of(path: Path) -> list[Path]:
         return list(series_headers(path)) if is_dicom(path) else [path]
 
 
-def load_ultrasound(path: Checked[str | os.PathLike[str]]) -> tuple[Volume, ToroidalMap]:
+def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:
     """Load an ultrasound volume as acquired by a swept probe, and the map that places it in the world.
 
     Angles are those of the file, with the middle beam at π/2. The first sample of a beam has depth γ = 0. The
@@ -238,7 +238,7 @@ def load_ultrasound(path: Checked[str | os.PathLike[str]]) -> tuple[Volume, Toro
     return Volume(data), probe
 
 
-def _existing(path: Checked[str | os.PathLike[str]]) -> tuple[Path, str | None]:
+def _existing(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
     """Existing file of a path, and the name of an array in it, after `::`."""
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise ValueError(f"path must be a str or a path; got {described(path)}.")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..._util.affine import SHEARED
-from ..._util.checks import Checked, described, output_file
+from ..._util.checks import described, output_file
 from ..._util.files import ensure, library, reason
 from ..._util.whole_files import whole_file
 from ...scene.volume import Volume, check_one_channel
@@ -17,7 +17,7 @@ from .arrays import VOLUME
 ENDINGS = (".mha", ".nii", ".nii.gz", ".npz", ".nrrd")
 
 
-def save(volume: Checked[Volume], path: Checked[str | os.PathLike[str]]) -> Path:
+def save(volume: Volume, path: str | os.PathLike[str]) -> Path:
     """Write a volume to a file, in the format of its ending; `jv.load` reads the same volume.
 
     | ending | content |

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..._util.checks import Checked, integer
+from ..._util.checks import integer
 from ...scene.volume import Volume
 from .bodies import draw_engine, draw_frog, draw_head
 from .canvas import Canvas
@@ -50,7 +50,7 @@ DRAWN: dict[str, Callable[[Canvas, np.random.Generator], np.ndarray | None]] = {
 PHANTOMS = (*DRAWN, *FORMULAS)
 
 
-def phantom(name: str, resolution: Checked[int] = 128, *, seed: Checked[int] = 0) -> Volume:
+def phantom(name: str, resolution: int = 128, *, seed: int = 0) -> Volume:
     """Make a synthetic volume on the cube [-1, 1]³, with `resolution` nodes along each axis.
 
     The value at a world point does not depend on the resolution, except at boundaries of the uint8 phantoms,

@@ -7,7 +7,7 @@ from functools import reduce
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import Checked, flag, integer
+from ..._util.checks import flag, integer
 from ...march.transforms.toroidal_map import ToroidalMap
 from ...scene.volume import Volume
 from .bodies import parts
@@ -21,11 +21,11 @@ GRAIN = 0.35  # correlation length of speckle along a beam, mm: half the pulse l
 
 def toroidal_phantom(
     name: str,
-    shape: Checked[Sequence[int]] = (64, 96, 160),
+    shape: Sequence[int] = (64, 96, 160),
     *,
-    probe: Checked[ToroidalMap] | None = None,
-    speckle: Checked[bool] = True,
-    seed: Checked[int] = 0,
+    probe: ToroidalMap | None = None,
+    speckle: bool = True,
+    seed: int = 0,
 ) -> tuple[Volume, ToroidalMap]:
     """Make a synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the
     world.

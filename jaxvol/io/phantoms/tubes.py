@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import Checked, integer
+from ..._util.checks import integer
 from .canvas import Canvas, plane_waves
 from .shapes import ball, box, capsule, lengths, to_segment
 
 
-def colon_path(points: Checked[int] = 400) -> Float[np.ndarray, "points 3"]:
+def colon_path(points: int = 400) -> Float[np.ndarray, "points 3"]:
     """Compute evenly spaced points of the centre line of the `colon` lumen, end to end.
 
     The line is a path for a fly-through camera, the same for every seed and resolution.
