@@ -43,7 +43,7 @@ def automatic_camera(
     view_angle: Arrayable = 30.0,
     *,
     parallel: bool = False,
-    size: tuple[int, int] | int = (512, 512),
+    size: Sequence[int] | int = (512, 512),
     least: float = VISIBLE,
     centered: bool = False,
 ) -> Camera:
