@@ -26,6 +26,9 @@ Arrayable: TypeAlias = Any
 """Argument that is converted to an array. `Any`: checked at run time, by errors that name the argument."""
 
 
+Flag: TypeAlias = bool | np.bool_
+
+
 def described(value: object) -> str:
     """Short description of a value for error messages."""
     if isinstance(value, type):

@@ -99,8 +99,8 @@ def fit(
 ) -> Fit:
     """Fit parameters to make a residual small: the loss is half the sum of its squares.
 
-    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Failures of fits are
-    measured by `experiments/stability.py`: "fits of what images do not show", "fits from opaque starts",
+    A fit whose rays are opaque from their first cell on may end in a wrong minimum. Where it fails:
+    `experiments/stability.py`, "fits of what images do not show", "fits from opaque starts",
     "fits under noise".
 
     Args:

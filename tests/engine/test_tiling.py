@@ -100,6 +100,7 @@ def test_adjoints_share_one_image(adjoint):
 def test_one_program_serves_all_cameras_steps_seeds_transfer_functions_and_volumes():
     class Counting(Transfer):
         function: jv.TransferFunction
+        bands = 3
         traces: ClassVar[int] = 0
         """Programs traced with it."""
 

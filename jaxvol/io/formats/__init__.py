@@ -40,7 +40,7 @@ FOLDERS: list[tuple[Callable[[Path], bool], Callable[[Path], ImageRecord]]] = []
 def load(
     path: str | os.PathLike[str],
     *,
-    shape: Sequence[int] | None = None,
+    shape: Sequence[int] | np.ndarray | None = None,
     dtype: DTypeLike | None = None,
     spacing: Arrayable | None = None,
     origin: Arrayable | None = None,
@@ -106,7 +106,7 @@ def load(
 
 def read_record(
     path: str | os.PathLike[str],
-    shape: Sequence[int] | None = None,
+    shape: Sequence[int] | np.ndarray | None = None,
     dtype: DTypeLike | None = None,
     spacing: Arrayable | None = None,
     time: int | None = None,

@@ -7,7 +7,7 @@ from functools import reduce
 import numpy as np
 from jaxtyping import Float
 
-from ..._util.checks import flag, integer
+from ..._util.checks import Flag, flag, integer
 from ...march.transforms.toroidal_map import ToroidalMap
 from ...scene.volume import Volume
 from .bodies import parts
@@ -24,7 +24,7 @@ def toroidal_phantom(
     shape: Sequence[int] = (64, 96, 160),
     *,
     probe: ToroidalMap | None = None,
-    speckle: bool = True,
+    speckle: Flag = True,
     seed: int = 0,
 ) -> tuple[Volume, ToroidalMap]:
     """Make a synthetic ultrasound volume as acquired by a swept probe, and the map that places it in the

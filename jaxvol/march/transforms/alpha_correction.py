@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from ..._util.checks import flag
+from ..._util.checks import Flag, flag
 from ..._util.vec3 import Scalar, Vec3, greatest, minus
 from ...scene.space import Path, Ray
 from ...scene.volume import Volume
@@ -60,7 +60,7 @@ class AlphaCorrection(Transform):
 
     labels: bool = eqx.field(static=True)
 
-    def __init__(self, labels: bool = False):
+    def __init__(self, labels: Flag = False):
         self.labels = flag("labels", labels)
 
     def cut(self, cell: Cell, ray: Ray, volume: Volume) -> tuple[Cell, ...]:

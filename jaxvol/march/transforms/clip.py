@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..._util.checks import Arrayable, finite_array, flag, require, shortened
+from ..._util.checks import Arrayable, Flag, finite_array, flag, require, shortened
 from ..._util.vec3 import Scalar, Vec3, apart, dot, minus
 from ...scene.occupancy import BLOCK, Occupancy
 from ...scene.space import Gap, Path, Space
@@ -55,7 +55,7 @@ class Clip(Transform):
         box: Arrayable | None = None,
         planes: Sequence[tuple[Arrayable, Arrayable]] = (),
         *,
-        inside_out: bool = False,
+        inside_out: Flag = False,
     ):
         self.box = None
         if box is not None:

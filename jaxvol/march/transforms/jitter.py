@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
-from ..._util.checks import flag
+from ..._util.checks import Flag, flag
 from ..._util.noise import blue_tile, hashed_uniforms, seed_word
 from ..._util.vec3 import Scalar
 from ...scene.space import Ray
@@ -74,7 +74,7 @@ class Jitter(Transform):
     noise: Noise
     front_residual: bool = eqx.field(static=True)
 
-    def __init__(self, seed: Seed = 0, pattern: Pattern = "white", *, front_residual: bool = False):
+    def __init__(self, seed: Seed = 0, pattern: Pattern = "white", *, front_residual: Flag = False):
         self.noise = Noise(seed, pattern, stream=0)
         self.front_residual = flag("front_residual", front_residual)
 
