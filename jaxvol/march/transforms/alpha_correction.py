@@ -41,7 +41,7 @@ class AlphaCorrection(Transform):
         labels: also cut cells at the first and the last plane, half-way between nodes, where the label of the
             nearest node changes, so that the faces of a segmentation stay smooth under jitter. What lies
             between two labels of one cell has the label behind the first face. Costs four label fetches per
-            cell of up to a voxel, and two more samples: a frame takes 3 to 4 times as long. Gradients include
+            cell of up to a voxel, and two more samples: a frame takes 3 to 5 times as long. Gradients include
             the motion of exit and faces.
 
     Where it fails: `experiments/stability.py`, "grazing exits", "exits at the end of a cell",
