@@ -40,7 +40,7 @@ from ..xla.trees import constant, unchecked
 from .rays import RayTiles, lines, vmap_rays
 from .shifts import begin_rays
 from .tiling import Tiling
-from .wavefront import blinded, march_rays
+from .wavefront import finish_blind, march_rays
 
 
 LARGE = 2**24
@@ -209,7 +209,7 @@ def empty_space_of(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
         rays = tiles.rays(pixel_rays, space, jnp.zeros((), jnp.int32), no_fault)
         start = begin_rays(plain, prepared, rays, tiling, "depth")
         skips = tiles.skips(index, rays, march.step)
-        marched = march_rays(prepared, rays, blinded(skips, start), tiling, skips)
+        marched = march_rays(prepared, rays, finish_blind(skips, start), tiling, skips)
         rendering = vmap_rays(partial(end, prepared))(rays, marched.at)
         return tiles.assemble(rendering.depth[None]).reshape(columns.shape)
 

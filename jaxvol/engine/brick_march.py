@@ -23,7 +23,7 @@ from .rays import RayTiles, vmap_rays
 from .resolve import resolve_image
 from .shifts import begin_rays
 from .tiling import RenderOptions
-from .wavefront import CellRange, blinded, into_range, march_rays
+from .wavefront import CellRange, finish_blind, into_range, march_rays
 
 
 class RayStates(eqx.Module):
@@ -67,8 +67,8 @@ def march_brick(
             over = opaque(prepared, start) | (range_.until <= range_.first)
             start = with_fields(start, index=range_.first, finished=over)
         skips = tiles.skips(index, rays, scene.march.step)
-        entered = into_range(prepared, rays, start, range_, shifts=shifts)
-        after = march_rays(prepared, rays, blinded(skips, entered), tiles.tiling, skips, shifts=shifts).at
+        at = into_range(prepared, rays, start, range_, shifts=shifts)
+        after = march_rays(prepared, rays, finish_blind(skips, at), tiles.tiling, skips, shifts=shifts).at
         after = eqx.tree_at(lambda at: at.track.until, after, start.track.until)
         # a restarted ray may go back
         over = opaque(prepared, after) if restart else start.finished | ended(prepared, rays, after)

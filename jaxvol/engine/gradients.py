@@ -26,7 +26,7 @@ from .replay import Cotangents, Replay, Total
 from .shifts import begin_rays
 from .tiling import GROUPS_OF_BEAM, RenderOptions
 from .voxel_gradient import asked_of, cotangents_of
-from .wavefront import CellRange, Marched, Recorded, blinded, into_range, march_rays
+from .wavefront import CellRange, Marched, Recorded, finish_blind, into_range, march_rays
 
 
 def render_vjp(
@@ -150,7 +150,7 @@ class ImageVjp(NamedTuple):
         """Marches the rays of a tile once more, and pulls their samples back by `replay`."""
         tiles, step = self.tiles, self.scene.march.step
         skips = tiles.skips(self.empty_space, rays, step) if skips is None else skips
-        start = blinded(skips, start)
+        start = finish_blind(skips, start)
         if range_ is not None:
             start = into_range(self.prepared, rays, start, range_, shifts=False)
         return march_rays(self.lit, rays, start, tiles.tiling, skips, replay, shifts=False)

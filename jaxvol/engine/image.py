@@ -33,7 +33,7 @@ from .resolve import MarchResult, resolve_image, with_pixels
 from .shifts import begin_rays
 from .stages import is_staged, staged_image
 from .tiling import Adjoint, RenderOptions, Tiling
-from .wavefront import Recorded, blinded, march_rays
+from .wavefront import Recorded, finish_blind, march_rays
 
 
 RenderOutputs: TypeAlias = Literal["all", "rgba"]
@@ -136,7 +136,7 @@ def march_image(
         start = begin_rays(scene.march, prepared, rays, tiling, options.outputs)
         skips = tiles.skips(index, rays, scene.march.step)
         ranges = record and skips is not None
-        marched = march_rays(prepared, rays, blinded(skips, start), tiling, skips, record=ranges)
+        marched = march_rays(prepared, rays, finish_blind(skips, start), tiling, skips, record=ranges)
         recorded = Recorded(marched.range, start.track.shifted if record else None)
         if record and tiles.number == 1:
             recorded = recorded.with_rays(rays, skips)

@@ -116,7 +116,7 @@ class RayTiles(eqx.Module):
     def rays(self, source: Source, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
         """The rays of a tile, cut to the volume. Rays that only fill up groups miss it. All are NaN, and so
         invalid, if the scene has a `fault`."""
-        return entering(space, *self.ending_lines(source, tile, fault), self.tiling.searched)
+        return enter_rays(space, *self.ending_lines(source, tile, fault), self.tiling.searched)
 
     def ending_lines(
         self, source: Source, tile: Int[Array, ""], fault: Bool[Array, ""]
@@ -338,7 +338,7 @@ def vmap_cells(f: Callable[..., Any], of_cells: tuple[bool, ...] = (True,)) -> C
     return jax.vmap(jax.vmap(f), in_axes=tuple(0 if mapped else None for mapped in of_cells))
 
 
-def entering(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], searched: int) -> Ray:
+def enter_rays(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], searched: int) -> Ray:
     """Rays, cut to the volume; those that are not wanted miss it. `searched`: number of groups at a time if
     the space searches for the ends of rays."""
 

@@ -188,7 +188,7 @@ def _sampled(scene: Scene, number: int, ahead: Ahead) -> Samples:
         pairs = zip(cells(ahead, stored), values, strict=True)
         return [opacity_of(ray, piece, measured) for piece, measured in pairs]
 
-    live = always(ahead)
+    live = opaque_true(ahead)
     if march.integrates:
         values = _measured_over(scene, ahead, live, cells, stored)
     else:
@@ -200,7 +200,7 @@ def _sampled(scene: Scene, number: int, ahead: Ahead) -> Samples:
     return Samples(list(cells(ahead, stored)), values, alphas, light)
 
 
-def always(at: PyTree) -> Bool[Array, ""]:
+def opaque_true(at: PyTree) -> Bool[Array, ""]:
     """A true value that XLA cannot fold, so that branches survive."""
     # testing whether any ray is alive would take 1 % of a frame
     return at.index[0] >= 0
@@ -224,7 +224,7 @@ def _colors(scene: Scene, at: Progress, measured: list[Measured]) -> list[Any]:
 
     # Means and look-ups would be computed again for each use if they were fused into compositing.
     stored = scene.classification.search is not None or isinstance(scene.transfer, Together)
-    return in_memory(always(at), all_, measured) if stored or scene.march.integrates else all_(measured)
+    return in_memory(opaque_true(at), all_, measured) if stored or scene.march.integrates else all_(measured)
 
 
 def _measured_over(

@@ -57,7 +57,7 @@ def begin_rays(
         at = find_shifts(scene, rays, at, tiling)
     else:
         at = eqx.tree_at(lambda at: at.track.shifted, at, shifted)
-    return behind_first_cells(scene, rays, at)
+    return skip_first_cells(scene, rays, at)
 
 
 def find_shifts(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Progress:
@@ -65,7 +65,7 @@ def find_shifts(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Progre
     return eqx.tree_at(lambda at: at.track.shifted, at, _shifted(scene, rays, at, tiling))
 
 
-def behind_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
+def skip_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
     """Moves rays that shift behind their first cell to the second: a segment would end there (`segment`). Not
     for a `Selection`, which may use transparent cells."""
     if not isinstance(scene.compositing, Weighting):

@@ -39,16 +39,16 @@ from ..xla.memo import memoized_of, when_any_dies
 from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
 from .acceleration import VolumeAcceleration, empty_space_of, unshaped, visible_in_numpy
-from .rays import RayTiles, Source, box_of_corners, box_of_rays, entering, vmap_rays
-from .shifts import behind_first_cells, find_shifts
+from .rays import RayTiles, Source, box_of_corners, box_of_rays, enter_rays, vmap_rays
+from .shifts import find_shifts, skip_first_cells
 from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
-from .wavefront import Marched, Recorded, blinded, march_rays
+from .wavefront import Marched, Recorded, finish_blind, march_rays
 
 
 program = partial(kept, compiler_options=OPTIONS)
 
 
-class Started(NamedTuple):
+class StartedTile(NamedTuple):
     """The rays of a tile before their march. None: a part that the scene lacks."""
 
     rays: Ray
@@ -80,7 +80,7 @@ class Kernel(NamedTuple):
         return Scene(self.volume, self.transfer, None, march, mode, self.lighting, space, classification)
 
 
-class Passed(NamedTuple):
+class MarchedTile(NamedTuple):
     """The marched rays of a tile: entries, lengths, result of the march, and shifts."""
 
     t_in: Array
@@ -116,7 +116,7 @@ def staged_image(
     for tile in range(number):
         lines = _lines_of(scene.source, tiling, number, size, tile)
         started = _start(*lines, corners, seams, place, index, fault, tiling)
-        none, zero, never, nowhere = _nothing(*started.rays.length.shape, started.rays.length.dtype)
+        none, zero, never, nowhere = _defaults(*started.rays.length.shape, started.rays.length.dtype)
         offset, shift = started.track.offset, started.track.shift
         offset, shift = (none if part is None else part for part in (offset, shift))
         track = unchecked(Track, offset=offset, shift=shift, shifted=never, until=limit)
@@ -128,7 +128,7 @@ def staged_image(
         # without leaps, cells without extinction have a gradient, too: no ranges
         marched = _march(*inputs, track, first, skips, options.outputs, tiling, record and scene.march.leaps)
         kept_tile = started.rays, started.skips
-        passed.append(Passed(started.rays.t_in, started.rays.length, marched, track.shifted))
+        passed.append(MarchedTile(started.rays.t_in, started.rays.length, marched, track.shifted))
     rendering, recorded = _finish(passed, scene.compositing, source, tiling, size, record)
     if record and number == 1 and kept_tile is not None:
         recorded = recorded.with_rays(*kept_tile)
@@ -155,7 +155,7 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
     parts += [] if scene.lighting is None else [scene.lighting]
     key = tuple(map(id, parts))
     if key not in _STAGINGS:
-        seams = _only(scene.march, "start", "shift", "locate", "clip")
+        seams = _with_seams(scene.march, "start", "shift", "locate", "clip")
         place, index = _without_voxels(scene.volume, seams), None
         if not _depends_on_view(scene):
             index = _index_of(scene, acceleration)
@@ -173,7 +173,7 @@ def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
     return _STAGINGS[key]
 
 
-def _only(march: March, *seams: str) -> March:
+def _with_seams(march: March, *seams: str) -> March:
     """The march with only the transforms that override these seams, and neutral static parts."""
     chosen = [id(transform) for seam in seams for transform in march.overriding(seam)]
     transforms = tuple(transform for transform in march.transforms if id(transform) in chosen)
@@ -188,18 +188,18 @@ def _has_fault(scene: Scene) -> Bool[Array, ""] | np.ndarray:
         return _has_fault_by_jax(scene)
     if any(kind is not TransferFunction for kind in custom):
         return np.asarray(_has_fault_by_jax(scene))
-    return np.asarray(jax.tree.map(_known, scene).has_fault)
+    return np.asarray(jax.tree.map(_to_numpy, scene).has_fault)
 
 
 def _is_invalid(camera: Camera, fault: Bool[Array, ""] | np.ndarray) -> Bool[Array, ""] | np.ndarray:
     """True if the camera is invalid, or the scene has a `fault`."""
     if platform() != "cpu":
         return _is_invalid_by_jax(camera, fault)
-    camera = jax.tree.map(_known, camera)
+    camera = jax.tree.map(_to_numpy, camera)
     return np.asarray(fault | ~(all_finite(camera) & camera.valid))
 
 
-def _known(leaf: Any) -> Any:
+def _to_numpy(leaf: Any) -> Any:
     return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
@@ -236,7 +236,7 @@ class Place(NamedTuple):
 
     @classmethod
     def of(cls, march: March, volume: Volume) -> "Place":
-        seams = _only(march, "locate", "clip")
+        seams = _with_seams(march, "locate", "clip")
         return cls(seams, _without_voxels(volume, seams))
 
     @property
@@ -305,12 +305,12 @@ def _start(
     index: EmptySpaceIndex | None,
     fault: Bool[Array, ""],
     tiling: Tiling,
-) -> Started:
+) -> StartedTile:
     """Cuts the rays of a tile to the volume. `corners`: whether the rays at the corners of a beam bound it,
     as for squares of a camera's pixels."""
     x, y, z = line.origin
     line = line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z))
-    rays = entering(seams.locate(place), line, wanted, tiling.searched)
+    rays = enter_rays(seams.locate(place), line, wanted, tiling.searched)
     track = vmap_rays(partial(track_of, seams))(rays)
     offset = track.offset if seams.overriding("start") else None
     box = box_of_corners if corners else box_of_rays
@@ -318,11 +318,11 @@ def _start(
     if index is not None:
         skips = index.on_axes_of(place).skips(partial(box, tiling, rays), tiling.cells * seams.step)
     track = unchecked(track, offset=offset, shifted=None, until=None)
-    return Started(rays, track, skips, seams.locate(place))
+    return StartedTile(rays, track, skips, seams.locate(place))
 
 
 @cache
-def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, Stretches]:
+def _defaults(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, Stretches]:
     """Defaults without offset, shift or empty space: offset 0, cell 0, cell NEVER, unknown stretches."""
     none, beams = np.zeros((groups, group), dtype), groups // GROUPS_OF_BEAM
     stretches = Stretches.unknown(beams, none.dtype)
@@ -340,7 +340,7 @@ def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex
     """The empty-space index of a scene for all views, computed once for each volume and transfer function."""
     if not scene.march.leaps:
         return None
-    march = unchecked(_only(scene.march, "empty_space", "locate", "clip"), step=None)
+    march = unchecked(_with_seams(scene.march, "empty_space", "locate", "clip"), step=None)
     inputs = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
     if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(inputs)):
         return memoized_of(inputs, _index)
@@ -392,7 +392,7 @@ def _kernel_of(scene: Scene, acceleration: VolumeAcceleration) -> Kernel:
     return Kernel(volume, transfer, scene.march.rules, scene.compositing, lighting)
 
 
-def _march_inputs(kernel: Kernel, started: Started) -> tuple[Kernel, Ray]:
+def _march_inputs(kernel: Kernel, started: StartedTile) -> tuple[Kernel, Ray]:
     """The kernel and rays for the march; world coordinates of rays only if they are used."""
     rays, space = started.rays, started.space
     if kernel.lighting is not None:
@@ -410,7 +410,7 @@ def _shift(
     scene, track = kernel.scene, _per_ray(track, rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, None))(rays, track)
     at = find_shifts(scene, rays, with_fields(at, finished=rays.length <= 0), tiling)
-    return with_fields(at.track, until=limit), behind_first_cells(scene, rays, at).index
+    return with_fields(at.track, until=limit), skip_first_cells(scene, rays, at).index
 
 
 def _per_ray(track: Track, rays: Ray) -> Track:
@@ -432,7 +432,7 @@ def _march(
     """Marches the rays of a tile to their ends."""
     scene, track = kernel.scene, _per_ray(track, rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, outputs))(rays, track)
-    at = blinded(skips, with_fields(at, index=first, finished=rays.length <= 0))
+    at = finish_blind(skips, with_fields(at, index=first, finished=rays.length <= 0))
     if at.stats is not None:  # skipped transparent cells are samples
         at = eqx.tree_at(lambda at: at.stats.samples, at, first)
     return march_rays(scene, rays, at, tiling, skips, record=record)
@@ -443,7 +443,7 @@ def _march(
 
 @program
 def _finish(
-    passed: list[Passed],
+    passed: list[MarchedTile],
     compositing: Compositing[Any],
     source: Camera | GivenRays,
     tiling: Tiling,

@@ -273,7 +273,7 @@ def _march_batch(
     return packed.put(rows, lanes), total, living(lanes)
 
 
-def blinded(skips: Skips | None, at: Progress) -> Progress:
+def finish_blind(skips: Skips | None, at: Progress) -> Progress:
     """Finishes the rays of beams without visible cells."""
     if skips is None:
         return at
