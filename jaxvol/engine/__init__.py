@@ -1,1 +1,1 @@
-"""The fast engine: what `render` and its gradients run."""
+"""The fast engine of `render`: marches images, and computes their gradients."""

@@ -109,7 +109,7 @@ class Total(NamedTuple):
 
 
 class Replay(SampleVisitor):
-    """Pulls the cotangents of rays (groups, rays in a group) back to what their samples depend on.
+    """Pulls the cotangents of rays (groups, rays in a group) back to the inputs of their samples.
 
     Args:
         scene: the scene, whose leaves get the cotangents.

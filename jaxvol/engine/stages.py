@@ -2,7 +2,7 @@
 
     A  start: rays of a camera are generated, cut to the volume and offset, and their empty stretches found
     B  march: one program for all cameras, image sizes, shapes of volumes, numbers of control points, and
-       subsets of the library's transforms, all of which are arrays
+       subsets of the library's transforms: all are arrays
     C  finish: the results of the march become an image
 
 Large images are several tiles of rays. Within a traced program, `image.march_image` composes the same
