@@ -1,1 +1,1 @@
-"""How are images rendered fast? What `render` runs, and what its gradients do."""
+"""The fast engine of `render`: marches images, and computes their gradients."""

@@ -1,7 +1,7 @@
-"""Marches an image through one brick of a volume after the other, and pulls it back in a second march.
+"""Marches an image through the bricks of a volume, one after the other.
 
-Of each ray, it is kept where it has come to; in each brick it marches those of its cells that lie there
-(`CellRange`), from where the brick before left off.
+The state of each ray is kept between bricks. In a brick, a ray marches the cells within it (`CellRange`),
+from its state after the previous brick.
 """
 
 from dataclasses import replace
@@ -23,23 +23,23 @@ from .rays import RayTiles, vmap_rays
 from .resolve import resolve_image
 from .shifts import begin_rays
 from .tiling import RenderOptions
-from .wavefront import CellRange, blinded, into_range, march_rays
+from .wavefront import CellRange, finish_blind, into_range, march_rays
 
 
 class RayStates(eqx.Module):
-    """The rays of an image, and where they have come to, (tiles, groups, rays in a group)."""
+    """The rays of an image, and their progress, (tiles, groups, rays in a group)."""
 
     rays: Ray
     at: Progress
 
 
 def begin_image(scene: Scene, options: RenderOptions) -> RayStates:
-    """All rays at their entries. Of the volume, no voxel is read."""
+    """The rays of an image at their entries. No voxel is read."""
     tiles, fault = RayTiles.of(scene.source, options.tiling), scene.has_fault
     prepared, tiling = scene._replace(lighting=None).prepared(), options.tiling
 
-    def one(each: tuple[Int[Array, ""]]) -> RayStates:
-        rays = tiles.rays(scene.source, prepared.space, each[0], fault)
+    def one(inputs: tuple[Int[Array, ""]]) -> RayStates:
+        rays = tiles.rays(scene.source, prepared.space, inputs[0], fault)
         at = begin_rays(scene.march, prepared, rays, tiling, options.outputs, finds_shifts=False)
         return RayStates(rays, at)
 
@@ -54,23 +54,23 @@ def march_brick(
     ranges: CellRange,
     restart: bool = False,
 ) -> RayStates:
-    """Marches each ray through `ranges`. `scene`: with a brick of the volume, which holds what rays meet
-    there. `restart`: from where their ranges begin, unless they are opaque."""
+    """Marches each ray through its range. `scene`: a scene with a brick that covers the ranges. `restart`:
+    whether rays that are not opaque start at their ranges, regardless of their state."""
     tiles = RayTiles.of(scene.source, options.tiling)
     index = empty_space_of(acceleration.packed(scene), acceleration, options.tiling)
     prepared, shifts = by_rules(acceleration.prepared(scene)), scene.march.may_shift
 
-    def one(each: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
-        _, states, range_ = each
+    def one(inputs: tuple[Int[Array, ""], RayStates, CellRange]) -> RayStates:
+        _, states, range_ = inputs
         rays, start = states.rays, states.at
         if restart:
             over = opaque(prepared, start) | (range_.until <= range_.first)
             start = with_fields(start, index=range_.first, finished=over)
         skips = tiles.skips(index, rays, scene.march.step)
-        here = into_range(prepared, rays, start, range_, shifts=shifts)
-        after = march_rays(prepared, rays, blinded(skips, here), tiles.tiling, skips, shifts=shifts).at
+        at = into_range(prepared, rays, start, range_, shifts=shifts)
+        after = march_rays(prepared, rays, finish_blind(skips, at), tiles.tiling, skips, shifts=shifts).at
         after = eqx.tree_at(lambda at: at.track.until, after, start.track.until)
-        # where it was restarted, a ray may go back
+        # a restarted ray may go back
         over = opaque(prepared, after) if restart else start.finished | ended(prepared, rays, after)
         return RayStates(rays, with_fields(after, finished=over))
 
@@ -78,13 +78,13 @@ def march_brick(
 
 
 def ended(scene: Scene, rays: Ray, at: Progress) -> Bool[Array, "groups rays"]:
-    """Which rays need no other cell, wherever it lies."""
+    """True for rays that need no other cell of any brick."""
     past = vmap_rays(lambda ray, at: front(scene.march, at) >= ray.length)(rays, at)
     return past | opaque(scene, at)
 
 
 def opaque(scene: Scene, at: Progress) -> Bool[Array, "groups rays"]:
-    """Which rays are stopped by what lies in front."""
+    """True for rays that are stopped by their opacity."""
     return vmap_rays(partial(stopped, scene))(at.composite)
 
 
@@ -97,14 +97,14 @@ def resolve_brick(
     after: RayStates,
     pixels: Array | None,
 ) -> Array:
-    """Pixels of a mode that chooses a sample: `pixels`, computed again from this brick where it holds another
-    sample than the one chosen `before`. `march`: of the rays."""
+    """Pixels of a mode that selects a sample: `pixels`, recomputed where this brick changed the selected
+    sample. `before`: progress before the brick. `march`: the march of the rays."""
     tiles = RayTiles.of(scene.source, options.tiling)
     rendering = _assembled(scene._replace(march=march), tiles, after)
     states = zip(jax.tree.leaves(before.composite), jax.tree.leaves(after.at.composite), strict=True)
     changed = tiles.assemble(jnp.any(jnp.stack([old != new for old, new in states]), axis=0))[..., None]
-    found = jnp.where(changed, rendering.rgba, 0), rendering.depth, rendering.details.selected
-    resolved = resolve_image(scene, options, acceleration, found)
+    marched = jnp.where(changed, rendering.rgba, 0), rendering.depth, rendering.details.selected
+    resolved = resolve_image(scene, options, acceleration, marched)
     return resolved if pixels is None else jnp.where(changed, resolved, pixels)
 
 
@@ -115,8 +115,8 @@ def _assembled(scene: Scene, tiles: RayTiles, states: RayStates) -> Rendering:
 
 
 def join_segments(scene: Scene, segments: RayStates) -> RayStates:
-    """Combines independently marched segments of rays, front to back, along the first axis, to rays that have
-    passed all bricks. What is behind does not show where a ray was stopped in front."""
+    """Combines independently marched segments of rays, front to back along the first axis, to rays that have
+    passed all bricks. Segments behind a stopped ray are ignored."""
     prepared = scene._replace(lighting=None).prepared()
 
     def join(front: Progress, back: Progress) -> Progress:
@@ -124,7 +124,7 @@ def join_segments(scene: Scene, segments: RayStates) -> RayStates:
         if front.stats is not None and back.stats is not None:
             samples = front.stats.samples + back.stats.samples
             stats = replace(front.stats, samples=samples, aligned=front.stats.aligned | back.stats.aligned)
-        both = replace(
+        combined = replace(
             front,
             index=jnp.maximum(front.index, back.index),
             composite=joined(front.composite, back.composite),
@@ -132,13 +132,12 @@ def join_segments(scene: Scene, segments: RayStates) -> RayStates:
             stats=stats,
         )
         stops = stopped(prepared, front.composite)
-        return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, both)
+        return jax.tree.map(lambda a, b: jnp.where(stops, a, b), front, combined)
 
     at = _passed(scene.march, segments.at)
-    each = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(at.finished.shape[0])]
-    return RayStates(
-        jax.tree.map(lambda leaf: leaf[0], segments.rays), reduce(jax.vmap(vmap_rays(join)), each)
-    )
+    parts = [jax.tree.map(lambda leaf, i=i: leaf[i], at) for i in range(at.finished.shape[0])]
+    rays = jax.tree.map(lambda leaf: leaf[0], segments.rays)
+    return RayStates(rays, reduce(jax.vmap(vmap_rays(join)), parts))
 
 
 def finish_image(scene: Scene, options: RenderOptions, states: RayStates) -> Rendering:
@@ -148,5 +147,5 @@ def finish_image(scene: Scene, options: RenderOptions, states: RayStates) -> Ren
 
 
 def _passed(march: March, at: Progress) -> Progress:
-    """Finishes rays, behind whose last brick nothing lies, unless they ran out of samples."""
+    """Finishes rays that have passed all bricks, unless they ran out of samples."""
     return with_fields(at, finished=at.finished | (at.index < march.most_samples))

@@ -1,7 +1,7 @@
-"""Deals the rays of an image out to devices, each of which has the whole scene.
+"""Shards the rays of an image over devices; the scene is replicated.
 
-Beams of rays are dealt round-robin, so that each device has its share of what is expensive wherever that lies
-in the image. Each renders its own by the program of one device, and JAX sums their gradients.
+Beams of rays are assigned round-robin, which balances expensive regions of the image over the devices. Each
+device runs the program of a single device, and JAX sums the gradients.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -30,24 +30,24 @@ from .tiling import RenderOptions, Tiling
 
 
 Devices: TypeAlias = Sequence[Any] | Mesh
-"""What a caller may pass for devices."""
+"""The argument `devices` of the renderers."""
 
 AXIS = "devices"
 """Name of the mesh axis."""
 
 REPLICATED, SHARDED = PartitionSpec(), PartitionSpec(AXIS)
-"""An array that every device has; and one of which each has its part along the first axis."""
+"""Arrays that are copied to every device, and arrays that are divided along their first axis."""
 
 LARGE = 2**16
-"""Bytes from which on an array is kept on all devices for the next image."""
+"""Minimum size in bytes of arrays that are kept on all devices for the next image."""
 
 
-def mesh_of(devices: Any) -> Mesh | None:
+def mesh_of(devices: Devices | None) -> Mesh | None:
     """The devices as a mesh of one axis; None for None: JAX decides where the image is computed.
 
     Raises:
-        ValueError: for what is neither a sequence of JAX's devices nor a mesh of them of one axis, for none,
-            for one that is there twice, and for devices of several kinds.
+        ValueError: if `devices` is neither a sequence of JAX devices nor a mesh of one axis, is empty, has
+            duplicates, or is of several platforms.
     """
     if devices is None:
         return None
@@ -56,48 +56,49 @@ def mesh_of(devices: Any) -> Mesh | None:
         if devices.devices.ndim != 1:
             raise ValueError(f"devices must be {expected}; got a mesh of the axes {dict(devices.shape)}.")
         devices = devices.devices.tolist()
-    listed = list(devices) if isinstance(devices, Iterable) and not isinstance(devices, str) else [devices]
-    found: list[Any] = [each for each in listed if isinstance(each, jax.Device)]
-    if len(found) < len(listed) or not isinstance(devices, Iterable):
-        wrong = next((each for each in listed if not isinstance(each, jax.Device)), devices)
-        raise ValueError(f"devices must be {expected}; got {described(wrong)}.")
-    if not found or len(set(found)) < len(found) or len({each.platform for each in found}) > 1:
-        raise ValueError(f"devices must be one or more different devices of one platform; got {found}.")
-    return Mesh(np.asarray(found), (AXIS,))
+    listed: list[Any] = (
+        list(devices) if isinstance(devices, Iterable) and not isinstance(devices, str) else [devices]
+    )
+    wrong = [device for device in listed if not isinstance(device, jax.Device)]
+    if wrong or not isinstance(devices, Iterable):
+        raise ValueError(f"devices must be {expected}; got {described(wrong[0] if wrong else devices)}.")
+    if not listed or len(set(listed)) < len(listed) or len({device.platform for device in listed}) > 1:
+        raise ValueError(f"devices must be one or more different devices of one platform; got {listed}.")
+    return Mesh(np.asarray(listed), (AXIS,))
 
 
-def _dealt_image(
+def _sharded_image(
     mesh: Mesh,
     render: Callable[[Scene, RenderOptions, VolumeAcceleration], Rendering],
     scene: Scene,
     options: RenderOptions,
     acceleration: VolumeAcceleration,
 ) -> Rendering:
-    """What `render` returns, by all devices of a mesh, each of which renders its part of the rays. The image
-    is then on all of them."""
-    shape, *dealt = dealt_rays(scene.source, options.tiling, mesh.size)
-    indices, place = map(jnp.asarray, dealt)
-    arrays, rest = eqx.partition((scene, acceleration), eqx.is_array)
+    """Renders an image by `render` on all devices of a mesh, each with its shard of the rays. The image is
+    replicated."""
+    shape, *tables = shard_rays(scene.source, options.tiling, mesh.size)
+    indices, place = map(jnp.asarray, tables)
+    arrays, static = eqx.partition((scene, acceleration), eqx.is_array)
 
-    def own(arrays: PyTree, indices: Int[Array, " rays"]) -> Rendering:
-        scene, acceleration = eqx.combine(arrays, rest)
+    def render_shard(arrays: PyTree, indices: Int[Array, " rays"]) -> Rendering:
+        scene, acceleration = eqx.combine(arrays, static)
         return render(scene._replace(source=RaySubset(scene.source, indices)), options, acceleration)
 
-    # Types are not checked: every loop, in a user's transform too, would have to start with arrays that vary.
-    how: Any = {"mesh": mesh, "in_specs": (REPLICATED, SHARDED), "out_specs": SHARDED, "check_vma": False}
-    found = jax.shard_map(own, **how)(arrays, indices)
-    whole = jax.tree.map(lambda leaf: leaf[place].reshape(*shape, *leaf.shape[1:]), found)
-    return jax.lax.with_sharding_constraint(whole, NamedSharding(mesh, REPLICATED))
+    # With `check_vma`, each loop, also of a user's transform, would have to start with varying arrays.
+    specs: Any = {"mesh": mesh, "in_specs": (REPLICATED, SHARDED), "out_specs": SHARDED, "check_vma": False}
+    shards = jax.shard_map(render_shard, **specs)(arrays, indices)
+    image = jax.tree.map(lambda leaf: leaf[place].reshape(*shape, *leaf.shape[1:]), shards)
+    return jax.lax.with_sharding_constraint(image, NamedSharding(mesh, REPLICATED))
 
 
-over_devices = compiled(_dealt_image, has_jvp=True)
+over_devices = compiled(_sharded_image, has_jvp=True)
 
 
-def dealt_rays(
+def shard_rays(
     source: Source, tiling: Tiling, devices: int
-) -> tuple[tuple[int, ...], Int[np.ndarray, " dealt"], Int[np.ndarray, " rays"]]:
-    """The shape of an image; the indices of its rays, those of each device in turn, beam by beam; and where
-    each ray of the image is among these. Beams that are not full repeat rays."""
+) -> tuple[tuple[int, ...], Int[np.ndarray, " sharded"], Int[np.ndarray, " rays"]]:
+    """The shape of an image; its rays' indices, by device and then by beam; and the position of each ray in
+    that order. Beams that are not full repeat rays."""
     rays = without_ends(source)
     if isinstance(rays, Camera):
         (width, height), side = rays.size, tiling.beam
@@ -105,10 +106,10 @@ def dealt_rays(
         y, x = np.indices((down * side, across * side)).reshape(2, down, side, across, side)
         inside = (y < height) & (x < width)
         index = np.minimum(y, height - 1) * width + np.minimum(x, width - 1)
-        # where the columns are a multiple of the devices, each device would always get the same ones
+        # rotates the rows if `across` is a multiple of `devices`: else devices would get whole columns
         row = np.arange(down)[:, None]
         column = (np.arange(across) + row * (across % devices == 0)) % across
-        index, inside = (np.swapaxes(each, 1, 2)[row, column] for each in (index, inside))
+        index, inside = (np.swapaxes(table, 1, 2)[row, column] for table in (index, inside))
         index, inside = index.reshape(-1, side**2), inside.reshape(-1, side**2)
         shape = height, width
     else:
@@ -117,7 +118,7 @@ def dealt_rays(
         index = np.arange(-(-count // size) * size).reshape(-1, size)
         index, inside = np.minimum(index, count - 1), index < count
     missing = -len(index) % devices
-    index, inside = (np.pad(each, ((0, missing), (0, 0))) for each in (index, inside))
+    index, inside = (np.pad(table, ((0, missing), (0, 0))) for table in (index, inside))
     beams = np.arange(len(index)).reshape(-1, devices).T.reshape(-1)
     index, inside = index[beams].reshape(-1), inside[beams].reshape(-1)
     place = np.zeros(int(np.prod(shape)), int)
@@ -126,35 +127,35 @@ def dealt_rays(
 
 
 def on_all(mesh: Mesh | None, tree: PyTree) -> PyTree:
-    """The tree, with its large arrays (`LARGE` bytes or more) and committed ones copied to all devices, once
-    in the lifetime of each; JAX copies the others for each image."""
+    """Copies a tree's large (`LARGE`) and committed arrays to all devices, once in their lifetime. JAX copies
+    the others for each image."""
     if mesh is None:
         return tree
-    there = set(mesh.devices.tolist())
+    targets = set(mesh.devices.tolist())
 
-    def one(leaf: Any) -> Any:
-        if not isinstance(leaf, jax.Array) or is_traced(leaf) or leaf.sharding.device_set == there:
+    def replicate(leaf: PyTree) -> PyTree:
+        if not isinstance(leaf, jax.Array) or is_traced(leaf) or leaf.sharding.device_set == targets:
             return leaf
         return memoized(leaf, _copier(mesh)) if leaf.nbytes >= LARGE or leaf.committed else leaf
 
-    return jax.tree.map(one, tree)
+    return jax.tree.map(replicate, tree)
 
 
 @cache
 def _copier(mesh: Mesh) -> Callable[[Array], Array]:
-    def copied(array: Array) -> Array:
-        # not `device_put` to all, which would compare the arrays of all processes
+    def copy(array: Array) -> Array:
+        # `device_put` to all devices would compare the arrays of all processes
         parts = [jax.device_put(array, device) for device in mesh.local_devices]
         return jax.make_array_from_single_device_arrays(array.shape, NamedSharding(mesh, REPLICATED), parts)
 
-    return copied
+    return copy
 
 
 def check_not_sharded(tree: PyTree) -> None:
-    """Raises `ValueError` inside of a `jax.shard_map`, where devices are shared out already."""
+    """Raises `ValueError` inside `jax.shard_map`, which already assigns devices."""
     varies = any(map(varies_over, filter(eqx.is_array, jax.tree.leaves(tree))))
     if jax.sharding.get_abstract_mesh().manual_axes or varies:
         raise ValueError(
-            "devices cannot be given inside jax.shard_map, which has dealt them out: leave it out there, or "
-            "call the renderer outside."
+            "devices= is not allowed inside jax.shard_map, which already assigns devices. Remove it, or call "
+            "the renderer outside."
         )

@@ -1,8 +1,8 @@
-"""How is an image divided into tiles, and a tile into beams and groups of rays?
+"""Division of an image into tiles, beams and groups of rays, and generation of the rays of a tile.
 
 An image is divided into tiles (of 4096 beams by default), a tile into beams (8 x 8 pixels: four groups), and
 a beam into groups (4 x 4 pixels: 16 rays). Besides finished pixels, only the rays of one tile are in memory,
-as arrays (groups, rays in a group), however large the image.
+as arrays (groups, rays in a group), for images of any size.
 """
 
 import math
@@ -36,8 +36,8 @@ class RayTiles(eqx.Module):
     """The order of an image's rays.
 
     Attributes:
-        number: of tiles.
-        beam_count: of beams in each tile.
+        number: number of tiles.
+        beam_count: number of beams in each tile.
     """
 
     number: int = eqx.field(static=True)
@@ -56,16 +56,16 @@ class RayTiles(eqx.Module):
         """The tiles of a camera's pixels, or of given rays.
 
         Args:
-            direct: small ones, for `"direct"`.
-            tiles: number of tiles, and of beams in each, in place of those that follow from the tiling.
+            direct: whether tiles are small, for `adjoint="direct"`.
+            tiles: number of tiles, and of beams in each; None: as the tiling says.
         """
         source = source.rays if isinstance(source, Ending) else source
-        most = tiling.direct_tile if direct else tiling.tile
+        limit = tiling.direct_tile if direct else tiling.tile
 
-        def divided(beams: Any) -> tuple[int, int]:
+        def divided(beams: int) -> tuple[int, int]:
             if tiles is not None:
                 return tiles
-            count = max(min(most, beams), 1)
+            count = max(min(limit, beams), 1)
             return -(-beams // count), count
 
         if isinstance(source, Camera):
@@ -76,8 +76,7 @@ class RayTiles(eqx.Module):
 
     @staticmethod
     def shared(source: Camera | GivenRays, tiling: Tiling) -> tuple[int, int]:
-        """Beams of a tile, one of three numbers, so that most images share programs; and how many tiles hold
-        all rays."""
+        """Number of beams in a tile, one of three, so that images share programs; and number of tiles."""
         beams = max(_beams_of(source, tiling), tiling.least)
         for size in (tiling.tile // 16, tiling.tile // 4):
             if beams <= 2 * size:
@@ -90,67 +89,67 @@ class RayTiles(eqx.Module):
         return self.beam_count * GROUPS_OF_BEAM
 
     def scan(
-        self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *each: PyTree
+        self, f: Callable[[PyTree, PyTree], tuple[PyTree, PyTree]], sums: PyTree, *trees: PyTree
     ) -> tuple[PyTree, PyTree]:
-        """Folds `f(sums, (tile, *each))` over the tiles, and stacks what else it returns."""
-        return jax.lax.scan(f, sums, (jnp.arange(self.number), *each))
+        """Folds `f(sums, (tile, *trees))` over the tiles, and stacks its second result."""
+        return jax.lax.scan(f, sums, (jnp.arange(self.number), *trees))
 
-    def map(self, f: Callable[[PyTree], PyTree], *each: PyTree) -> PyTree:
-        """`f((tile, *each))` of the tiles, stacked."""
-        return jax.lax.map(f, (jnp.arange(self.number), *each))
+    def map(self, f: Callable[[PyTree], PyTree], *trees: PyTree) -> PyTree:
+        """Stacked results of `f((tile, *trees))` for all tiles."""
+        return jax.lax.map(f, (jnp.arange(self.number), *trees))
 
     def beams(self, tile: Int[Array, ""]) -> Int[Array, " beams"]:
         """The numbers of a tile's beams."""
         return tile * self.beam_count + jnp.arange(self.beam_count)
 
     def of_beams(self, leaf: Array) -> Array:
-        """From (tiles, groups, rays in a group, *rest) to (beams, rays of a beam, *rest)."""
+        """Reshapes (tiles, groups, rays in a group, ...) to (beams, rays of a beam, ...)."""
         return leaf.reshape(self.number * self.beam_count, self.tiling.rays_per_beam, *leaf.shape[3:])
 
     def of_tiles(self, beams: Array) -> Array:
-        """The inverse of `of_beams`; 0 for beams that are missing."""
-        rest, missing = beams.shape[2:], self.number * self.beam_count - beams.shape[0]
+        """Inverse of `of_beams`; 0 for missing beams."""
+        trailing, missing = beams.shape[2:], self.number * self.beam_count - beams.shape[0]
         beams = jnp.pad(beams, [(0, missing)] + [(0, 0)] * (beams.ndim - 1))
         groups = self.beam_count * self.tiling.rays_per_beam // self.tiling.group
-        return beams.reshape(self.number, groups, self.tiling.group, *rest)
+        return beams.reshape(self.number, groups, self.tiling.group, *trailing)
 
     def rays(self, source: Source, space: Space, tile: Int[Array, ""], fault: Bool[Array, ""]) -> Ray:
-        """The rays of a tile, cut to the volume. Those that only fill up groups miss it. If there is a
-        `fault` in the scene, all of them are NaN, and so invalid."""
-        return entering(space, *self.ending_lines(source, tile, fault), self.tiling.searched)
+        """The rays of a tile, cut to the volume. Rays that only fill up groups miss it. All are NaN, and so
+        invalid, if the scene has a `fault`."""
+        return enter_rays(space, *self.ending_lines(source, tile, fault), self.tiling.searched)
 
     def ending_lines(
         self, source: Source, tile: Int[Array, ""], fault: Bool[Array, ""]
     ) -> tuple[Line, Bool[Array, "groups rays"]]:
-        """The rays of a tile, up to where they end, and which of them are of the image."""
-        found, wanted = self.lines_of(source.rays if isinstance(source, Ending) else source, tile, fault)
+        """The rays of a tile, up to their `until`, and whether each belongs to the image."""
+        line, wanted = self.lines_of(source.rays if isinstance(source, Ending) else source, tile, fault)
         if isinstance(source, Ending):
-            found = found._replace(until=self.disassemble(source.until)[tile])
-        return found, wanted
+            line = line._replace(until=self.disassemble(source.until)[tile])
+        return line, wanted
 
     @abstractmethod
     def lines_of(
-        self, source: Any, tile: Int[Array, ""], fault: Bool[Array, ""]
+        self, source: PyTree, tile: Int[Array, ""], fault: Bool[Array, ""]
     ) -> tuple[Line, Bool[Array, "groups rays"]]:
-        """The rays of a tile, and which of them are of the image."""
+        """The rays of a tile, and whether each belongs to the image."""
 
     @abstractmethod
     def box(self, occupancy: Occupancy, rays: Ray) -> Box:
         """The boxes around the beams of a tile."""
 
     def skips(self, index: EmptySpaceIndex | None, rays: Ray, step: Scalar) -> Skips | None:
-        """Where the rays of a tile see nothing, if that is known."""
+        """Empty stretches along the beams of a tile; None without an index."""
         if index is None:
             return None
         return index.skips(partial(self.box, rays=rays), self.tiling.cells * step)
 
     @abstractmethod
     def assemble(self, leaf: Array) -> Array:
-        """From (tiles, groups, rays in a group, *rest) to the image's shape."""
+        """Reshapes (tiles, groups, rays in a group, ...) to the image's shape."""
 
     @abstractmethod
     def disassemble(self, leaf: Array) -> Array:
-        """The inverse of `assemble`; 0 for rays that only fill up groups."""
+        """Inverse of `assemble`; 0 for rays that only fill up groups."""
 
 
 def _shape_of(source: GivenRays | RaySubset) -> tuple[int, ...]:
@@ -192,25 +191,25 @@ class _PixelTiles(RayTiles):
         return (beam % self.across) * side + x[None], (beam // self.across) * side + y[None]
 
     def assemble(self, leaf: Array) -> Array:
-        rest, (width, height) = leaf.shape[3:], self.size
+        trailing, (width, height) = leaf.shape[3:], self.size
         side, beam = self.tiling.side, self.tiling.beam
         beams = self.of_beams(leaf)[: self.across * self.down]
-        image = beams.reshape(self.down, self.across, 2, 2, side, side, *rest)
+        image = beams.reshape(self.down, self.across, 2, 2, side, side, *trailing)
         image = jnp.moveaxis(image, (0, 2, 4), (0, 1, 2))
-        return image.reshape(self.down * beam, self.across * beam, *rest)[:height, :width]
+        return image.reshape(self.down * beam, self.across * beam, *trailing)[:height, :width]
 
     def disassemble(self, leaf: Array) -> Array:
-        rest, (width, height) = leaf.shape[2:], self.size
+        trailing, (width, height) = leaf.shape[2:], self.size
         side, beam = self.tiling.side, self.tiling.beam
-        more = (self.down * beam - height, self.across * beam - width)
-        image = jnp.pad(leaf, [(0, n) for n in more] + [(0, 0)] * len(rest))
-        image = image.reshape(self.down, 2, side, self.across, 2, side, *rest)
-        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, self.tiling.rays_per_beam, *rest)
+        padding = (self.down * beam - height, self.across * beam - width)
+        image = jnp.pad(leaf, [(0, n) for n in padding] + [(0, 0)] * len(trailing))
+        image = image.reshape(self.down, 2, side, self.across, 2, side, *trailing)
+        beams = jnp.moveaxis(image, (0, 1, 2), (0, 2, 4)).reshape(-1, self.tiling.rays_per_beam, *trailing)
         return self.of_tiles(beams)
 
 
 class _GivenRayTiles(RayTiles):
-    """Given rays, or some of an image's, in their order."""
+    """`GivenRays`, or a subset of an image's rays, in order."""
 
     shape: tuple[int, ...] = eqx.field(static=True)
 
@@ -218,24 +217,22 @@ class _GivenRayTiles(RayTiles):
         self, source: GivenRays | RaySubset, tile: Int[Array, ""], fault: Bool[Array, ""]
     ) -> tuple[Line, Bool[Array, "groups rays"]]:
         count = math.prod(self.shape)
+        numbers, wanted = self._numbers(tile, count)
         if isinstance(source, RaySubset):
-            known, wanted = self._numbers(tile, count)
-            found = lines_at(source.rays, source.indices[known.reshape(-1)])
-            found = jax.tree.map(lambda leaf: leaf.reshape(known.shape), found)
-            x, y, z = found.origin
-            return found._replace(origin=(jnp.where(fault, jnp.nan, x), y, z)), wanted
-        if count == 0:  # a row for the look-ups below
+            line = lines_at(source.rays, source.indices[numbers.reshape(-1)])
+            line = jax.tree.map(lambda leaf: leaf.reshape(numbers.shape), line)
+            x, y, z = line.origin
+            return line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z)), wanted
+        if count == 0:  # the look-ups below need a row
             source = GivenRays(
                 *(jnp.ones((1, 3), leaf.dtype) for leaf in (source.origins, source.directions))
             )
-        known, wanted = self._numbers(tile, count)
-        x, y, z = (source.origins.reshape(-1, 3)[known, i] for i in range(3))
-        dx, dy, dz = (source.directions.reshape(-1, 3)[known, i] for i in range(3))
-        own = Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(known))
-        return own, wanted
+        x, y, z = (source.origins.reshape(-1, 3)[numbers, i] for i in range(3))
+        dx, dy, dz = (source.directions.reshape(-1, 3)[numbers, i] for i in range(3))
+        return Line((jnp.where(fault, jnp.nan, x), y, z), (dx, dy, dz), source.pixel(numbers)), wanted
 
     def _numbers(self, tile: Int[Array, ""], count: int) -> tuple[Lanes, Bool[Array, "groups rays"]]:
-        """The numbers of a tile's rays, the last one in place of those that are missing; and which exist."""
+        """Numbers of a tile's rays, clipped to the last one, and whether each exists."""
         size = self.tiling.rays_per_beam
         number = (self.beams(tile)[:, None] * size + jnp.arange(size)[None]).reshape(-1, self.tiling.group)
         return jnp.minimum(number, max(count - 1, 0)), number < count
@@ -244,19 +241,23 @@ class _GivenRayTiles(RayTiles):
         return box_of_rays(self.tiling, rays, occupancy)
 
     def assemble(self, leaf: Array) -> Array:
-        rest, size = leaf.shape[3:], self.tiling.rays_per_beam
+        trailing, size = leaf.shape[3:], self.tiling.rays_per_beam
         beams = self.of_beams(leaf)
-        rays = beams.reshape(beams.shape[0] * size, *rest)
-        return rays[: math.prod(self.shape)].reshape(*self.shape, *rest)
+        rays = beams.reshape(beams.shape[0] * size, *trailing)
+        return rays[: math.prod(self.shape)].reshape(*self.shape, *trailing)
 
     def disassemble(self, leaf: Array) -> Array:
-        rest, count, size = leaf.shape[len(self.shape) :], math.prod(self.shape), self.tiling.rays_per_beam
-        padded = jnp.pad(leaf.reshape(count, *rest), [(0, -count % size)] + [(0, 0)] * len(rest))
-        return self.of_tiles(padded.reshape(-(-count // size), size, *rest))
+        trailing, count, size = (
+            leaf.shape[len(self.shape) :],
+            math.prod(self.shape),
+            self.tiling.rays_per_beam,
+        )
+        padded = jnp.pad(leaf.reshape(count, *trailing), [(0, -count % size)] + [(0, 0)] * len(trailing))
+        return self.of_tiles(padded.reshape(-(-count // size), size, *trailing))
 
 
 def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
-    """The rays of indices into the flattened image, as the march rounds them."""
+    """The rays at these indices of the flattened image, rounded as in the march."""
     if isinstance(source, RaySubset):
         return lines_at(source.rays, source.indices[indices])
     if isinstance(source, Ending):
@@ -269,33 +270,30 @@ def lines_at(source: Source, indices: Int[Array, " rays"]) -> Line:
 
 
 def lines(camera: Camera, columns: Lanes, rows: Lanes, fault: Bool[Array, ""]) -> Line:
-    """The rays of pixels. If the camera is not finite and valid, or there is a `fault`, all are NaN."""
-    left, top = (first.astype(columns.dtype) for first in camera.first_pixel)
-    # on a GPU, `in_memory` computes rays also of a fault
+    """The rays of pixels. All are NaN if the camera is not finite and valid, or if there is a `fault`."""
+    first_column, first_row = (first.astype(columns.dtype) for first in camera.first_pixel)
+    # on a GPU, `in_memory` also computes the rays of an invalid camera
     camera = eqx.tree_at(lambda c: c.position, camera, jnp.where(fault, jnp.nan, camera.position))
-    beside, direction = _rounded(camera, columns, rows)
+    offset, direction = _rounded(camera, columns, rows)
     # the position need not be stored for each ray
     x, y, z = (jnp.broadcast_to(c, columns.shape) for c in camera.position)
-    return Line((x, y, z), direction, (columns + left, rows + top), beside=beside)
+    return Line((x, y, z), direction, (columns + first_column, rows + first_row), beside=offset)
 
 
-def _through(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
-    """What is computed of the rays of pixels: directions, and where they begin in parallel projection."""
+def _through(camera: Camera, columns: Lanes, rows: Lanes) -> PyTree:
+    """Origin offsets (in parallel projection) and directions of the rays of pixels."""
     return vmap_rays(camera.beside)(columns, rows)
 
 
 @jax.custom_jvp
-def _rounded(camera: Camera, columns: Lanes, rows: Lanes) -> Any:
-    """`_through`, rounded alike in every program.
-
-    Otherwise a program that also differentiates it would round it differently, by 1e-4 of a voxel; and a
-    sample on the other side of a voxel's face has another slope. So it is computed in a branch of its own,
-    without derivatives."""
+def _rounded(camera: Camera, columns: Lanes, rows: Lanes) -> PyTree:
+    """Computes `_through` in a branch without derivatives, so that every program rounds it alike. A program
+    that differentiates it would differ by 1e-4 of a voxel, and slopes jump at voxels' faces."""
     return in_memory(all_finite(camera), partial(_through, camera), columns, rows)
 
 
 @_rounded.defjvp
-def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -> tuple[Any, Any]:
+def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, PyTree, PyTree]) -> tuple[PyTree, PyTree]:
     camera, columns, rows = primals
     _, change = jax.jvp(lambda camera: _through(camera, columns, rows), (camera,), tangents[:1])
     return _rounded(*primals), change
@@ -304,7 +302,7 @@ def _(primals: tuple[Camera, Lanes, Lanes], tangents: tuple[Camera, Any, Any]) -
 def box_of_corners(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
     """The boxes around beams of pixels."""
     side, last = tiling.side, tiling.group - 1
-    lanes = 0, side - 1, last - side + 1, last  # in the groups of a beam, its corners
+    lanes = 0, side - 1, last - side + 1, last  # of the beam's corners, in its four groups
 
     def corners(leaf: Array) -> Array:
         groups = leaf.reshape(-1, GROUPS_OF_BEAM, leaf.shape[1])
@@ -319,7 +317,7 @@ def box_of_corners(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
 
 
 def box_of_rays(tiling: Tiling, rays: Ray, occupancy: Occupancy) -> Box:
-    """The boxes around beams of any rays."""
+    """The boxes around beams of arbitrary rays."""
     return Box.around(occupancy, jax.tree.map(lambda leaf: leaf.reshape(-1, tiling.rays_per_beam), rays))
 
 
@@ -328,16 +326,21 @@ def vmap_rays(f: Callable[..., Any]) -> Callable[..., Any]:
 
     def run(*trees: PyTree) -> PyTree:
         groups, group = jax.tree.leaves(trees)[0].shape[:2]
-        # of one axis: XLA unrolls a short last one, to ten times the code, which takes twice as long
+        # flattened to one axis: XLA unrolls a short last axis, to ten times the code and twice the time
         flat = jax.tree.map(lambda leaf: leaf.reshape(groups * group, *leaf.shape[2:]), trees)
         return jax.tree.map(lambda leaf: leaf.reshape(groups, group, *leaf.shape[1:]), jax.vmap(f)(*flat))
 
     return run
 
 
-def entering(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], searched: int) -> Ray:
-    """Rays, cut to the volume; those that are not wanted miss it. `searched`: groups at a time, where ends of
-    rays are searched."""
+def vmap_cells(f: Callable[..., Any], of_cells: tuple[bool, ...] = (True,)) -> Callable[..., Any]:
+    """Maps a function over rays, and over cells for arguments (cells, rays), whose `of_cells` is true."""
+    return jax.vmap(jax.vmap(f), in_axes=tuple(0 if mapped else None for mapped in of_cells))
+
+
+def enter_rays(space: Space, lines: Line, wanted: Bool[Array, "groups rays"], searched: int) -> Ray:
+    """Rays, cut to the volume; those that are not wanted miss it. `searched`: number of groups at a time if
+    the space searches for the ends of rays."""
 
     def one(line: Line) -> Ray:
         return enter(space, *line)

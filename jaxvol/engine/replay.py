@@ -1,22 +1,22 @@
-"""VJP of marching a tile's rays: a second march, front to back, computes each sample again.
+"""VJP of marching a tile's rays: a second march, front to back, recomputes all samples.
 
 Let c̄, ā and d̄ be the cotangents of a ray's colour C, opacity A and depth D = t_in + Σ w s / A, where sample
-k has weight w_k, colour c_k and depth s_k past the entry. Then a unit of its weight is worth
+k has weight w_k, colour c_k and depth s_k past the entry. The derivative of the loss by its weight is
 
     q_k = c̄ · c_k + ā + (d̄ / A) (s_k - (D - t_in))
 
-to the loss, and
+(`weight_bar`), and
 
     ∂L/∂c_k = w_k c̄        ∂L/∂s_k = w_k d̄ / A        ∂L/∂τ_k = Σ_j q_j ∂w_j/∂τ_k
 
-with the optical depth τ_k (extinction × width). The last is the compositing mode's to say
-(`Weighting.slope`) from q_k and Σ_{j>k} w_j q_j, which is Σ w_j q_j = c̄ · C + ā A, known from the image,
-minus the sum over j ≤ k. So nothing is kept for each sample, and nothing is divided by a transmittance,
-which may be 0. `Transfer.vjp` pulls colours and optical depths back to the transfer function, JAX all else to
-the voxels, the ray and the step, one segment at a time.
+with the optical depth τ_k (extinction × width). The compositing mode computes the last (`Weighting.slope`)
+from q_k and Σ_{j>k} w_j q_j: the total Σ w_j q_j = c̄ · C + ā A, known from the image, minus the sum over
+j ≤ k. So no sample is stored, and nothing is divided by a transmittance, which may be 0. `Transfer.vjp` pulls
+colours and optical depths back to the transfer function; JAX pulls the others back to voxels, ray and step,
+segment by segment.
 
-Where rays leap over empty space, the first march records each ray's first and last visible cell, and the
-second one leaps over all others, which saves two fifths of the samples in the head.
+If rays leap over empty space, the first march records each ray's first and last visible cell, and the second
+leaps over all others, which saves two fifths of the samples in the head.
 """
 
 from functools import reduce
@@ -38,64 +38,65 @@ from ..scene.transfer import classification_of
 from ..scene.volume import fetches_of, voxels_of, with_fetches, with_voxels, without_voxels
 from ..scene.voxel_fetch import Fetched
 from ..xla.trees import PyTree, added, floats, with_fields, zeros_of
-from .segment import Samples, SampleVisitor, vmap_cells
+from .rays import vmap_cells
+from .segment import Samples, SampleVisitor
 from .shading import Weights, lit_colors, weights_of
 from .shading_gradient import ShadingTotal, ShadingVjp, shading_vjp
 from .voxel_gradient import Sums, check_fetched, recorded, with_cotangents, zero_perturbations, zero_sums
 
 
 class Cotangents(NamedTuple):
-    """For each ray, the cotangents of colour and opacity, c̄ and ā; `worth`, Σ w_j q_j; and, where the loss
-    depends on depth, `depth`, d̄ / A, and `middle`, D - t_in."""
+    """Cotangents of rays: c̄ and ā of colour and opacity; `total`, Σ w_j q_j; and, if the loss depends on
+    depth, `depth`, d̄ / A, and `middle`, D - t_in."""
 
     color: Color
     opacity: Scalar
-    worth: Scalar
+    total: Scalar
     depth: Scalar | None = None
     middle: Scalar | None = None
 
     @classmethod
     def of(cls, ray: Ray, rendering: Rendering, gradient: Rendering) -> "Cotangents":
-        """Of rays (groups, rays in a group), from their part of the image and of its cotangent."""
+        """Cotangents of rays (groups, rays in a group), from their pixels and the pixels' cotangents."""
         *color, opacity = (gradient.rgba[..., i] for i in range(gradient.rgba.shape[-1]))
-        final, worth = rendering.opacity, jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
+        final, total = rendering.opacity, jnp.sum(gradient.rgba * rendering.rgba, axis=-1)
         if gradient.details.depth is None:
-            return cls(tuple(color), opacity, worth)
+            return cls(tuple(color), opacity, total)
         visible = final > 0
         middle = jnp.where(visible, rendering.depth - ray.t_in, 0)
         depth = jnp.where(visible, gradient.depth, 0) / jnp.where(visible, final, 1)
-        return cls(tuple(color), opacity, worth, depth, middle)
+        return cls(tuple(color), opacity, total, depth, middle)
 
 
 class Total(NamedTuple):
-    """Gradients summed over all rays; None for what is not asked for."""
+    """Cotangents summed over all rays; None for parts that are not perturbed."""
 
     transfer: PyTree
     rules: PyTree
-    """Of `CellRules.moving`."""
+    """Cotangent of `CellRules.moving`."""
     march: PyTree
-    """Of the march, but for what its rules take from it."""
+    """Cotangent of the march, except through its rules."""
     volume: PyTree
-    """Of everything in it but the voxels."""
+    """Cotangent of the volume without its voxels."""
     voxels: Sums
     shader: PyTree
-    """Of `Shader.leaves`."""
+    """Cotangent of `Shader.leaves`."""
 
     @property
     def of_voxels(self) -> bool:
-        """Whether voxels have a gradient."""
+        """True if the gradient to any voxels is requested."""
         return any(sums is not None for sums in self.voxels)
 
     @property
     def geometric(self) -> bool:
-        """Whether samples' depths, widths and points have a gradient, not only what they show."""
+        """True if samples' depths, widths and points have a gradient, in addition to their values."""
         return self.march is not None
 
     @classmethod
     def zeros(
         cls, scene: Scene, shader: Shader | None, *, transfer: bool, geometric: bool, voxels: list[bool]
     ) -> "Total":
-        """Zeros for these parts."""
+        """Zeros for the requested parts."""
         volume = scene.volume
         return cls(
             zeros_of(scene.transfer) if transfer else None,
@@ -108,18 +109,18 @@ class Total(NamedTuple):
 
 
 class Replay(SampleVisitor):
-    """Pulls the cotangents of rays (groups, rays in a group) back to what their samples depend on.
+    """Pulls the cotangents of rays (groups, rays in a group) back to the inputs of their samples.
 
     Args:
-        scene: as given; its leaves get the cotangents.
-        prepared: the same, without lighting.
-        shader: what shades the samples, `chunk` at a time.
-        rays: those that are marched.
-        given: their cotangents.
-        total: the gradients so far, to which those of these rays are added.
+        scene: the scene, whose leaves get the cotangents.
+        prepared: the prepared scene, without lighting.
+        shader: the shader of samples, applied to `chunk` samples at a time.
+        rays: the rays that are marched.
+        constants: the rays' cotangents.
+        total: the cotangents summed so far, to which those of these rays are added.
     """
 
-    given: Cotangents
+    constants: Cotangents
     carry: Scalar
     sums: PyTree
     total: Total
@@ -131,24 +132,23 @@ class Replay(SampleVisitor):
         shader: Shader | None,
         chunk: int,
         rays: Ray,
-        given: Cotangents,
+        constants: Cotangents,
         total: Total,
     ):
         self.scene, self.prepared, self.shader, self.chunk = scene, prepared, shader, chunk
-        self.given, self.total = given, total
-        self.carry = jnp.zeros_like(given.worth)  # what the samples in front are worth
+        self.constants, self.total = constants, total
+        self.carry = jnp.zeros_like(constants.total)  # the sum of w_j q_j over the samples in front
         self.sums = zeros_of(rays) if total.geometric else None
 
     def visit(
-        self, ray: Ray, at: Progress, samples: Samples, given: Cotangents, carry: Scalar, total: Total
+        self, ray: Ray, at: Progress, samples: Samples, constants: Cotangents, carry: Scalar, total: Total
     ) -> tuple[Scalar, PyTree, Total]:
-        each = jax.tree.map(lambda leaf: leaf[None], given)  # broadcast over a ray's cells
-        whole = with_fields(ray, reach=None)
+        bar = jax.tree.map(lambda leaf: leaf[None], constants)  # broadcast over a ray's cells
         classify = vmap_cells(self.prepared.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.prepared.march.sample(cell) for cell in samples.cells]
         weights = weights_of(self.prepared, at, samples.opacity)
-        of_color = [tuple(weight * of for of in each.color) for weight in weights.weight]
+        of_color = [tuple(weight * of for of in bar.color) for weight in weights.weight]
         shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
         if self.shader is not None:
@@ -160,15 +160,14 @@ class Replay(SampleVisitor):
             of_color = [part.of_color for part in shaded]
             if samples.light is None:
                 colors = [part.color for part in shaded]
-            else:  # also of invisible samples, which are worth something: they would become visible
+            else:  # also of invisible samples, whose weight has a derivative
                 colors = lit_colors(self.shader, self.prepared, ray, samples.cells, colors, samples.light)
-        worth = [_dot(each.color, color) + each.opacity for color in colors]
-        if each.depth is not None:
-            worth = [
-                value + each.depth * (depth - each.middle) for value, depth in zip(worth, depths, strict=True)
-            ]
+        weight_bars = [_dot(bar.color, color) + bar.opacity for color in colors]
+        if bar.depth is not None:
+            pairs = zip(weight_bars, depths, strict=True)
+            weight_bars = [value + bar.depth * (depth - bar.middle) for value, depth in pairs]
         inside = vmap_cells(Ray.contains, of_cells=(False, True))
-        carry, slopes = self._slopes(samples.opacity, weights, worth, given.worth, carry)
+        carry, slopes = self._slopes(samples.opacity, weights, weight_bars, constants.total, carry)
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
         of_measured = []
@@ -178,9 +177,9 @@ class Replay(SampleVisitor):
                 (color, extinction), weight = classified[i], weights.weight[i]
                 live = inside(ray, depths[i]) & ~weights.finished[i]
                 clear = jnp.where(live, self._weight_of_thin(weights.before[i]) * cell.width, 0)
-                # what a unit of emission shows as, where nothing is visible, too
-                seen = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
-                emission = tuple(of * seen for of in each.color)
+                # the derivative of colour by emission, also where nothing is visible
+                scale = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
+                emission = tuple(of * scale for of in bar.color)
                 of_extinction = of_extinction - _dot(emission, color)
                 of_transfer, of_read = self.scene.transfer.emission_vjp(measured, emission, of_extinction)
             else:
@@ -189,16 +188,17 @@ class Replay(SampleVisitor):
                 )
             total = total._replace(transfer=added(total.transfer, of_transfer))
             if shaded is not None:
-                of_value, *rest = of_read
-                of_read = (of_value + shaded[i].of_value, *rest)
+                of_value, *of_attributes = of_read
+                of_read = (of_value + shaded[i].of_value, *of_attributes)
             of_measured.append(of_read)
         if not (total.geometric or self.reads_transfer or total.of_voxels):
             return carry, None, total
         of_width = [slope * extinction for slope, (_, extinction) in zip(slopes, classified, strict=True)]
-        of_depth = [None if each.depth is None else weight * each.depth for weight in weights.weight]
+        of_depth = [None if bar.depth is None else weight * bar.depth for weight in weights.weight]
         of_place = [None] * len(depths) if shaded is None else [part.of_place for part in shaded]
+        cotangents = list(zip(of_measured, of_width, of_depth, of_place, strict=True))
         (of_rules, of_march, of_volume, of_rays, of_transfer), fetched, of_fetched = self._geometric_vjp(
-            whole, at, samples.number, list(zip(of_measured, of_width, of_depth, of_place, strict=True))
+            with_fields(ray, reach=None), at, samples.number, cotangents
         )
         total = total._replace(rules=added(total.rules, of_rules), volume=added(total.volume, of_volume))
         if of_march is not None:
@@ -211,32 +211,31 @@ class Replay(SampleVisitor):
         return carry, of_rays, total
 
     def _weight_of_thin(self, before: Scalar) -> Scalar:
-        """The weight of a very thin cell behind this opacity, for a unit of its own opacity."""
+        """The derivative of a cell's weight by its opacity, at 0, behind the opacity `before`."""
         compositing, zero = self.prepared.compositing, jnp.zeros_like(before)
         assert isinstance(compositing, Weighting)
         return jax.jvp(lambda alpha: compositing.weight(alpha, before), (zero,), (zero + 1,))[1]
 
     @property
     def reads_transfer(self) -> bool:
-        """Whether what is measured at a sample may depend on the transfer function, and has a gradient."""
+        """True if measured values may depend on the transfer function, and it is perturbed."""
         return self.total.transfer is not None and self.scene.transfer.reads_more
 
     def _geometric_vjp(
         self, ray: Ray, at: Progress, number: int, cotangents: list[tuple[PyTree, Scalar, Any, Any]]
     ) -> tuple[tuple[PyTree, ...], list[list[Fetched]], list[Any]]:
-        """From the cotangents of each piece's measured values and width, of its depth where the loss depends
-        on that, and of its point where it is shaded: those of the march's rules, of the march where samples
-        are shaded, of volume, rays, and of the transfer function where samples are measured by it; what was
-        fetched of each array of voxels; and the cotangents of that. The number of samples counts as constant.
-        """
+        """Pulls the cotangents of pieces' measured values, width, depth (None if the loss ignores it) and
+        point (None if it is not shaded) back to rules, march (if samples are shaded), volume, rays, and
+        transfer function (if it measures samples). Also returns the fetches of each array of voxels, with
+        their cotangents. The number of samples is a constant."""
         rules: Any = self.prepared.march
         geometric, voxels = self.total.geometric, self.total.of_voxels
         parts = self.scene.march, without_voxels(self.scene.volume), ray, self.scene.transfer
         asked = geometric and self.shader is not None, geometric, geometric, self.reads_transfer
-        moving = tuple(floats(part) if a else None for part, a in zip(parts, asked, strict=True))
+        pairs = list(zip(parts, asked, strict=True))
+        moving = tuple(floats(part) if wanted else None for part, wanted in pairs)
         fixed = tuple(
-            eqx.filter(part, eqx.is_inexact_array, inverse=True) if a else part
-            for part, a in zip(parts, asked, strict=True)
+            eqx.filter(part, eqx.is_inexact_array, inverse=True) if wanted else part for part, wanted in pairs
         )
         moving = (rules.moving if geometric else None, *moving)
         fixed = (rules.constant if geometric else rules, *fixed)
@@ -248,7 +247,7 @@ class Replay(SampleVisitor):
             volume: PyTree,
             ray: PyTree,
             transfer: PyTree,
-            perturbations: Any,
+            perturbations: PyTree,
             ray_fixed: PyTree,
             at: Progress,
             number: Int[Array, ""],
@@ -256,30 +255,30 @@ class Replay(SampleVisitor):
             rules, march, volume, ray, transfer = eqx.combine(
                 (rules, march, volume, ray, transfer), (*shared, ray_fixed, transfer_fixed)
             )
-            whole, fetched = with_voxels(volume, voxels_of(self.scene.volume)), []
+            volume, fetched = with_voxels(volume, voxels_of(self.scene.volume)), []
             if voxels:
-                here, fetched = recorded(whole, perturbations)
+                volume, fetched = recorded(volume, perturbations)
             else:
-                here = with_fetches(whole, fetches_of(self.prepared.volume))
-            classification = classification_of(transfer, here, integrated=rules.integrates)
-            classification = classification._replace(search=None)  # what it finds has no gradient
-            scene = self.prepared._replace(march=rules, volume=here, classification=classification)
-            space = None if self.shader is None else march.locate(here)
-            found = []
+                volume = with_fetches(volume, fetches_of(self.prepared.volume))
+            classification = classification_of(transfer, volume, integrated=rules.integrates)
+            classification = classification._replace(search=None)  # its results have no gradient
+            scene = self.prepared._replace(march=rules, volume=volume, classification=classification)
+            space = None if self.shader is None else march.locate(volume)
+            outputs = []
             for piece in pieces(scene, ray, at, number):
                 depth, measured = rules.sample(piece), measure(scene, ray, piece, recorded=True)
                 place = along(ray.entry, ray.direction, depth)
                 lit = None if space is None else (space.world(place), place, ray.direction)
-                at_depth = depth if self.given.depth is not None else None
-                found.append((floats(measured), piece.width, at_depth, lit))
-            return found, fetched
+                at_depth = depth if self.constants.depth is not None else None
+                outputs.append((floats(measured), piece.width, at_depth, lit))
+            return outputs, fetched
 
         rays = jax.vmap(one, in_axes=(None, None, None, 0, None, 0, 0, 0, None))
         cells: Any = jax.vmap(rays, in_axes=(None, None, None, None, None, 0, None, None, 0))
 
         def all_(moving: tuple[PyTree, ...], perturbations: list[Any]) -> PyTree:
-            each = jnp.arange(number, dtype=at.index.dtype)
-            return cells(*moving, perturbations, ray_fixed, at, each)
+            numbers = jnp.arange(number, dtype=at.index.dtype)
+            return cells(*moving, perturbations, ray_fixed, at, numbers)
 
         perturbations = []
         if voxels:
@@ -292,18 +291,18 @@ class Replay(SampleVisitor):
         return of_moving, fetched, of_fetched
 
     def _slopes(
-        self, alphas: list[Scalar], weights: Weights, worth: list[Scalar], whole: Scalar, front: Scalar
+        self, alphas: list[Scalar], weights: Weights, weight_bars: list[Scalar], total: Scalar, front: Scalar
     ) -> tuple[Scalar, list[Scalar]]:
-        """What all samples so far are worth, and the derivative of the loss by each one's optical depth."""
-        slopes: list[list[Scalar]] = [[] for _ in worth]
+        """The new sum of w_j q_j in front, and the derivative of the loss by each sample's optical depth."""
+        slopes: list[list[Scalar]] = [[] for _ in weight_bars]
         compositing = self.prepared.compositing
         assert isinstance(compositing, Weighting)
-        for k in range(worth[0].shape[0]):
-            for i, value in enumerate(worth):
+        for k in range(weight_bars[0].shape[0]):
+            for i, value in enumerate(weight_bars):
                 front = front + weights.weight[i][k] * value[k]
-                slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], whole - front)
+                slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], total - front)
                 slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
-        return front, [jnp.stack(each) for each in slopes]
+        return front, [jnp.stack(values) for values in slopes]
 
 
 def _dot(a: Color, b: Color) -> Scalar:

@@ -1,5 +1,5 @@
-"""Shades the samples of a segment: those of positive weight, gathered in chunks, as they are few and shading
-costs much; or, by a shader of one cheap term, all of them inline."""
+"""Shades the samples of a segment: only those of positive weight, gathered in chunks, since they are few and
+shading is expensive; or all samples inline, if the shader has one cheap term."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,13 +22,14 @@ from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
 from ..xla.trees import PyTree
+from .rays import vmap_cells
 
 
 # ---------------------------------------------------------------- inline
 
 
 def inline_shader(scene: Scene) -> Shader | None:
-    """What shades all samples of a march where they are, if anything does."""
+    """The shader of all samples of a march, if it is inline."""
     light = scene.classification.light
     if not isinstance(light, Shader) or isinstance(scene.compositing, Selection):
         return None
@@ -49,13 +50,12 @@ def light_terms(
     def term(ray: Ray, cell: Cell, begin: Int[Array, ""]) -> PyTree:
         sample = _inline_sample(scene, ray, cell)
         first, *inner = fetches_of(volume)
-        here = replace(around, volume=with_fetches(volume, [first.of_slopes_at(begin), *inner]))
-        return shading.term(here, sample, shading.begin(here, sample), jnp.zeros((), jnp.int32))
+        near = replace(around, volume=with_fetches(volume, [first.of_slopes_at(begin), *inner]))
+        return shading.term(near, sample, shading.begin(near, sample), jnp.zeros((), jnp.int32))
 
-    def all_(f: Callable[..., PyTree], *more: list[PyTree]) -> list[PyTree]:
-        over_rays = jax.vmap(f, in_axes=(0,) * (2 + len(more)))
-        mapped = jax.vmap(over_rays, in_axes=(None, *(0,) * (1 + len(more))))
-        return [mapped(ray, *piece) for piece in zip(cells(), *more, strict=True)]
+    def all_(f: Callable[..., PyTree], *extra: list[PyTree]) -> list[PyTree]:
+        mapped = vmap_cells(f, (False, True, *(True for _ in extra)))
+        return [mapped(ray, *piece) for piece in zip(cells(), *extra, strict=True)]
 
     begins = in_memory(live, partial(all_, begin))
     return in_memory(live, partial(all_, term), begins)
@@ -71,12 +71,12 @@ def lit_colors(
         sample = _inline_sample(scene, ray, cell)._replace(color=color)
         return shader.color(sample, shading.begin(around, sample), term)
 
-    each = jax.vmap(jax.vmap(one), in_axes=(None, 0, 0, 0))
-    return [each(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
+    shade = vmap_cells(one, (False, True, True, True))
+    return [shade(ray, *piece) for piece in zip(cells, colors, terms, strict=True)]
 
 
 def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
-    """Where a sample is. What it shows is not told, which would take time: NaN."""
+    """The place of a sample. Its value, colour and extinction would take time: NaN."""
     depth, unknown = scene.march.sample(cell), jnp.full_like(cell.front, jnp.nan)
     place, color = along(ray.entry, ray.direction, depth), (unknown, unknown, unknown)
     point, one = scene.space.world(place), jnp.ones_like(unknown)
@@ -87,8 +87,8 @@ def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
 
 
 class Weights(NamedTuple):
-    """Of samples, arrays (cells, rays), one for each piece of a cell: their weight, the opacity before and
-    with them, and whether the ray was finished before."""
+    """Weights of samples, opacity before and after them, and whether the ray was finished before: one array
+    (cells, rays) per piece of a cell."""
 
     weight: list[Scalar]
     before: list[Scalar]
@@ -100,24 +100,24 @@ def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
     compositing = scene.compositing
     assert isinstance(compositing, Weighting)
     composite, finished = Composite(at.composite.opacity), at.finished
-    found: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
+    steps: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
             before = composite.opacity
             weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
             composite = composite.add(weight)
-            found[i].append((weight, before, composite.opacity, finished))
+            steps[i].append((weight, before, composite.opacity, finished))
         finished |= jax.vmap(partial(stopped, scene))(composite)
-    each = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in found]
-    return Weights(*(list(values) for values in zip(*each, strict=True)))
+    stacked = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in steps]
+    return Weights(*(list(values) for values in zip(*stacked, strict=True)))
 
 
-Seen: TypeAlias = list[tuple[Scalar, Measured, Scalar]]
-"""For each piece of a cell: depth, measured values, and the opacity before; arrays (cells, rays)."""
+Parts: TypeAlias = list[tuple[Scalar, Measured, Scalar]]
+"""Depth, measured values, and the opacity before, of each piece of a cell; arrays (cells, rays)."""
 
 
-def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: Scalar) -> Sample:
-    """The sample at this depth of a ray (entry, direction, pixel), behind this opacity."""
+def _sample(scene: Scene, ray: PyTree, depth: Scalar, measured: Measured, opacity: Scalar) -> Sample:
+    """The sample at `depth` along a ray (entry, direction, pixel), behind `opacity`."""
     entry, direction, pixel = ray
     color, extinction = scene.classification.of_cells(measured)
     transmittance = scene.compositing.transmittance(Composite(opacity))
@@ -127,11 +127,11 @@ def _sample(scene: Scene, ray: Any, depth: Scalar, measured: Measured, opacity: 
     return Sample(point, direction, measured, shown, extinction, transmittance, pixel, place)
 
 
-def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, seen: Seen) -> Sample:
+def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, parts: Parts) -> Sample:
     """The samples at these flat indices of a segment."""
     column, of_rays = indices % chosen.columns, (ray.entry, ray.direction, ray.pixel)
     of_rays = jax.tree.map(lambda leaf: leaf.at[column].get(mode="clip"), of_rays)
-    return jax.vmap(partial(_sample, scene))(of_rays, *chosen.take(seen, indices))
+    return jax.vmap(partial(_sample, scene))(of_rays, *chosen.take(parts, indices))
 
 
 def shaded_colors(
@@ -143,31 +143,31 @@ def shaded_colors(
     measured: list[Measured],
     alphas: list[Scalar],
 ) -> list[Vec3]:
-    """Shaded colours of a segment's samples; any finite ones for invisible samples."""
+    """Shaded colours of a segment's samples; arbitrary finite ones for invisible samples."""
     weights, light = weights_of(scene, at, alphas), scene.classification.light
     assert isinstance(light, Shader)
     (shading, around), thresholds = light, light.shading.thresholds()
     none = jnp.zeros_like(alphas[0])
     start, shown = [(none, none, none)] * len(alphas), [weight > 0 for weight in weights.weight]
-    seen: Seen = list(zip(map(scene.march.sample, cells), measured, weights.before, strict=True))
+    parts: Parts = list(zip(map(scene.march.sample, cells), measured, weights.before, strict=True))
 
     if shading.skips_hidden and thresholds is not None:
 
-        def without_terms(ray: Ray, *seen: Any) -> tuple[Vec3, Bool[Array, ""]]:
+        def without_terms(ray: Ray, *part: Any) -> tuple[Vec3, Bool[Array, ""]]:
             """The colour of a sample without any term of light, and whether it needs one."""
-            sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *seen)
+            sample = _sample(scene, (ray.entry, ray.direction, ray.pixel), *part)
             shared = shading.begin(around, sample)
             color = light.color(sample, shared, no_terms(shading, around, sample, shared))
             return color, ~(sample.transmittance < thresholds[0])
 
-        each = jax.vmap(jax.vmap(without_terms), in_axes=(None, 0, 0, 0))
-        found = [each(ray, *piece) for piece in seen]
-        start = [color for color, _ in found]
-        shown = [weight & lit for weight, (_, lit) in zip(shown, found, strict=True)]
+        shade = vmap_cells(without_terms, (False, True, True, True))
+        unlit = [shade(ray, *part) for part in parts]
+        start = [color for color, _ in unlit]
+        shown = [weight & lit for weight, (_, lit) in zip(shown, unlit, strict=True)]
     chosen = Chosen.of(shown, chunk)
 
     def one(indices: Int[Array, " chunk"], colors: Vec3) -> Vec3:
-        return chosen.put(colors, indices, light(samples_of(chosen, indices, scene, ray, seen)))
+        return chosen.put(colors, indices, light(samples_of(chosen, indices, scene, ray, parts)))
 
-    flat = jax.tree.map(lambda *each: jnp.concatenate(each).reshape(-1), *start)
+    flat = jax.tree.map(lambda *leaves: jnp.concatenate(leaves).reshape(-1), *start)
     return chosen.split(chosen.fold(one, flat), len(alphas))

@@ -22,7 +22,7 @@ from .voxel_gradient import Sums, recorded, with_cotangents, zero_perturbations
 
 
 class ShadingTotal(NamedTuple):
-    """Gradients summed over all samples; None for what is not asked for."""
+    """Cotangents summed over all samples; None for parts that are not perturbed."""
 
     shader: PyTree
     transfer: PyTree | None
@@ -49,37 +49,36 @@ def shading_vjp(
     chunk: int,
     total: ShadingTotal,
 ) -> tuple[list[ShadingVjp], ShadingTotal]:
-    """Pulls back the `cotangents` of the shaded colours of a segment's samples, and adds to the total."""
+    """Pulls back `cotangents` of the shaded colours of a segment's samples; adds to `total`."""
     chosen = Chosen.of([weight > 0 for weight in weights.weight], chunk)
     size = sum(weight.size for weight in weights.weight)
     depths = map(scene.march.sample, samples.cells)
-    seen = list(zip(depths, samples.measured, weights.before, strict=True))
+    parts = list(zip(depths, samples.measured, weights.before, strict=True))
 
     def one(
         indices: Int[Array, " chunk"], carry: tuple[ShadingVjp, ShadingTotal]
     ) -> tuple[ShadingVjp, ShadingTotal]:
-        found, total = carry
-        some, real = samples_of(chosen, indices, scene, ray, seen), indices < size
-        red, green, blue = (jnp.where(real, each, 0) for each in chosen.take(cotangents, indices))
-        color, of_sample, total = _chunk_vjp(shader, some, (red, green, blue), total)
+        vjps, total = carry
+        chunk_samples, real = samples_of(chosen, indices, scene, ray, parts), indices < size
+        red, green, blue = (jnp.where(real, channel, 0) for channel in chosen.take(cotangents, indices))
+        color, of_sample, total = _chunk_vjp(shader, chunk_samples, (red, green, blue), total)
         place = of_sample.point, of_sample.place, of_sample.direction
         vjp = ShadingVjp(color, of_sample.color, of_sample.extinction, of_sample.measured[0], place)
-        return chosen.put(found, indices, vjp), total
+        return chosen.put(vjps, indices, vjp), total
 
     zero = jnp.zeros(size, weights.weight[0].dtype)
     zeros = zero, zero, zero
-    found, total = chosen.fold(one, (ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros, zeros)), total))
-    return chosen.split(found, len(weights.weight)), total
+    vjps, total = chosen.fold(one, (ShadingVjp(zeros, zeros, zero, zero, (zeros, zeros, zeros)), total))
+    return chosen.split(vjps, len(weights.weight)), total
 
 
 def _chunk_vjp(
     shader: Shader, samples: Sample, cotangent: Vec3, total: ShadingTotal
 ) -> tuple[Vec3, PyTree, ShadingTotal]:
-    """The shaded colours of many samples, the cotangents of the samples, and the new total. Each term has the
-    cotangent of the terms' sum: they are pulled back one by one, and nothing is kept of them."""
-    # Differentiated are the shader's leaves and the transfer function, samples, and what terms share.
-    given = (shader.leaves, shader.around.transfer), samples
-    moving, fixed = eqx.partition(given, eqx.is_inexact_array)
+    """The shaded colours of samples, the samples' cotangents, and the new total. Each term has the cotangent
+    of the terms' sum: terms are pulled back one by one, and none is stored."""
+    inputs = (shader.leaves, shader.around.transfer), samples
+    moving, fixed = eqx.partition(inputs, eqx.is_inexact_array)
 
     def rebuilt(moving: PyTree) -> tuple[Shading, Surroundings, Sample]:
         (leaves, transfer), samples = eqx.combine(moving, fixed)
@@ -110,18 +109,18 @@ def _chunk_vjp(
             if perturbations is None:
                 return shading.term(around.in_memory_by(number >= 0, sample), sample, shared, number), []
             volume, fetched = recorded(around.volume, perturbations)
-            here = Surroundings(volume, around.transfer, around.space)
-            return shading.term(here, sample, shared, number), fetched
+            surroundings = Surroundings(volume, around.transfer, around.space)
+            return shading.term(surroundings, sample, shared, number), fetched
 
         return jax.vmap(one)(samples, eqx.combine(shared, fixed_shared), perturbations)
 
     def add(number: Int[Array, ""], carry: tuple[list[PyTree], PyTree]) -> tuple[list[PyTree], PyTree]:
         of_inputs, voxels = carry
         _, pull, fetched = jax.vjp(partial(term, number=number), moving, shared, perturbations, has_aux=True)
-        *more, of_fetched = pull(of_sums)
+        *of_term, of_fetched = pull(of_sums)
         if perturbations is not None:
             voxels = with_cotangents(voxels, around.volume, fetched, of_fetched)
-        return added(of_inputs, more), voxels
+        return added(of_inputs, of_term), voxels
 
     perturbations, voxels = None, total.voxels
     if shading.terms > 0:

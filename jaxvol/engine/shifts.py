@@ -1,7 +1,7 @@
-"""Where do rays begin, and where do they shift? Both are known before they are marched.
+"""Starts rays at their entries, and finds their shifts before they are marched.
 
 A shift (`Transform.shift`) moves all cells behind a ray's first transparent one. Most rays begin in such a
-cell. The cells of all others are looked at in order, some rays at a time, before any is composited.
+cell. The cells of the others are tested in order, by chunks of rays, before any cell is composited.
 """
 
 from functools import partial
@@ -25,7 +25,7 @@ from .tiling import Tiling
 
 
 CELLS = 8
-"""Cells of a ray that are looked at before it is asked whether one of them is transparent."""
+"""Number of cells of a ray that are tested for transparency at a time."""
 
 
 def begin_rays(
@@ -41,12 +41,12 @@ def begin_rays(
     """Rays at their entries; those that miss the volume are finished.
 
     Args:
-        march: as given.
-        scene: prepared, with the march's `rules`.
-        rays: of shape (groups, rays in a group).
-        outputs: without them, nothing but the opacity is computed.
-        shifted: where the rays shift, if that is known.
-        finds_shifts: whether to find it out, otherwise.
+        march: the march.
+        scene: the prepared scene, with the `rules` of the march.
+        rays: rays of shape (groups, rays in a group).
+        outputs: outputs besides the opacity; None: no colours either.
+        shifted: the cell behind which each ray shifts, if known.
+        finds_shifts: whether to search for the shifts if `shifted` is None.
     """
     track = vmap_rays(partial(track_of, march))(rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, outputs))(rays, track)
@@ -57,23 +57,23 @@ def begin_rays(
         at = find_shifts(scene, rays, at, tiling)
     else:
         at = eqx.tree_at(lambda at: at.track.shifted, at, shifted)
-    return behind_first_cells(scene, rays, at)
+    return skip_first_cells(scene, rays, at)
 
 
 def find_shifts(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Progress:
-    """Rays at their entries, of which is then known where they shift."""
+    """Rays at their entries, with `Track.shifted`."""
     return eqx.tree_at(lambda at: at.track.shifted, at, _shifted(scene, rays, at, tiling))
 
 
-def behind_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
-    """Rays, behind their first cells where they shift there: a segment of cells would end there (`segment`).
-    Not for a `Selection`, to which transparent cells may matter."""
+def skip_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
+    """Moves rays that shift behind their first cell to the second: a segment would end there (`segment`). Not
+    for a `Selection`, which may use transparent cells."""
     if not isinstance(scene.compositing, Weighting):
         return at
 
-    def behind(ray: Ray, at: Progress) -> Progress:
+    def advance(ray: Ray, at: Progress) -> Progress:
         cut = pieces(scene, ray, at)
-        if len(cut) > 1:  # some of which may be no samples
+        if len(cut) > 1:  # pieces that may not be samples
             return at
         moves = (at.track.shifted == 1) & ~at.finished & is_sample(scene.march, ray, *cut, divided=False)
         stats = at.stats
@@ -81,54 +81,54 @@ def behind_first_cells(scene: Scene, rays: Ray, at: Progress) -> Progress:
             stats = with_fields(stats, samples=stats.samples + moves.astype(stats.samples.dtype))
         return with_fields(at, index=jnp.where(moves, 1, at.index), stats=stats)
 
-    return vmap_rays(behind)(rays, at)
+    return vmap_rays(advance)(rays, at)
 
 
 def _shifted(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Int[Array, "groups rays"]:
-    """For each ray, the cell behind its first transparent one; NEVER if it meets none before its end."""
+    """Index of the cell behind the first transparent cell of each ray; NEVER without one before its end."""
     clear = vmap_rays(lambda ray, at: _opacity(scene, ray, at, 0) == 0)(rays, at)
     shape = clear.shape
-    found = jnp.where(clear, jnp.int32(1), jnp.int32(NEVER))
+    shifted = jnp.where(clear, jnp.int32(1), jnp.int32(NEVER))
     chosen = Chosen.of([~clear & ~at.finished], tiling.chunk)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (rays, at))
 
-    def search(indices: Int[Array, " chunk"], found: Int[Array, " rays"]) -> Int[Array, " rays"]:
+    def search(indices: Int[Array, " chunk"], shifted: Int[Array, " rays"]) -> Int[Array, " rays"]:
         rays, at = jax.tree.map(lambda leaf: leaf.at[indices].get(mode="clip"), flat)
-        return found.at[indices].set(_search(scene, rays, at), mode="drop")
+        return shifted.at[indices].set(_search(scene, rays, at), mode="drop")
 
-    return chosen.fold(search, varying(found.reshape(-1), rays)).reshape(shape)
+    return chosen.fold(search, varying(shifted.reshape(-1), rays)).reshape(shape)
 
 
 def _search(scene: Scene, rays: Ray, at: Progress) -> Int[Array, " rays"]:
-    """As `_shifted`, of a few rays."""
+    """Computes `_shifted` for a chunk of rays."""
     rules: Any = scene.march
     over = isinstance(scene.compositing, Over)
 
-    def look(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        index, found, left = state
-        each = jnp.arange(CELLS, dtype=index.dtype)
+    def test_cells(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        index, shifted, transmittance = state
+        numbers = jnp.arange(CELLS, dtype=index.dtype)
 
         def opacities(index: Array) -> Array:
             rays_of = jax.vmap(partial(_opacity, scene), in_axes=(0, 0, None))
-            return jax.vmap(rays_of, in_axes=(None, None, 0))(rays, with_fields(at, index=index), each)
+            return jax.vmap(rays_of, in_axes=(None, None, 0))(rays, with_fields(at, index=index), numbers)
 
         alpha = in_memory(index[0] >= 0, opacities, index)
-        first = jnp.min(jnp.where(alpha == 0, each[:, None], jnp.int32(CELLS)), axis=0)
-        found = jnp.where((found == NEVER) & (first < CELLS), index + first + 1, found)
-        # what lies behind the end of an opaque ray does not show
-        left = left * jnp.prod(1 - alpha, axis=0) if over else left
-        return index + CELLS, found, left
+        first = jnp.min(jnp.where(alpha == 0, numbers[:, None], jnp.int32(CELLS)), axis=0)
+        shifted = jnp.where((shifted == NEVER) & (first < CELLS), index + first + 1, shifted)
+        # cells behind an opaque one are not visible
+        transmittance = transmittance * jnp.prod(1 - alpha, axis=0) if over else transmittance
+        return index + CELLS, shifted, transmittance
 
-    def going(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
-        index, found, left = state
+    def searching(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
+        index, shifted, transmittance = state
         front = jax.vmap(lambda track, index: track.front(index, rules.step))(at.track, index)
-        opaque = jax.vmap(rules.stop)(left) | (left <= 0)
-        searched = (found == NEVER) & (front < rays.length) & (index < at.track.until)
+        opaque = jax.vmap(rules.stop)(transmittance) | (transmittance <= 0)
+        searched = (shifted == NEVER) & (front < rays.length) & (index < at.track.until)
         return jnp.any(searched & ~(opaque if over else jnp.zeros_like(opaque)))
 
     none = jnp.full_like(at.index, NEVER)
     state = varying((at.index, none, jnp.ones_like(rays.length)), rays)
-    return jax.lax.while_loop(going, look, state)[1]
+    return jax.lax.while_loop(searching, test_cells, state)[1]
 
 
 def _opacity(scene: Scene, ray: Ray, at: Progress, number: Any) -> Array:

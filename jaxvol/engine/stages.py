@@ -1,12 +1,12 @@
-"""Renders an image by a few programs with plain arrays between them, where nothing is traced.
+"""Renders an image without traced arrays, by a few programs that share as much as possible between images.
 
-    A  start: rays are made from a camera, cut to the volume; where they begin, and where they see nothing
+    A  start: rays of a camera are generated, cut to the volume and offset, and their empty stretches found
     B  march: one program for all cameras, image sizes, shapes of volumes, numbers of control points, and
-       subsets of the library's transforms, which are arrays to it
-    C  finish: what the march left becomes an image
+       subsets of the library's transforms: all are arrays
+    C  finish: the results of the march become an image
 
-Larger images are several tiles of rays. Inside of a larger program, `image.march_image` does the same, by the
-same functions, as a part of that.
+Large images are several tiles of rays. Within a traced program, `image.march_image` composes the same
+functions.
 """
 
 import math
@@ -39,17 +39,17 @@ from ..xla.memo import memoized_of, when_any_dies
 from ..xla.platform import platform
 from ..xla.trees import unchecked, with_fields
 from .acceleration import VolumeAcceleration, empty_space_of, unshaped, visible_in_numpy
-from .rays import RayTiles, box_of_corners, box_of_rays, entering, vmap_rays
-from .shifts import behind_first_cells, find_shifts
+from .rays import RayTiles, Source, box_of_corners, box_of_rays, enter_rays, vmap_rays
+from .shifts import find_shifts, skip_first_cells
 from .tiling import GROUPS_OF_BEAM, RenderOptions, Tiling
-from .wavefront import Marched, Recorded, blinded, march_rays
+from .wavefront import Marched, Recorded, finish_blind, march_rays
 
 
 program = partial(kept, compiler_options=OPTIONS)
 
 
-class Started(NamedTuple):
-    """The rays of a tile before they are marched. None: what a scene has nothing of."""
+class StartedTile(NamedTuple):
+    """The rays of a tile before their march. None: a part that the scene lacks."""
 
     rays: Ray
     track: Track
@@ -58,7 +58,7 @@ class Started(NamedTuple):
 
 
 class Kernel(NamedTuple):
-    """What the march of rays is told of a scene."""
+    """The inputs of the march of a scene's rays."""
 
     volume: Volume
     transfer: Transfer
@@ -74,15 +74,14 @@ class Kernel(NamedTuple):
         if self.lighting is None or self.space is None:
             classification = classification_of(self.transfer, self.volume, integrated=integrated)
         else:
-            given = self.volume, self.transfer, self.space, self.lighting
-            classification = lit_classification(*given, integrated=integrated)
+            parts = self.volume, self.transfer, self.space, self.lighting
+            classification = lit_classification(*parts, integrated=integrated)
         march, space, mode = cast(Any, self.rules), cast(Any, self.space), self.compositing
-        parts = self.volume, self.transfer, None, march, mode, self.lighting, space, classification
-        return Scene(*parts)
+        return Scene(self.volume, self.transfer, None, march, mode, self.lighting, space, classification)
 
 
-class Passed(NamedTuple):
-    """What is kept of the rays of a tile: where they enter, where they ended, and where they shifted."""
+class MarchedTile(NamedTuple):
+    """The marched rays of a tile: entries, lengths, result of the march, and shifts."""
 
     t_in: Array
     length: Array
@@ -91,20 +90,20 @@ class Passed(NamedTuple):
 
 
 def is_staged(scene: Scene, options: RenderOptions) -> bool:
-    """Whether the image of a scene that is not traced is rendered here."""
+    """True if `staged_image` renders the scene, provided that it is not traced."""
     if options.adjoint == "direct":
         return False
-    # an index of one's own may ask anything of the view
+    # a custom index may depend on the view in any way
     return all(type(leap) is SpaceLeaping for leap in scene.march.overriding("empty_space"))
 
 
 def staged_image(
     scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration, *, record: bool = False
 ) -> tuple[Rendering, Recorded]:
-    """The image; and, if `record` asks for it, what the second march needs of the first."""
+    """The image; and, with `record`, the `Recorded` part of the march that a second march needs."""
     tiling, source = options.tiling, without_ends(scene.source)
     kernel, seams, place, index, fault = _staging_of(scene, acceleration)
-    if _by_view(scene):
+    if _depends_on_view(scene):
         view = scene._replace(source=source, lighting=None)
         index = _index_of_view(view, acceleration, Tiling.of_backend())
     if isinstance(source, Camera):
@@ -112,34 +111,33 @@ def staged_image(
     size, number = RayTiles.shared(source, tiling)
     corners = index is not None and (isinstance(source, Camera) or tiling.squares)
     tiling = tiling._replace(least=0, squares=False)
-    most = np.asarray(scene.march.most_samples, np.int32)
-    passed, of_tile = [], None
+    limit = np.asarray(scene.march.most_samples, np.int32)
+    passed, kept_tile = [], None
     for tile in range(number):
         lines = _lines_of(scene.source, tiling, number, size, tile)
         started = _start(*lines, corners, seams, place, index, fault, tiling)
-        none, zero, never, nowhere = _nothing(*started.rays.length.shape, started.rays.length.dtype)
+        none, zero, never, nowhere = _defaults(*started.rays.length.shape, started.rays.length.dtype)
         offset, shift = started.track.offset, started.track.shift
         offset, shift = (none if part is None else part for part in (offset, shift))
-        track = unchecked(Track, offset=offset, shift=shift, shifted=never, until=most)
+        track = unchecked(Track, offset=offset, shift=shift, shifted=never, until=limit)
         first = zero
         if scene.march.may_shift:
-            track, first = _shift(kernel, started.rays, track, most, tiling)
+            track, first = _shift(kernel, started.rays, track, limit, tiling)
         skips = nowhere if started.skips is None else started.skips
-        told = _told(kernel, started._replace(skips=skips))
-        # where rays do not leap, what has no extinction has a gradient, too
-        found = _march(*told, track, first, skips, options.outputs, tiling, record and scene.march.leaps)
-        of_tile = started.rays, started.skips
-        passed.append(Passed(started.rays.t_in, started.rays.length, found, track.shifted))
+        inputs = _march_inputs(kernel, started._replace(skips=skips))
+        # without leaps, cells without extinction have a gradient, too: no ranges
+        marched = _march(*inputs, track, first, skips, options.outputs, tiling, record and scene.march.leaps)
+        kept_tile = started.rays, started.skips
+        passed.append(MarchedTile(started.rays.t_in, started.rays.length, marched, track.shifted))
     rendering, recorded = _finish(passed, scene.compositing, source, tiling, size, record)
-    if record and number == 1 and of_tile is not None:
-        recorded = recorded.with_rays(*of_tile)
+    if record and number == 1 and kept_tile is not None:
+        recorded = recorded.with_rays(*kept_tile)
     return rendering, recorded
 
 
 class Staging(NamedTuple):
-    """What the stages of all images of a scene share: the kernel, the march with the seams of stage A alone,
-    the place of the voxels, where the scene is empty, unless that depends on the view, and whether it
-    `has_fault`."""
+    """Parts shared by all images of a scene: the kernel, the march with the seams of stage A only, the place
+    of the voxels, the empty space unless it depends on the view, and the scene's `has_fault`."""
 
     kernel: Kernel
     seams: March
@@ -152,56 +150,56 @@ _STAGINGS: dict[tuple[int, ...], Staging] = {}
 
 
 def _staging_of(scene: Scene, acceleration: VolumeAcceleration) -> Staging:
-    """That of a scene, as long as its parts live: to take it apart takes as long as some thousand rays."""
+    """The staging of a scene, kept while its parts live: it takes as long as some thousand rays."""
     parts = [scene.volume, scene.transfer, scene.march, scene.compositing]
     parts += [] if scene.lighting is None else [scene.lighting]
     key = tuple(map(id, parts))
     if key not in _STAGINGS:
-        seams = _only(scene.march, "start", "shift", "locate", "clip")
+        seams = _with_seams(scene.march, "start", "shift", "locate", "clip")
         place, index = _without_voxels(scene.volume, seams), None
-        if not _by_view(scene):
+        if not _depends_on_view(scene):
             index = _index_of(scene, acceleration)
         fault = _has_fault(scene._replace(volume=without_voxels(scene.volume), source=None))
-        # copies, or what is kept would keep its own parts alive
+        # copies: the parts themselves would never be freed
         kernel: Any = (
             unchecked(part) if isinstance(part, eqx.Module) else part
             for part in _kernel_of(scene, acceleration)
         )
-        found = Staging(Kernel(*kernel), seams, unchecked(place), index, fault)
+        staging = Staging(Kernel(*kernel), seams, unchecked(place), index, fault)
         if any(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(parts)):  # may change in place
-            return found
-        _STAGINGS[key] = found
+            return staging
+        _STAGINGS[key] = staging
         when_any_dies(parts, lambda: _STAGINGS.pop(key, None))
     return _STAGINGS[key]
 
 
-def _only(march: March, *seams: str) -> March:
-    """The march with the transforms that override one of these seams alone, and no other static part."""
-    chosen = [each for seam in seams for each in march.overriding(seam)]
-    kept = tuple(each for each in march.transforms if any(each is one for one in chosen))
-    return unchecked(march, transforms=kept, quadrature="left", max_samples=None)
+def _with_seams(march: March, *seams: str) -> March:
+    """The march with only the transforms that override these seams, and neutral static parts."""
+    chosen = [id(transform) for seam in seams for transform in march.overriding(seam)]
+    transforms = tuple(transform for transform in march.transforms if id(transform) in chosen)
+    return unchecked(march, transforms=transforms, quadrature="left", max_samples=None)
 
 
 def _has_fault(scene: Scene) -> Bool[Array, ""] | np.ndarray:
-    """`Scene.has_fault`; on a CPU in NumPy, which compiles nothing, of the kinds that know how."""
+    """`Scene.has_fault`; on a CPU by NumPy, which compiles nothing, for types that support it."""
     kinds = (*map(type, scene.march.transforms), type(scene.transfer))
-    others = [kind for kind in kinds if getattr(kind, "valid", None) not in (Transform.valid, Transfer.valid)]
+    custom = [kind for kind in kinds if getattr(kind, "valid", None) not in (Transform.valid, Transfer.valid)]
     if platform() != "cpu":
         return _has_fault_by_jax(scene)
-    if any(kind is not TransferFunction for kind in others):
+    if any(kind is not TransferFunction for kind in custom):
         return np.asarray(_has_fault_by_jax(scene))
-    return np.asarray(jax.tree.map(_known, scene).has_fault)
+    return np.asarray(jax.tree.map(_to_numpy, scene).has_fault)
 
 
 def _is_invalid(camera: Camera, fault: Bool[Array, ""] | np.ndarray) -> Bool[Array, ""] | np.ndarray:
-    """Whether this holds of a camera, which other images of the scene do not share, or else of a `fault`."""
+    """True if the camera is invalid, or the scene has a `fault`."""
     if platform() != "cpu":
         return _is_invalid_by_jax(camera, fault)
-    camera = jax.tree.map(_known, camera)
+    camera = jax.tree.map(_to_numpy, camera)
     return np.asarray(fault | ~(all_finite(camera) & camera.valid))
 
 
-def _known(leaf: Any) -> Any:
+def _to_numpy(leaf: Any) -> Any:
     return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
 
 
@@ -219,27 +217,26 @@ def _is_invalid_by_jax(camera: Camera, fault: Bool[Array, ""]) -> Bool[Array, ""
 
 
 def _without_voxels(volume: Volume, seams: March) -> Volume:
-    """The place of the voxels. Of a single grid in the world's own space, their number is an array; a
-    transform with a space of its own is told the whole volume."""
+    """The volume without voxels. The shape of a single grid is an array, unless a transform overrides
+    `locate`, which needs the volume."""
     if seams.overriding("locate"):
         return volume
-    own = grids(volume)
-    extents: list[Any] = [Extent(grid.shape) for grid in own]
-    if len(own) == 1:
+    extents: list[Any] = [Extent(grid.shape) for grid in grids(volume)]
+    if len(extents) == 1:
         extents = [Nodes(np.asarray(volume.shape, np.int32))]
     place = with_fetches(without_voxels(volume), extents)
     return unchecked(place, labels=None, label_ids=None)
 
 
 class Place(NamedTuple):
-    """Where a volume is, for programs for volumes of all shapes."""
+    """Place of a volume, for programs that serve volumes of all shapes."""
 
     seams: March
     volume: Volume
 
     @classmethod
     def of(cls, march: March, volume: Volume) -> "Place":
-        seams = _only(march, "locate", "clip")
+        seams = _with_seams(march, "locate", "clip")
         return cls(seams, _without_voxels(volume, seams))
 
     @property
@@ -247,11 +244,11 @@ class Place(NamedTuple):
         return self.seams.locate(self.volume)
 
     def voxel(self, blocks: tuple[int, ...]) -> float:
-        """The size of a voxel; where it differs, the median of the middles of some of so many blocks."""
+        """The size of a voxel; if it varies, the median over the centres of some of the `blocks`."""
         if not self.seams.overriding("locate"):
             return float(np.min(np.asarray(self.volume.spacing)))
-        middles = (BLOCK * (np.round(np.linspace(0, n - 1, MIDDLES)) + 0.5) for n in blocks)
-        return float(_median_distance(self, *middles))
+        centres = (BLOCK * (np.round(np.linspace(0, n - 1, MIDDLES)) + 0.5) for n in blocks)
+        return float(_median_distance(self, *centres))
 
 
 MIDDLES = 8
@@ -259,14 +256,14 @@ MIDDLES = 8
 
 
 @program
-def _median_distance(place: Place, *middles: Array) -> Array:
-    return median_node_distance(place.space, *middles)
+def _median_distance(place: Place, *centres: Array) -> Array:
+    return median_node_distance(place.space, *centres)
 
 
 def _lines_of(
-    source: Any, tiling: Tiling, number: int, size: int, tile: int
+    source: Source, tiling: Tiling, number: int, size: int, tile: int
 ) -> tuple[Line, Bool[Any, "groups rays"]]:
-    """`RayTiles.ending_lines` of a tile before there is a fault; of given rays on a CPU in NumPy."""
+    """`RayTiles.ending_lines` of a tile, without a fault; for `GivenRays` on a CPU by NumPy."""
     if (
         not isinstance(source, GivenRays)
         or platform() != "cpu"
@@ -274,15 +271,15 @@ def _lines_of(
     ):
         return _lines(source, tiling, number, size, np.asarray(tile, jnp.result_type(int)))
     count = size * tiling.rays_per_beam
-    own = slice(tile * count, (tile + 1) * count)
+    span = slice(tile * count, (tile + 1) * count)
 
-    def rows(leaf: Any) -> Any:
+    def rows(leaf: Array | np.ndarray) -> Any:
         flat = np.asarray(leaf).reshape(-1, leaf.shape[-1])
-        flat = flat[own] if len(flat) else np.ones((1, leaf.shape[-1]), flat.dtype)
+        flat = flat[span] if len(flat) else np.ones((1, leaf.shape[-1]), flat.dtype)
         flat = np.pad(flat, ((0, count - len(flat)), (0, 0)), "edge")
         return tuple(np.ascontiguousarray(flat.T).reshape(leaf.shape[-1], -1, tiling.group))
 
-    numbers = np.arange(own.start, own.stop, dtype=np.int32).reshape(-1, tiling.group)
+    numbers = np.arange(span.start, span.stop, dtype=np.int32).reshape(-1, tiling.group)
     first = np.asarray(source.first, np.int32)
     pixel: Any = (first + numbers, 0 * numbers) if source.pixels is None else rows(source.pixels)
     line: Any = Line(rows(source.origins), rows(source.directions), pixel)
@@ -291,9 +288,9 @@ def _lines_of(
 
 @program
 def _lines(
-    source: Any, tiling: Tiling, number: int, size: int, tile: Int[Array, ""]
+    source: Source, tiling: Tiling, number: int, size: int, tile: Int[Array, ""]
 ) -> tuple[Line, Bool[Array, "groups rays"]]:
-    """The rays of a tile before they meet the volume, and which of them are of the image."""
+    """The rays of a tile, not yet cut to the volume, and whether each belongs to the image."""
     tiles = RayTiles.of(source, tiling, tiles=(number, size))
     return tiles.ending_lines(source, tile, jnp.zeros((), bool))
 
@@ -308,12 +305,12 @@ def _start(
     index: EmptySpaceIndex | None,
     fault: Bool[Array, ""],
     tiling: Tiling,
-) -> Started:
-    """Cuts the rays of a tile to the volume. `corners`: whether those at the corners of a beam bound it, as
-    they do of squares of a camera's pixels."""
+) -> StartedTile:
+    """Cuts the rays of a tile to the volume. `corners`: whether the rays at the corners of a beam bound it,
+    as for squares of a camera's pixels."""
     x, y, z = line.origin
     line = line._replace(origin=(jnp.where(fault, jnp.nan, x), y, z))
-    rays = entering(seams.locate(place), line, wanted, tiling.searched)
+    rays = enter_rays(seams.locate(place), line, wanted, tiling.searched)
     track = vmap_rays(partial(track_of, seams))(rays)
     offset = track.offset if seams.overriding("start") else None
     box = box_of_corners if corners else box_of_rays
@@ -321,47 +318,46 @@ def _start(
     if index is not None:
         skips = index.on_axes_of(place).skips(partial(box, tiling, rays), tiling.cells * seams.step)
     track = unchecked(track, offset=offset, shifted=None, until=None)
-    return Started(rays, track, skips, seams.locate(place))
+    return StartedTile(rays, track, skips, seams.locate(place))
 
 
 @cache
-def _nothing(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, Stretches]:
-    """What is told of rays that neither begin nor shift anywhere in particular: no steps, the first cell, no
-    cell; and where they see nothing, as far as is known."""
+def _defaults(groups: int, group: int, dtype: Any) -> tuple[Array, Array, Array, Stretches]:
+    """Defaults without offset, shift or empty space: offset 0, cell 0, cell NEVER, unknown stretches."""
     none, beams = np.zeros((groups, group), dtype), groups // GROUPS_OF_BEAM
     stretches = Stretches.unknown(beams, none.dtype)
     zero, never = (np.full(none.shape, number, np.int32) for number in (0, NEVER))
     return jax.device_put((none, zero, never, stretches))
 
 
-def _by_view(scene: Scene) -> bool:
-    """Whether where a scene is empty depends on the view: where rays start as their neighbours do."""
+def _depends_on_view(scene: Scene) -> bool:
+    """True if the empty-space index depends on the view."""
     leaps: list[Any] = scene.march.overriding("empty_space")
     return bool(leaps) and leaps[0].method in ("min_distance", "beam")
 
 
 def _index_of(scene: Scene, acceleration: VolumeAcceleration) -> EmptySpaceIndex | None:
-    """Where the scene is empty, for all views: found once for each volume and transfer function."""
+    """The empty-space index of a scene for all views, computed once for each volume and transfer function."""
     if not scene.march.leaps:
         return None
-    march = unchecked(_only(scene.march, "empty_space", "locate", "clip"), step=None)
-    given = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
-    if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(given)):
-        return memoized_of(given, _index)
-    return _index(given)
+    march = unchecked(_with_seams(scene.march, "empty_space", "locate", "clip"), step=None)
+    inputs = scene._replace(source=None, march=march, lighting=None), acceleration.of_space
+    if all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(inputs)):
+        return memoized_of(inputs, _index)
+    return _index(inputs)
 
 
-def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
-    scene, acceleration = given
+def _index(inputs: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
+    scene, acceleration = inputs
     transforms: tuple[Any, ...] = scene.march.transforms
     transfer: Any = scene.transfer
     (leap, *seams), blocks = transforms, acceleration.blocks
-    whole = scene.volume.field is None and scene.volume.first is None
-    if seams or not whole or leap.method != "hierarchy" or not isinstance(blocks, Blocks):
-        return _index_by_jax(given)
+    plain = scene.volume.field is None and scene.volume.first is None
+    if seams or not plain or leap.method != "hierarchy" or not isinstance(blocks, Blocks):
+        return _index_by_jax(inputs)
     visible = visible_in_numpy(scene.compositing, transfer, blocks)
     if visible is None or blocks.low.committed:
-        return _index_by_jax(given)
+        return _index_by_jax(inputs)
     spacing, origin = np.asarray(scene.volume.spacing), np.asarray(scene.volume.origin)
     size, zero = tuple(blocks.side * step for step in spacing), np.zeros_like(spacing[0])
     place = {"origin": (zero, zero, zero), "size": size, "anchor": tuple(origin), "frame": None}
@@ -371,8 +367,8 @@ def _index(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
 
 
 @program
-def _index_by_jax(given: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
-    scene, acceleration = given
+def _index_by_jax(inputs: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
+    scene, acceleration = inputs
     nowhere = GivenRays(jnp.zeros((0, 3)), jnp.zeros((0, 3)))
     index = empty_space_of(scene._replace(source=nowhere), acceleration, Tiling())
     return None if index is None else index.unshaped
@@ -387,7 +383,7 @@ def _index_of_view(scene: Scene, acceleration: VolumeAcceleration, tiling: Tilin
 
 
 def _kernel_of(scene: Scene, acceleration: VolumeAcceleration) -> Kernel:
-    """The scene, so that its march is the same program as that of as many other scenes as possible."""
+    """The inputs of the march, such that as many scenes as possible share its program."""
     volume, lighting = acceleration.packed(scene).volume, scene.lighting
     shared = lighting is None or (lighting.reads_gradient and lighting.farthest_read == 0)
     if shared and len(grids(volume)) == 1:
@@ -396,8 +392,8 @@ def _kernel_of(scene: Scene, acceleration: VolumeAcceleration) -> Kernel:
     return Kernel(volume, transfer, scene.march.rules, scene.compositing, lighting)
 
 
-def _told(kernel: Kernel, started: Started) -> tuple[Kernel, Ray]:
-    """What the march is told of a scene and of its rays: what they meet in the world only if it is used."""
+def _march_inputs(kernel: Kernel, started: StartedTile) -> tuple[Kernel, Ray]:
+    """The kernel and rays for the march; world coordinates of rays only if they are used."""
     rays, space = started.rays, started.space
     if kernel.lighting is not None:
         return kernel._replace(space=space.whole), rays
@@ -408,17 +404,17 @@ def _told(kernel: Kernel, started: Started) -> tuple[Kernel, Ray]:
 
 @program
 def _shift(
-    kernel: Kernel, rays: Ray, track: Track, most: Int[Array, ""], tiling: Tiling
+    kernel: Kernel, rays: Ray, track: Track, limit: Int[Array, ""], tiling: Tiling
 ) -> tuple[Track, Int[Array, "groups rays"]]:
-    """Where the rays of a tile shift, and the first cell that is to be marched."""
-    scene, track = kernel.scene, _for_each(track, rays)
+    """The track of a tile's rays with their shifts, and the first cell to march."""
+    scene, track = kernel.scene, _per_ray(track, rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, None))(rays, track)
     at = find_shifts(scene, rays, with_fields(at, finished=rays.length <= 0), tiling)
-    return with_fields(at.track, until=most), behind_first_cells(scene, rays, at).index
+    return with_fields(at.track, until=limit), skip_first_cells(scene, rays, at).index
 
 
-def _for_each(track: Track, rays: Ray) -> Track:
-    """The track of each ray: the number of samples is one for all."""
+def _per_ray(track: Track, rays: Ray) -> Track:
+    """The tracks of rays, from a track with one `until` for all."""
     return with_fields(track, until=jnp.broadcast_to(track.until, rays.length.shape))
 
 
@@ -434,10 +430,10 @@ def _march(
     record: bool,
 ) -> Marched:
     """Marches the rays of a tile to their ends."""
-    scene, track = kernel.scene, _for_each(track, rays)
+    scene, track = kernel.scene, _per_ray(track, rays)
     at = vmap_rays(lambda ray, track: begin(scene, ray, track, outputs))(rays, track)
-    at = blinded(skips, with_fields(at, index=first, finished=rays.length <= 0))
-    if at.stats is not None:  # transparent cells, which are samples
+    at = finish_blind(skips, with_fields(at, index=first, finished=rays.length <= 0))
+    if at.stats is not None:  # skipped transparent cells are samples
         at = eqx.tree_at(lambda at: at.stats.samples, at, first)
     return march_rays(scene, rays, at, tiling, skips, record=record)
 
@@ -447,7 +443,7 @@ def _march(
 
 @program
 def _finish(
-    passed: list[Passed],
+    passed: list[MarchedTile],
     compositing: Compositing[Any],
     source: Camera | GivenRays,
     tiling: Tiling,
@@ -462,8 +458,8 @@ def _finish(
     def finish(t_in: Array, length: Array, at: Progress) -> Rendering:
         return end(scene, unchecked(Ray, t_in=t_in, length=length), at)
 
-    each = [vmap_rays(finish)(tile.t_in, tile.length, tile.marched.at) for tile in passed]
-    rendering = jax.tree.map(lambda *leaves: tiles.assemble(jnp.stack(leaves)), *each)
+    renderings = [vmap_rays(finish)(tile.t_in, tile.length, tile.marched.at) for tile in passed]
+    rendering = jax.tree.map(lambda *leaves: tiles.assemble(jnp.stack(leaves)), *renderings)
     if not record:
         return rendering, Recorded(None, None)
     recorded = [Recorded(tile.marched.range, tile.shifted) for tile in passed]

@@ -1,4 +1,4 @@
-"""How is work divided for this machine? All constants of the fast engine, in one place."""
+"""Sizes by which the fast engine divides work, for CPUs and GPUs."""
 
 import math
 from typing import Literal, NamedTuple, TypeAlias
@@ -18,8 +18,8 @@ GROUPS_OF_BEAM = 4
 
 LEAST_BATCH = 72
 """Groups that are marched at a time in a small image: 1152 rays, whose kernels still take longer than their
-launch. (Two CPU cores, the engine: images of 64², 128² and 256² pixels take 0.67, 0.68 and 0.89 of the time
-that batches of 520 take; 512² pixels would take 1.28 times as long in batches of 72.)"""
+launch. (Two CPU cores, the engine: relative to batches of 520, images of 64², 128² and 256² pixels take 0.67,
+0.68 and 0.89 of the time, 512² pixels 1.28 times as long.)"""
 
 
 class Tiling(NamedTuple):
@@ -29,19 +29,17 @@ class Tiling(NamedTuple):
     Attributes:
         cells: cells of a segment, whose samples are all fetched before any is composited.
         group: rays compacted as one unit, a square number.
-        batch: groups marched at a time, as many as fit into the cache; where `turns` is 0, no more than a
-            sixteenth of a tile's, or LEAST_BATCH (`batch_of`).
-        min_alive: share of a batch's groups that must be alive for it to go on; below it, batches are
-            refilled.
-        turns: if not 0, the segments by which a batch is marched before it is refilled, in place of
-            `min_alive`: a number that is known when the program is compiled.
+        batch: groups marched at a time, as many as fit into the cache; `batch_of` limits it in small images.
+        min_alive: share of a batch's groups that must be alive; below it, batches are refilled.
+        turns: if not 0, number of segments that a batch is marched before it is refilled, in place of
+            `min_alive`: a constant of the compiled program.
         tile: beams that are marched to their ends before the next ones are made: 262 144 rays.
-        direct_tile: the same where JAX differentiates the march itself, and so keeps all its states.
-        searched: groups whose entries and exits are searched at a time, where a search is needed. It takes
-            as many steps as the slowest ray among them.
-        chunk: samples shaded at a time, a multiple of 128. If 0, all of a segment, the invisible ones too.
-        least: beams of a tile at least, so that a few rays are marched by the program of an image.
-        squares: whether given rays are those of squares of a camera's pixels, beam by beam.
+        direct_tile: `tile` where JAX differentiates the march itself, and so keeps all its states.
+        searched: groups whose entries and exits are searched at a time, where a search is needed. The search
+            takes as many steps as the slowest ray among them.
+        chunk: samples shaded at a time, a multiple of 128. If 0, all of a segment, also invisible ones.
+        least: minimum number of beams of a tile, so that a few rays are marched by the program of an image.
+        squares: whether each beam of a `GivenRays` is a square of a camera's pixels.
     """
 
     cells: int = 8
@@ -58,8 +56,8 @@ class Tiling(NamedTuple):
     squares: bool = False
 
     def batch_of(self, groups: int) -> int:
-        """Groups of so many that are marched at a time. Of few, a part only: an image that is one batch goes
-        on with all its lanes to the end of its longest rays, since only others could fill their places."""
+        """Number of groups per batch, of `groups` in a tile. A small image is several batches: a single one
+        could not be refilled, and would keep all its lanes until its longest ray ends."""
         part = groups if self.turns else max(groups // 16 + 8, LEAST_BATCH)
         return min(self.batch, groups, part)
 
@@ -80,16 +78,15 @@ class Tiling(NamedTuple):
 
     @classmethod
     def of_backend(cls) -> "Tiling":
-        """The sizes for programs that are traced now: `GPU` where they are for one, the defaults, which were
-        measured on CPUs, elsewhere."""
+        """The sizes for programs that are traced now: `GPU` on a GPU, else the defaults, measured on CPUs."""
         return GPU if on_gpu() else Tiling()
 
 
 class RenderOptions(eqx.Module):
-    """What is computed, how it is differentiated, and how work is divided.
+    """Options of a render: its outputs, the rule of its derivatives, and the division of work.
 
     Attributes:
-        steps: of each ray's scan, for `"direct"`.
+        steps: number of steps of each ray's scan, for `adjoint="direct"`.
     """
 
     outputs: Outputs = eqx.field(static=True)
@@ -100,13 +97,14 @@ class RenderOptions(eqx.Module):
 
 GPU = Tiling(cells=16, batch=2**12, turns=8, tile=2**14, searched=2**16, chunk=0)
 """For GPUs, where the host waits for the device at each branch, and at each turn of a loop of unknown length
-(see `platform`). So one loop of unknown length is left, each turn of which makes up one batch of the groups
-that are alive, and marches it by `turns` segments; and a batch of 65 536 rays has a million samples in
-flight. A tile is an image of up to 1024 × 1024 pixels.
+(see `platform`). So one loop of unknown length remains: it gathers a batch of living groups and marches it by
+`turns` segments; a batch of 65 536 rays has a million samples in flight. A tile is an image of up to
+1024 × 1024 pixels.
 
 Chosen on an H200: the head phantom of 512³ voxels, 1024 × 1024 pixels, steps of half a voxel, with leaps and
 early termination. An image with the gradient of its transfer function took 9.3 ms; in segments of 8 cells
-11.0 ms, and in these by batches of 2¹³ groups and 16 turns 14.3 ms. (Of the lanes of a batch of 2¹² groups,
-41 % take samples of this image, of one of 2¹³ 24 %.) In the view of `experiments/scenes.py`, the host waits
-13 times. Loops of unknown length remain in shading with many terms (`ScattererTemplates`), in each segment.
+11.0 ms; in segments of 8 cells, batches of 2¹³ groups and 16 turns 14.3 ms. (In batches of 2¹² groups, 41 %
+of the lanes take samples of this image; in batches of 2¹³, 24 %.) In the view of `experiments/scenes.py`, the
+host waits 13 times. Shading with many terms (`ScattererTemplates`) has a loop of unknown length in each
+segment.
 """

@@ -1,8 +1,8 @@
-"""How does a gradient reach the voxels? Each sample's cotangent is added to the voxels that it was read from.
+"""Gradients to voxels: the cotangent of each fetch is added in place to the voxels that it read.
 
-JAX would make an array like the voxels for each segment, to add them up. Here each fetch is recorded, with a
-perturbation of 0, whose cotangent is added in place. A volume has several arrays of voxels if its field holds
-others (`scene.volume.grids`): lists here have one entry for each, None where no gradient is asked for.
+JAX would allocate an array like the voxels for each segment, and sum these. Here each fetch is recorded, with
+a perturbation of 0, whose cotangent is added in place. A volume has several arrays of voxels if its field
+holds other volumes (`scene.volume.grids`): lists have one entry per array, None without a requested gradient.
 """
 
 from typing import Any, TypeAlias
@@ -15,78 +15,78 @@ from jaxtyping import Array
 from ..scene.volume import Volume, grids, voxels_of, with_fetches, with_voxels
 from ..scene.voxel_fetch import Extent, Fetch, Fetched, Recording, Zeros, perturbations_of, scatter_add
 from ..xla.sharding import varying
+from ..xla.trees import PyTree
 
 
 Sums: TypeAlias = list[Array | None]
-"""Of the numbers of each array, flattened."""
+"""Summed cotangents of each array of voxels, flattened."""
 
 
 def asked_of(volume: Volume, perturbed: Volume) -> list[bool]:
-    """Of which arrays of voxels the gradient is asked for, and exists."""
-    each = zip(voxels_of(volume), voxels_of(perturbed), strict=True)
-    return [eqx.is_inexact_array(data) and bool(asked) for data, asked in each]
+    """True for each array of voxels whose gradient is requested, and exists."""
+    pairs = zip(voxels_of(volume), voxels_of(perturbed), strict=True)
+    return [eqx.is_inexact_array(data) and bool(asked) for data, asked in pairs]
 
 
 def zero_sums(volume: Volume, asked: list[bool]) -> Sums:
-    """Sums of 0. Many small parts are summed, which 16 bits would lose."""
+    """Sums of 0, of 32 bits or more: 16 bits would lose small terms."""
 
-    def zeros(data: Any) -> Array:
-        return jnp.zeros(data.size, data.dtype if jnp.finfo(data.dtype).bits >= 32 else jnp.float32)
+    def zeros(array: Array) -> Array:
+        return jnp.zeros(array.size, array.dtype if jnp.finfo(array.dtype).bits >= 32 else jnp.float32)
 
-    return [zeros(data) if a else None for data, a in zip(voxels_of(volume), asked, strict=True)]
+    return [zeros(data) if wanted else None for data, wanted in zip(voxels_of(volume), asked, strict=True)]
 
 
 def recorded(volume: Volume, perturbations: list[Any]) -> tuple[Volume, list[list[Fetched]]]:
-    """The volume, whose fetches are recorded and perturbed; and the lists that this fills while tracing."""
-    own = grids(volume)
-    records = [Recording(each, []) for each in perturbations or [[]] * len(own)]
-    each = zip(own, records, strict=True)
-    fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else record for g, record in each]
+    """The volume with recorded, perturbed fetches; and the lists of fetches, filled while it is traced."""
+    parts = grids(volume)
+    records = [Recording(changes, []) for changes in perturbations or [[]] * len(parts)]
+    pairs = zip(parts, records, strict=True)
+    fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else record for g, record in pairs]
     return with_fetches(volume, fetches), [record.fetched for record in records]
 
 
 def check_fetched(volume: Volume, sums: Sums) -> None:
-    """Raises `ValueError` where a field reads voxels otherwise than by interpolation, and the gradient to
-    these, which would be lost, is asked for."""
+    """Raises `ValueError` if a gradient to voxels is requested that a field reads without interpolation: that
+    gradient would be lost."""
     if volume.field is None:
         return
-    own, kind = grids(volume), type(volume.field).__name__
-    data = voxels_of(volume)
-    like = [None if each is None else jax.ShapeDtypeStruct(each.shape, each.dtype) for each in data]
-    fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else Zeros() for g in own]
+    like = [None if a is None else jax.ShapeDtypeStruct(a.shape, a.dtype) for a in voxels_of(volume)]
+    fetches: list[Fetch] = [g.fetch if isinstance(g.fetch, Extent) else Zeros() for g in grids(volume)]
 
-    def value(data: list[Any], at: Any) -> Any:
+    def value(data: list[Any], at: PyTree) -> PyTree:
         return with_fetches(with_voxels(volume, data), fetches).value(at)
 
     place = (jax.ShapeDtypeStruct((), volume.spacing.dtype),) * 3
     program = jax.make_jaxpr(value)(like, place).jaxpr
-    read = [*program.outvars, *(variable for step in program.eqns for variable in step.invars)]
+    uses = {id(variable) for step in program.eqns for variable in step.invars}
+    uses |= set(map(id, program.outvars))
     asked = [sum_ is not None for sum_, data in zip(sums, like, strict=True) if data is not None]
-    if any(a and any(each is of for each in read) for a, of in zip(asked, program.invars, strict=False)):
+    if any(wanted and id(of) in uses for wanted, of in zip(asked, program.invars, strict=False)):
         raise ValueError(
-            f"the gradient to the voxels of a volume with the field {kind}, which reads them otherwise than"
-            ' by interpolation, is not known to adjoint="replay": pass adjoint="direct", or leave these'
-            " voxels (volume.data) out of what is differentiated."
+            f"volume.field: {type(volume.field).__name__} reads voxels without interpolation; got"
+            ' adjoint="replay", which has no gradient to such voxels. Pass adjoint="direct", or do not'
+            " differentiate with respect to volume.data."
         )
 
 
-def zero_perturbations(volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: Any) -> list[Any]:
-    """Perturbations of 0 of what was fetched, where its gradient is asked for: varying as the sums do, since
-    inside `jax.shard_map` the cotangents of what does not vary are summed over the shards."""
-    each = zip(voxels_of(volume), fetched, sums, strict=True)
-    zeros = [[] if sum_ is None else perturbations_of(data, found, dtype) for data, found, sum_ in each]
+def zero_perturbations(
+    volume: Volume, fetched: list[list[Fetched]], sums: Sums, dtype: jnp.dtype[Any]
+) -> list[Any]:
+    """Perturbations of 0 for all fetches with a requested gradient. They vary over shards as the sums do:
+    `jax.shard_map` would sum cotangents of values that do not vary."""
+    parts = zip(voxels_of(volume), fetched, sums, strict=True)
+    zeros = [[] if sum_ is None else perturbations_of(data, reads, dtype) for data, reads, sum_ in parts]
     return varying(zeros, sums)
 
 
 def with_cotangents(sums: Sums, volume: Volume, fetched: list[list[Fetched]], cotangents: list[Any]) -> Sums:
-    """The sums with the cotangents of what was fetched."""
-    each = zip(sums, voxels_of(volume), fetched, cotangents, strict=True)
-    return [
-        None if sum_ is None else scatter_add(sum_, data.shape, found, of) for sum_, data, found, of in each
-    ]
+    """The sums plus the cotangents of all fetches."""
+    parts = zip(sums, voxels_of(volume), fetched, cotangents, strict=True)
+    return [None if s is None else scatter_add(s, data.shape, reads, bars) for s, data, reads, bars in parts]
 
 
 def cotangents_of(volume: Volume, sums: Sums) -> list[Array | None]:
-    """The sums, like the arrays of voxels."""
-    each = zip(sums, voxels_of(volume), strict=True)
-    return [None if sum_ is None else sum_.reshape(data.shape).astype(data.dtype) for sum_, data in each]
+    """The sums, in shape and type of the arrays of voxels."""
+    pairs = zip(sums, voxels_of(volume), strict=True)
+    return [None if sum_ is None else sum_.reshape(data.shape).astype(data.dtype) for sum_, data in pairs]

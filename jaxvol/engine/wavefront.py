@@ -1,15 +1,15 @@
 """Marches the rays of a tile to their ends, in batches of groups that are refilled as rays finish.
 
 - Rays are compacted in small *groups* of neighbours. A *batch* of groups, which fits into the cache, is
-  marched segment by segment until too few of its groups are left (`Tiling.min_alive`); then batches are
-  refilled from the groups that are left. Idle lanes cost as much as working ones.
-- On a GPU, to find out how many are left costs more than some idle lanes: a batch, of as many rays as keep it
-  busy, is marched by a known number of segments (`Tiling.turns`), and refilled after each.
-- Where a ray shifts (`Transform.shift`) is found before it is marched (`shifts`), so that all of its cells
-  are known. Through bricks, whose voxels are not there before, it is found on the way, cell by cell.
-- Where empty space is known (`EmptySpaceIndex`), rays leap over it between two segments.
+  marched segment by segment until too few of its groups are alive (`Tiling.min_alive`); then batches are
+  refilled from the living groups. Idle lanes cost as much as working ones.
+- On a GPU, counting the living groups costs more than some idle lanes: a batch, large enough to keep the GPU
+  busy, is marched by a constant number of segments (`Tiling.turns`) between two refills.
+- The shift of a ray (`Transform.shift`) is found before the march (`shifts`), so that all cells are known.
+  Through bricks, whose voxels are loaded during the march, it is found cell by cell.
+- With an `EmptySpaceIndex`, rays leap over empty space between two segments.
 
-None of it shows in an image: cells, transforms and compositing are those of `ray`. (Measured on CPU.)
+The image does not depend on it: cells, transforms and compositing are those of `ray`. (Measured on CPU.)
 """
 
 from collections.abc import Callable
@@ -40,18 +40,18 @@ Visited: TypeAlias = tuple[PyTree, PyTree, PyTree]
 
 
 class CellRange(NamedTuple):
-    """Indices of steps: all visible cells of a ray begin at `first` or later, and before `until`."""
+    """Indices of cells: all visible cells of a ray are in [first, until)."""
 
     first: Int[Array, "*rays"]
     until: Int[Array, "*rays"]
 
     @classmethod
     def none(cls, shape: tuple[int, ...]) -> "CellRange":
-        """Those of rays without any visible cell."""
+        """The ranges of rays without visible cells."""
         return cls(jnp.full(shape, NEVER, jnp.int32), jnp.zeros(shape, jnp.int32))
 
     def widened(self, at: Progress, samples: Samples) -> "CellRange":
-        """The range with those cells of a segment that are visible."""
+        """The range, extended by the visible cells of a segment."""
         number = at.index[None] + jnp.arange(samples.number, dtype=at.index.dtype)[:, None]
         visible = jnp.any(jnp.stack(samples.opacity) > 0, axis=0) & ~at.finished[None]
         first = jnp.min(jnp.where(visible, number, NEVER), axis=0)
@@ -60,13 +60,13 @@ class CellRange(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What the first march of rays leaves for the second.
+    """Record of the first march of rays, for the second.
 
     Attributes:
-        range: of their visible cells, where rays leap.
-        shifted: where they shift, where they do.
-        rays: of an image of a single tile, which need not be made again for what they do not depend on.
-        skips: where these see nothing.
+        range: range of visible cells, if rays leap.
+        shifted: cell behind which each ray shifts, if rays shift.
+        rays: rays of an image of a single tile, reused if they are not differentiated.
+        skips: empty stretches along these rays.
     """
 
     range: CellRange | None
@@ -75,38 +75,38 @@ class Recorded(NamedTuple):
     skips: Skips | None = None
 
     def with_rays(self, rays: Ray, skips: Skips | None) -> "Recorded":
-        """The same of a single tile, with its rays."""
-        # other skips are for beams without ranges
+        """The record of a single tile, with its rays."""
+        # other skips are of use only without ranges
         return self._replace(rays=rays, skips=skips if isinstance(skips, Stretches) else None)
 
 
 class Marched(NamedTuple):
-    """What marching a tile's rays found, of shape (groups, rays in a group)."""
+    """Result of marching a tile's rays, of shape (groups, rays in a group)."""
 
     lanes: Packed
     track: Track
     total: PyTree
-    """Of the visitor."""
+    """Total of the visitor."""
 
     @property
     def at(self) -> Progress:
-        """Where the rays end."""
+        """Progress of the rays at their ends."""
         return vmap_rays(_progress)(self.lanes.tree, self.track)
 
     @property
     def range(self) -> CellRange | None:
-        """The range of each ray's visible cells, if it was asked for."""
+        """The range of each ray's visible cells, if it was recorded."""
         return self.lanes.tree.range
 
     @property
     def visited(self) -> Visited:
-        """What the visitor did."""
+        """The visitor's carry, sums and total."""
         lanes = self.lanes.tree
         return lanes.carry, lanes.sums, self.total
 
 
 class Lanes(eqx.Module):
-    """What of rays changes while they are marched."""
+    """State of rays that changes while they are marched."""
 
     index: Int[Array, "*rays"]
     composite: PyTree
@@ -119,10 +119,10 @@ class Lanes(eqx.Module):
 
 
 class Job(NamedTuple):
-    """What does not change while the rays of a tile are marched.
+    """Constants of the march of a tile's rays.
 
     Attributes:
-        fixed: what does not change of rays: `Ray`, `Track`, and the visitor's `given`.
+        fixed: constants of rays: `Ray`, `Track`, and the visitor's `constants`.
         skips, shifts: as for `march_rays`.
     """
 
@@ -140,13 +140,13 @@ class Job(NamedTuple):
 
     @property
     def rules(self) -> CellRules:
-        """Those of the march."""
+        """The rules of the march."""
         rules: Any = self.scene.march
         return rules
 
 
 def alive(at: Progress) -> Bool[Array, "*rays"]:
-    """Rays that are not finished, and may take more samples."""
+    """True for rays that are not finished, and may take more samples."""
     return ~at.finished & (at.index < at.track.until)
 
 
@@ -164,61 +164,62 @@ def march_rays(
     """Marches rays to their ends.
 
     Args:
-        scene: prepared, with the `rules` of its march in the march's place.
-        rays: of shape (groups, rays in a group); equally many groups in a row make up a beam.
-        start: where they are.
-        skips: where their beams see nothing, if that is known.
+        scene: the prepared scene, with the `rules` of its march as `march`.
+        rays: rays of shape (groups, rays in a group); `GROUPS_OF_BEAM` successive groups form a beam.
+        start: progress of the rays.
+        skips: empty stretches along the beams, if known.
+        visitor: visitor of all samples.
         record: whether to record the range of each ray's visible cells.
-        shifts: whether rays find on their way where they shift.
+        shifts: whether the march finds the shifts of rays.
     """
-    if shifts:  # a cell at a time, since those behind a transparent one lie elsewhere
+    if shifts:  # one cell at a time, since the cells behind a transparent one are shifted
         tiling = tiling._replace(cells=1)
-    given, carry, sums, total = None, None, None, None
+    constants, carry, sums, total = None, None, None, None
     if visitor is not None:
-        given, carry, sums, total = visitor.given, visitor.carry, visitor.sums, visitor.total
+        constants, carry, sums, total = visitor.constants, visitor.carry, visitor.sums, visitor.total
     track, shifted = start.track, None
     if shifts:
         track, shifted = with_fields(track, shifted=None), track.shifted
     range_ = CellRange.none(start.index.shape) if record else None
-    fixed = rays, track, given
+    fixed = rays, track, constants
     lanes = Lanes(start.index, start.composite, start.stats, start.finished, shifted, range_, carry, sums)
     lanes, total = varying((lanes, total), rays)
     job = Job(scene, tiling, fixed, visitor, skips, shifts)
-    going = jnp.any(alive(start), axis=-1)
-    packed, total = _march_all(job, Layout.of(lanes).pack(lanes), total, going)
+    living = jnp.any(alive(start), axis=-1)
+    packed, total = _march_all(job, Layout.of(lanes).pack(lanes), total, living)
     return Marched(packed, track, total)
 
 
 def _progress(lanes: Lanes, track: Track) -> Progress:
-    """Where one ray is."""
+    """The progress of one ray."""
     if lanes.shifted is not None:
         track = with_fields(track, shifted=lanes.shifted)
     return Progress(lanes.index, lanes.composite, lanes.stats, lanes.finished, track)
 
 
 def _march_all(
-    job: Job, lanes: Packed, total: PyTree, going: Bool[Array, " groups"]
+    job: Job, lanes: Packed, total: PyTree, living: Bool[Array, " groups"]
 ) -> tuple[Packed, PyTree]:
-    """Marches groups for as long as any of their rays is alive, in rounds of batches."""
+    """Marches groups in rounds of batches, until no ray is alive."""
     size = job.tiling.batch_of(job.groups)
     enough = int(job.tiling.min_alive * size)
 
-    def round_(state: Any) -> Any:
-        # of floats, which XLA adds with SIMD
+    def round_(state: PyTree) -> PyTree:
+        # as floats, which XLA adds with SIMD
         rows, count = in_front(state[2]), jnp.sum(state[2].astype(jnp.float32)).astype(jnp.int32)
-        # only full batches, as long as there are any: what remains joins those of the next round
+        # only full batches, if any: the remaining groups join the next round
         batches = 1 if job.tiling.turns else jnp.maximum(count // size, 1)
         keep = jnp.where(count > size, enough, 0)
 
-        def one(i: Int[Array, ""], state: Any) -> Any:
-            packed, total, going = state
-            some = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
-            packed, total, living = _march_batch(job, some, packed, total, keep)
-            return packed, total, going.at[some].set(living, mode="drop", unique_indices=True)
+        def one(i: Int[Array, ""], state: PyTree) -> PyTree:
+            packed, total, living = state
+            batch = jax.lax.dynamic_slice_in_dim(rows, i * size, size)
+            packed, total, living_batch = _march_batch(job, batch, packed, total, keep)
+            return packed, total, living.at[batch].set(living_batch, mode="drop", unique_indices=True)
 
         return jax.lax.fori_loop(0, batches, one, state)
 
-    start = lanes, total, going
+    start = lanes, total, living
     packed, total, _ = jax.lax.while_loop(lambda state: jnp.any(state[2]), round_, start)
     return packed, total
 
@@ -226,37 +227,35 @@ def _march_all(
 def _march_batch(
     job: Job, rows: Int[Array, " batch"], packed: Packed, total: PyTree, keep: Int[Array, ""]
 ) -> tuple[Packed, PyTree, Bool[Array, " batch"]]:
-    """Marches the groups in these rows by `Tiling.turns` segments, or else while more than `keep` of them are
-    alive, and tells which still are. A row past the last one stands for no group."""
+    """Marches the groups in these rows by `Tiling.turns` segments, or while more than `keep` are alive, and
+    returns which are still alive. A row past the last group is padding."""
     tiling, group = job.tiling, job.tiling.group
     known = jnp.minimum(rows, job.groups - 1)
     beam = jnp.repeat(known // GROUPS_OF_BEAM, group)
     lanes = packed.take(known).tree
 
     def take(leaf: Array) -> Array:
-        # from each array by itself: to join those of all rays would take longer
+        # from each array separately: packing the arrays of all rays would take longer
         return gather(leaf, known).reshape(-1, *leaf.shape[2:])
 
-    taken = jax.tree.map(take, job.fixed)
-    none = jnp.repeat(rows >= job.groups, group)
-    lanes = with_fields(lanes, finished=lanes.finished | none)
+    rays, track, constants = jax.tree.map(take, job.fixed)
+    padding = jnp.repeat(rows >= job.groups, group)
+    lanes = with_fields(lanes, finished=lanes.finished | padding)
 
     def living(lanes: Lanes) -> Bool[Array, " batch"]:
-        _, track, _ = taken
-        rays = ~lanes.finished & (lanes.index < track.until)
-        # XLA finds the maximum of floats with SIMD, but looks at one truth value after the other
-        return jnp.max(rays.astype(jnp.float32).reshape(-1, group), axis=-1) > 0
+        active = ~lanes.finished & (lanes.index < track.until)
+        # XLA reduces floats with SIMD, booleans one by one
+        return jnp.max(active.astype(jnp.float32).reshape(-1, group), axis=-1) > 0
 
     def advance(state: tuple[Lanes, PyTree]) -> tuple[Lanes, PyTree]:
         lanes, total = state
-        rays, track, given = taken
-        here = _to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
-        after, samples = march_segment(job.scene, tiling, rays, here, shifts=job.shifts)
+        at = _to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
+        after, samples = march_segment(job.scene, tiling, rays, at, shifts=job.shifts)
         carry, sums = lanes.carry, lanes.sums
         if job.visitor is not None:
-            carry, found, total = job.visitor.visit(samples.ray, here, samples, given, carry, total)
-            sums = jax.tree.map(jnp.add, sums, found)
-        range_ = None if lanes.range is None else lanes.range.widened(here, samples)
+            carry, terms, total = job.visitor.visit(samples.ray, at, samples, constants, carry, total)
+            sums = jax.tree.map(jnp.add, sums, terms)
+        range_ = None if lanes.range is None else lanes.range.widened(at, samples)
         shifted = after.track.shifted if job.shifts else None
         moved = after.index, after.composite, after.stats, after.finished, shifted
         return Lanes(*moved, range_, carry, sums), total
@@ -274,32 +273,31 @@ def _march_batch(
     return packed.put(rows, lanes), total, living(lanes)
 
 
-def blinded(skips: Skips | None, at: Progress) -> Progress:
-    """Finishes the rays of beams along which nothing is visible."""
+def finish_blind(skips: Skips | None, at: Progress) -> Progress:
+    """Finishes the rays of beams without visible cells."""
     if skips is None:
         return at
     groups = at.finished.shape[0]
-    seen = jnp.broadcast_to(skips.any_visible(), (groups // GROUPS_OF_BEAM,))
-    return with_fields(at, finished=at.finished | ~jnp.repeat(seen, GROUPS_OF_BEAM)[:, None])
+    visible = jnp.broadcast_to(skips.any_visible(), (groups // GROUPS_OF_BEAM,))
+    return with_fields(at, finished=at.finished | ~jnp.repeat(visible, GROUPS_OF_BEAM)[:, None])
 
 
 def into_range(scene: Scene, rays: Ray, at: Progress, range_: CellRange, *, shifts: bool = False) -> Progress:
-    """Moves rays to the first cell of their range, in front of which all cells are transparent. They take no
-    cell behind its last one."""
+    """Moves rays over transparent cells to the first cell of their range, and limits them to its last one."""
     first, until = range_
     at = eqx.tree_at(lambda at: at.track.until, at, jnp.minimum(until, at.track.until))
-    # of rays that see nothing, `first` is no index
+    # `first` of an empty range is no index
     steps = jnp.where(first < until, jnp.maximum(first - at.index, 0), 0)
     return vmap_rays(partial(_moved, scene.march, transparent=_clear(shifts)))(rays, at, steps)
 
 
 def _clear(shifts: bool) -> Bool[Array, ""] | None:
-    """What `move` is told of transparent cells."""
+    """The argument `transparent` of `move`, for transparent cells."""
     return jnp.ones((), bool) if shifts else None
 
 
-def _moved(march: Any, ray: Ray, at: Progress, steps: Int[Array, ""], *, transparent: Any) -> Progress:
-    """Moves a ray on by so many steps, whose cells are all transparent. `transparent`: as for `move`."""
+def _moved(march: Any, ray: Ray, at: Progress, steps: Int[Array, ""], *, transparent: PyTree) -> Progress:
+    """Moves a ray over `steps` transparent cells. `transparent`: as for `move`."""
     moved = move(march, ray, at, transparent, steps)
     return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
@@ -313,11 +311,10 @@ def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) 
 
 
 def _leap(march: CellRules, skip_to: Callable[..., Array], rays: Ray, at: Progress) -> Int[Array, " rays"]:
-    """Steps to the first cell that is not proven empty. Where there is none, they end past the exit."""
-    here = front(march, at)
-    there = skip_to(rays, here)
-    whole = jnp.floor((jnp.minimum(there, rays.length + march.step) - here) / march.step - 1e-3)
-    left = jnp.maximum(at.track.until - at.index, 0)
-    # clipped before it becomes an integer, whose range it may exceed
-    steps = jnp.clip(whole, 0, left.astype(whole.dtype)).astype(left.dtype)
-    return jnp.minimum(steps, left)
+    """Number of steps to the first cell that is not proven empty, or past the exit without one."""
+    depth = front(march, at)
+    target = jnp.minimum(skip_to(rays, depth), rays.length + march.step)
+    steps = jnp.floor((target - depth) / march.step - 1e-3)
+    limit = jnp.maximum(at.track.until - at.index, 0)
+    # clipped as a float, since it may exceed the range of integers
+    return jnp.minimum(jnp.clip(steps, 0, limit.astype(steps.dtype)).astype(limit.dtype), limit)

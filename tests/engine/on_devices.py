@@ -102,7 +102,7 @@ def balance(_: Any):
         "a ball": np.hypot(x - 200, y - 270) < 60,
     }
     for name, seen in objects.items():
-        _, dealt, place = devices.dealt_rays(around(blocks(), (512, 512)), Tiling(), 8)
+        _, dealt, place = devices.shard_rays(around(blocks(), (512, 512)), Tiling(), 8)
         np.testing.assert_array_equal(dealt[place], np.arange(seen.size))
         counts = seen.reshape(-1)[dealt].reshape(8, -1).sum(axis=1)
         assert counts.sum() == seen.sum()

@@ -116,10 +116,10 @@ BOX = np.zeros((5, 5, 5), np.float32)
 @pytest.mark.parametrize(
     ("volume", "message"),
     [
-        (lambda data: jv.Volume(data, field=Nearest()), 'with the field Nearest, .* pass adjoint="direct"'),
+        (lambda data: jv.Volume(data, field=Nearest()), 'field: Nearest reads .* Pass adjoint="direct"'),
         (
             lambda data: jv.Volume(BOX, field=Both(jv.Volume(data))),
-            "with the field Both, which reads them other",
+            "field: Both reads voxels without interpolation",
         ),
         (
             lambda data: jv.Volume(BOX, field=Looped(jv.Volume(data))),

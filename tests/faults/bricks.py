@@ -36,7 +36,7 @@ def _only(brick: int, empty: Any) -> Any:
 FAULTS = [
     Fault(
         "devices: each ray of a beam that is not full is taken for another",
-        "engine.devices:dealt_rays",
+        "engine.devices:shard_rays",
         lambda dealt: lambda *given: (*dealt(*given)[:2], dealt(*given)[2][::-1]),
         (DEVICES,),
     ),
