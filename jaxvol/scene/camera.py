@@ -37,6 +37,9 @@ from .volume import Volume
 Size: TypeAlias = Sequence[SupportsIndex] | int
 """(width, height) of an image in pixels, or the side of a square one."""
 
+Index: TypeAlias = SupportsIndex | Array
+Coordinate: TypeAlias = Num[Array, ""] | float
+
 
 class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
@@ -206,15 +209,13 @@ class Camera(eqx.Module):
         parallel: bool = False,
     ) -> "Camera":
         """The camera of an X-ray machine, such as a C-arm: a flat detector seen from the source.
-        Differentiable with respect to the geometry. Rays continue behind the detector; `render(until=)` can
-        end them.
+        Differentiable with respect to the geometry. Rays continue behind it; `render(until=)` ends them.
 
         Args:
             source: world position of the focal spot.
             center: world position of the middle of the detector.
             right: direction in which the image's columns count up, of any length.
-            down: direction in which its rows count up, perpendicular to `right`. The detector may be seen
-                from behind.
+            down: direction in which its rows count up, perpendicular to `right`; it may be seen from behind.
             pixel_pitch: distance between pixels, world length; or (along `right`, along `down`).
             size: (width, height) of the detector in pixels.
             parallel: whether rays run perpendicular to the detector, from the plane through `source`.
@@ -237,13 +238,7 @@ class Camera(eqx.Module):
         scale = 1 if parallel else None
         return cls(*place, view_angle=90, size=size, window=window, parallel_scale=scale)
 
-    def crop(
-        self,
-        left: SupportsIndex | Array,
-        top: SupportsIndex | Array,
-        width: SupportsIndex,
-        height: SupportsIndex,
-    ) -> "Camera":
+    def crop(self, left: Index, top: Index, width: SupportsIndex, height: SupportsIndex) -> "Camera":
         """A camera that renders a rectangle of the image: the same pixels, jitter included, except that the
         rounding of `window` turns rays by 1e-7 in float32. For 256³ voxels and a hard edge of the transfer
         function, that changes up to one pixel in fifty by 2e-5 to 1e-3. Where it decides whether a sample is
@@ -283,8 +278,7 @@ class Camera(eqx.Module):
 
         Args:
             factor: magnification of the image, > 0.
-            center: point that moves to the image's center, in fractions of width and height from the top
-                left.
+            center: the image's new center, in fractions of width and height from the top left.
         """
         factor = number("zoom factor", factor, above=0)
         window = _zoomed(*in_numpy(self.window, factor, finite_array("center", center, (2,))))
@@ -296,19 +290,17 @@ class Camera(eqx.Module):
         height = self.view_angle if self.parallel_scale is None else self.parallel_scale
         return _is_valid(height, self.parallel_scale is None, self.view_up, self.focal_point - self.position)
 
-    def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
+    def ray(self, column: Coordinate, row: Coordinate) -> tuple[Vec3, Vec3]:
         """Origin and unit direction of one pixel's ray; fractional pixels give rays in between."""
         return self.ray_from(None, column, row)
 
-    def ray_from(
-        self, anchor: Vec3 | None, column: Num[Array, ""] | float, row: Num[Array, ""] | float
-    ) -> tuple[Vec3, Vec3]:
+    def ray_from(self, anchor: Vec3 | None, column: Coordinate, row: Coordinate) -> tuple[Vec3, Vec3]:
         """Origin, relative to `anchor`, and unit direction of one pixel's ray."""
         offset, direction = self.beside(column, row)
         place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
         return place if offset is None else plus(place, offset), direction
 
-    def beside(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3 | None, Vec3]:
+    def beside(self, column: Coordinate, row: Coordinate) -> tuple[Vec3 | None, Vec3]:
         """Offset of a ray's origin from the camera's position, None in perspective; and unit direction."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._util import piecewise_linear as linear
-from .._util.checks import Arrayable, described, finite_array, flag, integer, require
+from .._util.checks import Arrayable, described, flag, integer, not_negative
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
@@ -87,9 +87,7 @@ class LabelTransferFunction(Transfer):
         """
         result = self.opacity
         for label, factor in self._changes("opacity", opacity):
-            name = f"opacity[{label}]"
-            factor = finite_array(name, factor, ())
-            factor = require(factor, lambda f: f >= 0, f"{name} must be at least 0; got {{got}}.")
+            factor = not_negative(f"opacity[{label}]", factor)
             result = result.at[label].set(factor.astype(result.dtype))
         return eqx.tree_at(lambda transfer: transfer.opacity, self, result)
 
@@ -145,7 +143,7 @@ class LabelTransferFunction(Transfer):
         tables = jax.vmap(table_of)(self._effective)
         hidden, count, rows = tables.shape[0] - 1, tables.shape[1], tables.reshape(-1, tables.shape[2])
 
-        def table(label: Scalar) -> tuple[Array, Any]:
+        def table(label: Array) -> tuple[Array, Any]:
             label = jnp.where((label < 0) | (label > hidden), hidden, label)
             return gather(self.stacked.values, label), lambda row: linear.table_row(rows, label * count + row)
 

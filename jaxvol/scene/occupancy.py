@@ -194,17 +194,12 @@ class Occupancy(eqx.Module):
 def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Array]:
     """Distances in a plane from those of the previous plane, with diagonal steps along the axes `across`."""
     for axis in across:
-        before = _with_both_sides(before, axis)
+        widths, n = [(1, 1) if i == axis else (0, 0) for i in range(plane.ndim)], plane.shape[axis]
+        padded = jnp.pad(before, widths, constant_values=FARTHEST)
+        sides = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
+        before = reduce(jnp.minimum, sides, before)
     plane = jnp.minimum(plane, jnp.minimum(before, FARTHEST - 2) + jnp.uint8(1))
     return plane, plane
-
-
-def _with_both_sides(plane: Array, axis: int) -> Array:
-    """The least distance of each cell and the two next to it along an axis."""
-    around, n = [(1, 1) if i == axis else (0, 0) for i in range(plane.ndim)], plane.shape[axis]
-    padded = jnp.pad(plane, around, constant_values=FARTHEST)
-    before, after = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
-    return jnp.minimum(jnp.minimum(plane, before), after)
 
 
 @cache
@@ -214,18 +209,15 @@ def _for(side: int, compute: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _ranges(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
-    low, high = widened(*extremes(data, side))
-    return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
+    return widened(*_extremes(data, side))
 
 
 def _ranges_in_numpy(data: Shaped[np.ndarray, "nx ny nz *c"], side: int) -> tuple[np.ndarray, np.ndarray]:
     low, high = (over_blocks(data, combine, side=side) for combine in (np.minimum, np.maximum))
-    low, high = _widened(low, high, np)
-    return (low, high) if data.ndim == 3 else (np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0))
+    return _widened(low, high, np)
 
 
-@partial(jax.jit, static_argnums=1)
-def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Array, Array]:
+def _extremes(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
     """Least and greatest node of each block; NaN where a node is NaN."""
 
     def ends_of(nodes: Array) -> tuple[Array, Array]:
@@ -245,16 +237,15 @@ def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Arr
     return low, high
 
 
-@jax.jit
-def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"]) -> tuple[Array, Array]:
-    """Ranges of the values interpolated between nodes, from those of the nodes."""
-    return _widened(low, high, jnp)
-
-
 def _widened(low: Any, high: Any, xp: Any) -> tuple[Any, Any]:
+    """Ranges of interpolated values, channels first, from those of the nodes."""
     low, high = low.astype(np.float32), high.astype(np.float32)
     slack = ROUNDING * xp.maximum(abs(low), abs(high))
-    return low - slack, high + slack
+    low, high = low - slack, high + slack
+    return (low, high) if low.ndim == 3 else (xp.moveaxis(low, -1, 0), xp.moveaxis(high, -1, 0))
+
+
+widened = jax.jit(partial(_widened, xp=jnp))
 
 
 def _slope_ranges(data: Shaped[Array, "nx ny nz"], side: int) -> tuple[Array, Array, Array]:

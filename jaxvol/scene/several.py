@@ -27,9 +27,8 @@ ROUNDING = 1e-3
 
 
 def together(volume: object, transfer: object) -> tuple[Any, Any]:
-    """Combine lists of volumes and transfer functions into one of each; other arguments stay unchanged. A
-    transfer function per voxel takes the voxel size of its volume. **Raises** `ValueError` for lists with
-    other entries or different lengths."""
+    """Combine lists of volumes and transfer functions into one of each, with extinctions in world length.
+    **Raises** `ValueError` for lists with other entries or of different lengths."""
     if (pairs := pairs_of(volume, transfer)) is None:
         return volume, sized(transfer, volume)
     volumes, transfers = zip(*pairs, strict=True)
@@ -45,10 +44,8 @@ def pairs_of(volume: object, transfer: object) -> list[tuple[Volume, Transfer]] 
         return None
     volumes, transfers = _entries("volume", volume, Volume), _entries("transfer", transfer, Transfer)
     if len(volumes) != len(transfers):
-        raise ValueError(
-            "volume and transfer must have the same number of entries; "
-            f"got {len(volumes)} and {len(transfers)}."
-        )
+        got = f"got {len(volumes)} and {len(transfers)}"
+        raise ValueError(f"volume and transfer must have the same number of entries; {got}.")
     pairs = list(zip(volumes, transfers, strict=True))
     for k, (grid, function) in enumerate(pairs):
         if function.channels not in (None, grid.channels):
@@ -168,6 +165,7 @@ class SeveralBlocks(eqx.Module):
     """The bounding grid of `together`, without values."""
     grids: list[Volume]
     """The grids of the volumes, without values."""
+    side: int = eqx.field(static=True, default=BLOCK)
 
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False) -> "SeveralBlocks":
@@ -175,11 +173,6 @@ class SeveralBlocks(eqx.Module):
         volumes = volume.field.volumes
         parts = [Blocks.of(part, slopes=slopes) for part in volumes]
         return cls(parts, _empty(volume), list(map(_empty, volumes)))
-
-    @property
-    def side(self) -> int:
-        """Cells along the side of a block, as in `Blocks`."""
-        return BLOCK
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -80,8 +80,7 @@ class Space(eqx.Module):
         return ()
 
     def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
-        """Entry and exit depth of the line for each volume of a group, () for one volume. On a miss,
-        exit < entry."""
+        """Entry and exit depth for each volume of a group, () for one volume. On a miss, exit < entry."""
         return ()
 
     @abstractmethod
@@ -110,9 +109,8 @@ class Space(eqx.Module):
 
 
 class Line(NamedTuple):
-    """A ray before it is clipped to the volume: origin, unit direction, (column, row), end distance, and
-    `beside`, an offset added after the origin was made relative to the volume; float32 would lose it in world
-    coordinates."""
+    """A ray before it is clipped to the volume: origin, unit direction, (column, row), end distance, and an
+    offset `beside` of the origin, added relative to the volume, since float32 would lose it in the world."""
 
     origin: Vec3
     direction: Vec3
@@ -149,13 +147,10 @@ class Ray(eqx.Module):
 
     def contains(self, depth: Scalar) -> Bool[Array, "..."]:
         """True where a depth is sampled inside the volume: neither past the end nor in a gap."""
-        return (depth < self.end) & ~self.in_gap(depth)
-
-    def in_gap(self, depth: Scalar) -> Bool[Array, "..."]:
-        within = jnp.zeros(jnp.shape(depth), bool)
+        inside = depth < self.end
         for begin, end in self.gaps:
-            within |= (depth >= begin) & (depth < end)
-        return within
+            inside &= ~((depth >= begin) & (depth < end))
+        return inside
 
 
 def enter(

@@ -204,7 +204,7 @@ class TransferFunction(Transfer):
     per_voxel: bool = eqx.field(static=True)
 
     def __init__(
-        self, values: Arrayable, colors: Arrayable, extinction: Arrayable, *, per_voxel: bool = False
+        self, values: Arrayable, colors: Arrayable, extinction: Arrayable, *, per_voxel: bool | Any = False
     ):
         self.per_voxel = flag("per_voxel", per_voxel)
         self.values = increasing("values", values)

@@ -273,8 +273,7 @@ class Volume(eqx.Module):
         return value if isinstance(value, tuple) else (value,)
 
     def interpolated(self, coordinate: Vec3) -> Voxel:
-        """Trilinear interpolation of the voxels at a grid coordinate, in its float type; a tuple for several
-        channels."""
+        """Trilinear interpolation of the voxels, or a tuple of channels, at a grid coordinate."""
         return self.fetch.interpolated(self.data, coordinate)
 
     def gradient(self, coordinate: Vec3) -> Vec3:
@@ -377,14 +376,11 @@ def part_of(
 
 def read_as(volume: Volume, *fetches: Fetch | None) -> Volume:
     """The volume with new fetches of its `grids`, in the same windows; None keeps the old one."""
-
-    def in_window(grid: Volume, fetch: Fetch | None) -> Fetch:
-        if fetch is None:
-            return grid.fetch
-        window = grid.fetch.window
-        return eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=is_none)
-
-    return with_fetches(volume, [in_window(*pair) for pair in zip(grids(volume), fetches, strict=True)])
+    windowed = [
+        old if new is None else eqx.tree_at(lambda f: f.window, new, old.window, is_leaf=is_none)
+        for old, new in zip(fetches_of(volume), fetches, strict=True)
+    ]
+    return with_fetches(volume, windowed)
 
 
 def with_fetches(volume: Volume, fetches: list[Fetch]) -> Volume:
