@@ -1,1 +1,1 @@
-"""What is looked at: volumes, transfer functions, cameras, and what a render returns."""
+"""The scene: volumes, transfer functions, cameras, and the result of a render."""

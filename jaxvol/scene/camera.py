@@ -1,12 +1,14 @@
-"""Which ray belongs to a pixel?
+"""Cameras and other sources of rays: origin and direction of each pixel's ray.
 
 Names and conventions are those of VTK and PyVista: `view_angle` and `parallel_scale` measure the height of
 the view. Pixel (0, 0) is at the top left; a pixel's ray passes through its center.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from types import ModuleType
+from typing import Any, SupportsIndex, TypeAlias
 
 import equinox as eqx
 import jax
@@ -32,28 +34,35 @@ from .space import Line
 from .volume import Volume
 
 
+Size: TypeAlias = Sequence[SupportsIndex] | int
+"""(width, height) of an image in pixels, or the side of a square one."""
+
+Index: TypeAlias = SupportsIndex | Array
+Coordinate: TypeAlias = Num[Array, ""] | float
+
+
 class Camera(eqx.Module):
     """A pinhole camera, or an orthographic one if `parallel_scale` is given.
 
     Args:
-        position: world position, rounded as all numbers here to the type of the others (float32 has steps of
-            half a metre at 5 846 925 m). It may lie inside a volume (endoscopy); nothing behind it is
-            visible. On a face of the volume the image has a kink: the gradient is, pixel by pixel, that of
-            one side, and so it is where rays run along planes of voxels.
+        position: world position, in JAX's default float type (float32 has steps of half a metre at
+            5 846 925 m). It may lie inside a volume (endoscopy); nothing behind it is visible. On a face of
+            the volume the image has a kink, and the gradient of a pixel is one-sided; so it is where rays
+            run along planes of voxels.
         focal_point: world point at the center of the image.
         view_up: direction that points up in the image; not parallel to the view direction.
         view_angle: angle between the lower and the upper edge of the image, degrees, in (0, 180).
         parallel_scale: half the height of the view, in world length. Makes the camera orthographic, with ray
             origins in the plane through `position`.
         size: (width, height) of the image in pixels; one number is a square.
-        window: (left, right, bottom, top) of what is shown of the image plane, relative to its center, in
-            half heights of the whole view; by default all of it. Set by `crop` and `zoom`.
-        corner: (column, row) of the first pixel in the image that this one was cropped from, so that its
-            pixels keep their random numbers; by default (0, 0). Set by `crop`.
+        window: (left, right, bottom, top) of the visible rectangle of the image plane, relative to its
+            center, in half heights of the full view; by default the full view. Set by `crop` and `zoom`.
+        corner: (column, row) of the first pixel in the uncropped image, so that pixels of a crop keep their
+            random numbers; by default (0, 0). Set by `crop`.
 
     Raises:
         ValueError: for a camera at its focal point, a `view_up` along the view direction, an angle, scale or
-            size out of range, and coordinates from 1e18 on (in float32).
+            size out of range, and coordinates of 1e18 or more (in float32).
     """
 
     position: Float[Array, "3"]
@@ -73,7 +82,7 @@ class Camera(eqx.Module):
         view_up: Arrayable = (0.0, 1.0, 0.0),
         view_angle: Arrayable = 30.0,
         *,
-        size: tuple[int, int] | Any = (512, 512),
+        size: Size = (512, 512),
         parallel_scale: Arrayable | None = None,
         window: Arrayable | None = None,
         corner: Arrayable | None = None,
@@ -82,13 +91,13 @@ class Camera(eqx.Module):
         self.focal_point = _moderate("focal_point", finite_array("focal_point", focal_point, (3,)))
         self.position = require(
             _moderate("position", finite_array("position", position, (3,))),
-            lambda here, there: (here != there).any(),
+            lambda position, focal: (position != focal).any(),
             "position must differ from focal_point; got {got} for both.",
             self.focal_point,
         )
         self.view_up = require(
             finite_array("view_up", view_up, (3,)),
-            lambda up, here, there: _sine(up, there - here) > 1e-6,
+            lambda up, position, focal: _sine(up, focal - position) > 1e-6,
             "view_up must not be zero or point along the view; got {got}.",
             self.position,
             self.focal_point,
@@ -97,39 +106,39 @@ class Camera(eqx.Module):
         self.parallel_scale = None
         if parallel_scale is not None:
             self.parallel_scale = number("parallel_scale", parallel_scale, above=0)
-        whole = (-width / height, width / height, -1.0, 1.0)
-        self.window = finite_array("window", whole if window is None else window, (4,))
+        window = (-width / height, width / height, -1.0, 1.0) if window is None else window
+        self.window = finite_array("window", window, (4,))
         self.corner = finite_array("corner", (0.0, 0.0) if corner is None else corner, (2,))
 
     def __repr__(self) -> str:
         aspect = self.size[0] / self.size[1]
         usual: dict[str, Any] = {"parallel_scale": None, "window": (-aspect, aspect, -1, 1), "corner": (0, 0)}
-        told: list[str] = []
+        arguments: list[str] = []
         for name in ("position", "focal_point", "view_up", "view_angle", *usual):
-            given, expected = getattr(self, name), usual.get(name)
-            is_usual = expected is not None and is_concrete(given) and np.allclose(given, expected)
-            told += [] if is_usual or given is None else [f"{name}={pasted(given)}"]
-        return f"Camera({', '.join(told)}, size={self.size})"
+            value, expected = getattr(self, name), usual.get(name)
+            is_usual = expected is not None and is_concrete(value) and np.allclose(value, expected)
+            arguments += [] if is_usual or value is None else [f"{name}={pasted(value)}"]
+        return f"Camera({', '.join(arguments)}, size={self.size})"
 
     @classmethod
     def looking_at(
         cls,
-        volume: Volume | Any,
+        volume: Volume,
         direction: Arrayable = (0.5, -1.0, 0.4),
         view_up: Arrayable = (0.0, 0.0, 1.0),
         view_angle: Arrayable = 30.0,
         *,
-        parallel: bool | Any = False,
-        size: tuple[int, int] | Any = (512, 512),
+        parallel: bool = False,
+        size: Size = (512, 512),
     ) -> "Camera":
-        """A camera that sees the whole volume from the side that `direction` points to: as by VTK's
-        `ResetCamera`, its bounding sphere just fits into the view.
+        """A camera that sees the whole volume from the side that `direction` points to. As in VTK's
+        `ResetCamera`, the bounding sphere just fits into the view.
 
         Args:
-            volume: what is seen.
+            volume: the `Volume` to look at.
             direction: from the center of the volume to the camera, of any length.
             view_up: as in `Camera`. Within 0.06° of `direction`, y is used instead, or else -z.
-            view_angle: degrees. For an orthographic camera, it only sets the distance.
+            view_angle: degrees. It only sets the distance of an orthographic camera.
             parallel: whether the camera is orthographic.
             size: (width, height) of the image in pixels.
 
@@ -156,24 +165,22 @@ class Camera(eqx.Module):
         return cls(position, center, up, view_angle, size=size, parallel_scale=scale)
 
     @classmethod
-    def from_intrinsics(
-        cls, K: Arrayable, R: Arrayable, t: Arrayable, size: tuple[int, int] | Any
-    ) -> "Camera":
-        """The calibrated camera of OpenCV and COLMAP: it sees a world point x at the pixel coordinates
-        K (R x + t), divided by the third of them. Differentiable with respect to K, R and t.
+    def from_intrinsics(cls, K: Arrayable, R: Arrayable, t: Arrayable, size: Size) -> "Camera":
+        """The calibrated camera of OpenCV and COLMAP, which sees a world point x at the homogeneous pixel
+        coordinates K (R x + t). Differentiable with respect to K, R and t.
 
         Args:
             K: ((fx, 0, cx), (0, fy, cy), (0, 0, 1)) in pixels, without skew. The first pixel reaches from 0
-                to 1 and has its center at 0.5, as in COLMAP. OpenCV's `calibrateCamera` has centers at whole
-                numbers: add 0.5 to its cx and cy. Distorted images must be undistorted before.
+                to 1 and has its center at 0.5, as in COLMAP. OpenCV's `calibrateCamera` has centers at
+                integers: add 0.5 to its cx and cy. Undistort images first.
             R: (3, 3), the rotation from the world to the camera's axes: x to the right of the image, y down,
                 z forward.
-            t: (3,), the world's origin in these axes, world length.
+            t: (3,), the world's origin in the camera's axes, world length.
             size: (width, height) of the image in pixels.
 
         Raises:
-            ValueError: for another form of `K`, an `R` that is no rotation (up to 0.001), and as `Camera`
-                does.
+            ValueError: for another form of `K`, an `R` that is no rotation (up to 0.001), and the errors of
+                `Camera`.
         """
         K = require(
             finite_array("K", K, (3, 3)),
@@ -197,25 +204,25 @@ class Camera(eqx.Module):
         right: Arrayable,
         down: Arrayable,
         pixel_pitch: Arrayable,
-        size: tuple[int, int] | Any,
+        size: Size,
         *,
-        parallel: bool | Any = False,
+        parallel: bool = False,
     ) -> "Camera":
-        """The camera of an X-ray machine, a C-arm for example: a flat detector as seen from the source, with
-        gradients with respect to all of its geometry. Rays go on behind it; `render(until=)` can end them.
+        """The camera of an X-ray machine, such as a C-arm: a flat detector seen from the source.
+        Differentiable with respect to the geometry. Rays continue behind it; `render(until=)` ends them.
 
         Args:
             source: world position of the focal spot.
             center: world position of the middle of the detector.
             right: direction in which the image's columns count up, of any length.
-            down: that of its rows, perpendicular to `right`. The detector may be looked at from behind.
-            pixel_pitch: distance between pixels, world length; or those along `right` and along `down`.
+            down: direction in which its rows count up, perpendicular to `right`; it may be seen from behind.
+            pixel_pitch: distance between pixels, world length; or (along `right`, along `down`).
             size: (width, height) of the detector in pixels.
             parallel: whether rays run perpendicular to the detector, from the plane through `source`.
 
         Raises:
             ValueError: for directions that are not perpendicular (up to 0.001), a pitch that is not positive,
-                and as `Camera` does (whose position is the source).
+                and the errors of `Camera` (whose position is the source).
         """
         source, center = finite_array("source", source, (3,)), finite_array("center", center, (3,))
         right = require(
@@ -231,46 +238,47 @@ class Camera(eqx.Module):
         scale = 1 if parallel else None
         return cls(*place, view_angle=90, size=size, window=window, parallel_scale=scale)
 
-    def crop(self, left: int | Any, top: int | Any, width: int | Any, height: int | Any) -> "Camera":
-        """A camera that renders only this rectangle of the image: the same pixels, jitter included, but for
-        the rounding of `window`, which turns rays by 1e-7 in float32. Of 256³ voxels under a hard edge of the
-        transfer function, that changes up to one pixel in fifty by 2e-5 to 1e-3. Where it decides whether a
-        sample is visible, a pixel jumps: by 0.03 in ten pixels of a large volume.
+    def crop(self, left: Index, top: Index, width: SupportsIndex, height: SupportsIndex) -> "Camera":
+        """A camera that renders a rectangle of the image: the same pixels, jitter included, except that the
+        rounding of `window` turns rays by 1e-7 in float32. For 256³ voxels and a hard edge of the transfer
+        function, that changes up to one pixel in fifty by 2e-5 to 1e-3. Where it decides whether a sample is
+        visible, a pixel jumps: by 0.03 in ten pixels of a large volume.
 
         Args:
             left: column of the rectangle's first pixel.
-            top: its row. Where one of the two is traced, so that patches anywhere are one program, what lies
-                outside of the image cannot be refused: it shows what the camera would see there.
+            top: row of the rectangle's first pixel. If `left` or `top` is traced, so that all patches share
+                one program, a rectangle beyond the image is not refused: it shows the continued view.
             width: number of columns.
             height: number of rows.
 
         Raises:
-            ValueError: for a rectangle that is empty or extends beyond the image, and corners that are no
-                integers.
+            ValueError: for a rectangle that is empty or extends beyond the image, and a `left` or `top` that
+                is no integer.
         """
         width, height = integer("width", width, 1), integer("height", height, 1)
         if is_traced(left, top):
-            if not all(jnp.issubdtype(jnp.result_type(edge), jnp.integer) for edge in (left, top)):
+            column, row = jnp.asarray(left), jnp.asarray(top)
+            if not all(jnp.issubdtype(edge.dtype, jnp.integer) for edge in (column, row)):
                 got = f"got {described(left)} and {described(top)}"
                 raise ValueError(f"left and top must be integers; {got}.")
         else:
-            left, top = integer("left", left, 0), integer("top", top, 0)
-            if left + width > self.size[0] or top + height > self.size[1]:
-                got = f"got left={left}, top={top}, width={width}, height={height}"
+            column, row = integer("left", left, 0), integer("top", top, 0)
+            if column + width > self.size[0] or row + height > self.size[1]:
+                got = f"got left={column}, top={row}, width={width}, height={height}"
                 raise ValueError(f"crop must be a rectangle inside the image of {self.size} pixels; {got}.")
-        x = [self._column(edge) for edge in (left, left + width)]
-        y = [self._row(edge) for edge in (top + height, top)]
+        x = [self._column(edge) for edge in (column, column + width)]
+        y = [self._row(edge) for edge in (row + height, row)]
         camera = replace(self, window=jnp.stack([*x, *y]), size=(width, height), corner=None)
-        corner = self.corner + jnp.asarray([left, top], self.corner.dtype)
+        corner = self.corner + jnp.asarray([column, row], self.corner.dtype)
         return eqx.tree_at(lambda camera: camera.corner, camera, corner)
 
-    def zoom(self, factor: Arrayable, center: tuple[Any, Any] = (0.5, 0.5)) -> "Camera":
+    def zoom(self, factor: Arrayable, center: Arrayable = (0.5, 0.5)) -> "Camera":
         """A camera that shows 1/`factor` of the view's width and height at the same image size, in the same
-        perspective. Its `corner` is (0, 0): a crop that is zoomed is an image of its own.
+        perspective. Its `corner` is (0, 0): a zoomed crop is a new image.
 
         Args:
-            factor: by which the image is magnified, > 0.
-            center: what becomes the image's center, in fractions of width and height from the top left.
+            factor: magnification of the image, > 0.
+            center: the image's new center, in fractions of width and height from the top left.
         """
         factor = number("zoom factor", factor, above=0)
         window = _zoomed(*in_numpy(self.window, factor, finite_array("center", center, (2,))))
@@ -278,23 +286,22 @@ class Camera(eqx.Module):
 
     @property
     def valid(self) -> Any:
-        """Whether angle, scale and `view_up`, which may be traced, are such as the constructor accepts; else
-        all rays are NaN."""
+        """True if angle, scale and `view_up` are as the constructor requires; else all rays are NaN."""
         height = self.view_angle if self.parallel_scale is None else self.parallel_scale
         return _is_valid(height, self.parallel_scale is None, self.view_up, self.focal_point - self.position)
 
-    def ray(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3, Vec3]:
-        """Origin and unit direction of one pixel's ray; fractional pixels give the rays between."""
+    def ray(self, column: Coordinate, row: Coordinate) -> tuple[Vec3, Vec3]:
+        """Origin and unit direction of one pixel's ray; fractional pixels give rays in between."""
         return self.ray_from(None, column, row)
 
-    def ray_from(self, anchor: Vec3 | None, column: Any, row: Any) -> tuple[Vec3, Vec3]:
-        """As `ray`, with an origin that counts from `anchor`."""
-        beside, direction = self.beside(column, row)
+    def ray_from(self, anchor: Vec3 | None, column: Coordinate, row: Coordinate) -> tuple[Vec3, Vec3]:
+        """Origin, relative to `anchor`, and unit direction of one pixel's ray."""
+        offset, direction = self.beside(column, row)
         place = apart(self.position) if anchor is None else minus(apart(self.position), anchor)
-        return place if beside is None else plus(place, beside), direction
+        return place if offset is None else plus(place, offset), direction
 
-    def beside(self, column: Num[Array, ""] | float, row: Num[Array, ""] | float) -> tuple[Vec3 | None, Vec3]:
-        """How far beside the position a pixel's ray begins, if not there, and its unit direction."""
+    def beside(self, column: Coordinate, row: Coordinate) -> tuple[Vec3 | None, Vec3]:
+        """Offset of a ray's origin from the camera's position, None in perspective; and unit direction."""
         dtype = self.position.dtype
         column, row = jnp.asarray(column, dtype), jnp.asarray(row, dtype)
         x, y = self._column(column + 0.5), self._row(row + 0.5)
@@ -310,19 +317,19 @@ class Camera(eqx.Module):
         norm = jnp.sqrt(dx * dx + dy * dy + dz * dz)
         return None, (dx / norm, dy / norm, dz / norm)
 
-    def point(self, column: Any, row: Any, depth: Any) -> Float[Array, "*pixels 3"]:
-        """The world point at a distance along a pixel's ray, as when something is picked:
-        `camera.point(column, row, rendering.depth[row, column])`; of arrays, an array of points.
+    def point(self, column: Arrayable, row: Arrayable, depth: Arrayable) -> Float[Array, "*pixels 3"]:
+        """The world point at a distance along a pixel's ray, to pick what is visible there:
+        `camera.point(column, row, rendering.depth[row, column])`. Arrays give an array of points.
 
         Args:
-            column: of the pixel.
-            row: of the pixel.
+            column: column of the pixel.
+            row: row of the pixel.
             depth: distance from the ray's origin.
 
         Returns:
             The point; NaN where the depth is infinite, since nothing is visible.
         """
-        return _points(self, *(jnp.asarray(each, self.position.dtype) for each in (column, row, depth)))
+        return _points(self, *(jnp.asarray(value, self.position.dtype) for value in (column, row, depth)))
 
     @eqx.filter_jit  # compiled like the renderer's rays, so that both round the same way
     def rays(self) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
@@ -335,13 +342,13 @@ class Camera(eqx.Module):
     @property
     def first_pixel(self) -> tuple[Int[Array, ""], Int[Array, ""]]:
         """`corner`, as integers."""
-        left, top = jnp.round(self.corner).astype(jnp.int32)
-        return left, top
+        column, row = jnp.round(self.corner).astype(jnp.int32)
+        return column, row
 
     def _column(self, column: Any) -> Scalar:
-        """Image-plane x of a column; whole numbers are pixel edges."""
-        left, right, _, _ = self.window
-        return left + (right - left) * (column / self.size[0])
+        """Image-plane x of a column; integers are pixel edges."""
+        low, high, _, _ = self.window
+        return low + (high - low) * (column / self.size[0])
 
     def _row(self, row: Any) -> Scalar:
         _, _, bottom, top = self.window
@@ -349,7 +356,7 @@ class Camera(eqx.Module):
 
 
 class GivenRays(eqx.Module):
-    """World origins and unit directions. A ray's pixel, (column, row), keys its random numbers; without
+    """World origins and unit directions. A ray's pixel, (column, row), seeds its random numbers; without
     `pixels` it is (`first` + index in the flattened array, 0)."""
 
     origins: Float[Array, "*rays 3"]
@@ -372,32 +379,32 @@ class GivenRays(eqx.Module):
 
 
 class Ending(eqx.Module):
-    """Rays that end at these distances from their origins; infinite where they go on to the exit."""
+    """Rays with end distances `until` from their origins; infinite for rays that continue to the exit."""
 
     rays: Camera | GivenRays
     until: Float[Array, "*rays"]
 
 
 class RaySubset(eqx.Module):
-    """Some rays of an image, by indices into it as it is flattened."""
+    """Selected rays of an image, by indices into the flattened image."""
 
     rays: Camera | GivenRays | Ending
     indices: Int[Array, " n"]
 
 
 def without_ends(source: Camera | GivenRays | Ending | RaySubset) -> Camera | GivenRays:
-    """Where rays come from, whether they end or not, and whether they are all."""
+    """Unwrap the camera or `GivenRays` from end distances and subsets."""
     return source if isinstance(source, Camera | GivenRays) else without_ends(source.rays)
 
 
 def finer(camera: Camera, n: int) -> Camera:
-    """The same view with n x n pixels in place of each."""
+    """The same view with n x n pixels for each pixel of `camera`."""
     width, height = camera.size
     return replace(camera, size=(n * width, n * height), corner=n * camera.corner)
 
 
-def axes_of(camera: Camera, xp: Any = jnp) -> tuple[Any, Any, Any]:
-    """Unit vectors to the right of the image, up in it, and forward: in `jax.numpy`, or in `numpy`."""
+def axes_of(camera: Camera, xp: ModuleType = jnp) -> tuple[Any, Any, Any]:
+    """Unit vectors right, up and forward of the image; `xp`: `jax.numpy` or `numpy`."""
     place = camera.focal_point, camera.position, camera.view_up
     focal, position, up = place if xp is jnp else map(np.asarray, place)
     forward = focal - position
@@ -407,40 +414,39 @@ def axes_of(camera: Camera, xp: Any = jnp) -> tuple[Any, Any, Any]:
     return right, xp.cross(right, forward), forward
 
 
-def _fitted_view(xp: Any, of: Any) -> tuple[Any, ...]:
-    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere.
-    `of`: the place of the volume, direction, up direction, view angle and aspect."""
-    (origin, spacing, turn, cells), direction, up, angle, aspect = of
+def _fitted_view(xp: Any, arguments: Any) -> tuple[Any, ...]:
+    """Position, focal point, up direction and parallel scale of the view of a volume's bounding sphere."""
+    (origin, spacing, turn, cells), direction, up, angle, aspect = arguments
     across = cells * spacing
     across = across if turn is None else (turn * across[None, :]).sum(axis=1)
     center, radius = origin + across / 2, xp.linalg.norm(across) / 2
     half = xp.arctan(xp.tan(xp.deg2rad(angle) / 2) * aspect)
     position = center + direction / xp.linalg.norm(direction) * radius / xp.sin(half)
     y, minus_z = np.array([0, 1, 0], direction.dtype), np.array([0, 0, -1], direction.dtype)
-    other = xp.where(_sine(y, direction) > 1e-3, y, minus_z)
-    up = xp.where(_sine(up, direction) > 1e-3, up, other)
+    fallback = xp.where(_sine(y, direction) > 1e-3, y, minus_z)
+    up = xp.where(_sine(up, direction) > 1e-3, up, fallback)
     return position, center, up, radius / aspect
 
 
 @eqx.filter_jit
 def _points(camera: Camera, columns: Array, rows: Array, depths: Array) -> Float[Array, "*pixels 3"]:
-    def one(column: Scalar, row: Scalar, depth: Scalar) -> Float[Array, "3"]:
+    def point_at(column: Scalar, row: Scalar, depth: Scalar) -> Float[Array, "3"]:
         point = jnp.stack(along(*camera.ray(column, row), jnp.where(jnp.isinf(depth), 0, depth)))
         return jnp.where(jnp.isinf(depth), jnp.nan, point)
 
-    return jnp.vectorize(one, signature="(),(),()->(k)")(columns, rows, depths)
+    return jnp.vectorize(point_at, signature="(),(),()->(k)")(columns, rows, depths)
 
 
 @jax.jit
 def _calibrated(k: Array, r: Array, t: Array, size: Array) -> tuple[list[Array], Array]:
     """Position, focal point and up of a calibrated camera, and its window for a view angle of 90°."""
     position = -jnp.sum(r * t[:, None], axis=0)
-    # as far away as the world's origin, since a near point would be rounded
-    away = 1 + jax.lax.stop_gradient(jnp.linalg.norm(t))
+    # as far as the world's origin, since a near point would be rounded
+    distance = 1 + jax.lax.stop_gradient(jnp.linalg.norm(t))
     focal, middle = jnp.diagonal(k)[:2], k[:2, 2]
     low, high = -middle / focal, (size - middle) / focal
     window = jnp.stack([low[0], high[0], -high[1], -low[1]])
-    return [position, position + away * r[2], -r[1]], window
+    return [position, position + distance * r[2], -r[1]], window
 
 
 @partial(jax.jit, static_argnums=6)
@@ -459,18 +465,18 @@ def _facing(
     return [source, source + distance * normal, -down], window
 
 
-def _zoomed(xp: Any, of: Any) -> Any:
-    """1/`factor` of a window. `of`: the window, factor and center."""
-    (left, right, bottom, top), factor, center = of
-    x, y = left + (right - left) * center[0], top - (top - bottom) * center[1]
-    half_x, half_y = (right - left) / 2 / factor, (top - bottom) / 2 / factor
+def _zoomed(xp: Any, arguments: Any) -> Any:
+    """1/`factor` of a window around a center; `arguments`: (window, factor, center)."""
+    (x_min, x_max, y_min, y_max), factor, center = arguments
+    x, y = x_min + (x_max - x_min) * center[0], y_max - (y_max - y_min) * center[1]
+    half_x, half_y = (x_max - x_min) / 2 / factor, (y_max - y_min) / 2 / factor
     return xp.stack([x - half_x, x + half_x, y - half_y, y + half_y])
 
 
 def _is_valid(height: Any, is_angle: bool, up: Any, forward: Any) -> Any:
     # a margin, since the constructor may round another way
-    beside = _sine(up, forward / abs(forward).max()) > 0.5e-6
-    return (height > 0) & ((height < 180) | (not is_angle)) & beside
+    has_plane = _sine(up, forward / abs(forward).max()) > 0.5e-6
+    return (height > 0) & ((height < 180) | (not is_angle)) & has_plane
 
 
 def _sine(a: Any, b: Any) -> Any:
@@ -481,30 +487,31 @@ def _sine(a: Any, b: Any) -> Any:
 
 
 def _is_rotation(r: Any) -> Any:
-    """Whether the rows of a matrix are orthonormal and right-handed, up to 0.001."""
+    """True if the rows of a matrix are orthonormal and right-handed, up to 0.001."""
     x, y, z = r
     across = [x[i - 2] * y[i - 1] - x[i - 1] * y[i - 2] - z[i] for i in range(3)]
-    off = (x * x).sum() - 1, (y * y).sum() - 1, (x * y).sum(), *across
-    return sum(each * each for each in off) < 1e-6
+    errors = (x * x).sum() - 1, (y * y).sum() - 1, (x * y).sum(), *across
+    return sum(error * error for error in errors) < 1e-6
 
 
 def _moderate(name: str, point: Float[Array, "3"]) -> Float[Array, "3"]:
-    """A point whose squared lengths do not overflow; a traced one that does makes the image NaN."""
+    """A point checked for squared lengths that do not overflow; unchecked if traced, the image is NaN."""
     if is_traced(point):
         return point
-    most = float(jnp.finfo(point.dtype).max) ** 0.5 / 16
-    message = f"{name} must have coordinates below {most:.1e}, since squares of greater ones overflow; use a "
-    return require(point, lambda p: abs(p) < most, f"{message}greater unit of length. Got {{got}}.")
+    limit = float(jnp.finfo(point.dtype).max) ** 0.5 / 16
+    message = f"{name} must have coordinates below {limit:.1e}, since squares of larger ones overflow; use a "
+    return require(point, lambda p: abs(p) < limit, f"{message}greater unit of length. Got {{got}}.")
 
 
-def image_size(size: Any) -> tuple[int, int]:
-    size = (size, size) if isinstance(size, int) and not is_flag(size) else size
+def image_size(size: Size) -> tuple[int, int]:
+    """(width, height) of an image, checked. **Raises** `ValueError` for a bad `size`."""
+    pair: Any = (size, size) if isinstance(size, int) and not is_flag(size) else size
     try:
-        width, height = (int(n) for n in size)
-        whole = (width, height) == tuple(size)
+        width, height = (int(n) for n in pair)
+        integral = (width, height) == tuple(pair)
     except (TypeError, ValueError, OverflowError):
-        width = height = whole = 0
-    if not whole or min(width, height) < 1 or width * height >= 2**31:
+        width = height = integral = 0
+    if not integral or min(width, height) < 1 or width * height >= 2**31:
         expected = "(width, height) in whole pixels, fewer than 2**31 in all and each at least 1"
-        raise ValueError(f"size must be {expected}; got {shortened(size)}.")
+        raise ValueError(f"size must be {expected}; got {shortened(pair)}.")
     return width, height

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._util import piecewise_linear as linear
-from .._util.checks import described, finite_array, flag, integer, require
+from .._util.checks import Arrayable, described, flag, integer, not_negative
 from .._util.piecewise_means import mean_by_rows
 from .._util.vec3 import Scalar, Vec3
 from ..xla.memory import gather
@@ -23,83 +23,80 @@ class LabelTransferFunction(Transfer):
     """A transfer function for each label of a segmented volume.
 
     Args:
-        functions: by label, `{1: function}`; or a sequence of those of label 0, 1, 2, …, with None for a
-            label that is not seen, as others without a function are not. Labels are 0 to 255; renumber
-            others, as `jv.load(path, labels=...)` and `np.unique(labels, return_inverse=True)` do.
+        functions: a dictionary from label to function, `{1: function}`; or a sequence of functions for the
+            labels 0, 1, 2, …. Labels with None or without a function are invisible. Labels are 0 to 255;
+            `jv.load(path, labels=...)` and `np.unique(labels, return_inverse=True)` renumber others.
 
-    The label is that of the nearest node, so it jumps along a ray, half-way between nodes, and a pixel jumps
-    where a sample crosses there: gradients with respect to camera and place do not include these jumps.
-    `AlphaCorrection(labels=True)` cuts cells there, so that nothing jumps; otherwise `"preintegrated"` takes
-    the label in the middle of a cell.
+    A sample has the label of the nearest node. Labels change half-way between nodes, and a pixel jumps where
+    a sample crosses there: gradients with respect to camera and place do not include these jumps.
+    `AlphaCorrection(labels=True)` cuts cells there, so that pixels are continuous; otherwise
+    `"preintegrated"` takes the label in the middle of a cell.
 
-    What `with_visibility` hides is leapt over. Other factors, or labels hidden and shown, compile nothing
-    again.
+    Rays leap over hidden labels (`with_visibility`). New factors and visibilities do not recompile.
 
     Raises:
-        ValueError: for no function at all, something that is none, and labels out of range; and when
+        ValueError: for no function, an entry that is no `TransferFunction`, and labels out of range; and when
             rendering a volume without labels.
     """
 
     bands = 3
     stacked: TransferFunction
-    """All functions, stacked along a leading axis for the label; the last is that of invisible labels."""
+    """All functions, stacked along a leading axis for the label; the last one is that of invisible labels."""
     opacity: Float[Array, " labels"]
-    """Of each label, a factor of its extinction: see `with_opacity`. Differentiable."""
+    """Factor of the extinction by label: see `with_opacity`. Differentiable."""
     shown: Bool[Array, " labels"]
-    """Of each label, whether it is seen: see `with_visibility`."""
+    """Visibility by label: see `with_visibility`."""
 
-    def __init__(self, functions: Mapping[int, Any] | Sequence[TransferFunction | None] | Any):
-        given = _by_label(functions)
-        seen = [function for function in given if function is not None]
-        if not seen:
-            raise ValueError("functions must hold a TransferFunction for one label at least; got none.")
-        if any(function.per_voxel for function in seen):
+    def __init__(self, functions: Mapping[int, TransferFunction | None] | Sequence[TransferFunction | None]):
+        by_label = _by_label(functions)
+        visible = [function for function in by_label if function is not None]
+        if not visible:
+            raise ValueError("functions must hold a TransferFunction for at least one label; got none.")
+        if any(function.per_voxel for function in visible):
             raise ValueError(
-                "functions must count lengths in world length; got one per voxel. Give it a unit_distance, "
-                "such as the volume: jv.colormap(..., unit_distance=volume)."
+                "functions must count lengths in world length; got one with per_voxel=True. Pass a "
+                "unit_distance, such as the volume: jv.colormap(..., unit_distance=volume)."
             )
-        hidden = TransferFunction(seen[0].values, 0 * seen[0].colors, 0 * seen[0].extinction)
-        each = [hidden if function is None else function for function in [*given, None]]
-        self.stacked = _stacked(each)
-        self.opacity = jnp.asarray(np.ones(len(each)), self.stacked.extinction.dtype)
-        self.shown = jnp.asarray(np.ones(len(each)), bool)
+        hidden = TransferFunction(visible[0].values, 0 * visible[0].colors, 0 * visible[0].extinction)
+        complete = [hidden if function is None else function for function in [*by_label, None]]
+        self.stacked = _stacked(complete)
+        self.opacity = jnp.asarray(np.ones(len(complete)), self.stacked.extinction.dtype)
+        self.shown = jnp.asarray(np.ones(len(complete)), bool)
 
-    def with_visibility(self, visible: Mapping[int, bool] | Any) -> "LabelTransferFunction":
-        """The same, with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
+    def with_visibility(self, visible: Mapping[int, bool | np.bool_ | Array]) -> "LabelTransferFunction":
+        """A copy with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
 
         Raises:
-            ValueError: for labels beyond the last one, and for what is not true or false.
+            ValueError: for labels beyond the last one, and for values that are not true or false.
         """
-        found = self.shown
+        result = self.shown
         for label, shown in self._changes("visible", visible):
             is_array = isinstance(shown, jax.Array) and shown.shape == () and shown.dtype == bool
-            found = found.at[label].set(shown if is_array else flag(f"visible[{label}]", shown))
-        return eqx.tree_at(lambda transfer: transfer.shown, self, found)
+            result = result.at[label].set(shown if is_array else flag(f"visible[{label}]", shown))
+        return eqx.tree_at(lambda transfer: transfer.shown, self, result)
 
-    def with_opacity(self, opacity: Mapping[int, float] | Any) -> "LabelTransferFunction":
-        """The same, with these factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels
-        keep theirs, which are 1 at first.
+    def with_opacity(self, opacity: Mapping[int, Arrayable]) -> "LabelTransferFunction":
+        """A copy with new factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels keep
+        their factors, initially 1.
 
-        f is a factor of the extinction: what has the opacity α at f = 1 has 1 - (1 - α)^f. It may exceed 1,
-        and is differentiable; where it is 0, its derivative misses what is leapt over (`SpaceLeaping`).
+        f multiplies the extinction: an opacity α at f = 1 becomes 1 - (1 - α)^f. f may exceed 1, and is
+        differentiable; at f = 0, its derivative misses regions that rays leap over (`SpaceLeaping`).
 
         Raises:
             ValueError: for labels beyond the last one, and for factors that are negative or not finite.
         """
-        found = self.opacity
+        result = self.opacity
         for label, factor in self._changes("opacity", opacity):
-            name = f"opacity[{label}]"
-            factor = finite_array(name, factor, ())
-            factor = require(factor, lambda f: f >= 0, f"{name} must be at least 0; got {{got}}.")
-            found = found.at[label].set(factor.astype(found.dtype))
-        return eqx.tree_at(lambda transfer: transfer.opacity, self, found)
+            factor = not_negative(f"opacity[{label}]", factor)
+            result = result.at[label].set(factor.astype(result.dtype))
+        return eqx.tree_at(lambda transfer: transfer.opacity, self, result)
 
     def _changes(self, name: str, changes: Any) -> list[tuple[int, Any]]:
-        """Checked labels, each with what was given for it."""
+        """Pairs of a checked label and its new value."""
         if not isinstance(changes, Mapping):
             raise ValueError(f"{name} must be by label, such as {{1: ...}}; got {described(changes)}.")
-        last = self.opacity.shape[0] - 2  # the one behind it stands for all without a function
-        return [(integer(f"{name}'s label", label, 0, last), each) for label, each in changes.items()]
+        last = self.opacity.shape[0] - 2  # the entry after it is that of all labels without a function
+        return [(integer(f"{name}'s label", label, 0, last), value) for label, value in changes.items()]
 
     @property
     def channels(self) -> int:
@@ -110,8 +107,8 @@ class LabelTransferFunction(Transfer):
         return self.stacked.valid
 
     @property
-    def _seen(self) -> TransferFunction:
-        """All functions, with the extinctions that are seen."""
+    def _effective(self) -> TransferFunction:
+        """The stacked functions with extinctions times opacity factors, 0 for hidden labels."""
         factor = jnp.where(self.shown, self.opacity, 0)
         extinction = linear.not_negative(self.stacked.extinction * factor[:, None])
         return eqx.tree_at(lambda functions: functions.extinction, self.stacked, extinction)
@@ -142,15 +139,15 @@ class LabelTransferFunction(Transfer):
         return integrate
 
     def _tables(self, table_of: Callable[[TransferFunction], Array]) -> Callable[[Any], tuple[Array, Any]]:
-        """From a label to the control points of its function, and the look-up of its table's rows."""
-        tables = jax.vmap(table_of)(self._seen)
+        """A function from a label to its control points and a look-up of its table's rows."""
+        tables = jax.vmap(table_of)(self._effective)
         hidden, count, rows = tables.shape[0] - 1, tables.shape[1], tables.reshape(-1, tables.shape[2])
 
-        def of(label: Any) -> tuple[Array, Any]:
+        def table(label: Array) -> tuple[Array, Any]:
             label = jnp.where((label < 0) | (label > hidden), hidden, label)
             return gather(self.stacked.values, label), lambda row: linear.table_row(rows, label * count + row)
 
-        return of
+        return table
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
         return jnp.where(
@@ -163,34 +160,34 @@ class LabelTransferFunction(Transfer):
     def _greatest(
         self, between: Callable[..., Array], blocks: Blocks, dtype: Any
     ) -> Shaped[Array, "bx by bz"]:
-        """The greatest answer of the functions whose labels a block may hold, without a gradient."""
-        functions = jax.lax.stop_gradient(self._seen)
+        """The maximum of `between` over the labels that a block may hold, without a gradient."""
+        functions = jax.lax.stop_gradient(self._effective)
         greatest = jnp.zeros(blocks.low.shape, dtype)
         for label, points in enumerate(zip(functions.values[:-1], functions.extinction[:-1], strict=True)):
-            found = jnp.maximum(greatest, between(*points, blocks.low, blocks.high))
-            greatest = jnp.where(blocks.may_hold(label), found, greatest)
+            larger = jnp.maximum(greatest, between(*points, blocks.low, blocks.high))
+            greatest = jnp.where(blocks.may_hold(label), larger, greatest)
         return greatest
 
 
 def _by_label(functions: Any) -> list[TransferFunction | None]:
-    """Those of label 0, 1, 2, …"""
+    """The functions of labels 0, 1, 2, …, checked."""
     if isinstance(functions, Mapping):
-        named = {integer("functions' label", label, 0, 255): each for label, each in functions.items()}
+        named = {integer("functions' label", label, 0, 255): entry for label, entry in functions.items()}
         functions = [named.get(label) for label in range(max(named, default=-1) + 1)]
     if not isinstance(functions, list | tuple) or len(functions) > 256:
-        expected = "{label: TransferFunction}, or a sequence of those of labels 0 to 255"
+        expected = "{label: TransferFunction}, or a sequence of functions for labels 0 to 255"
         raise ValueError(f"functions must be {expected}; got {described(functions)}.")
-    for label, each in enumerate(functions):
-        if not isinstance(each, TransferFunction | None):
+    for label, entry in enumerate(functions):
+        if not isinstance(entry, TransferFunction | None):
             raise ValueError(
-                f"functions[{label}] must be a TransferFunction, or None; got {described(each)}."
+                f"functions[{label}] must be a TransferFunction, or None; got {described(entry)}."
             )
     return list(functions)
 
 
 @jax.jit
 def _stacked(functions: list[TransferFunction]) -> TransferFunction:
-    """All functions along a leading axis; those with fewer points get copies of their last one beyond it."""
+    """The functions along a leading axis, padded to the same number of points with copies of the last one."""
     points = max(function.values.shape[0] for function in functions)
 
     def continued(function: TransferFunction) -> TransferFunction:
@@ -198,7 +195,7 @@ def _stacked(functions: list[TransferFunction]) -> TransferFunction:
         # far enough apart to differ in the float type
         gap = jnp.maximum(values[-1] - values[0], jnp.maximum(abs(values[-1]), 1))
         beyond = values[-1] + gap * jnp.arange(1, missing + 1, dtype=values.dtype)
-        padded = jax.tree.map(lambda of: jnp.concatenate([of, *[of[-1:]] * missing]), function)
-        return eqx.tree_at(lambda of: of.values, padded, jnp.concatenate([values, beyond]))
+        padded = jax.tree.map(lambda leaf: jnp.concatenate([leaf, *[leaf[-1:]] * missing]), function)
+        return eqx.tree_at(lambda f: f.values, padded, jnp.concatenate([values, beyond]))
 
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(continued, functions))

@@ -1,5 +1,5 @@
-"""Finds where anything may be visible: ranges of values of blocks, kept as long as the voxels, and grids of
-occupied cells, computed for each image. What is called empty is proven to be. No gradients."""
+"""Conservative search for empty space: ranges of the values in blocks, cached with the voxels, and grids of
+occupied cells, computed for each image. Cells marked empty are proven to be. No gradients."""
 
 import itertools
 import math
@@ -25,19 +25,19 @@ from .volume import Volume
 
 
 BLOCK = 4
-"""Cells of the voxel grid along the side of a block, if nothing else is asked for."""
+"""Default number of cells of the voxel grid along the side of a block."""
 
 LAYERS = 8
-"""Layers of blocks whose extremes are found at a time, so that they stay in the cache."""
+"""Layers of blocks whose extremes are computed at a time, so that they stay in the cache."""
 
 LENGTHS = 2**19, 2**23, 2**27
-"""Of summed-volume tables, so that few programs read them: of blocks of up to 318³, 808³, 2044³ voxels."""
+"""Lengths of summed-volume tables, few so that programs are shared: for up to 318³, 808³, 2044³ voxels."""
 
 FARTHEST = 255
 """Distance in a grid without occupied cells. Other distances, in cells, are at most one less."""
 
 ROUNDING = 4 * float(jnp.finfo(jnp.float32).eps)
-"""By how much interpolation may leave the range of the surrounding nodes, relative to their magnitude."""
+"""Relative error by which interpolation may leave the range of the surrounding nodes."""
 
 Index = tuple[Int[Array, "*batch"], Int[Array, "*batch"], Int[Array, "*batch"]]
 
@@ -46,7 +46,7 @@ class Blocks(eqx.Module):
     """Ranges of the values in each block of `side`³ cells, including the nodes on its faces."""
 
     low: Float[Array, "*c bx by bz"]
-    """Of a volume of several channels, one after the other."""
+    """Least values; channels along the first axis if there are several."""
     high: Float[Array, "*c bx by bz"]
     labels: UInt32[Array, "bx by bz"] | None
     """Bit `label % 32` is set for each label of the block's nodes."""
@@ -56,14 +56,14 @@ class Blocks(eqx.Module):
 
     @classmethod
     def of(cls, volume: Volume, *, slopes: bool = False, side: int = BLOCK) -> "Blocks":
-        """The blocks of a volume, computed once for each array; ranges of `slopes` only where asked for."""
+        """The blocks of a volume, computed once for each array; `slopes`: also ranges of gradients."""
         bits, ends = _for(side, _label_bits), _for(side, _ranges)
         labels = (
             None if volume.labels is None else memoized(volume.labels, bits, partial(_label_bits, side=side))
         )
         low, high = memoized(volume.data, ends, partial(_ranges_in_numpy, side=side))
         low, high = map(volume.in_grid_order, (low, high))
-        if volume.field is not None:  # its values need not lie between those of the voxels
+        if volume.field is not None:  # values of a field may exceed those of the voxels
             low, high = jnp.full_like(low, -jnp.inf), jnp.full_like(high, jnp.inf)
         known = slopes and volume.field is None
         return cls(low, high, labels, _magnitudes(volume, side) if known else None, side)
@@ -75,44 +75,44 @@ class Blocks(eqx.Module):
 
     @property
     def unordered(self) -> Bool[Array, "bx by bz"]:
-        """Blocks that hold NaN, also as a slope."""
+        """Blocks that hold NaN, as a value or a slope."""
         unordered = ~(self.low <= self.high)
         if unordered.ndim > 3:
             unordered = jnp.any(unordered, axis=0)
-        least, most = self.magnitudes
-        return unordered | ~(least <= most)
+        low, high = self.magnitudes
+        return unordered | ~(low <= high)
 
     @property
     def magnitudes(self) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
-        """`slopes`, or what is known without them: from 0 to infinity."""
+        """`slopes`, or 0 to infinity where they are unknown."""
         if self.slopes is None:
             unknown = jnp.zeros(self.shape, self.low.dtype)
             return unknown, unknown + jnp.inf
         return self.slopes
 
     def may_hold(self, label: int) -> Bool[Array, "bx by bz"]:
-        """Which blocks may hold this label."""
+        """Blocks that may hold a label."""
         if self.labels is None:
             return jnp.ones(self.shape, bool)
         return (self.labels >> (label % 32)) & 1 == 1
 
 
 class Sums(eqx.Module):
-    """A summed-volume table: counts the occupied cells of a grid in any box, by eight look-ups."""
+    """A summed-volume table: the number of occupied cells in any box of a grid, by eight look-ups."""
 
     table: Int[Array, " entries"]
-    """Those of the grid with one more cell on each axis; then any."""
+    """Entries of the grid with one more cell on each axis, then padding."""
     sizes: Int[Array, "3"] | np.ndarray
     """Number of cells along x, y, z."""
 
     @classmethod
     def of(cls, occupied: Bool[Array, "cx cy cz"] | np.ndarray) -> "Sums":
-        """Of a NumPy array, in NumPy."""
+        """The table of a grid, computed in NumPy for a NumPy array."""
         sizes = np.asarray(occupied.shape, np.int32)
         if isinstance(occupied, np.ndarray):
             shape = tuple(n + 1 for n in occupied.shape)
             count = math.prod(shape)
-            length = next(each for each in LENGTHS if each >= count) if count <= LENGTHS[-1] else count
+            length = next(n for n in LENGTHS if n >= count) if count <= LENGTHS[-1] else count
             table = zeros_in_reserve(length, np.int32)
             entries = table[:count].reshape(shape)
             entries[1:, 1:, 1:] = occupied
@@ -131,7 +131,7 @@ class Sums(eqx.Module):
         return cls(table.reshape(-1), sizes)
 
     def any_between(self, first: Index, last: Index) -> Bool[Array, "*batch"]:
-        """Whether any cell from `first` to `last` is occupied, both inclusive and inside the grid."""
+        """True if any cell from `first` to `last` is occupied, both inclusive and inside the grid."""
         ny, nz = self.sizes[1] + 1, self.sizes[2] + 1
         x, y, z = (((low, -1), (high + 1, 1)) for low, high in zip(first, last, strict=True))
         count = jnp.zeros((), jnp.int32)
@@ -141,25 +141,25 @@ class Sums(eqx.Module):
 
 
 class Occupancy(eqx.Module):
-    """A regular grid of cells. Everything visible lies in an occupied cell of it."""
+    """A regular grid of cells. Everything visible lies in an occupied cell."""
 
     occupied: Any
-    """(cx, cy, cz), truth values; None of what is `unshaped`."""
+    """(cx, cy, cz), booleans; None in an `unshaped` grid."""
     origin: Vec3
-    """Corner of the grid, along the axes of `frame`, from `anchor` on."""
+    """Corner of the grid, along the axes of `frame`, relative to `anchor`."""
     size: Vec3
     """Side lengths of a cell."""
     frame: Frame = Frame()
     anchor: Vec3 | None = None
-    """That of the `Space`."""
+    """`Space.anchor`."""
     known: UInt8[Array, " cells"] | None = None
-    """`distance`, where it has been computed before."""
+    """`distance`, if already computed."""
     sizes: Int[Array, "3"] | np.ndarray | None = None
     """Number of cells along x, y, z, where it is traced."""
 
     @property
     def unshaped(self) -> "Occupancy":
-        """The place of its cells, of which their number is traced."""
+        """The grid without `occupied`, and with a traced number of cells."""
         return unchecked(self, occupied=None, sizes=np.asarray(self.shape, np.int32))
 
     @property
@@ -175,101 +175,92 @@ class Occupancy(eqx.Module):
         """Chessboard distance of each cell to the nearest occupied one, in cells, in row-major order."""
         if self.known is not None:
             return self.known
-        found = jnp.where(self.occupied, 0, FARTHEST - 1).astype(jnp.uint8)
+        distance = jnp.where(self.occupied, 0, FARTHEST - 1).astype(jnp.uint8)
         for axis in (2, 1, 0):  # exact: a shortest way may take its steps along the later axes last
-            planes = varying(jnp.moveaxis(found, axis, 0))
+            planes = varying(jnp.moveaxis(distance, axis, 0))
             for backwards in (False, True):
                 step = partial(_one_further, range(axis, 2))
                 _, planes = jax.lax.scan(step, planes[-1 if backwards else 0], planes, reverse=backwards)
-            found = jnp.moveaxis(planes, 0, axis)
-        return jnp.where(jnp.any(self.occupied), found, jnp.uint8(FARTHEST)).reshape(-1)
+            distance = jnp.moveaxis(planes, 0, axis)
+        return jnp.where(jnp.any(self.occupied), distance, jnp.uint8(FARTHEST)).reshape(-1)
 
     def cell(self, point: Vec3) -> Vec3:
-        """Coordinate in the grid, in cells, of a place that counts from `anchor`."""
+        """Coordinate in the grid, in cells, of a point relative to `anchor`."""
         point = self.frame.components(point)
         x, y, z = ((p - low) / size for p, low, size in zip(point, self.origin, self.size, strict=True))
         return x, y, z
 
 
 def _one_further(across: range, before: Array, plane: Array) -> tuple[Array, Array]:
-    """Distances in a plane from those of the plane before, one step away, also diagonally along `across`."""
+    """Distances in a plane from those of the previous plane, with diagonal steps along the axes `across`."""
     for axis in across:
-        before = _with_both_sides(before, axis)
+        widths, n = [(1, 1) if i == axis else (0, 0) for i in range(plane.ndim)], plane.shape[axis]
+        padded = jnp.pad(before, widths, constant_values=FARTHEST)
+        sides = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
+        before = reduce(jnp.minimum, sides, before)
     plane = jnp.minimum(plane, jnp.minimum(before, FARTHEST - 2) + jnp.uint8(1))
     return plane, plane
 
 
-def _with_both_sides(plane: Array, axis: int) -> Array:
-    """The least distance of each cell and the two next to it along an axis."""
-    around, n = [(1, 1) if i == axis else (0, 0) for i in range(plane.ndim)], plane.shape[axis]
-    padded = jnp.pad(plane, around, constant_values=FARTHEST)
-    before, after = (jax.lax.slice_in_dim(padded, i, i + n, axis=axis) for i in (0, 2))
-    return jnp.minimum(jnp.minimum(plane, before), after)
-
-
 @cache
 def _for(side: int, compute: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of an array for blocks of this side: the same one each time, as `memoized` needs it."""
+    """`compute` for blocks of this side, compiled; always the same object, as `memoized` requires."""
     return jax.jit(partial(compute, side=side))
 
 
 def _ranges(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
-    low, high = widened(*extremes(data, side))
-    return (low, high) if data.ndim == 3 else (jnp.moveaxis(low, -1, 0), jnp.moveaxis(high, -1, 0))
+    return widened(*_extremes(data, side))
 
 
 def _ranges_in_numpy(data: Shaped[np.ndarray, "nx ny nz *c"], side: int) -> tuple[np.ndarray, np.ndarray]:
     low, high = (over_blocks(data, combine, side=side) for combine in (np.minimum, np.maximum))
-    low, high = _widened(low, high, np)
-    return (low, high) if data.ndim == 3 else (np.moveaxis(low, -1, 0), np.moveaxis(high, -1, 0))
+    return _widened(low, high, np)
 
 
-@partial(jax.jit, static_argnums=1)
-def extremes(data: Shaped[Array, "nx ny nz *c"], side: int = BLOCK) -> tuple[Array, Array]:
-    """Least and greatest node of each block; NaN where a node is."""
+def _extremes(data: Shaped[Array, "nx ny nz *c"], side: int) -> tuple[Array, Array]:
+    """Least and greatest node of each block; NaN where a node is NaN."""
 
-    def of(nodes: Array) -> tuple[Array, Array]:
+    def ends_of(nodes: Array) -> tuple[Array, Array]:
         return over_blocks(nodes, jnp.minimum, side=side), over_blocks(nodes, jnp.maximum, side=side)
 
-    whole = (data.shape[0] - 1) // side
-    if whole == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
-        return of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
-    begins = side * jnp.arange(whole)
+    count = (data.shape[0] - 1) // side
+    if count == 0 or jnp.issubdtype(data.dtype, jnp.inexact):
+        return ends_of(data)  # inside loops on CPU, XLA's minima and maxima lose NaN
+    begins = side * jnp.arange(count)
     layers = jax.lax.map(
-        lambda x: of(jax.lax.dynamic_slice_in_dim(data, x, side + 1)), begins, batch_size=LAYERS
+        lambda x: ends_of(jax.lax.dynamic_slice_in_dim(data, x, side + 1)), begins, batch_size=LAYERS
     )
-    found = [jax.tree.map(lambda layer: layer[:, 0], layers)]
-    if whole * side < data.shape[0] - 1:
-        found.append(of(data[whole * side :]))
-    low, high = (jnp.concatenate(ends) for ends in zip(*found, strict=True))
+    parts = [jax.tree.map(lambda layer: layer[:, 0], layers)]
+    if count * side < data.shape[0] - 1:
+        parts.append(ends_of(data[count * side :]))
+    low, high = (jnp.concatenate(ends) for ends in zip(*parts, strict=True))
     return low, high
 
 
-@jax.jit
-def widened(low: Shaped[Array, "bx by bz *c"], high: Shaped[Array, "bx by bz *c"]) -> tuple[Array, Array]:
-    """Ranges of the values interpolated between nodes, from those of the nodes."""
-    return _widened(low, high, jnp)
-
-
 def _widened(low: Any, high: Any, xp: Any) -> tuple[Any, Any]:
+    """Ranges of interpolated values, channels first, from those of the nodes."""
     low, high = low.astype(np.float32), high.astype(np.float32)
     slack = ROUNDING * xp.maximum(abs(low), abs(high))
-    return low - slack, high + slack
+    low, high = low - slack, high + slack
+    return (low, high) if low.ndim == 3 else (xp.moveaxis(low, -1, 0), xp.moveaxis(high, -1, 0))
+
+
+widened = jax.jit(partial(_widened, xp=jnp))
 
 
 def _slope_ranges(data: Shaped[Array, "nx ny nz"], side: int) -> tuple[Array, Array, Array]:
-    """Least and greatest slopes along the array's axes in each block, per node, and the greatest length of
-    the three; layer by layer, to save memory."""
+    """Least and greatest slope along each axis of the array, and greatest gradient length, per node, by block
+    (layer by layer, to save memory)."""
     last = data.shape[0] - 1
 
     def layer(block: Int[Array, ""]) -> tuple[Array, Array, Array]:
         node = jnp.clip(side * block + jnp.arange(side + 1), 0, last)
         # subtracted in their own type: doubles that differ little are the same in single precision
         dtype = data.dtype if data.dtype == jnp.float64 else jnp.float32
-        before, here, after = (data[jnp.clip(node + step, 0, last)].astype(dtype) for step in (-1, 0, 1))
+        before, middle, after = (data[jnp.clip(node + step, 0, last)].astype(dtype) for step in (-1, 0, 1))
         border = ((node == 0) | (node == last))[:, None, None]
         along_x = (after - before) * jnp.where(border, 1, 0.5).astype(dtype)
-        slopes = jnp.stack([along_x, *jnp.gradient(here, axis=(1, 2))]).astype(jnp.float32)
+        slopes = jnp.stack([along_x, *jnp.gradient(middle, axis=(1, 2))]).astype(jnp.float32)
         blocks = partial(over_blocks, side=side)
         square = blocks(jnp.max(jnp.sum(slopes**2, axis=0), axis=0), jnp.maximum)
         low = jax.vmap(lambda part: blocks(part, jnp.minimum))(jnp.min(slopes, axis=1))
@@ -297,19 +288,19 @@ def _magnitudes(volume: Volume, side: int) -> tuple[Array, Array]:
 def _lengths(
     low: Array, high: Array, steepest: Array, spacing: Array, direction: Array | None
 ) -> tuple[Array, Array]:
-    least = most = jnp.zeros_like(steepest)
+    lower = upper = jnp.zeros_like(steepest)
     for begin, end, step in zip(low, high, spacing, strict=True):  # XLA's sum over axis 0 is slow on CPU
         begin, end = begin / step, end / step
-        least += jnp.maximum(jnp.maximum(begin, -end), 0) ** 2  # 0 where slopes change sign
-        most += jnp.maximum(-begin, end) ** 2
-    most = jnp.minimum(jnp.sqrt(most), steepest / jnp.min(spacing)) * (1 + ROUNDING)
+        lower += jnp.maximum(jnp.maximum(begin, -end), 0) ** 2  # 0 where slopes change sign
+        upper += jnp.maximum(-begin, end) ** 2
+    upper = jnp.minimum(jnp.sqrt(upper), steepest / jnp.min(spacing)) * (1 + ROUNDING)
     if direction is not None:
-        # where axes are sheared, slopes along them give a length only up to this (Gershgorin's discs)
+        # slopes along sheared axes bound the length only up to this factor (Gershgorin's discs)
         gram = jnp.sum(direction[:, :, None] * direction[:, None, :], axis=0)
         shear = jnp.max(jnp.sum(jnp.abs(gram - jnp.eye(3, dtype=gram.dtype)), axis=1))
-        least = least / (1 + shear)
-        most = jnp.where(shear < 1, most / jnp.sqrt(jnp.where(shear < 1, 1 - shear, 1)), jnp.inf)
-    return jnp.sqrt(least) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, most)
+        lower = lower / (1 + shear)
+        upper = jnp.where(shear < 1, upper / jnp.sqrt(jnp.where(shear < 1, 1 - shear, 1)), jnp.inf)
+    return jnp.sqrt(lower) * (1 - ROUNDING), jnp.where(jnp.any(~(low <= high), axis=0), jnp.nan, upper)
 
 
 def _label_bits(labels: Any, side: int) -> Any:
@@ -317,22 +308,22 @@ def _label_bits(labels: Any, side: int) -> Any:
     return over_blocks(bits, operator.or_, side=side)
 
 
-def over_blocks(values: Any, combine: Callable[[Any, Any], Any], *, side: int) -> Any:
-    """Combines all nodes of each block, axis by axis, in the library of the array."""
+def over_blocks(values: Array | np.ndarray, combine: Callable[[Any, Any], Any], *, side: int) -> Any:
+    """Combine all nodes of each block, axis by axis, in the library of the array."""
     known = isinstance(values, np.ndarray)
     join, part = (np.concatenate, _part) if known else (jnp.concatenate, jax.lax.slice_in_dim)
     for axis in range(min(values.ndim, 3)):  # channels stay
         cells = values.shape[axis] - 1
-        along = partial(part, values, axis=axis)
+        layers = partial(part, values, axis=axis)
         # the last block may be shorter; padding would copy the nodes
-        whole, rest = divmod(cells, side)
-        found = []
-        if whole:
-            length, nodes = (whole - 1) * side + 1, range(side + 1)
-            found.append(reduce(combine, [along(i, i + length, side) for i in nodes]))
-        if rest:
-            found.append(reduce(combine, [along(i, i + 1) for i in range(whole * side, cells + 1)]))
-        values = join(found, axis)
+        count, remainder = divmod(cells, side)
+        blocks = []
+        if count:
+            length, nodes = (count - 1) * side + 1, range(side + 1)
+            blocks.append(reduce(combine, [layers(i, i + length, side) for i in nodes]))
+        if remainder:
+            blocks.append(reduce(combine, [layers(i, i + 1) for i in range(count * side, cells + 1)]))
+        values = join(blocks, axis)
     return values
 
 

@@ -3,7 +3,7 @@
 import json
 import re
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, SupportsIndex, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from .transfer import TransferFunction, extinction_of
 # Unlit surfaces show their shape if the foot of their opacity ramp is dark and thin, and the rest bright and
 # dense: a grazing ray stays in the foot and draws a dark contour.
 #
-# name: (what it is for, its range of values, control points (value, linear rgb, opacity per mm))
+# name: (purpose, range of values, control points (value, linear rgb, opacity per mm))
 Preset: TypeAlias = tuple[str, tuple[float, float], list[tuple[float, tuple[float, float, float], float]]]
 
 PRESETS: dict[str, Preset] = {}
@@ -32,7 +32,7 @@ SLICER = "3D Slicer"
 def _add_presets(file: str) -> None:
     """Add the presets of a file: ours, or 3D Slicer's
     (Modules/Loadable/VolumeRendering/Resources/presets.xml) at the points of both curves, with linear
-    colours, without its opacity by gradient, which is 1."""
+    colours and without the gradient opacity, which is 1."""
     for name, entry in json.loads(Path(__file__).with_name(file).read_text("utf-8")).items():
         points = [(value, (r, g, b), opacity) for value, r, g, b, opacity in entry["points"]]
         low, high = entry.get("range") or (points[0][0], points[-1][0])
@@ -46,17 +46,17 @@ _add_presets("presets.json")
 _add_presets("slicer_presets.json")
 
 
-def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1.0) -> TransferFunction:
+def preset(name: str, clim: Arrayable | None = None, unit_distance: Arrayable = 1.0) -> TransferFunction:
     """A transfer function by name.
 
     Args:
         name: a key of `jaxvol.PRESETS`, which lists each preset's purpose and range of values: ours, and
-            those of 3D Slicer ("CT-AAA", "MR-Default", …). Case and what separates words do not count, but
-            for "ct_bone" (ours) and "CT-Bone".
-        clim: (low, high) in the volume's values, to which that range is stretched linearly. CT stored as
-            Hounsfield units + 1000 needs (0, 4000).
-        unit_distance: world length to which the opacities refer; they are designed for 1 mm. Or a `Volume`,
-            for the size of its voxels.
+            those of 3D Slicer ("CT-AAA", "MR-Default", …). Case and word separators are ignored, except to
+            distinguish "ct_bone" (ours) and "CT-Bone".
+        clim: (low, high) in the volume's values, to which the preset's range is stretched linearly. CT stored
+            as Hounsfield units + 1000 needs (0, 4000).
+        unit_distance: world length to which the opacities refer, by design 1 mm; a `Volume` for the size of
+            its voxels.
 
     Returns:
         The `TransferFunction`, its colours linear.
@@ -71,8 +71,8 @@ def preset(name: str | Any, clim: Arrayable = None, unit_distance: Arrayable = 1
     return TransferFunction(stretched, colors, extinction_of(opacities, unit_distance))
 
 
-def preset_name(name: str | Any) -> str:
-    """Key of `PRESETS`, whatever case and separators. **Raises** `ValueError` for an unknown name."""
+def preset_name(name: str) -> str:
+    """The key of `PRESETS` for any case and separators. **Raises** `ValueError` for an unknown name."""
 
     def plain(text: str) -> str:
         return re.sub("[^a-z0-9]", "", text.lower())
@@ -87,31 +87,30 @@ def preset_name(name: str | Any) -> str:
 def fitted_range(
     name: str, values: Shaped[np.ndarray, "..."]
 ) -> tuple[tuple[float, float] | None, str | None]:
-    """To what a preset is stretched for these values of a volume if nothing is said, None for its own range;
-    and a word where that does not fit. Values of MR have no unit, those of CT are Hounsfield units."""
-    name, low, most = preset_name(name), float(values.min()), float(values.max())
-    high = most if name.endswith("MIP") else float(np.percentile(values, 99.9))
+    """Default `clim` of a preset for the values of a volume, None for the preset's range; and a warning if
+    that does not fit. MR values have no unit, CT values are Hounsfield units."""
+    name, low, maximum = preset_name(name), float(values.min()), float(values.max())
+    high = maximum if name.endswith("MIP") else float(np.percentile(values, 99.9))
     first, last = PRESETS[name][1]
     if name.upper().startswith("MR") and high > 0 and not last / 2 <= high <= 2 * last:
-        told = f"{name} is for values from {first:g} to {last:g}; it was stretched to 0 to {high:g}"
-        return (0.0, high), f"{told}. Another clim stretches it otherwise."
+        warning = f"{name} is for values from {first:g} to {last:g}; it was stretched to 0 to {high:g}"
+        return (0.0, high), f"{warning}. Another clim stretches it otherwise."
     if name.upper().startswith("CT") and (low >= 0 or high < 200):
-        told = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to {most:g}"
-        stored = (
-            f" Of those stored + 1024, clim is ({first + 1024:g}, {last + 1024:g})." if most > 1000 else ""
-        )
-        return None, f"{told}.{stored or ' Another preset, or clim, suits them.'}"
+        warning = f"{name} is for Hounsfield units, with air at -1000; the values run from {low:g} to"
+        hint = f"If stored + 1024, pass clim=({first + 1024:g}, {last + 1024:g})."
+        hint = hint if maximum > 1000 else "Another preset, or clim, suits them."
+        return None, f"{warning} {maximum:g}. {hint}"
     return None, None
 
 
 def attenuation(water: Arrayable) -> TransferFunction:
-    """The attenuation of X-rays in CT of Hounsfield units, for `compositing="integral"`: white, of an
-    extinction μ = water (1 + HU / 1000), 0 below -1000.
+    """A transfer function of X-ray attenuation for CT in Hounsfield units and `compositing="integral"`:
+    white, with the extinction μ = water (1 + HU / 1000), 0 below -1000.
 
     Args:
         water: attenuation of water at the energy of the image, 1/length in the unit of the volume, > 0:
             0.0206 /mm at 60 keV, 0.0171 /mm at 100 keV (NIST, tables of X-ray mass attenuation coefficients).
-            Bone attenuates relatively more at lower energies than at that of the CT.
+            Bone attenuates relatively more at energies below that of the CT.
 
     Returns:
         The `TransferFunction`.
@@ -125,23 +124,23 @@ def attenuation(water: Arrayable) -> TransferFunction:
 
 
 def colormap(
-    cmap: str | Any,
+    cmap: str | Arrayable,
     clim: Arrayable,
     opacity: str | Arrayable = "linear",
     unit_distance: Arrayable | None = None,
-    n_colors: int | Any = 256,
+    n_colors: SupportsIndex = 256,
 ) -> TransferFunction:
     """A transfer function from a matplotlib colormap and an opacity ramp, as in PyVista's `add_volume`.
 
     Args:
-        cmap: a matplotlib colormap or its name; or one colour, such as `"tomato"` or (1, 0.39, 0.28); or
-            several, evenly spaced and interpolated in sRGB. All are sRGB; their alpha is ignored.
+        cmap: a matplotlib colormap or its name; or one colour, such as `"tomato"` or (1, 0.39, 0.28); or a
+            list of colours, evenly spaced and interpolated in sRGB. All are sRGB; their alpha is ignored.
         clim: (low, high), the volume's values at which the colormap begins and ends.
-        opacity: over the range, `"linear"`, from 0 to 1; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to
-            10; or an array of evenly spaced ones, in [0, 1].
-        unit_distance: thickness, in world length, of a layer that has these opacities; or a `Volume`, for the
-            size of its voxels (the geometric mean of its spacing). By default those of whichever volume is
-            rendered (`TransferFunction.per_voxel`).
+        opacity: `"linear"`, from 0 to 1 over the range; `"sigmoid"`, `1/(1 + exp(-x))` for x from -10 to 10;
+            or an array of evenly spaced opacities, in [0, 1].
+        unit_distance: thickness, in world length, of a layer with these opacities; or a `Volume`, for the
+            size of its voxels (the geometric mean of its spacing). By default, the voxel size of the volume
+            that is rendered (`TransferFunction.per_voxel`).
         n_colors: number of control points, at least 2.
 
     Returns:

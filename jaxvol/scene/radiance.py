@@ -1,4 +1,4 @@
-"""Which colour and extinction does a volume have that stores both? Radiance fields, RGBA images."""
+"""Transfer function of volumes that store colour and density: radiance fields, RGBA images."""
 
 from collections.abc import Callable
 
@@ -17,38 +17,36 @@ from .transfer import Classify, Measured, Transfer
 
 Activation = Callable[[Scalar], Scalar]
 
-MOST = 1e30
+OPAQUE = 1e30
 """Activated density that counts as opaque."""
 
 
 class RadianceField(Transfer):
-    """Colour and extinction as the volume itself stores them, in four channels: `data[x, y, z]` is
-    (red, green, blue, density).
+    """Colour and extinction from a volume of four channels: `data[x, y, z]` is (red, green, blue, density).
 
-    Channels are interpolated, and then activated: colour (r, g, b) is `color` of the first three, extinction
-    is `scale` × `density` of the last. Rays leap over blocks of voxels where `density` of the greatest is 0.
+    Channels are interpolated, then activated: the colour is `color` of the first three, the extinction
+    `scale` × `density` of the last. Rays leap over blocks of voxels whose greatest density activates to 0.
 
     Args:
         scale: extinction (1/length) where the activated density is 1, at least 0. Differentiable.
-        density: from a stored density to the one that is seen: a function of one number that does not
-            decrease, such as `jax.nn.softplus`; by default as it is stored. Below 0 it counts as 0, above
-            1e30, as where `jnp.exp` overflows, as that; both have no gradient.
-        color: from a stored channel to linear colour, such as `jax.nn.sigmoid`; by default as it is stored,
-            also where that is an integer: of 8 bits, divide by 255, and give `scale` in these units.
+        density: activation of the stored density, a non-decreasing function of one number such as
+            `jax.nn.softplus`; by default the identity. Results are clipped to [0, 1e30] (`jnp.exp` may
+            overflow), without a gradient outside.
+        color: activation of a stored channel to linear colour, such as `jax.nn.sigmoid`; by default the
+            identity, also for integers: divide 8-bit colours by 255, and choose `scale` for stored densities.
 
-    Give functions that exist once: each new `lambda` is compiled anew. Parameters of one, which are to have
-    gradients, are arrays of a module (`eqx.Module`, `jax.tree_util.Partial`), not captured by a `lambda`.
+    Reuse function objects: each new `lambda` is compiled anew. Parameters that need gradients are arrays of a
+    module (`eqx.Module`, `jax.tree_util.Partial`), not captured by a `lambda`.
 
-    Gradients reach all channels (`Volume.data`), in every adjoint; but see `SpaceLeaping` about what is leapt
-    over.
-    `quadrature="preintegrated"`, modes that compare values and lightings are refused, as they need one value;
-    but for `ScattererTemplates` whose materials have no `values`, but labels.
+    Gradients reach all channels (`Volume.data`), in every adjoint, except where rays leap (`SpaceLeaping`).
+    `quadrature="preintegrated"`, modes that compare values, and lightings are refused, as they need one
+    value; `ScattererTemplates` are supported if their materials have labels and no `values`.
 
-    Source: Mildenhall et al. 2020; activation behind interpolation: Sun et al. 2022 (DVGO).
+    Source: Mildenhall et al. 2020; activation after interpolation: Sun et al. 2022 (DVGO).
 
     Raises:
-        ValueError: for a scale that is negative or not finite, and for what is no function; and when
-            rendering a volume of another number of channels.
+        ValueError: for a scale that is negative or not finite, and an activation that is no function; and
+            when rendering a volume of another number of channels.
     """
 
     bands = 3
@@ -83,13 +81,13 @@ class RadianceField(Transfer):
         return classify
 
     def _activated(self, density: Scalar) -> Scalar:
-        """The density that is seen. Of an infinite one, JAX's slope is infinity times 0."""
+        """`density`, saturated at `OPAQUE`: the slope of an infinite one would be infinity times 0."""
         if isinstance(self.density, _Fixed) and self.density.function is _as_stored:
             return density
-        most = jnp.asarray(MOST, density.dtype)
-        saturated = self.density(jax.lax.stop_gradient(density)) >= most  # NaN stays
+        opaque = jnp.asarray(OPAQUE, density.dtype)
+        saturated = self.density(jax.lax.stop_gradient(density)) >= opaque  # NaN stays
         return jnp.where(
-            saturated, most, self.density(jnp.where(saturated, jnp.zeros_like(density), density))
+            saturated, opaque, self.density(jnp.where(saturated, jnp.zeros_like(density), density))
         )
 
     def majorant(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
@@ -100,7 +98,7 @@ class RadianceField(Transfer):
         return self._greatest(blocks) > 0
 
     def _greatest(self, blocks: Blocks) -> Float[Array, "bx by bz"]:
-        """Density of the greatest stored one, in the type of parameters, which may be wider."""
+        """Activated greatest density of each block, in the type of `scale`, which may be wider."""
         return self.density(blocks.high[3].astype(self.scale.dtype))
 
 
@@ -115,12 +113,12 @@ class _Fixed(eqx.Module):
 
 def _activation(function: Activation | None) -> Activation:
     """The function as a pytree of its parameters."""
-    found = _as_stored if function is None else function
-    found = found if any(map(eqx.is_array, jax.tree.leaves(found))) else _Fixed(found)
+    function = _as_stored if function is None else function
+    function = function if any(map(eqx.is_array, jax.tree.leaves(function))) else _Fixed(function)
     like = jax.ShapeDtypeStruct((), jnp.result_type(float))
-    if getattr(answer := eqx.filter_eval_shape(found, like), "shape", None) != ():
+    if getattr(answer := eqx.filter_eval_shape(function, like), "shape", None) != ():
         raise ValueError(f"density and color must return a number for a number; got {answer}.")
-    return found
+    return function
 
 
 def _as_stored(channel: Scalar) -> Scalar:

@@ -1,8 +1,9 @@
-"""What does a render return?"""
+"""Results of a render: the image, optional outputs, and how notebooks show it."""
 
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,33 +14,33 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.checks import described
+from .._util.checks import Arrayable, described
 from .._util.srgb import displayed, linear_color, png_of, warn_of_8_bits
 from ..xla.platform import is_traced, on_gpu
 from ..xla.trees import PyTree
 
 
 class BrickReport(NamedTuple):
-    """What an image by `render_bricks` took."""
+    """Bricks, bytes and memory of an image by `render_bricks`."""
 
     counts: tuple[int, int, int]
     """Bricks along x, y and z."""
     needed: int
-    """How many of them may hold anything visible."""
+    """Number of bricks that may hold anything visible."""
     loads: int
-    """How often a brick was read."""
+    """Number of times a brick was read."""
     reloads: int
-    """Of these, all but the first of each brick."""
+    """Number of loads except the first one of each brick."""
     bytes_read: int
-    """Of voxels, with what is read around each brick."""
+    """Bytes of voxels read, including the margin of each brick."""
     stored: tuple[int, int, int]
     """Voxels along x, y and z that are held at a time."""
     bytes_held: int
-    """Memory that these take, with what is made of them and with the next ones."""
+    """Memory of the voxels held, of the data derived from them, and of the next brick."""
 
 
 class Details(NamedTuple):
-    """Outputs that cost time, each None where it was not asked for. See `Rendering`."""
+    """Outputs that cost time; None for those not requested. See `Rendering`."""
 
     depth: Float[Array, "*rays"] | None = None
     samples: Int[Array, "*rays"] | None = None
@@ -51,29 +52,29 @@ class Details(NamedTuple):
 
 
 class Rendering(eqx.Module):
-    """The image of rays, and what they met. The leading shape is that of the rays: (height, width) from a
+    """The image and other outputs of rays. The leading shape is that of the rays: (height, width) for a
     camera.
 
     Attributes:
-        rgba: linear colour, premultiplied by opacity, and opacity; not composited over a background. Of a
-            `Transfer` of n colours, n + 1 numbers, the opacity last.
-        exhausted: whether the ray took `March.max_samples` before it was finished.
-        depth: mean distance from the ray's origin to what is visible, weighted by what each cell adds to the
+        rgba: linear colour, premultiplied by opacity, and opacity; not composited over a background. A
+            `Transfer` of n colours gives n + 1 numbers, the opacity last.
+        exhausted: whether the ray reached `March.max_samples` before its end.
+        depth: mean distance from the ray's origin to visible cells, weighted by their contributions to the
             opacity, world length; infinite where nothing is visible.
         samples: number of samples evaluated, one for each piece of a cell.
-        aligned: whether a last cell that is not transparent was cut at the exit (Kye 2013, Fig. 13).
-        normal: of an `Isosurface`, the unit normal in the world; 0 where nothing is visible.
+        aligned: whether a visible last cell was cut at the exit (Kye 2013, Fig. 13).
+        normal: unit normal of an `Isosurface` in the world; 0 where nothing is visible.
         bricks: the `BrickReport` of `render_bricks`.
-        background: linear RGB, over which it shows itself and `image` composites it; white, but where
-            `jaxvol.show` was given another. Static.
+        background: linear RGB of the default background of `image` and of the notebook's picture; white
+            unless set by `jaxvol.show`. Static.
 
-    As the last line of a notebook's cell it shows itself; `show` does so anywhere.
+    A notebook displays it as the last line of a cell; `show` displays it anywhere.
 
-    With `antialias`, a pixel has the mean of its rays' `rgba`, that of `depth` and `normal` weighted by
-    opacity, and the sum of `samples`; it is `exhausted` or `aligned` where any of them is.
+    With `antialias`, a pixel has the mean `rgba` of its rays, the means of `depth` and `normal` weighted by
+    opacity, and the sum of `samples`; it is `exhausted` or `aligned` if any of its rays is.
 
-    All from `depth` on raise `AttributeError` where they were not computed, as with `outputs="rgba"`. Modes
-    other than `"over"` say what their depth is.
+    `depth`, `samples`, `aligned`, `normal` and `bricks` raise `AttributeError` if not computed, as with
+    `outputs="rgba"`. Modes other than `"over"` document their depth.
     """
 
     rgba: Float[Array, "*rays numbers"]
@@ -83,7 +84,7 @@ class Rendering(eqx.Module):
 
     @property
     def opacity(self) -> Float[Array, "*rays"]:
-        """The last of the numbers of `rgba`."""
+        """The last number of `rgba`."""
         return self.rgba[..., self.rgba.shape[-1] - 1]
 
     @property
@@ -106,24 +107,24 @@ class Rendering(eqx.Module):
     def bricks(self) -> BrickReport:
         return self._detail("bricks", "render it by render_bricks, and ")
 
-    def _detail(self, name: str, more: str = "") -> Any:
+    def _detail(self, name: str, condition: str = "") -> Any:
         if (value := getattr(self.details, name)) is None:
-            raise AttributeError(f'{name} is not part of this rendering: {more}pass outputs="all".')
+            raise AttributeError(f'{name} is not part of this rendering: {condition}pass outputs="all".')
         return value
 
-    def image(self, background: Any = None) -> Float[Array, "*rays 3"]:
+    def image(self, background: Arrayable | None = None) -> Float[Array, "*rays 3"]:
         """Linear RGB over a background: one colour, (3,) or by name ("white"), or an image of the same shape;
-        by default that of the rendering.
+        by default `self.background`.
 
         Raises:
-            ValueError: for a background of another shape, or that is not finite, and an unknown name.
+            ValueError: for a background of another shape or with NaN or infinity, and an unknown name.
 
         Warns of 8-bit colours.
         """
         if (numbers := self.rgba.shape[-1]) != 4:
             raise ValueError(f"image needs a rendering of three colours; this one has {numbers - 1}.")
-        given = self.background if background is None else background
-        background = linear_color("background", given, (..., 3))
+        background = self.background if background is None else background
+        background = linear_color("background", background, (..., 3))
         warn_of_8_bits("background", background, stacklevel=3)
         background = jnp.asarray(background, self.rgba.dtype)
         if background.shape not in ((3,), shape := (*self.rgba.shape[:-1], 3)):
@@ -135,13 +136,13 @@ class Rendering(eqx.Module):
         return jnp.asarray(rgba[..., :3] + (1 - rgba[..., 3:]) * background, rgba.dtype)
 
     def show(self) -> None:
-        """Shows the image over its background: under the cell of a notebook, at once, or else in a window of
-        matplotlib, until that is closed.
+        """Show the image over its background: below the cell of a notebook, or else in a window of
+        matplotlib, until it is closed.
 
         Raises:
-            ValueError: for what is traced, or no image.
+            ValueError: for a traced rendering, or rays that are no image.
 
-        Warns of an image in which nothing is visible.
+        Warns if nothing is visible in the image.
         """
         if self.rgba.ndim != 3 or is_traced(self.rgba):
             raise ValueError(f"show needs an image whose numbers are known; got {described(self.rgba)}.")
@@ -152,7 +153,7 @@ class Rendering(eqx.Module):
         open_window(self, stacklevel=4)
 
     def _repr_png_(self) -> bytes | None:
-        """What notebooks show: the image as a PNG, if it is one."""
+        """The image as a PNG, for notebooks; None for rays that are no image."""
         if self.rgba.ndim != 3 or self.rgba.shape[-1] != 4 or is_traced(self.rgba):
             return None
         _warn_if_empty(self)
@@ -161,13 +162,13 @@ class Rendering(eqx.Module):
 
 def _warn_if_empty(rendering: Rendering) -> None:
     if not np.asarray(rendering.opacity).any():  # NaN is not nothing
-        what = "does the camera see the volume, and the transfer function show its values?"
-        told = f"nothing is visible, all pixels are transparent: {what} jaxvol.show says why."
-        warnings.warn(told, stacklevel=4)  # where a method was called, which equinox wraps
+        causes = "does the camera see the volume, and the transfer function show its values?"
+        warning = f"nothing is visible, all pixels are transparent: {causes} jaxvol.show says why."
+        warnings.warn(warning, stacklevel=4)  # the caller of a method, which equinox wraps
 
 
 def open_window(rendering: Rendering, stacklevel: int = 3) -> None:
-    """Shows an image over its background in a window of matplotlib, until that is closed."""
+    """Show an image over its background in a window of matplotlib, until it is closed."""
     import matplotlib.pyplot as plt
 
     if plt.get_backend().lower() == "agg" and "MPLBACKEND" not in os.environ:  # as without a display
@@ -183,17 +184,17 @@ def open_window(rendering: Rendering, stacklevel: int = 3) -> None:
 
 
 def in_notebook() -> bool:
-    """Whether a kernel runs this, whose cells show their last value."""
+    """True inside a notebook's kernel, whose cells display their last value."""
     ipython = sys.modules.get("IPython")
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
 @partial(jax.jit, static_argnums=1)
 def pooled(rendering: Rendering, n: int) -> Rendering:
-    """The image of which each pixel is the mean of n x n of this one."""
+    """The image with each n x n pixels averaged."""
     height, width = (size // n for size in rendering.exhausted.shape)
 
-    def of_pixels(reduce: Any, tree: PyTree) -> Any:
+    def of_pixels(reduce: Callable[..., Array], tree: PyTree) -> Any:
         return jax.tree.map(
             lambda leaf: reduce(leaf.reshape(height, n, width, n, *leaf.shape[2:]), axis=(1, 3)), tree
         )

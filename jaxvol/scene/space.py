@@ -1,5 +1,5 @@
-"""Where a world point lies in the grid, and where a ray enters and leaves it: a `Space`, the seam `locate`.
-In the default, `Affine`, rays are straight in the grid; others have another `Path`."""
+"""Maps between the world and the grid, and rays clipped to the grid: a `Space` (seam `locate`). Rays are
+straight in the grid of the default, `Affine`; other spaces return another `Path`."""
 
 from abc import abstractmethod
 from functools import reduce
@@ -25,7 +25,7 @@ class Path(eqx.Module):
 
 
 Gap: TypeAlias = tuple[Scalar, Scalar]
-"""Depths between which a ray is outside the grid."""
+"""Entry and exit depth of an interval along a ray, such as one outside the grid."""
 
 
 class Space(eqx.Module):
@@ -33,31 +33,31 @@ class Space(eqx.Module):
 
     @property
     def searches(self) -> bool:
-        """Whether `interval` and `gaps` are loops."""
+        """True if `interval` and `gaps` are loops."""
         return False
 
     @property
     def anchor(self) -> Vec3 | None:
-        """A world point near the volume, from which `local` and `occupancy` count, so that float32 resolves
-        places where the world's own zero is far away. None: they count from that."""
+        """A world point near the volume, the origin of points in `local` and `occupancy`, since float32 is
+        coarse far from the world's origin. None: the world's origin."""
         return None
 
     @property
     def local(self) -> "Space":
-        """The same space, whose points count from `anchor`."""
+        """The same space for points relative to `anchor`."""
         return self
 
     def world(self, place: Vec3) -> Vec3:
-        """World point of a place that counts from `anchor`."""
+        """World point of a point relative to `anchor`."""
         return place if self.anchor is None else plus(self.anchor, place)
 
     def place(self, point: Vec3) -> Vec3:
-        """A world point, counted from `anchor`."""
+        """A world point, relative to `anchor`."""
         return point if self.anchor is None else minus(point, self.anchor)
 
     @property
     def whole(self) -> "Space":
-        """The space without what is clipped from it: light is that of the whole volume."""
+        """The space without clips, since light is that of the whole volume."""
         return self
 
     @property
@@ -75,12 +75,12 @@ class Space(eqx.Module):
         """Distances at which a line enters and leaves the grid; on a miss, the first exceeds the second."""
 
     def gaps(self, entry: Vec3, direction: Vec3, length: Scalar) -> tuple[Gap, ...]:
-        """Where a line is outside the grid between its entry and its exit, `length` from there: a static
-        number of gaps, in any order, which may overlap; missing ones begin at infinity."""
+        """Depths between which a line is outside the grid, from its entry to its exit at `length`: a static
+        number of gaps in any order, which may overlap; unused gaps begin at infinity."""
         return ()
 
     def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
-        """Entry and exit depth in each of several volumes, () for one. On a miss, exit < entry."""
+        """Entry and exit depth for each volume of a group, () for one volume. On a miss, exit < entry."""
         return ()
 
     @abstractmethod
@@ -93,14 +93,14 @@ class Space(eqx.Module):
 
     @abstractmethod
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
-        """Least world distance between neighbouring layers of nodes across each axis, in a box of grid
-        coordinates that may exceed the grid; 0 where nodes meet."""
+        """Least world distance between neighbouring layers of nodes along each axis, in a box of grid
+        coordinates that may exceed the grid; 0 where nodes coincide."""
 
     @abstractmethod
     def occupancy(
         self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None, side: int = BLOCK
     ) -> Occupancy:
-        """Cells that may hold anything visible, placed from `anchor` on, from the visible blocks of `side`³
+        """Cells that may hold anything visible, relative to `anchor`, from the visible blocks of `side`³
         cells of the grid, or of a part of it that begins at the node `first`."""
 
     def path(self, entry: Vec3, direction: Vec3) -> Path:
@@ -109,8 +109,8 @@ class Space(eqx.Module):
 
 
 class Line(NamedTuple):
-    """A ray before it is cut to the volume: origin, unit direction, (column, row), the distance at which it
-    ends, and `beside`, added to the origin once that counts from near the volume, where float32 is fine."""
+    """A ray before it is clipped to the volume: origin, unit direction, (column, row), end distance, and an
+    offset `beside` of the origin, added relative to the volume, since float32 would lose it in the world."""
 
     origin: Vec3
     direction: Vec3
@@ -120,10 +120,10 @@ class Line(NamedTuple):
 
 
 class Ray(eqx.Module):
-    """One ray, clipped to the volume. Depths count from the entry, for float32 and far cameras."""
+    """One ray, clipped to the volume. Depths are relative to the entry, for float32 and far cameras."""
 
     entry: Vec3
-    """Where the ray enters the volume, from the `anchor` of its space on."""
+    """Entry point into the volume, relative to the `anchor` of its space."""
     direction: Vec3
     """Unit direction in the world."""
     t_in: Scalar
@@ -132,28 +132,25 @@ class Ray(eqx.Module):
     """Distance from entry to exit; 0 on a miss."""
     path: Path
     pixel: tuple[Int[Array, ""], Int[Array, ""]]
-    """(column, row); keys everything random along the ray."""
+    """(column, row); seeds all random numbers of the ray."""
     gaps: tuple[Gap, ...] = ()
     """Depths between entry and exit where the ray is outside the volume."""
     spans: tuple[Gap, ...] = ()
-    """Of several volumes, the depths between which the ray is in each."""
+    """Entry and exit depth for each volume of a group."""
     reach: Scalar | None = None
-    """Depth from which on nothing is sampled; None: the exit."""
+    """End of sampling; None: the exit."""
 
     @property
     def end(self) -> Scalar:
-        """Depth from which on nothing is sampled."""
+        """Depth at which sampling ends."""
         return self.length if self.reach is None else self.reach
 
     def contains(self, depth: Scalar) -> Bool[Array, "..."]:
-        """Whether this depth is sampled inside the volume: neither past the end nor in a gap."""
-        return (depth < self.end) & ~self.in_gap(depth)
-
-    def in_gap(self, depth: Scalar) -> Bool[Array, "..."]:
-        within = jnp.zeros(jnp.shape(depth), bool)
-        for left, back in self.gaps:
-            within |= (depth >= left) & (depth < back)
-        return within
+        """True where a depth is sampled inside the volume: neither past the end nor in a gap."""
+        inside = depth < self.end
+        for begin, end in self.gaps:
+            inside &= ~((depth >= begin) & (depth < end))
+        return inside
 
 
 def enter(
@@ -162,13 +159,13 @@ def enter(
     direction: Vec3,
     pixel: tuple[Int[Array, ""], Int[Array, ""]],
     until: Scalar | None = None,
-    beside: Vec3 | None = None,
+    offset: Vec3 | None = None,
 ) -> Ray:
-    """Clip a ray to the volume, ahead of its origin (+ `beside`) and to `until`; `invalid` if not finite."""
+    """Clip a ray to the volume, ahead of its origin (+ `offset`) and to `until`; `invalid` if not finite."""
     origin, space = space.place(origin), space.local
-    if beside is not None:
-        origin = plus(origin, beside)
-    # distances are measured from a point close to the volume, since those from a far camera are rounded
+    if offset is not None:
+        origin = plus(origin, offset)
+    # distances are relative to a point close to the volume, since those from a far camera are rounded
     toward = sum((m - o) * d for m, o, d in zip(space.middle, origin, direction, strict=True))
     base = jax.lax.stop_gradient(jnp.maximum(toward - space.diagonal / 2, 0))
     close = along(origin, direction, base)
@@ -178,20 +175,20 @@ def enter(
     start = jnp.where(hit, start, 0)  # a miss has infinite distances, whose products are NaN
     entry = along(close, direction, start)
     length = jnp.where(hit, far - start, 0)
-    # also those gaps that reach past where the ray ends
+    # gaps may reach past the end of the ray
     path, gaps = space.path(entry, direction), space.gaps(entry, direction, length)
     spans = space.spans(entry, direction)
     fault = ~jnp.isfinite(toward)
     if until is not None:
-        left = until - base - start
-        length = jnp.where(left < length, jnp.where(left > 0, left, 0), length)
+        until_depth = until - base - start
+        length = jnp.where(until_depth < length, jnp.where(until_depth > 0, until_depth, 0), length)
         fault |= jnp.isnan(until)
     ray = Ray(entry, direction, base + start, length, path, pixel, gaps, spans)
     return invalid(ray, fault)
 
 
 def invalid(ray: Ray, fault: Bool[Array, "..."]) -> Ray:
-    """Where `fault` is true, a ray that is never marched, which might not end, and renders as NaN."""
+    """Replace the ray where `fault` is true by one of length 0 that renders as NaN: a march might not end."""
     t_in, length = jnp.where(fault, jnp.nan, ray.t_in), jnp.where(fault, 0, ray.length)
     return eqx.tree_at(lambda ray: (ray.t_in, ray.length), ray, (t_in, length))
 
@@ -221,13 +218,13 @@ class Affine(Space):
     """A grid given by spacing, origin and direction."""
 
     first: Vec3 | None
-    """The first node; None: points count from there."""
+    """The first node; None: points are relative to it."""
     high: Vec3
-    """The last node, from the first one, along the axes of `frame`."""
+    """The last node, relative to the first one, along the axes of `frame`."""
     spacing: Vec3
     frame: Frame
     inner: "tuple[Affine, ...]"
-    """The grids of several volumes that this one holds."""
+    """The grids of a group of volumes inside this one."""
 
     def __init__(self, volume: Volume):
         field = volume.field
@@ -246,8 +243,8 @@ class Affine(Space):
     def local(self) -> "Affine":
         if self.first is None:
             return self
-        away = [minus(cast(Vec3, grid.first), self.first) for grid in self.inner]
-        inner = tuple(eqx.tree_at(lambda g: g.first, *each) for each in zip(self.inner, away, strict=True))
+        firsts = [minus(cast(Vec3, grid.first), self.first) for grid in self.inner]
+        inner = tuple(eqx.tree_at(lambda g: g.first, *pair) for pair in zip(self.inner, firsts, strict=True))
         return eqx.tree_at(lambda space: (space.first, space.inner), self, (None, inner))
 
     @property
@@ -262,7 +259,7 @@ class Affine(Space):
     def interval(self, origin: Vec3, direction: Vec3) -> tuple[Scalar, Scalar]:
         zero = jnp.zeros_like(self.high[0])
         return slab_interval(
-            self._own(origin), self.frame.components(direction), (zero, zero, zero), self.high
+            self._components(origin), self.frame.components(direction), (zero, zero, zero), self.high
         )
 
     def spans(self, entry: Vec3, direction: Vec3) -> tuple[Gap, ...]:
@@ -270,7 +267,7 @@ class Affine(Space):
 
     def coordinate(self, point: Vec3) -> Vec3:
         # times the reciprocal: XLA stores quotients that are used more than once
-        x, y, z = (p * (1 / step) for p, step in zip(self._own(point), self.spacing, strict=True))
+        x, y, z = (p * (1 / step) for p, step in zip(self._components(point), self.spacing, strict=True))
         return x, y, z
 
     def point(self, coordinate: Vec3) -> Vec3:
@@ -293,8 +290,8 @@ class Affine(Space):
         dx, dy, dz = (d / step for d, step in zip(direction, self.spacing, strict=True))
         return Straight(self.coordinate(entry), (dx, dy, dz))
 
-    def _own(self, point: Vec3) -> Vec3:
-        """Components of a point along the axes, from the first node on."""
+    def _components(self, point: Vec3) -> Vec3:
+        """Components of a point along the axes, relative to the first node."""
         return self.frame.components(self.place(point))
 
 
@@ -307,12 +304,12 @@ def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple
 def median_node_distance(space: Space, *middles: Array) -> Scalar:
     """Size of a voxel: median over grid coordinates of the least world distance between nodes."""
 
-    def least(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
-        along = jax.jacfwd(lambda at: jnp.stack(space.point((at[0], at[1], at[2]))))(jnp.stack([x, y, z]))
-        return jnp.sqrt(jnp.min(jnp.sum(along * along, axis=0)))
+    def distance(x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+        jacobian = jax.jacfwd(lambda c: jnp.stack(space.point((c[0], c[1], c[2]))))(jnp.stack([x, y, z]))
+        return jnp.sqrt(jnp.min(jnp.sum(jacobian * jacobian, axis=0)))
 
-    at = [each.astype(space.middle[0].dtype) for each in middles]
-    return jnp.median(jnp.vectorize(least)(*jnp.meshgrid(*at, indexing="ij")))
+    coordinates = [middle.astype(space.middle[0].dtype) for middle in middles]
+    return jnp.median(jnp.vectorize(distance)(*jnp.meshgrid(*coordinates, indexing="ij")))
 
 
 def world_gradient(volume: Volume, space: Space, point: Vec3) -> Vec3:

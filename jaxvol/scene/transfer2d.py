@@ -1,7 +1,6 @@
-"""Which colour and extinction has this value, where the volume is this steep?"""
+"""Transfer functions of the value and the magnitude of its gradient."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,23 +19,23 @@ from .volume import Volume
 
 
 class TransferFunction2D(Transfer):
-    """Colour and extinction by the value and the magnitude of its gradient, which tells boundaries from
-    materials: a table, bilinear between its lines and constant beyond them.
+    """Colour and extinction by value and gradient magnitude, which separates boundaries from materials: a
+    table, bilinear between its lines and constant beyond them.
 
     Args:
         values: (n,) increasing, in value units; n ≥ 2.
-        magnitudes: (m,) increasing, in value units per world length; m ≥ 2. Two neighbours may be equal, and
-            make a step. Values and magnitudes have no gradient.
+        magnitudes: (m,) increasing, in value units per world length; m ≥ 2. Two equal neighbours make a step.
+            Values and magnitudes have no gradient.
         colors: (n, m, 3) linear RGB, not premultiplied; usually in [0, 1].
-        extinction: (n, m), in 1/length, ≥ 0; below, it counts as 0, and has no gradient.
+        extinction: (n, m), in 1/length, ≥ 0; negative values count as 0, without a gradient.
 
-    The magnitude is that of the value's gradient in the volume's own grid, also under a `ToroidalMap`, which
-    bends the grid: choose a spacing for which that has a meaning. Where the gradient is 0, the derivative of
-    its magnitude is taken as 0. `quadrature="preintegrated"` and `"average"` are refused.
+    The gradient is taken in the volume's grid, also under a `ToroidalMap`, which bends the grid: choose a
+    meaningful spacing. Where the gradient is 0, the derivative of its magnitude is taken as 0.
+    `quadrature="preintegrated"` and `"average"` are refused.
 
     Raises:
-        ValueError: for fewer than two lines, lines that do not increase or of which three are equal,
-            negative extinction, NaN or infinity, or shapes that do not fit together.
+        ValueError: for fewer than two lines, lines that do not increase, three equal lines, negative
+            extinction, NaN or infinity, or shapes that do not fit together.
 
     Sources: Levoy, "Display of Surfaces from Volume Data", 1988; Kniss et al., "Multidimensional Transfer
     Functions for Interactive Volume Rendering", 2002.
@@ -59,22 +58,23 @@ class TransferFunction2D(Transfer):
     @classmethod
     def from_points(
         cls,
-        points: Sequence[tuple[float, float, Sequence[float], float, tuple[float, float]]] | Any,
+        points: Sequence[tuple[Arrayable, Arrayable, Arrayable, Arrayable, Arrayable]],
         unit_distance: Arrayable = 1.0,
     ) -> "TransferFunction2D":
-        """From places in the plot of magnitude against value, each with the material seen there.
+        """A sum of tents in the plot of magnitude against value, one for each material.
 
         Args:
-            points: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`. The extinction of each
-                is that of this opacity, times 1 - |value - the point's| / reach, and so by the magnitude.
-            unit_distance: thickness of a layer that has these opacities, world length.
+            points: `(value, magnitude, (r, g, b), opacity, (reach, magnitude_reach))`. The extinction of a
+                point is that of its opacity, times 1 - |value - the point's| / reach, and likewise for the
+                magnitude.
+            unit_distance: thickness of a layer with these opacities, world length.
 
-        Where points overlap, extinctions are added; colours are means weighted by them on the lines through
-        points and sides, and bilinear between.
+        Where points overlap, extinctions are added; colours are means weighted by extinction on the lines
+        through centers and sides of the tents, and bilinear in between.
 
         Raises:
-            ValueError: for no points or what is none, an opacity outside [0, 1], reaches that are not
-                positive, and places that are traced: lines carry no gradient.
+            ValueError: for no points, malformed points, an opacity outside [0, 1], reaches that are not
+                positive, and traced values, magnitudes or reaches: lines carry no gradient.
 
         Source: Kniss et al. 2002, whose widgets are such tents.
         """
@@ -91,21 +91,22 @@ class TransferFunction2D(Transfer):
         reach = require(reach, lambda reach: reach > 0, "reaches must be positive; got {got}.")
 
         def axis(place: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Lines, the tent of each point on them, and how far they are from it, in reaches."""
+            """Lines, the tent of each point on the lines, and their distances from it, in reaches."""
             ends = np.stack([place - reach, place, place + reach], axis=1)
             lines = np.unique(ends)
             tents = np.stack([np.interp(lines, end, (0, 1, 0)) for end in ends])  # exactly 0 on the sides
             return lines, tents, np.abs(lines - place[:, None]) / reach[:, None]
 
-        (lines, along, far), (others, across, away) = map(axis, map(np.asarray, places), np.asarray(reach).T)
-        tents = along[:, :, None] * across[:, None]  # (points, values, magnitudes)
-        each = extinction_of(opacities, unit_distance)[:, None, None] * tents
-        extinction = jnp.sum(each, axis=0)
-        rgb = finite_array("colors", colors, (count, 3))
-        mean = jnp.einsum("pnm,pc->nmc", each, rgb) / jnp.where(extinction > 0, extinction, 1)[..., None]
-        # where nothing is seen, the colour of the nearest point, so that it reaches to its sides
-        nearest = rgb[np.argmin(np.maximum(far[:, :, None], away[:, None]), axis=0)]
-        return cls(lines, others, jnp.where((extinction > 0)[..., None], mean, nearest), extinction)
+        axes = map(axis, map(np.asarray, places), np.asarray(reach).T)
+        (rows, row_tents, row_distance), (columns, column_tents, column_distance) = axes
+        tents = row_tents[:, :, None] * column_tents[:, None]  # (points, values, magnitudes)
+        extinctions = extinction_of(opacities, unit_distance)[:, None, None] * tents
+        extinction = jnp.sum(extinctions, axis=0)
+        rgb, visible = finite_array("colors", colors, (count, 3)), (extinction > 0)[..., None]
+        mean = jnp.einsum("pnm,pc->nmc", extinctions, rgb) / jnp.where(visible, extinction[..., None], 1)
+        # the colour of the nearest point where nothing is visible, so that it reaches the sides of its tent
+        nearest = rgb[np.argmin(np.maximum(row_distance[:, :, None], column_distance[:, None]), axis=0)]
+        return cls(rows, columns, jnp.where(visible, mean, nearest), extinction)
 
     def __call__(self, value: Scalar, magnitude: Scalar) -> tuple[Color, Scalar]:
         """Colour (r, g, b) and extinction of a value and a magnitude of the gradient."""
@@ -129,9 +130,9 @@ class TransferFunction2D(Transfer):
     def search(self) -> Callable[[Measured], Measured]:
         def search(measured: Measured) -> Measured:
             value, magnitude = measured
-            i, along = bilinear.between_lines(self.values, value)
-            j, across = bilinear.between_lines(self.magnitudes, magnitude)
-            return i * (self.magnitudes.shape[0] - 1) + j, along, across
+            i, u = bilinear.between_lines(self.values, value)
+            j, v = bilinear.between_lines(self.magnitudes, magnitude)
+            return i * (self.magnitudes.shape[0] - 1) + j, u, v
 
         return search
 
@@ -139,8 +140,8 @@ class TransferFunction2D(Transfer):
         rows = self.rows()
 
         def classify(measured: Measured) -> tuple[Vec3, Scalar]:
-            _, _, cell, along, across = measured
-            r, g, b, extinction = bilinear.interpolate_corners(table_row(rows, cell), along, across)
+            _, _, cell, u, v = measured
+            r, g, b, extinction = bilinear.interpolate_corners(table_row(rows, cell), u, v)
             return (r, g, b), extinction
 
         return classify
@@ -148,19 +149,19 @@ class TransferFunction2D(Transfer):
     def vjp(
         self, measured: Measured, color: Color, extinction: Scalar, *, integrated: bool = False
     ) -> tuple[Transfer, Measured]:
-        # One scatter of whole rows; JAX's transpose would scatter each entry of a row by itself.
-        value, magnitude, cell, along, across = measured
+        # One scatter of rows; JAX's transpose would scatter each entry of a row by itself.
+        value, magnitude, cell, u, v = measured
         rows, pull_rows = jax.vjp(lambda transfer: transfer.rows(), self)
         row = table_row(rows, cell)
-        _, pull = jax.vjp(bilinear.interpolate_corners, row, along, across)
-        of_row, of_along, of_across = pull((*color, extinction))
+        _, pull = jax.vjp(bilinear.interpolate_corners, row, u, v)
+        of_row, of_u, of_v = pull((*color, extinction))
         (transfer,) = pull_rows(row_sums(len(rows), cell, jnp.stack(of_row, axis=-1)))
         i, j = jnp.divmod(cell, self.magnitudes.shape[0] - 1)
-        of_value = of_along * bilinear.slope_between_lines(self.values, value, i)
-        return transfer, (of_value, of_across * bilinear.slope_between_lines(self.magnitudes, magnitude, j))
+        of_value = of_u * bilinear.slope_between_lines(self.values, value, i)
+        return transfer, (of_value, of_v * bilinear.slope_between_lines(self.magnitudes, magnitude, j))
 
     def rows(self) -> Float[Array, "cells 16"]:
-        """A table with one row for each cell between lines: colour and extinction of its four corners."""
+        """One row for each cell between lines: colour and extinction of its four corners."""
         extinction = not_negative(self.extinction)
         return bilinear.corner_rows(jnp.concatenate([self.colors, extinction[..., None]], axis=-1))
 
@@ -175,6 +176,6 @@ class TransferFunction2D(Transfer):
         return bilinear.any_between(self.extinction > 0, values, magnitudes)
 
     def _lines(self, blocks: Blocks) -> tuple[Range, Range]:
-        """The values and magnitudes of the table on which blocks depend."""
+        """Ranges of the table's values and magnitudes on which blocks depend."""
         values, magnitudes = jax.lax.stop_gradient((self.values, self.magnitudes))
         return points_around(values, blocks.low, blocks.high), points_around(magnitudes, *blocks.magnitudes)

@@ -1,7 +1,7 @@
-"""What is a volume's value at a grid coordinate?
+"""Volumes: values, gradients and labels of a regular grid at grid coordinates.
 
 Grid coordinates count voxels: node `data[i, j, k]` lies at (i, j, k), so that n nodes span n - 1 cells.
-Values are interpolated trilinearly; outside the grid they are those of its nearest point.
+Values are interpolated trilinearly; outside the grid they are those of the nearest point of the grid.
 """
 
 import operator
@@ -29,23 +29,22 @@ from .voxel_fetch import Fetch, OneByOne, Voxel, Window, corners, flat_index, ne
 
 
 PLACE = 1e-4
-"""Voxels by which a box may miss a node through rounding."""
+"""Tolerance, in voxels, for rounding of a box that should meet a node."""
 
 
 class Field(eqx.Module):
     """A user-defined field in place of interpolated voxels: `Volume(data, field=...)`.
 
-    Gradients reach its own arrays, and the voxels that it reads by `volume.interpolated`; what a function
-    that it holds has captured is no array of its own, and is refused in reverse mode. It may hold other
-    volumes, whose voxels have gradients in less time and memory than arrays have; under `adjoint="replay"` it
-    must read these outside of `jax.vmap`, loops and branches of its own. `SpaceLeaping` leaps over no part
-    of it, since its range is unknown.
+    Gradients reach arrays that are leaves of the field, and voxels that it reads by `volume.interpolated`.
+    Values captured by its functions are refused in reverse mode. A field may hold other volumes, whose voxels
+    have gradients in less time and memory than arrays; `adjoint="replay"` requires that it reads them outside
+    `jax.vmap`, loops and branches. `SpaceLeaping` never leaps in a field, since its range is unknown.
     """
 
     @abstractmethod
     def value(self, volume: "Volume", coordinate: Vec3) -> Voxel:
-        """Value at a grid coordinate, whose world position is
-        `volume.origin + volume.direction @ (coordinate * volume.spacing)`; of several channels, a tuple."""
+        """Value, or a tuple of channels, at a grid coordinate, whose world position is
+        `volume.origin + volume.direction @ (coordinate * volume.spacing)`."""
 
 
 class Volume(eqx.Module):
@@ -53,25 +52,25 @@ class Volume(eqx.Module):
 
     Args:
         data: (nx, ny, nz) voxels, at least 2 along each axis, in an array of any library; or (nx, ny, nz, c)
-            of several numbers each, for a transfer function that reads them (`RadianceField`). 8- and 16-bit
-            integers and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are
-            enabled. Others become the first of uint8, int8, uint16, int16 and float32 that holds every value
-            exactly. Of an xarray `DataArray`, axes named x, y, z are put in this order, and coordinates,
-            which must be evenly spaced, give spacing and origin. Images of nibabel (in its world: x, y to the
-            right and front, here left and back), SimpleITK and VTK (`vtkImageData`, with scalars at points)
-            are taken as they lie. Of an image stack [plane, row, column], pass `stack.T`.
+            for c channels, for a transfer function that reads them (`RadianceField`). 8- and 16-bit integers
+            and floats of up to 32 bits keep their type; float64 does if JAX's 64-bit types are enabled.
+            Others become the first of uint8, int8, uint16, int16 and float32 that holds every value exactly.
+            Axes x, y, z of an xarray `DataArray` are put in this order, and its coordinates, which must be
+            evenly spaced, give spacing and origin. Images of nibabel (x, y to the right and front in its
+            world, left and back here), SimpleITK and VTK (`vtkImageData`, with scalars at points) keep their
+            place. Pass an image stack [plane, row, column] as `stack.T`.
         spacing: distance between neighbouring nodes along x, y, z, world length (mm for CT); by default 1.
         origin: world position of node (0, 0, 0), by default 0.
         direction: 3 x 3 matrix whose columns, of length 1, are the world directions of the data's axes, as in
             ITK (`GetDirection`): node (i, j, k) lies at `origin + direction @ (spacing * (i, j, k))`; by
             default the world's axes. Axes need not be orthogonal: a scan with a tilted gantry is sheared.
         labels: optional integer label of every node (a segmentation). 64-bit labels become 32-bit.
-        label_ids: what the labels stand for where they are numbers 0, 1, 2, … in place of larger ones: label
-            k, or the value k of a volume without labels, has the id `label_ids[k]`. `jv.load` gives them, and
+        label_ids: original ids of renumbered labels 0, 1, 2, …: label k, or the value k of a volume without
+            labels, has the id `label_ids[k]`. `jv.load` sets them;
             `LabelTransferFunction({volume.label_ids.index(997): function})` uses them. Static.
         field: optional `Field` that supplies the values; voxels then only set the volume's extent.
 
-    Where it fails: `experiments/stability.py`, "voxels of 16-bit floats".
+    Limits of its accuracy: `experiments/stability.py`, "voxels of 16-bit floats".
 
     Raises:
         ValueError: for data that are not 3-D or 4-D, have an axis of one voxel or an unsupported type, or
@@ -88,7 +87,7 @@ class Volume(eqx.Module):
     label_ids: tuple[int, ...] | None = eqx.field(static=True)
     field: Field | None
     fetch: Fetch
-    """How voxels are read. Internal."""
+    """Access to the voxels. Internal."""
 
     def __init__(
         self,
@@ -99,7 +98,7 @@ class Volume(eqx.Module):
         *,
         direction: Arrayable | None = None,
         label_ids: Arrayable | None = None,
-        field: Field | Any | None = None,
+        field: Field | None = None,
     ):
         place: dict[str, Any] = object_arguments(data) or {"data": data}
         self.data = voxel_array(place["data"])
@@ -120,39 +119,39 @@ class Volume(eqx.Module):
         if not is_concrete(self.data):
             return eqx.tree_pformat(self)
         data, place = np.asarray(self.data), ("spacing", "origin", "direction")
-        told = [f"{name}={pasted(getattr(self, name))}" for name in place if getattr(self, name) is not None]
-        told += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
-        told += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
-        return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(told)}>"
+        parts = [f"{name}={pasted(getattr(self, name))}" for name in place if getattr(self, name) is not None]
+        parts += [] if self.labels is None else [f"labels to {np.max(self.labels)}"]
+        parts += [f"values {data.min():g} to {data.max():g}" if self.field is None else f"field={self.field}"]
+        return f"<Volume shape={data.shape}, dtype={data.dtype}, {', '.join(parts)}>"
 
     def __getitem__(self, part: Any) -> "Volume":
-        """The part with these voxels, such as `volume[10:90, :, ::2]` or `volume[..., :50]`, at its place in
-        the world.
+        """The part of the volume in a slice such as `volume[10:90, :, ::2]` or `volume[..., :50]`, at its
+        place in the world.
 
         Raises:
-            ValueError: for what is no slice with a step above 0, fewer than two voxels along an axis, and a
-                volume with a `field`.
+            ValueError: for an index that is no slice with a step above 0, fewer than two voxels along an
+                axis, and a volume with a `field`.
         """
-        given = list(part) if isinstance(part, tuple) else [part]
-        at = next((k for k, each in enumerate(given) if each is ...), len(given))
-        given[at : at + 1] = [slice(None)] * (3 - len(given) + (at < len(given)))
+        indices = list(part) if isinstance(part, tuple) else [part]
+        at = next((k for k, index in enumerate(indices) if index is ...), len(indices))
+        indices[at : at + 1] = [slice(None)] * (3 - len(indices) + (at < len(indices)))
         if self.field is not None:
             raise ValueError("volume[a:b, c:d, e:f] is of voxels; this volume has a field.")
         try:
-            slices = tuple(slice(*map(_index, (s.start, s.stop, s.step))) for s in given)
-            ranges = [range(n)[each] for n, each in zip(self.shape, slices, strict=True)]
+            slices = tuple(slice(*map(_index, (s.start, s.stop, s.step))) for s in indices)
+            ranges = [range(n)[s] for n, s in zip(self.shape, slices, strict=True)]
         except (AttributeError, TypeError, ValueError) as fault:
             expected = "takes up to three slices of integers, with steps above 0, and an Ellipsis"
             raise ValueError(f"volume[a:b, c:d, e:f] {expected}; got {shortened(part)}.") from fault
-        if any(len(each) < 2 or each.step < 1 for each in ranges):
-            left = tuple(len(each) if each.step > 0 else 0 for each in ranges)
+        if any(len(r) < 2 or r.step < 1 for r in ranges):
+            counts = tuple(len(r) if r.step > 0 else 0 for r in ranges)
             raise ValueError(
                 f"volume[a:b, c:d, e:f] must leave 2 voxels or more along each axis, in order; "
-                f"{shortened(part)} of {self.shape} leaves {left}."
+                f"{shortened(part)} of {self.shape} leaves {counts}."
             )
         # in NumPy where numbers are known, which compiles nothing
-        own = self.data, self.spacing, self.origin, self.direction, self.labels
-        known: list[Any] = [np.asarray(each) if is_concrete(each) else each for each in own]
+        arrays = self.data, self.spacing, self.origin, self.direction, self.labels
+        known: list[Any] = [np.asarray(array) if is_concrete(array) else array for array in arrays]
         data, spacing, origin, direction, labels = known
         start, step = (
             np.array([getattr(r, name) for r in ranges], spacing.dtype) for name in ("start", "step")
@@ -160,20 +159,20 @@ class Volume(eqx.Module):
         shift = spacing * start
         shift = shift if direction is None else (direction * shift[None, :]).sum(axis=1)
         labels = None if labels is None else labels[slices]
-        how: Any = {"direction": direction, "label_ids": self.label_ids}
-        return Volume(data[slices], spacing * step, origin + shift, labels, **how)
+        place = spacing * step, origin + shift
+        return Volume(data[slices], *place, labels, direction=direction, label_ids=self.label_ids)
 
     def crop(self, box: Arrayable) -> "Volume":
-        """The part that just holds a box, at its place in the world; in turned axes, the box around that.
+        """The smallest part of the grid that contains a world box, at its place in the world.
 
         Args:
             box: (x_min, x_max, y_min, y_max, z_min, z_max) in the world, as `bounds`.
 
         Returns:
-            The `Volume`, of whole voxels.
+            The `Volume`, cut between voxels.
 
         Raises:
-            ValueError: for a box outside of it, what is traced, and as slices are.
+            ValueError: for a box outside the volume, traced arguments, and the errors of slices.
         """
         if is_traced(box, self.origin, self.spacing, self.direction):
             raise ValueError("crop needs numbers; box or place is traced: call it outside of jax.jit.")
@@ -182,8 +181,8 @@ class Volume(eqx.Module):
         corners = np.array(np.meshgrid(*ends)).reshape(3, -1) - np.asarray(self.origin, np.float64)[:, None]
         at = np.linalg.solve(turn * np.asarray(self.spacing, np.float64), corners)
         first, end = np.floor(at.min(1) + PLACE), np.ceil(at.max(1) - PLACE) + 1
-        beside = (at.max(1) < -PLACE) | (at.min(1) > np.array(self.shape) - 1 + PLACE)
-        if beside.any() or (ends[:, 0] >= ends[:, 1]).any():
+        misses = (at.max(1) < -PLACE) | (at.min(1) > np.array(self.shape) - 1 + PLACE)
+        if misses.any() or (ends[:, 0] >= ends[:, 1]).any():
             bounds = pasted(self.bounds)
             expected = f"(x_min, x_max, y_min, …) that meets the volume, {bounds}"
             raise ValueError(f"box must be {expected}; got {pasted(ends.ravel())}.")
@@ -193,7 +192,7 @@ class Volume(eqx.Module):
 
     @property
     def valid(self) -> Any:
-        """Whether spacing and direction, which may be traced, place the voxels in space, not in a plane."""
+        """True if spacing is positive and direction not flat; both may be traced."""
         placed = (self.spacing > 0).all()
         if self.direction is None:
             return placed
@@ -201,32 +200,32 @@ class Volume(eqx.Module):
 
     @property
     def shape(self) -> Any:
-        """Number of nodes along x, y, z: three integers, which are traced in some kernels."""
+        """Number of nodes along x, y, z: three integers, traced in some kernels."""
         return self.fetch.shape(self.data)
 
     @property
     def channels(self) -> int:
-        """How many numbers there are at a place."""
+        """Number of values at each point."""
         if self.field is None:
             return self.data.shape[3] if self.data.ndim > 3 else 1
         at = (jax.ShapeDtypeStruct((), self.spacing.dtype),) * 3
         answer = eqx.filter_eval_shape(Volume.value, self, at)
         numbers = answer if isinstance(answer, tuple) else (answer,)
-        if not numbers or any(getattr(each, "shape", None) != () for each in numbers):
+        if not numbers or any(getattr(n, "shape", None) != () for n in numbers):
             kind = type(self.field).__name__
             raise ValueError(f"{kind}.value must return a number, or a tuple of numbers; got {answer}.")
         return len(numbers)
 
     @property
     def first(self) -> Vec3 | None:
-        """The node at which `data` begins, in the type of `spacing`; None if `data` is the whole grid."""
+        """The node at which `data` begins, in the type of `spacing`; None if `data` is the full grid."""
         if self.fetch.window is None:
             return None
         x, y, z = self.fetch.window.first.astype(self.spacing.dtype)
         return x, y, z
 
     def in_grid_order(self, of_data: Array) -> Array:
-        """Moves the last three axes of an array, which are those of `data`, into the order x, y, z."""
+        """Move the last three axes of an array, in the order of `data`, into the order x, y, z."""
         if self.fetch.axes == XYZ:
             return of_data
         return jnp.moveaxis(of_data, (-3, -2, -1), tuple(axis - 3 for axis in self.fetch.axes))
@@ -240,7 +239,7 @@ class Volume(eqx.Module):
     def bounds(self) -> Float[Array, "6"]:
         """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes."""
         turn = np.eye(3, dtype=self.spacing.dtype) if self.direction is None else self.direction
-        # how far each axis of the data reaches along the world's, down or up
+        # extent of each axis of the data along the world's axes
         reach = turn * (self._steps * self.spacing)[None, :]
         ends = (self.origin + jnp.sum(end(reach, 0), axis=1) for end in (jnp.minimum, jnp.maximum))
         return jnp.stack(list(ends), axis=-1).reshape(-1)
@@ -248,10 +247,10 @@ class Volume(eqx.Module):
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """World positions of the first and the last node."""
-        along = self._steps * self.spacing
-        # not by a matrix product, which some GPUs round to 10 bits
-        turned = along if self.direction is None else jnp.sum(self.direction * along[None, :], axis=1)
-        return self.origin, self.origin + turned
+        diagonal = self._steps * self.spacing
+        if self.direction is not None:  # no matrix product, which some GPUs round to 10 bits
+            diagonal = jnp.sum(self.direction * diagonal[None, :], axis=1)
+        return self.origin, self.origin + diagonal
 
     @property
     def _steps(self) -> Float[np.ndarray, "3"]:
@@ -265,24 +264,22 @@ class Volume(eqx.Module):
         return (low + high) / 2
 
     def value(self, coordinate: Vec3) -> Voxel:
-        """Value at a grid coordinate, in the coordinate's float type; from `field` if there is one. Of
-        several channels, a tuple."""
+        """Value, or a tuple of channels, at a grid coordinate, in its float type; from `field` if set."""
         return self.interpolated(coordinate) if self.field is None else self.field.value(self, coordinate)
 
     def values(self, coordinate: Vec3) -> tuple[Scalar, ...]:
-        """The value, or those of all channels."""
+        """Values of all channels."""
         value = self.value(coordinate)
         return value if isinstance(value, tuple) else (value,)
 
     def interpolated(self, coordinate: Vec3) -> Voxel:
-        """Trilinear interpolation of the voxels at a grid coordinate, in the coordinate's float type; of
-        several channels, a tuple."""
+        """Trilinear interpolation of the voxels, or a tuple of channels, at a grid coordinate."""
         return self.fetch.interpolated(self.data, coordinate)
 
     def gradient(self, coordinate: Vec3) -> Vec3:
         """Gradient of the value along the grid axes, in value units per world length: interpolated central
-        differences of the nodes, one-sided at the border, with an error of O(spacing²); of a `field`, the
-        difference of its values one node to either side, inside the grid."""
+        differences of the nodes, one-sided at the border, with an error of O(spacing²); for a `field`,
+        differences of its values one node to either side, inside the grid."""
         central = self.field is None
         sx, sy, sz = self.fetch.slopes(self.data, coordinate) if central else self._field_slopes(coordinate)
         return sx / self.spacing[0], sy / self.spacing[1], sz / self.spacing[2]
@@ -296,7 +293,7 @@ class Volume(eqx.Module):
         return gather(self._labels().reshape(-1), place).astype(jnp.int32)
 
     def label_share(self, coordinate: Vec3, label: int) -> Scalar:
-        """Trilinear share of a label at a grid coordinate: 1 between nodes that have it, 0 between others."""
+        """Trilinear interpolation of the indicator of a label: 1 at its nodes, 0 at others."""
         labels, share = self._labels().reshape(-1), jnp.zeros_like(coordinate[0])
         for index, weight in corners(coordinate, self.shape):
             share = share + weight * (gather(labels, index) == label).astype(share.dtype)
@@ -319,13 +316,13 @@ class Volume(eqx.Module):
 
 
 def check_one_channel(volume: Volume, use: str) -> None:
-    """Raises `ValueError` for a volume of several channels, which has no such use."""
+    """Raise `ValueError` for a volume of several channels."""
     if (channels := volume.channels) > 1:
         raise ValueError(f"volume must have one channel for {use}; got one of {channels}.")
 
 
 def _checked_direction(direction: Arrayable) -> Float[Array, "3 3"] | None:
-    """None for a direction that is known to be the identity."""
+    """The direction, checked; None for a known identity."""
     turn = require(
         finite_array("direction", direction, (3, 3)),
         lambda d: (abs((d * d).sum(0) - 1) < 2e-4).all() & (abs(_determinant(d)) > FLAT),
@@ -345,13 +342,13 @@ def _with(coordinate: Vec3, axis: int, component: Scalar) -> Vec3:
 
 
 def grids(volume: Volume) -> list[Volume]:
-    """The volumes whose voxels are read: itself, and those that its field holds."""
-    inner = jax.tree.leaves(volume.field, is_leaf=_is_volume)
-    return [volume, *(grid for each in inner if _is_volume(each) for grid in grids(each))]
+    """The volume itself and all volumes inside its field."""
+    leaves = jax.tree.leaves(volume.field, is_leaf=_is_volume)
+    return [volume, *(grid for leaf in leaves if _is_volume(leaf) for grid in grids(leaf))]
 
 
 def voxels_of(volume: Volume) -> tuple[Any, ...]:
-    """The voxels of all its `grids`."""
+    """The voxels of all `grids`."""
     return tuple(grid.data for grid in grids(volume))
 
 
@@ -360,7 +357,7 @@ def without_voxels(volume: Volume) -> Volume:
 
 
 def with_voxels(volume: Volume, data: Sequence[Any]) -> Volume:
-    """The volume with these arrays as voxels of its `grids`."""
+    """The volume with other voxels in its `grids`."""
     return eqx.tree_at(lambda v: [grid.data for grid in grids(v)], volume, list(data), is_leaf=is_none)
 
 
@@ -369,28 +366,25 @@ def _is_volume(node: Any) -> bool:
 
 
 def part_of(
-    volume: Volume, first: Int[Array, "3"], whole: tuple[int, int, int], axes: Axes | None = None
+    volume: Volume, first: Int[Array, "3"], nodes: tuple[int, int, int], axes: Axes | None = None
 ) -> Volume:
-    """The volume as a part of a grid of `whole` nodes, from the node `first` on, with the grid's place;
-    beyond, its faces are read. `axes`: as in `Window`; by default unchanged."""
-    window = Window(first, whole, volume.fetch.axes if axes is None else axes)
+    """The volume as the `Window` of a grid of `nodes` that begins at the node `first`, with the grid's
+    place; by default with unchanged `axes`."""
+    window = Window(first, nodes, volume.fetch.axes if axes is None else axes)
     return eqx.tree_at(lambda v: v.fetch.window, volume, window, is_leaf=is_none)
 
 
 def read_as(volume: Volume, *fetches: Fetch | None) -> Volume:
-    """The volume with other fetches of its `grids`, in the same windows; None: as before."""
-
-    def in_window(grid: Volume, fetch: Fetch | None) -> Fetch:
-        if fetch is None:
-            return grid.fetch
-        window = grid.fetch.window
-        return eqx.tree_at(lambda f: f.window, fetch, window, is_leaf=is_none)
-
-    return with_fetches(volume, [in_window(*each) for each in zip(grids(volume), fetches, strict=True)])
+    """The volume with new fetches of its `grids`, in the same windows; None keeps the old one."""
+    windowed = [
+        old if new is None else eqx.tree_at(lambda f: f.window, new, old.window, is_leaf=is_none)
+        for old, new in zip(fetches_of(volume), fetches, strict=True)
+    ]
+    return with_fetches(volume, windowed)
 
 
 def with_fetches(volume: Volume, fetches: list[Fetch]) -> Volume:
-    """The volume with these ways to read the voxels of its `grids`."""
+    """The volume with new fetches of its `grids`."""
     return eqx.tree_at(
         lambda v: [grid.fetch for grid in grids(v)],
         volume,
@@ -403,5 +397,5 @@ def fetches_of(volume: Volume) -> list[Fetch]:
     return [grid.fetch for grid in grids(volume)]
 
 
-def _index(each: Any) -> int | None:
-    return None if each is None else operator.index(each)
+def _index(bound: Any) -> int | None:
+    return None if bound is None else operator.index(bound)

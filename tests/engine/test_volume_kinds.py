@@ -123,7 +123,7 @@ BOX = np.zeros((5, 5, 5), np.float32)
         ),
         (
             lambda data: jv.Volume(BOX, field=Looped(jv.Volume(data))),
-            "outside of jax.vmap, loops and branches",
+            "Field.value reads a Volume inside vmap, scan or cond",
         ),
         (
             lambda data: jv.Volume(BOX, field=Of(lambda c: c[0] * data[0, 0, 0])),

@@ -157,7 +157,7 @@ BAD = {
     "half hidden": (lambda: SINGLE.with_visibility({0: 0.5}), r"visible\[0\] must be True or False; got 0.5"),
     "negative opacity": (
         lambda: SINGLE.with_opacity({0: -0.1}),
-        r"opacity\[0\] must be at least 0; got -0.1",
+        r"opacity\[0\] must not be negative; got -0.1",
     ),
     "no labels to classify by": (lambda: along_x(UNLABELLED, SINGLE, cut=False), "labels are needed here"),
     "no labels to cut at": (lambda: along_x(UNLABELLED, ONE), "labels are needed here"),
