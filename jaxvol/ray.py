@@ -350,9 +350,9 @@ def _share(piece: Cell, enters: Scalar, leaves: Scalar) -> Scalar:
     # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
     back = piece.front + piece.width
     begin, end = jnp.where(enters > piece.front, enters, piece.front), jnp.where(leaves < back, leaves, back)
-    within = jnp.where(end > begin, end - begin, 0)
+    overlap = jnp.where(end > begin, end - begin, 0)
     contained = (begin == piece.front) & (end == back)
-    return jnp.where(contained, 1, within / jnp.where(piece.width > 0, piece.width, 1))
+    return jnp.where(contained, 1, overlap / jnp.where(piece.width > 0, piece.width, 1))
 
 
 def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:

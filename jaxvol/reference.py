@@ -92,11 +92,11 @@ def render_ray_reference(
     ray = invalid(enter(shown.space, *line), fault)
     marched = scene.marched.prepared()
 
-    def one(at: Progress, _: None) -> tuple[Progress, None]:
+    def advance(at: Progress, _: None) -> tuple[Progress, None]:
         return step(marched, ray, at), None
 
     start = begin(marched, ray, track_of(marched.march, ray))
-    at, _ = jax.lax.scan(one, varying(start, ray), None, length=length)
+    at, _ = jax.lax.scan(advance, varying(start, ray), None, length=length)
     rendering = end(marched, ray, at)
     return resolved(shown, line, rendering) if scene.resolves else rendering
 
@@ -110,18 +110,18 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
     """Sample one cell, composite it, and move on."""
     march, compositing = scene.march, scene.compositing
     sampler = RaySampler(ray, scene.classification, space=scene.space)
-    after, alphas, color = at, [], None
+    progress, alphas, color = at, [], None
     cut = pieces(scene, ray, at)
     for piece in cut:
         measured = measure(scene, ray, piece)
         alphas.append(opacity(scene, ray, piece, measured))
         if not isinstance(compositing, Selection):
-            transmittance = compositing.transmittance(after.composite)
+            transmittance = compositing.transmittance(progress.composite)
             classified = scene.classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
-        after = add(scene, ray, after, piece, measured, color, alphas[-1], divided=len(cut) > 1)
+        progress = add(scene, ray, progress, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    return move(march, ray, stop(scene, after), transparent, 1)
+    return move(march, ray, stop(scene, progress), transparent, 1)
 
 
 def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:

@@ -50,7 +50,7 @@ class Medium(NamedTuple):
 
 
 class PhotonShading(Shading):
-    """Shading by the templates of one image, of which each blends `blended` ones (for `cutoff`)."""
+    """Shading by the templates of one image. `blended`: number of templates in each, for `cutoff`."""
 
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]

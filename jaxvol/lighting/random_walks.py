@@ -30,14 +30,14 @@ def unit_walks(
     of `walks` are spread evenly. Lengths and turns are stratified: means over random ones would be off by
     1/√number."""
     number = count * walks
-    rotate, shuffle, within = jax.random.split(key, 3)
+    rotate, shuffle, jitter = jax.random.split(key, 3)
     q, r = jnp.linalg.qr(jax.random.normal(rotate, (count, 3, 3)))
     q = q * jnp.sign(jnp.diagonal(r, axis1=1, axis2=2))[:, None]
     spread = jnp.asarray(golden_spiral(walks), q.dtype)
     first = jnp.sum(spread[None, :, None] * q[:, None], axis=-1).reshape(number, 3)
     ranks = jnp.broadcast_to(jnp.arange(number, dtype=q.dtype), (levels, 3, number))
     ranks = jax.random.permutation(shuffle, ranks, axis=-1, independent=True)
-    u = (ranks + jax.random.uniform(within, (levels, 3, number), q.dtype)) / number
+    u = (ranks + jax.random.uniform(jitter, (levels, 3, number), q.dtype)) / number
     u = jnp.minimum(u, 1 - jnp.finfo(u.dtype).epsneg)  # rounding makes it 1, and the flight infinite
 
     def flight(

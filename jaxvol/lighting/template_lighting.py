@@ -115,7 +115,7 @@ class ScattererTemplates(Lighting):
             default all.
         occlusion: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
             each segment taken at its far end; materials and the lit side have soft edges, and the image is
-            differentiable. `"hard"`, as published: a photon is hidden if anything is visible at one of these
+            differentiable. `"hard"`, as published: a photon is hidden if anything is visible at one of the
             points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
             photons that become hidden or change their material.
         reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;

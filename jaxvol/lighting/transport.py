@@ -36,7 +36,7 @@ STEPS = 2
 """Steps from a node towards a light, per node of the grid's longest side. They grow with the distance."""
 
 LOCAL_STEPS = 6
-"""Steps from a sample towards a light, until the grid is fine enough for what lies beyond."""
+"""Steps from a sample towards a light, until the grid is fine enough."""
 
 LOCAL = 2.25
 """Length of the local steps together, in the grid's spacing."""
@@ -96,12 +96,12 @@ class ScatteredLight(Shading):
         kept = jnp.ones_like(fractions[0])
         for fraction, material in zip(fractions, self.materials, strict=True):
             kept = kept - fraction * material.opacity
-        ways, beyond = self._ways(around, sample), []
+        ways, far_depths = self._ways(around, sample), []
         for number, (direction, reach, lit) in enumerate(ways):
             point = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, point))
-            beyond.append(jnp.where(lit, 0, row[number]))
-        return (r, g, b), kept, ways, tuple(beyond)
+            far_depths.append(jnp.where(lit, 0, row[number]))
+        return (r, g, b), kept, ways, tuple(far_depths)
 
     def term(
         self, around: Surroundings, sample: Sample, shared: _Begun, number: Int[Array, ""]
@@ -117,8 +117,8 @@ class ScatteredLight(Shading):
         return tuple(reach * sum(width * next(values) for width, _ in steps) for _, reach, _ in ways)
 
     def color(self, sample: Sample, shared: _Begun, sums: tuple[Scalar, ...] | None) -> Vec3:
-        light, kept, _, beyond = shared
-        for source, near, far in zip(located(self.lights), sums or (), beyond, strict=True):
+        light, kept, _, far_depths = shared
+        for source, near, far in zip(located(self.lights), sums or (), far_depths, strict=True):
             light = plus(light, arrived(source, sample.point, sample.direction, jnp.exp(-near - far)))
         r, g, b = (clipped(c) * kept for c in sample.color)
         return times((r, g, b), light)
@@ -417,12 +417,12 @@ def _looks(rate: Scalar, length: Scalar, u: Scalar) -> _Looks:
     number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(fixed[0] * fixed[1], TINY)
     ends = jnp.expm1(number / LOOKS * jnp.log1p(depth)) / depth
     widths = jnp.diff(ends)
-    across = jnp.clip(widths * depth, 0, EVEN)
+    depths = jnp.clip(widths * depth, 0, EVEN)
     u = (u + GOLDEN * number[:-1]) % 1
-    within = -jnp.log1p(u * jnp.expm1(-across)) / across
-    across = jnp.where(across < EVEN, widths * jnp.maximum(rate * fixed[1], TINY), EVEN)
-    density = across * jnp.exp(-across * within) / -jnp.expm1(-across)
-    places = fixed[1] * (ends[:-1] + within * widths)
+    offsets = -jnp.log1p(u * jnp.expm1(-depths)) / depths
+    depths = jnp.where(depths < EVEN, widths * jnp.maximum(rate * fixed[1], TINY), EVEN)
+    density = depths * jnp.exp(-depths * offsets) / -jnp.expm1(-depths)
+    places = fixed[1] * (ends[:-1] + offsets * widths)
     return _Looks(places, length * widths, density / jax.lax.stop_gradient(density))
 
 
