@@ -64,8 +64,8 @@ class PrintedShading(PhotonShading):
         lit = color * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
         return lit + inner * sum(irradiance)
 
-    def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-        return seen * ratio, shows * ratio
+    def counted(self, visible: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+        return visible * ratio, shows * ratio
 
 
 class PrintedSteps(ScattererTemplates):

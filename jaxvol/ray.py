@@ -1,10 +1,10 @@
 """One ray, cell by cell: the steps that the reference and the fast engine share.
 
-`begin` a ray; cut each cell into `pieces`, `measure` each at its sample, find its `opacity`, and `add` it to
-the pixel; `stop` the ray if it needs no more, and `move` it on; at last `end` it. A cell of extinction σ and
-width w has the opacity α = 1 - exp(-σ w); `compositing` says how cells become a pixel. "In front" and
-"behind" are as seen from the camera. A bug in here is in both engines alike, so that comparing them cannot
-show it: `tests/oracle.py` is independent.
+`begin` a ray; cut each cell into `pieces`, `measure` each piece at its sample, compute its `opacity`, and
+`add` it to the pixel; `stop` the ray if it needs no more, and `move` it on; at last `end` it. A cell of
+extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` makes the pixel. "In front" and
+"behind" are as seen from the camera. Comparing the two engines cannot show a bug of this file, which is in
+both: `tests/oracle.py` is independent.
 """
 
 from dataclasses import replace
@@ -22,7 +22,7 @@ from ._util.vec3 import Color, Scalar, Vec3
 from .compositing.blending import Compositing, Fragment, Outputs, Over, Weighting
 from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
-from .march.march import Cell, March
+from .march.march import Cell, CellRules, March
 from .scene.camera import Camera, without_ends
 from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
@@ -38,12 +38,12 @@ from .xla.trees import PyTree
 
 
 class Scene(NamedTuple):
-    """All that an image depends on: what `render` is given, and what `prepared` computes from that.
+    """Inputs of an image: the arguments of `render`, and what `prepared` computes from them.
 
     Attributes:
-        source: where rays come from, a `Camera` or `GivenRays`; None where there is a single ray.
+        source: source of the rays, a `Camera` or `GivenRays`; None for a single ray.
         space: the map between world and grid; None until `prepared`.
-        classification: how samples are measured, classified and shaded; None until `prepared`.
+        classification: measures, classifies and shades samples; None until `prepared`.
     """
 
     volume: Volume
@@ -56,7 +56,7 @@ class Scene(NamedTuple):
     classification: Classification = cast(Classification, None)
 
     def prepared(self) -> "Scene":
-        """The scene with what is computed once for each image."""
+        """Compute the parts of the scene that are computed once for each image."""
         space = self.march.locate(self.volume)
         lit = lit_classification(
             self.volume, self.transfer, space, self.lighting, integrated=self.march.integrates
@@ -65,11 +65,11 @@ class Scene(NamedTuple):
 
     @property
     def has_fault(self) -> Any:
-        """Whether a number on which all pixels depend is NaN, infinite, or out of its range: a step that is
+        """True if a number on which all pixels depend is NaN, infinite, or out of its range: a step that is
         not positive; a volume, a transfer function, a transform or a camera that is not `valid`.
 
         All pixels are NaN then. Otherwise comparisons with NaN, which are false, would hide the fault, and a
-        fit that diverged would look converged. Given rays are checked one by one; NaN in voxels spreads to
+        fit that diverged would look converged. `GivenRays` are checked one by one; NaN in voxels spreads to
         the pixels that meet it."""
         rays = None if self.source is None else without_ends(self.source)
         camera = [rays] if isinstance(rays, Camera) else []
@@ -81,13 +81,13 @@ class Scene(NamedTuple):
 
     @property
     def resolves(self) -> bool:
-        """Whether pixels are computed after the march, by `resolve`. Rays are then marched without light."""
+        """True if pixels are computed after the march, by `resolve`. Rays are then marched without light."""
         return self.compositing.resolves
 
     @property
     def marched(self) -> "Scene":
-        """The scene as its rays are marched: if it `resolves`, without light, and with the march and transfer
-        function that its mode puts in place of its own."""
+        """The scene for marching rays: if it `resolves`, without light, and with the march and transfer
+        function that its compositing mode chooses."""
         if not self.resolves:
             return self
         if self.lighting is not None and not self.compositing.can_be_lit:
@@ -98,7 +98,7 @@ class Scene(NamedTuple):
 
 
 def by_rules(scene: Scene) -> Scene:
-    """The prepared scene for the kernel of its march, with the march's `rules` in its place."""
+    """The prepared scene for the kernel of its march, with the march's `rules` instead of the march."""
     rules: Any = scene.march.rules
     return scene._replace(march=rules)
 
@@ -133,10 +133,10 @@ EXPECTED: dict[str, tuple[type, str, str]] = {
 """For each argument name: its type, a description, and how to make one."""
 
 COARSE = 1 / 16
-"""How far apart world points may lie, in voxels, for light that is read from them."""
+"""Largest rounding error of world points, in voxels, for light that is read at them."""
 
 MATCH = 1e-3
-"""How near a sample lies to a selected depth to be that one, in steps."""
+"""Distance from a selected depth, in steps, up to which a sample is the selected one."""
 
 FINAL: dict[type, str] = {
     Volume: "jaxvol.Field instead, and pass it as Volume(..., field=...)",
@@ -149,38 +149,41 @@ voxels, ranges of blocks, the VJP), and what to subclass instead."""
 
 
 def check_arguments(call: str, **arguments: Any) -> None:
-    """Check that arguments are of the types that their names say.
+    """Check that arguments are of the types that `EXPECTED` has for their names.
 
     Args:
-        call: how the function is called, such as `render(volume, transfer, camera, march)`, quoted when
+        call: signature of the function, such as `render(volume, transfer, camera, march)`, quoted when
             arguments are swapped.
 
     Raises:
-        ValueError: naming the first argument that is not, what came, and what to pass.
+        ValueError: naming the first argument of another type, what came, and what to pass.
     """
     for name, value in arguments.items():
         kind, expected, remedy = EXPECTED[name]
-        for final, other in FINAL.items():
+        for final, base in FINAL.items():
             if isinstance(value, final) and type(value) is not final:
                 raise ValueError(
                     f"{name} must be a jaxvol {final.__name__} itself; got its subclass "
-                    f"{type(value).__name__}, with which the fast engine may disagree. Subclass {other}."
+                    f"{type(value).__name__}, with which the fast engine may disagree. Subclass {base}."
                 )
         if isinstance(value, kind) or (name == "lighting" and value is None):
             continue
-        for other, (kind, _, _) in EXPECTED.items():
+        for slot, (kind, _, _) in EXPECTED.items():
             if isinstance(value, kind):
-                remedy = f"That is the {other}: the order is {call}."
+                remedy = f"That is the {slot}: the order is {call}."
         raise ValueError(f"{name} must be {expected}; got {described(value)}. {remedy}")
 
 
 def check_channels(
     volume: Volume, transfer: Transfer, march: March, compositing: Compositing[Any], lighting: Lighting | None
 ) -> None:
-    """Raises `ValueError` for a transfer function that reads another number of channels than the volume has,
-    for what needs a single one, and for light in a volume so far from 0 that world points are coarse."""
-    if isinstance(volume.field, Several) and (moved := march.overriding("locate")):
-        raise ValueError(f"march.transforms: {type(moved[0]).__name__} places one volume; got several.")
+    """Raise `ValueError` for a transfer function of another number of channels than the volume, for modes and
+    lightings that need a single channel, and for light so far from 0 that world points are coarse."""
+    volumes = volume.field.volumes if isinstance(volume.field, Several) else ()
+    if volumes and (moved := march.overriding("locate")):
+        raise ValueError(
+            f"march.transforms: {type(moved[0]).__name__} places one volume; got {len(volumes)}."
+        )
     for leaf in jax.tree.leaves(volume.field):
         if callable(leaf):
             check_captured("a function of the volume's field", leaf)
@@ -188,54 +191,52 @@ def check_channels(
     if reads not in (None, channels):
         raise ValueError(
             f"volume must have as many channels as {type(transfer).__name__} reads, {reads}; got {channels}. "
-            "Several volumes are given as lists: render([a, b], [of_a, of_b], ...)."
+            "Pass several volumes as lists: render([a, b], [transfer_a, transfer_b], ...)."
         )
     # materials of colours are distinguished by labels, which a group of volumes does not have
-    needs_value = isinstance(volume.field, Several) or (lighting is not None and lighting.reads_value)
+    needs_value = bool(volumes) or (lighting is not None and lighting.reads_value)
     single = {
         "compositing": described(compositing) if compositing.reads_value else None,
         "lighting": None if lighting is None or not needs_value else described(lighting),
         "march.quadrature": '"preintegrated"' if march.integrates else None,
     }
-    for name, given in single.items():
-        if channels > 1 and given is not None:
-            field, got = volume.field, f"one of {channels} channels"
-            if isinstance(field, Several):
-                got = f"{len(field.volumes)} volumes"
-            raise ValueError(f"{name}: {given} needs a single volume of one channel; got {got}.")
+    for name, value in single.items():
+        if channels > 1 and value is not None:
+            got = f"{len(volumes)} volumes" if volumes else f"one of {channels} channels"
+            raise ValueError(f"{name}: {value} needs a single volume of one channel; got {got}.")
     bands_of(transfer, volume, lighting)
     if lighting is not None and not lighting.reads_gradient:  # as `Phong` does, where samples are placed
         _check_near(volume, lighting)
 
 
 def _check_near(volume: Volume, lighting: Lighting) -> None:
-    """Raises `ValueError` where world points, from which such a lighting reads, are not resolved."""
+    """Raise `ValueError` if the float type does not resolve the world points at which the lighting reads."""
     origin, spacing = volume.origin, volume.spacing
     if is_traced((origin, spacing)):
         return
     far = float(np.max(np.abs(np.asarray(origin)) + np.asarray(volume.shape) * np.asarray(spacing)))
-    apart, voxel = far * float(jnp.finfo(spacing.dtype).eps), float(np.min(np.asarray(spacing)))
-    if apart > COARSE * voxel:
+    gap, voxel = far * float(jnp.finfo(spacing.dtype).eps), float(np.min(np.asarray(spacing)))
+    if gap > COARSE * voxel:
         raise ValueError(
-            f"lighting: {described(lighting)} reads at world points, which lie {apart:.2g} apart at "
+            f"lighting: {described(lighting)} reads at world points, which lie {gap:.2g} apart at "
             f"{far:.3g} in {spacing.dtype}, for voxels of {voxel:.2g}. Move the volume (origin), the camera "
             "and the lights near 0."
         )
 
 
 def bands_of(transfer: Transfer, volume: Volume, lighting: Lighting | None = None) -> int:
-    """Number of colours that a transfer function gives a sample: 3 but for a user's (`Transfer.bands`).
+    """Number of colours of a transfer function: 3 except for custom ones (`Transfer.bands`).
 
     Raises:
         ValueError: if its classifier returns no colours and extinction, if transfer functions of several
-            volumes differ, and for a lighting that is to shade other than three colours.
+            volumes differ, and for a lighting if there are not three colours.
     """
     bands, kind = transfer.bands, type(transfer).__name__
     if bands is None and isinstance(transfer, Together) and isinstance(volume.field, Several):
-        each = [bands_of(*pair) for pair in zip(transfer.transfers, volume.field.volumes, strict=True)]
-        if len(set(each)) > 1:
-            raise ValueError(f"transfer functions must have equally many colours; got {each}.")
-        bands = each[0]
+        counts = [bands_of(*pair) for pair in zip(transfer.transfers, volume.field.volumes, strict=True)]
+        if len(set(counts)) > 1:
+            raise ValueError(f"transfer functions must have equally many colours; got {counts}.")
+        bands = counts[0]
     if bands is None:
         place = (jax.ShapeDtypeStruct((), volume.spacing.dtype),) * 3
         answer = eqx.filter_eval_shape(lambda t, v, at: _classified(t, v, at), transfer, volume, place)
@@ -261,16 +262,16 @@ def _classified(transfer: Transfer, volume: Volume, coordinate: Vec3) -> Any:
 
 
 NEVER = int(jnp.iinfo(jnp.int32).max)
-"""A cell that no ray has."""
+"""Index past the last cell of any ray."""
 
 
 class Track(eqx.Module):
-    """Where the cells of a ray lie.
+    """Depths of the cells of a ray.
 
-    Cell k begins at the depth `(offset + k) d`, and from the cell `shifted` on, at `(offset + shift + k) d`:
-    behind the first transparent cell, NEVER as long as that is not known. Counting steps rather than summing
-    them keeps the ten-thousandth sample as exact as the first. `until`: the first cell that is not taken.
-    `shift` and `shifted` are None where no transform shifts.
+    Cell k begins at the depth `(offset + k) d`, and from the cell `shifted` on, which follows the first
+    transparent cell (NEVER until that is known), at `(offset + shift + k) d`. Counting steps rather than
+    summing them keeps the ten-thousandth sample as exact as the first. `until`: end of the cells that are
+    marched, exclusive. `shift` and `shifted` are None where no transform shifts.
     """
 
     offset: Scalar
@@ -287,8 +288,8 @@ class Track(eqx.Module):
 
 
 class Progress(eqx.Module):
-    """How far a ray has come along its `track`: to the cell `index`, which is the next one. `composite` is
-    the compositing mode's state after all cells so far; `stats` is None unless all outputs are asked for."""
+    """State of a ray on its `track`. `index`: the next cell. `composite`: the compositing mode's state after
+    all cells before it. `stats`: None unless `outputs` is "all"."""
 
     index: Int[Array, ""]
     composite: PyTree
@@ -298,14 +299,14 @@ class Progress(eqx.Module):
 
 
 class SampleStats(eqx.Module):
-    """What `Rendering.samples` and `Rendering.aligned` report."""
+    """Values of `Rendering.samples` and `Rendering.aligned`."""
 
     samples: Int[Array, ""]
     aligned: Bool[Array, ""]
 
 
 def begin(scene: Scene, ray: Ray, track: Track, outputs: Outputs | None = "all") -> Progress:
-    """A ray at its entry. Without `outputs` nothing but its opacity is computed."""
+    """Start a ray at its entry. Without `outputs`, only its opacity is computed."""
     compositing = scene.compositing
     zero, no = jnp.zeros_like(ray.length), jnp.zeros(ray.length.shape, bool)
     count = jnp.zeros(ray.length.shape, jnp.int32)
@@ -323,42 +324,40 @@ def begin(scene: Scene, ray: Ray, track: Track, outputs: Outputs | None = "all")
 
 
 def track_of(march: March, ray: Ray) -> Track:
-    """The cells of a ray at its entry, of which none is known to be transparent."""
+    """Track of a ray at its entry, where no cell is known to be transparent."""
     count = jnp.full(ray.length.shape, march.most_samples, jnp.int32)
     if not march.may_shift:
         return Track(march.start(ray), None, None, count)
     return Track(march.start(ray), march.shift(ray), jnp.full_like(count, NEVER), count)
 
 
-def pieces(scene: Scene, ray: Ray, at: Any, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
-    """The pieces of the ray's next cell, or of the `number`-th one after it. `at`: a `Progress`, of which
-    `index` and `track` are read."""
+def pieces(scene: Scene, ray: Ray, at: PyTree, number: Int[Array, ""] | int = 0) -> tuple[Cell, ...]:
+    """Cut the ray's next cell, or the `number`-th one after it, into pieces. `at`: a `Progress`, or another
+    object with its `index` and `track`."""
     march = scene.march
     begin = at.track.front(at.index + number, march.step)
     return march.cut(Cell(begin, march.step, jnp.zeros(begin.shape, bool)), ray, scene.volume)
 
 
 def read(scene: Scene, ray: Ray, piece: Cell) -> Measured:
-    """What is read from memory at a piece's sample; of several volumes, also which share of the piece lies in
-    each."""
+    """Read a piece's sample from memory; for several volumes, with the shares of the piece inside them."""
     measured = scene.classification.measure(ray.path(scene.march.sample(piece)))
     return (*measured, tuple(_share(piece, *span) for span in ray.spans)) if ray.spans else measured
 
 
 def _share(piece: Cell, enters: Scalar, leaves: Scalar) -> Scalar:
-    """The share of a piece that lies between two depths."""
+    """Share of a piece between two depths."""
     # not by minima and maxima: inside loops on CPU, XLA loses their derivatives (jaxlib 0.10)
     back = piece.front + piece.width
     begin, end = jnp.where(enters > piece.front, enters, piece.front), jnp.where(leaves < back, leaves, back)
-    within = jnp.where(end > begin, end - begin, 0)
-    whole = (begin == piece.front) & (end == back)
-    return jnp.where(whole, 1, within / jnp.where(piece.width > 0, piece.width, 1))
+    overlap = jnp.where(end > begin, end - begin, 0)
+    contained = (begin == piece.front) & (end == back)
+    return jnp.where(contained, 1, overlap / jnp.where(piece.width > 0, piece.width, 1))
 
 
 def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> Measured:
-    """The measured values at a piece's sample, or over the piece where it is integrated, and what the
-    transfer function's search finds for them. `recorded`: by the engine's `Recording`, which cannot record
-    fetches inside branches."""
+    """Values at a piece's sample, or at its ends if the march integrates, with the results of the transfer
+    function's search. `recorded`: by the engine's `Recording`, which cannot record fetches in branches."""
     march, classification = scene.march, scene.classification
     if not march.integrates:
         return classification.searched(read(scene, ray, piece))
@@ -366,9 +365,8 @@ def measure(scene: Scene, ray: Ray, piece: Cell, *, recorded: bool = False) -> M
     def measured(depth: Scalar) -> Measured:
         return classification.measure(ray.path(depth))[:1]
 
-    # In branches of their own, which XLA does not fuse: where a kernel interpolates both values, one of them
-    # may come out as that of the next node (jaxlib 0.10 on CPU with FMA; seen by
-    # `test_render_agrees_with_the_reference`).
+    # In separate branches, which XLA does not fuse: where a kernel interpolates both values, one of them may
+    # be that of the next node (jaxlib 0.10 on CPU with FMA; see `test_render_agrees_with_the_reference`).
     ends = march.ends(piece, ray)
     front, back = (measured(s) if recorded else in_memory(march.step > 0, measured, s) for s in ends)
     attributes = classification.attributes(ray.path(march.sample(piece)))
@@ -385,9 +383,8 @@ def opacity(scene: Scene, ray: Ray, piece: Cell, measured: Measured) -> Scalar:
     return 2 * t / (1 + t)
 
 
-def is_sample(march: Any, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
-    """Whether a piece counts as a sample. `divided`: transforms divide cells, so that pieces may have
-    width 0."""
+def is_sample(march: March | CellRules, ray: Ray, piece: Cell, *, divided: bool) -> Bool[Array, ""]:
+    """True if a piece counts as a sample. `divided`: transforms divide cells, so pieces may have width 0."""
     before_exit = march.sample(piece) < ray.end
     # only where cells are divided: elsewhere the second test would take 15 % of a frame
     return before_exit & (piece.width > 0) if divided else before_exit
@@ -404,8 +401,8 @@ def add(
     *,
     divided: bool,
 ) -> Progress:
-    """Composites a piece of the next cell. A ray that is finished sees no more. `measured`: what a
-    `Selection` compares; a `Weighting` may be given the value alone. `divided`: as for `is_sample`."""
+    """Composite a piece of the next cell, unless the ray is finished. `measured`: a `Weighting` needs only
+    the value. `divided`: as for `is_sample`."""
     march, compositing = scene.march, scene.compositing
     depth, counts = march.sample(piece), ~at.finished & is_sample(march, ray, piece, divided=divided)
     alpha = jnp.where(at.finished, 0, alpha)
@@ -421,22 +418,24 @@ def add(
 
 
 def stop(scene: Scene, at: Progress) -> Progress:
-    """Finishes a ray that needs no other cell."""
+    """Finish a ray that needs no other cell."""
     return replace(at, finished=at.finished | stopped(scene, at.composite))
 
 
-def stopped(scene: Scene, composite: Any) -> Bool[Array, ""]:
-    """Whether a ray in this state of compositing needs no other cell."""
+def stopped(scene: Scene, composite: PyTree) -> Bool[Array, ""]:
+    """True if a ray in this state of compositing needs no other cell."""
     march, compositing = scene.march, scene.compositing
     stops, finished = march.stop(compositing.transmittance(composite)), compositing.finished(composite)
     check_answer(compositing, "finished", finished, stops)
     return stops | finished
 
 
-def move(march: Any, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Any) -> Progress:
-    """Moves on by this many steps. `transparent`: whether the cell just composited, or all cells leapt over,
-    are transparent, so that the ray shifts here if it has not yet; None where that is known before. The ray
-    is finished if the next cell begins past the exit."""
+def move(
+    march: March | CellRules, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None, steps: Array | int
+) -> Progress:
+    """Advance a ray by `steps`; it is finished if the next cell begins past the exit. `transparent`: true if
+    the cell just composited, or all cells leapt over, are transparent: the ray then shifts if it has not yet
+    shifted. None if the shift is known."""
     at = replace(at, index=at.index + steps)
     track = at.track
     if track.shifted is not None and transparent is not None:
@@ -445,17 +444,17 @@ def move(march: Any, ray: Ray, at: Progress, transparent: Bool[Array, ""] | None
     return replace(at, finished=at.finished | (front(march, at) >= ray.length))
 
 
-def front(march: Any, at: Progress, ahead: Any = 0) -> Scalar:
-    """Depth at which the next cell begins, or the one so many steps ahead of it."""
+def front(march: March | CellRules, at: Progress, ahead: Int[Array, "..."] | int = 0) -> Scalar:
+    """Depth at which the cell begins that is `ahead` steps after the next one."""
     return at.track.front(at.index + ahead, march.step)
 
 
 def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
-    """The rendering of a ray, with the outputs that it was begun with. Where the scene `resolves`, `resolve`
-    makes the pixel from it."""
+    """Rendering of a ray, with the outputs passed to `begin`. If the scene `resolves`, `resolve` makes the
+    pixel from it."""
     valid, details = ~jnp.isnan(ray.t_in), Details()
     rgba, depth = scene.compositing.end(at.composite)
-    # times NaN, so that the derivative is NaN, too; that of a `where` would be 0
+    # times NaN, so that the derivative is NaN, too; that of `where` would be 0
     rgba = rgba * jnp.where(valid, 1, jnp.nan).astype(ray.length.dtype)
     if depth is not None:
         details = Details(jnp.where(valid & jnp.isinf(depth), jnp.inf, ray.t_in + depth))
@@ -467,8 +466,8 @@ def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
 
 
 class Pixel(NamedTuple):
-    """What is computed after the march: premultiplied colour and opacity, the distance from the ray's origin,
-    infinite where nothing is visible, and a unit normal, if the mode has one."""
+    """Pixel computed after the march: premultiplied colour and opacity, distance from the ray's origin
+    (infinite where nothing is visible), and a unit normal, if the mode has one."""
 
     rgba: Float[Array, " n"]
     depth: Scalar
@@ -476,14 +475,14 @@ class Pixel(NamedTuple):
 
 
 def resolve(scene: Scene, line: Line, rgba: Float[Array, " n"], depth: Scalar, selected: PyTree) -> Pixel:
-    """The pixel of a ray that is not transparent, from what its march found, by the compositing mode."""
+    """Compute the pixel of a ray that is not transparent from the results of its march."""
     compositing = scene.compositing
     if isinstance(compositing, Selection):
         return _selected(compositing, scene, line, rgba, selected)
     assert isinstance(compositing, Weighting)
-    found = compositing.resolved(scene.classification, rgba)
-    check_answer(compositing, "resolved", found, _pixel_like(scene, rgba))
-    return Pixel(found, depth)
+    pixel = compositing.resolved(scene.classification, rgba)
+    check_answer(compositing, "resolved", pixel, _pixel_like(scene, rgba))
+    return Pixel(pixel, depth)
 
 
 def _pixel_like(scene: Scene, rgba: Float[Array, " n"]) -> jax.ShapeDtypeStruct:
@@ -501,23 +500,23 @@ def _selected(
     chosen = compositing.depth(state)
     moving = chosen + _movement(march, ray, scene.volume, chosen, scale)
     sampler = RaySampler(ray, scene.classification, scale, gradient, (chosen, moving), scene.space)
-    found = compositing.pixel(sampler, state)
-    check_answer(compositing, "pixel", found, (_pixel_like(scene, rgba), rgba[3]))
-    pixel, depth = found
+    answer = compositing.pixel(sampler, state)
+    check_answer(compositing, "pixel", answer, (_pixel_like(scene, rgba), rgba[3]))
+    pixel, depth = answer
     normal = compositing.normal(sampler, depth)
     if normal is not None:
         check_answer(compositing, "normal", normal, rgba[:3])
     valid = jnp.where(jnp.isnan(rgba[3]), jnp.nan, 1).astype(pixel.dtype)
     # a product with infinity would have the derivative NaN
-    seen = ~jnp.isinf(depth)
-    depth = sampler.differentiable_depth(jnp.where(seen, depth, 0))
-    depth = jnp.where(seen, ray.t_in + depth, jnp.inf)
+    visible = ~jnp.isinf(depth)
+    depth = sampler.differentiable_depth(jnp.where(visible, depth, 0))
+    depth = jnp.where(visible, ray.t_in + depth, jnp.inf)
     return Pixel(pixel * valid, depth, None if normal is None else normal * valid)
 
 
 def _movement(march: March, ray: Ray, volume: Volume, depth: Scalar, scale: Scalar) -> Scalar:
-    """0, with the derivatives of a sample that the march found at this depth: those of the sample in the cell
-    that begins a fixed number of steps past the entry, and is cut."""
+    """0, with the derivatives of the depth of a selected sample: those of the sample in a cell that begins a
+    fixed number of steps past the entry, and is cut."""
     start = march.start(ray)
     starts = [start, start + march.shift(ray)] if march.may_shift else [start]
     step = jax.lax.stop_gradient(march.step)
@@ -528,7 +527,7 @@ def _movement(march: March, ray: Ray, volume: Volume, depth: Scalar, scale: Scal
         cell = Cell(begin, march.step + jnp.zeros_like(begin), jnp.zeros(begin.shape, bool))
         for piece in march.cut(cell, ray, volume):
             sample = march.sample(piece)
-            apart_ = jnp.abs(jax.lax.stop_gradient(sample) - depth)
-            moving = jnp.where(apart_ < gap, sample, moving)
-            gap = jnp.minimum(gap, apart_)
+            distance = jnp.abs(jax.lax.stop_gradient(sample) - depth)
+            moving = jnp.where(distance < gap, sample, moving)
+            gap = jnp.minimum(gap, distance)
     return moving - jax.lax.stop_gradient(moving)

@@ -1,6 +1,7 @@
-"""What does one ray see? The definition: a plain scan over its cells, by the functions of `ray`."""
+"""Reference rendering of one ray: a plain scan over its cells, by the functions of `ray`."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -43,46 +44,46 @@ from .xla.sharding import varying
 
 
 def render_ray_reference(
-    volume: Volume | Any,
-    transfer: Transfer | Any,
+    volume: Volume | Sequence[Volume],
+    transfer: Transfer | Sequence[Transfer],
     origin: Arrayable,
     direction: Arrayable,
-    march: March | Any,
+    march: March,
     *,
-    pixel: tuple[Any, Any] = (0, 0),
-    compositing: Mode | Compositing[Any] | Any = "over",
-    lighting: Lighting | Any | None = None,
+    pixel: tuple[Arrayable, Arrayable] = (0, 0),
+    compositing: Mode | Compositing[Any] = "over",
+    lighting: Lighting | None = None,
 ) -> Rendering:
-    """What one ray sees, by a plain scan over its cells.
+    """Render one ray by a plain scan over its cells.
 
     Computes in the float type of `origin` and `direction`. Differentiable in forward and reverse mode, any
     number of times; the memory of reverse mode grows with the number of samples. `render` agrees to 1e-9 in
-    float64 and to 2e-5 in float32, but where a steep transfer function magnifies what is rounded,
-    or rounding decides a comparison (docs/features.md, "One reference").
+    float64 and to 2e-5 in float32, except where a steep transfer function magnifies rounding errors, or
+    rounding decides a comparison (docs/features.md, "One reference").
 
     Args:
-        volume: the values, on a grid.
-        transfer: their colours and extinctions.
+        volume: a volume, or a list of volumes on different grids.
+        transfer: transfer function, or a list with one for each volume.
         origin: world point where the ray begins.
         direction: unit vector.
-        march: step and transforms: where samples are.
+        march: step and transforms, which place the samples.
         pixel: (column, row), which keys random numbers.
-        compositing: how cells become a pixel.
-        lighting: how samples are shaded.
+        compositing: mode that makes a pixel of the cells, as for `render`.
+        lighting: shading of samples, as for `render`.
 
     Returns:
         A `Rendering` of a single pixel: `rgba` has shape (4,), all else ().
 
     Raises:
         ValueError: where the step, the volume's place or a transform that bends space is traced, and
-            `march.max_samples` is not given: the length of the scan cannot be known.
+            `march.max_samples` is not set: the length of the scan cannot be known.
     """
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
-    volume, transfer = together(volume, transfer)
-    check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
-    scene = Scene(volume, transfer, None, march, compositing_of(compositing), lighting)
-    check_channels(volume, transfer, march, scene.compositing, lighting)
-    length = steps_across(volume, march)
+    grid, function = together(volume, transfer)
+    check_arguments(order, volume=grid, transfer=function, march=march, lighting=lighting)
+    scene = Scene(grid, function, None, march, compositing_of(compositing), lighting)
+    check_channels(grid, function, march, scene.compositing, lighting)
+    length = steps_across(grid, march)
     column, row = (jnp.asarray(number, jnp.int32) for number in pixel)
     line = Line(apart(_vector("origin", origin)), apart(_vector("direction", direction)), (column, row))
     fault = _has_fault(scene)
@@ -91,11 +92,11 @@ def render_ray_reference(
     ray = invalid(enter(shown.space, *line), fault)
     marched = scene.marched.prepared()
 
-    def one(at: Progress, _: None) -> tuple[Progress, None]:
+    def advance(at: Progress, _: None) -> tuple[Progress, None]:
         return step(marched, ray, at), None
 
     start = begin(marched, ray, track_of(marched.march, ray))
-    at, _ = jax.lax.scan(one, varying(start, ray), None, length=length)
+    at, _ = jax.lax.scan(advance, varying(start, ray), None, length=length)
     rendering = end(marched, ray, at)
     return resolved(shown, line, rendering) if scene.resolves else rendering
 
@@ -106,29 +107,29 @@ def _has_fault(scene: Scene) -> Bool[Array, ""]:
 
 
 def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
-    """Samples one cell, composites it, and moves on."""
+    """Sample one cell, composite it, and move on."""
     march, compositing = scene.march, scene.compositing
     sampler = RaySampler(ray, scene.classification, space=scene.space)
-    after, alphas, color = at, [], None
+    progress, alphas, color = at, [], None
     cut = pieces(scene, ray, at)
     for piece in cut:
         measured = measure(scene, ray, piece)
         alphas.append(opacity(scene, ray, piece, measured))
         if not isinstance(compositing, Selection):
-            transmittance = compositing.transmittance(after.composite)
+            transmittance = compositing.transmittance(progress.composite)
             classified = scene.classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
-        after = add(scene, ray, after, piece, measured, color, alphas[-1], divided=len(cut) > 1)
+        progress = add(scene, ray, progress, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    return move(march, ray, stop(scene, after), transparent, 1)
+    return move(march, ray, stop(scene, progress), transparent, 1)
 
 
 def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:
     """Rendering of a ray whose pixel is computed after the march; a transparent ray has no depth."""
     visible, details = rendering.rgba[3] != 0, rendering.details
-    found = rendering.depth, details.selected
-    found = jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), found)
-    pixel = resolve(scene, line, rendering.rgba, *found)
+    results = rendering.depth, details.selected
+    results = jax.tree.map(lambda leaf: jnp.where(visible, leaf, jnp.zeros_like(leaf)), results)
+    pixel = resolve(scene, line, rendering.rgba, *results)
     compositing = scene.compositing
     shown = visible | (isinstance(compositing, Weighting) and compositing.resolves_transparent)
     rgba, depth = jnp.where(shown, pixel.rgba, 0), jnp.where(visible, pixel.depth, jnp.inf)
@@ -137,7 +138,7 @@ def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:
 
 
 def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
-    """A vector. Floats keep their type, all else becomes JAX's default float type."""
+    """Convert to a vector. Floats keep their type, other numbers get JAX's default float type."""
     floats = hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
     if floats and value.shape == (3,):
         return jnp.asarray(value)
@@ -145,7 +146,7 @@ def _vector(name: str, value: Arrayable) -> Float[Array, "3"]:
 
 
 def steps_across(volume: Volume, march: March) -> int:
-    """Number of steps that suffices for any ray: those across the volume's diagonal, and four more."""
+    """Upper bound of the steps of any ray: those along the volume's diagonal, and four more."""
     with jax.ensure_compile_time_eval():
         diagonal = march.locate(volume).diagonal
         traced = is_traced(march.step, diagonal)
@@ -159,6 +160,6 @@ def steps_across(volume: Volume, march: March) -> int:
         )
     if not math.isfinite(steps):  # then nothing is marched, and the image is NaN
         return 1
-    # the first cell may begin a step early, one step finds the exit, a jitter may shorten one, and one is for
+    # the first cell may begin a step early, one step detects the exit, jitter may shorten one, and one is for
     # rounding
     return min(math.ceil(steps) + 4, march.most_samples)

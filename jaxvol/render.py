@@ -1,9 +1,9 @@
-"""How is an image rendered? The public functions: they check what they are given, and hand it to the fast
-engine."""
+"""The public functions that render: they check their arguments, and call the fast engine."""
 
 import math
 import warnings
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Any, Literal, SupportsIndex
 
 import jax
 import jax.numpy as jnp
@@ -33,56 +33,56 @@ PLANNED = 1 / 255
 """Tolerance of `march="auto"`: one level of an 8-bit image."""
 
 BYTES = 136
-"""Memory of a ray until its image is done (measured: 110 to 160): its place, what it has seen, the result."""
+"""Memory of a ray until its image is done, in bytes (measured: 110 to 160): position, state, result."""
 
 LARGE = 2**31
-"""Bytes of an image from which on it is compared with the memory that is left."""
+"""Images of more bytes are compared with the memory that is left."""
 
 
 def render(
-    volume: Volume | Any,
-    transfer: Transfer | Any,
-    camera: Camera | Any,
-    march: March | Literal["auto"] | Any,
+    volume: Volume | Sequence[Volume],
+    transfer: Transfer | Sequence[Transfer],
+    camera: Camera,
+    march: March | Literal["auto"],
     *,
-    tolerance: float | Any | None = None,
-    compositing: Mode | Compositing[Any] | Any = "over",
-    lighting: Lighting | Any | None = None,
-    outputs: RenderOutputs | Any = "all",
-    adjoint: Adjoint | Any = "replay",
-    devices: Devices | Any | None = None,
-    antialias: int | Any = 1,
+    tolerance: float | None = None,
+    compositing: Mode | Compositing[Any] = "over",
+    lighting: Lighting | None = None,
+    outputs: RenderOutputs = "all",
+    adjoint: Adjoint = "replay",
+    devices: Devices | None = None,
+    antialias: SupportsIndex = 1,
     until: Arrayable | None = None,
 ) -> Rendering:
-    """Renders an image of a volume.
+    """Render an image of a volume.
 
     Args:
-        volume: the values, on a grid. Or a list of several, each with its own grid and place: their
-            extinctions add at each sample, colours are means weighted by extinction, and a cell that a
-            volume's face divides counts for the part that lies in it. Without a lighting, by `"over"`,
-            `"integral"` or a `Weighting` of one's own.
-        transfer: their colours and extinctions; of several volumes, a list of one for each. (Where all of
-            their extinctions are exactly 0, derivatives by extinction take the mean of their colours, except
-            for `jax.grad` under `"replay"`, which is exact: so are not `jax.jacfwd` and second derivatives.)
-        camera: makes one ray for each pixel.
+        volume: a volume, or a list of volumes on different grids. Extinctions of several volumes add at each
+            sample, colours are means weighted by extinction, and a cell that a volume's face divides counts
+            for its part inside. Several volumes cannot be lit, and are composited by `"over"`, `"integral"`
+            or a custom `Weighting`.
+        transfer: transfer function, or a list with one for each volume. (Where all extinctions are exactly 0,
+            the mixed colour is undefined. `jax.grad` with `adjoint="replay"` is exact there; forward mode and
+            second derivatives use the mean colour.)
+        camera: camera, one ray for each pixel.
         march: step and transforms; or `"auto"`: those of `plan`, which is called for each image, without
             transforms that are part of the scene (a `ToroidalMap`, a `Clip`). To plan with these, call
-            `found = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render by
-            `found.march`.
-        tolerance: with `"auto"`, the RMSE that the image's colours may have; by default 1/255.
-        compositing: how the cells of a ray become a pixel: `"over"`; `"maximum"`, `"minimum"` or
+            `planned = plan(volume, transfer, camera, tolerance, transforms=(clip,))`, and render by
+            `planned.march`.
+        tolerance: with `"auto"`, the RMSE allowed in the image's colours; by default 1/255.
+        compositing: mode that makes a pixel of the cells of a ray: `"over"`; `"maximum"`, `"minimum"` or
             `"average"`, the projections of VTK (`Maximum` and its siblings take a `thickness`); an
             `Isosurface(value)`; or another `Weighting` or `Selection`. Where a `Selection` chooses a depth,
-            the march is not differentiated: JAX differentiates the pixel that is computed there.
-        lighting: how samples are shaded: `lighting.Phong(lights)` or
-            `lighting.ScattererTemplates(materials, lights)`; by default not at all.
+            the march is not differentiated: JAX differentiates the pixel computed at that depth.
+        lighting: shading of samples: `lighting.Phong(lights)` or
+            `lighting.ScattererTemplates(materials, lights)`; by default none.
         outputs: `"all"`, or `"rgba"` for the image and `exhausted` only, in some 5 % less time.
-        adjoint: how the image is differentiated; the image itself is the same. `"replay"`: in either mode,
-            and in forward mode over these (`jax.hessian`, `jax.jvp` of `jax.grad`); for `jax.grad`, a second
-            march computes the samples again, so that memory does not grow with their number (one array like
-            each leaf, and the rays of one tile). `"forward"`: in forward mode (`jax.jvp`, `jax.jacfwd`) only,
-            by one march in place of two. `"direct"`: in any mode and order; JAX differentiates the
-            reference's march, in some 15 times the time, and memory grows with the number of samples.
+        adjoint: method of differentiation; the image is the same. `"replay"`: forward and reverse mode, and
+            forward mode over these (`jax.hessian`, `jax.jvp` of `jax.grad`); for `jax.grad`, a second march
+            computes the samples again, so that memory does not grow with their number (one array like each
+            leaf, and the rays of one tile). `"forward"`: forward mode (`jax.jvp`, `jax.jacfwd`) only, by one
+            march instead of two. `"direct"`: any mode and order; JAX differentiates the reference's march, in
+            some 15 times the time, and memory grows with the number of samples.
         devices: a sequence of JAX's devices, or a `jax.sharding.Mesh` of one axis, over which
             `jax.shard_map` shards the rays. Image and gradient are the same, and lie on all of these
             devices; so does the scene (a volume is copied to each once in its lifetime). By default JAX
@@ -90,33 +90,33 @@ def render(
             `jax.devices()` and make the same calls in all of them; each gets the whole image
             (`examples/several_processes.py`).
         antialias: number n of rays along the width and the height of each pixel, through the centers of
-            n x n equal parts of it; by default one. A pixel is their mean (a box filter), its depth that of
-            their opacity. Time and memory grow with n². With a single ray, what is smaller than a pixel
-            moves the image by jumps: the gradient of image statistics (entropy, histograms, edges) with
-            respect to the camera is then mostly noise.
-        until: (height, width) distances from the rays' origins, world length, at which rays end: what lies
-            behind something opaque that is drawn otherwise, a mesh, is not seen. Infinite where a ray goes on
-            to the exit; nothing is seen where it is below the entry. It is an exit like the volume's:
-            `AlphaCorrection` cuts the last cell there, and makes gradients by `until` complete. Another
-            renderer's planar depth z along the view lies at the distance z / cos of the ray's angle to it.
+            n x n equal parts of it; by default one. A pixel is their mean (a box filter), its depth is
+            weighted by their opacity. Time and memory grow with n². With a single ray, details smaller than
+            a pixel move the image by jumps: the gradient of image statistics (entropy, histograms, edges)
+            with respect to the camera is then mostly noise.
+        until: (height, width) distances from the rays' origins, world length, at which rays end, such as
+            those of an opaque mesh of another renderer, which hides the volume behind it. Infinite where a
+            ray goes on to the exit; nothing is visible where it is below the entry. It is an exit like the
+            volume's: `AlphaCorrection` cuts the last cell there, and makes gradients by `until` complete.
+            A planar depth z along the view is the distance z / cos of the ray's angle to the view.
 
     Returns:
         A `Rendering` of shape (height, width), in JAX's default float type. If a number on which all pixels
         depend is NaN or infinite (a transfer function whose fit diverged, say), or, where it is traced, out
-        of its range (a view angle of 180°, control points that decrease), all of the image and of its
-        gradient is NaN. A voxel that is NaN makes those pixels NaN whose rays sample it, or leave the volume
-        next to it (0 times NaN is NaN), unless what lies in front of it is opaque or decides the pixel, as an
-        isosurface does. An infinite voxel is a value beyond all others, and need not show. (`Volume` refuses
-        both: they come from what replaces its data.)
+        of its range (a view angle of 180°, control points that decrease), the image and its gradient are NaN.
+        A voxel that is NaN makes those pixels NaN whose rays sample it, or leave the volume next to it (0
+        times NaN is NaN), unless matter in front of it is opaque or decides the pixel, as an isosurface does.
+        An infinite voxel is a value beyond all others, and need not show. (`Volume` refuses both; they come
+        from replacing its data.)
 
     Raises:
-        ValueError: for an argument of another kind (an array for a `Volume`, a camera in the march's place);
+        ValueError: for an argument of another type (an array for a `Volume`, a camera in the march's place);
             for unknown outputs or adjoint; for `"direct"` where the step, the volume's place or a transform
-            that bends space is traced and `march.max_samples` is not given; for `"auto"` where arrays are
+            that bends space is traced and `march.max_samples` is not set; for `"auto"` where arrays are
             traced, and for a tolerance without it; for wrong `devices`, and for any inside a `jax.shard_map`;
             for an `antialias` that is no integer of at least 1; for an `until` of another shape or with NaN;
-            for a volume of another number of channels than the transfer function reads, and several where
-            one value is needed; and under a mode of differentiation that is not the adjoint's.
+            for another number of channels than the transfer function, the mode or the lighting reads; and for
+            a mode of differentiation that the adjoint does not support.
 
     `jax.vmap`, over any of the arguments, renders one image after the other, in one program, and so do
     gradients. Under `"direct"` and `"forward"`, images that are also differentiated, or compiled by a
@@ -133,21 +133,20 @@ def render(
     camera, the spacing and everything else that moves the exit misses these jumps, and is wrong by them.
     """
     order = "render(volume, transfer, camera, march)"
-    volume, transfer = together(volume, transfer)
+    grid, function = together(volume, transfer)
     if isinstance(march, str):
         if march != "auto":
             raise ValueError(f'march must be a jaxvol March or "auto"; got {march!r}.')
-        check_arguments(order, volume=volume)
-        given = PLANNED if tolerance is None else tolerance
-        found = plan(volume, transfer, camera, given, compositing=compositing, lighting=lighting)
-        if not found.within:
-            warnings.warn(f"the image may not be within the tolerance: {found}", stacklevel=2)
-        march = found.march
+        check_arguments(order, volume=grid)
+        tolerance = PLANNED if tolerance is None else tolerance
+        planned = plan(grid, function, camera, tolerance, compositing=compositing, lighting=lighting)
+        if not planned.within:
+            warnings.warn(f"the image may not be within the tolerance: {planned}", stacklevel=2)
+        march = planned.march
     elif tolerance is not None:
-        raise ValueError(f'tolerance goes with march="auto"; got {tolerance!r} with {described(march)}.')
-    check_arguments(order, volume=volume, transfer=transfer, camera=camera, march=march, lighting=lighting)
-    assert isinstance(march, March)
-    _warn_of_step(volume, march)
+        raise ValueError(f'tolerance needs march="auto"; got tolerance={tolerance!r}, {described(march)}.')
+    check_arguments(order, volume=grid, transfer=function, camera=camera, march=march, lighting=lighting)
+    _warn_of_step(grid, march)
     n, source = integer("antialias", antialias, 1), camera
     _warn_of_size(camera, n)
     if n > 1:
@@ -155,60 +154,60 @@ def render(
     if until is not None:
         until = finite_array("until", until, camera.size[::-1], infinite=True)
         source = Ending(source, until if n == 1 else jnp.kron(until, jnp.ones((n, n), until.dtype)))
-    scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
+    scene = Scene(grid, function, source, march, compositing_of(compositing), lighting)
     rendering = render_scene(scene, outputs, adjoint, devices=devices)
     return rendering if n == 1 else pooled(rendering, n)
 
 
 def _warn_of_step(volume: Volume, march: March) -> None:
-    """Say so if a step is longer than a volume that no transform bends, where both are known."""
+    """Warn of a step that is longer than the volume, if both are known and no transform bends the volume."""
     if is_traced(march.step, volume.spacing):
         return
     # JAX keeps what it brought to the host, so that no later image waits for the device here
     step, spacing = (np.asarray(array).tolist() for array in (march.step, volume.spacing))
     if step <= max(spacing) or march.overriding("locate"):
         return
-    across = math.hypot(*((n - 1) * s for n, s in zip(volume.shape, spacing, strict=True)))
-    if step > across:
-        told = f"march.step is {step:.4g}, longer than the volume, which is {across:.4g} across"
-        warnings.warn(f"{told}; half a voxel is {min(spacing) / 2:.4g}.", stacklevel=3)
+    diagonal = math.hypot(*((n - 1) * s for n, s in zip(volume.shape, spacing, strict=True)))
+    if step > diagonal:
+        message = f"march.step is {step:.4g}, longer than the volume, which is {diagonal:.4g} across"
+        warnings.warn(f"{message}; half a voxel is {min(spacing) / 2:.4g}.", stacklevel=3)
 
 
 def _warn_of_size(camera: Camera, antialias: int) -> None:
-    """Say so if an image may take more than half of the memory that is left."""
+    """Warn of an image that may take more than half of the memory that is left."""
     width, height = camera.size
-    taken = width * height * antialias**2 * BYTES
-    if taken > LARGE and taken > (left := memory_available()) / 2:
+    size = width * height * antialias**2 * BYTES
+    if size > LARGE and size > (available := memory_available()) / 2:
         rays = "" if antialias == 1 else f" of {antialias} x {antialias} rays"
-        told = f"{width} x {height} pixels{rays} take some {taken / 2**30:.3g} GiB of memory"
+        message = f"{width} x {height} pixels{rays} take some {size / 2**30:.3g} GiB of memory"
         remedy = "render parts of the image, camera.crop(left, top, width, height), whose pixels are the same"
-        warnings.warn(f"{told}, and {left / 2**30:.3g} GiB are left; {remedy}.", stacklevel=3)
+        warnings.warn(f"{message}, and {available / 2**30:.3g} GiB are left; {remedy}.", stacklevel=3)
 
 
 def render_rays(
-    volume: Volume | Any,
-    transfer: Transfer | Any,
+    volume: Volume | Sequence[Volume],
+    transfer: Transfer | Sequence[Transfer],
     origins: Arrayable,
     directions: Arrayable,
-    march: March | Any,
+    march: March,
     *,
     pixels: Arrayable | None = None,
-    compositing: Mode | Compositing[Any] | Any = "over",
-    lighting: Lighting | Any | None = None,
-    outputs: RenderOutputs | Any = "all",
-    adjoint: Adjoint | Any = "replay",
-    devices: Devices | Any | None = None,
+    compositing: Mode | Compositing[Any] = "over",
+    lighting: Lighting | None = None,
+    outputs: RenderOutputs = "all",
+    adjoint: Adjoint = "replay",
+    devices: Devices | None = None,
     until: Arrayable | None = None,
 ) -> Rendering:
-    """Renders arbitrary rays. All other arguments are as for `render`.
+    """Render arbitrary rays. All other arguments are as for `render`.
 
     Args:
         origins: (*rays, 3) world points where rays begin.
         directions: (*rays, 3), of any length but 0. Distances are measured in world length.
         pixels: (*rays, 2) integers, (column, row), which key the random numbers of each ray. By default
-            (index in the flattened array, 0). Within a `jax.shard_map` over the first axis that is the index
-            in the whole array; but under `check_vma=False`, where JAX does not tell a shard that it is one,
-            give pixels, or each shard draws the same numbers.
+            (index in the flattened array, 0). Within a `jax.shard_map` over the first axis, the index is that
+            in the full array; but under `check_vma=False`, where a shard is not known as one, pass pixels, or
+            all shards draw the same numbers.
         until: (*rays,) distances at which rays end.
 
     Returns:
@@ -219,29 +218,29 @@ def render_rays(
             directions of length 0.
     """
     order = "render_rays(volume, transfer, origins, directions, march)"
-    volume, transfer = together(volume, transfer)
-    check_arguments(order, volume=volume, transfer=transfer, march=march, lighting=lighting)
+    grid, function = together(volume, transfer)
+    check_arguments(order, volume=grid, transfer=function, march=march, lighting=lighting)
     origins = finite_array("origins", origins, (..., 3))
     directions = finite_array("directions", directions, (..., 3))
     if origins.shape != directions.shape:
         raise ValueError(
             f"origins and directions must agree in shape; got {origins.shape} and {directions.shape}."
         )
-    least = float(jnp.finfo(directions.dtype).tiny)
-    message = f"directions must not have length 0, or below {least:.2g}."
-    directions = _unit(require(directions, lambda d: (abs(d) >= least).any(-1, keepdims=True), message))
+    tiny = float(jnp.finfo(directions.dtype).tiny)
+    message = f"directions must not have length 0, or below {tiny:.2g}."
+    directions = _unit(require(directions, lambda d: (abs(d) >= tiny).any(-1, keepdims=True), message))
     count = jnp.asarray(math.prod(origins.shape[:-1]), jnp.int32)
     first = shard_number(origins, directions) * count
     source = GivenRays(origins, directions, _pixels(pixels, origins), first)
     if until is not None:
         source = Ending(source, finite_array("until", until, origins.shape[:-1], infinite=True))
-    scene = Scene(volume, transfer, source, march, compositing_of(compositing), lighting)
+    scene = Scene(grid, function, source, march, compositing_of(compositing), lighting)
     return render_scene(scene, outputs, adjoint, devices=devices)
 
 
 @jax.jit
 def _unit(directions: Float[Array, "*rays 3"]) -> Float[Array, "*rays 3"]:
-    """Directions of length 1; squares of long and short ones would overflow and underflow."""
+    """Scale directions to length 1. Squares of long and short ones would overflow and underflow."""
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(directions), axis=-1, keepdims=True))
     directions = directions / jnp.where((largest > 1e-9) & (largest < 1e9), 1, largest)
     return directions / jnp.linalg.norm(directions, axis=-1, keepdims=True)

@@ -1,12 +1,14 @@
-"""Run-time type checker: beartype, configured to accept int for float."""
+"""Run-time type checker: beartype, configured to accept int for float, and NumPy's flags for bool."""
 
 import functools
 
 import jaxtyping
-from beartype import BeartypeConf, beartype
+import numpy as np
+from beartype import BeartypeConf, BeartypeHintOverrides, beartype
 
 
-check = beartype(conf=BeartypeConf(is_pep484_tower=True))
+FLAGS = BeartypeHintOverrides({bool: bool | np.bool_})
+check = beartype(conf=BeartypeConf(is_pep484_tower=True, hint_overrides=FLAGS))
 
 
 def adapt_decorator():

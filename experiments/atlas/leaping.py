@@ -1,6 +1,7 @@
 """Where does space leaping fail? Thin sheets, steep transfer functions, gradients of what is leapt over."""
 
 from functools import cache
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -157,12 +158,12 @@ def _gradients(volume: jv.Volume, camera: jv.Camera, extinction: Array) -> tuple
     """The image's sum differentiated by the extinction of what surrounds a sphere: with leaping, and by the
     reference."""
 
-    def loss(extinction: Array, leaps: tuple, adjoint: str) -> Array:
+    def loss(extinction: Array, leaps: tuple, adjoint: Literal["replay", "direct"]) -> Array:
         levels = jnp.stack([extinction, extinction, jnp.full_like(extinction, 3.0)])
         transfer = jv.TransferFunction([0.0, 0.3, 1.0], np.ones((3, 3)), levels)
         march = jv.March(0.1, (*leaps, jv.AlphaCorrection()), max_samples=64)
-        how = {"outputs": "rgba", "adjoint": adjoint}
-        return jnp.sum(jv.render(volume, transfer, camera, march, **how).rgba[..., 3])
+        image = jv.render(volume, transfer, camera, march, outputs="rgba", adjoint=adjoint)
+        return jnp.sum(image.rgba[..., 3])
 
     slope = jax.grad(loss)
     return slope(extinction, (jv.SpaceLeaping(),), "replay"), slope(extinction, (), "direct")

@@ -65,8 +65,8 @@ EXTINCTION = 1.5
 def _opacity(step: Array) -> tuple[Array, Array]:
     """Opacity of a cube of side 2, and whether its ray was exhausted."""
     rays = jnp.array([[0.1, 0.2, -3.0]]), jnp.array([[0.0, 0.0, 1.0]])
-    march, how = jv.March(step, (jv.AlphaCorrection(),)), {"outputs": "rgba", "adjoint": "forward"}
-    rendering = jv.render_rays(cube(), uniform(EXTINCTION), *rays, march, **how)
+    march, volume = jv.March(step, (jv.AlphaCorrection(),)), cube()
+    rendering = jv.render_rays(volume, uniform(EXTINCTION), *rays, march, outputs="rgba", adjoint="forward")
     return rendering.rgba[0, 3], rendering.exhausted[0]
 
 

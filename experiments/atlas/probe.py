@@ -34,8 +34,10 @@ SIZE = A + B + 100
 def _within(origins: Array, directions: Array) -> Array:
     """Lengths of rays within the sector, as the march sees them."""
     march = jv.March(STEP, (probe(A, B, 100.0), jv.AlphaCorrection()))
-    volume, how = jv.Volume(np.ones((8, 8, 8), np.float32)), {"outputs": "rgba", "adjoint": "forward"}
-    rendering = jv.render_rays(volume, uniform(EXTINCTION), origins, directions, march, **how)
+    volume, transfer = jv.Volume(np.ones((8, 8, 8), np.float32)), uniform(EXTINCTION)
+    rendering = jv.render_rays(
+        volume, transfer, origins, directions, march, outputs="rgba", adjoint="forward"
+    )
     return -jnp.log1p(-rendering.rgba[..., 3]) / EXTINCTION
 
 

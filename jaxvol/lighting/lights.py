@@ -2,11 +2,13 @@
 power per area, radiance power per area and solid angle, each in linear RGB."""
 
 from abc import abstractmethod
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, not_negative, require
@@ -18,8 +20,8 @@ class Arriving(NamedTuple):
 
     Attributes:
         toward: direction to the light; None for light from all sides.
-        distance: of the light; infinite for parallel light.
-        irradiance: on a plane that faces the light.
+        distance: distance to the light; infinite for parallel light.
+        irradiance: irradiance of a plane that faces the light.
     """
 
     toward: Vec3 | None
@@ -39,7 +41,7 @@ class DirectionalLight(Light):
     """Parallel light, such as sunlight.
 
     Args:
-        direction: (3,), in which the light travels; any length except 0.
+        direction: (3,) direction in which the light travels, of any length except 0.
         irradiance: (3,) linear RGB, power per area on a plane that faces the light, ≥ 0.
 
     Raises:
@@ -95,7 +97,7 @@ class PointLight(Light):
 
 
 class HeadLight(Light):
-    """A light at the camera: each ray brings its own parallel light, which travels along it. For `Phong`.
+    """A light at the camera: parallel light along each ray. For `Phong`.
 
     Args:
         irradiance: (3,) linear RGB, power per area on a plane that faces the ray, ≥ 0.
@@ -135,24 +137,24 @@ class ConstantLight(Light):
 
 
 def located(lights: tuple[Light, ...]) -> list[Light]:
-    """The lights that reach a point from a single direction."""
+    """Select the lights that reach a point from a single direction."""
     return [light for light in lights if not isinstance(light, ConstantLight)]
 
 
-def sky_of(lights: tuple[Light, ...], dtype: Any) -> Vec3:
+def sky_of(lights: tuple[Light, ...], dtype: DTypeLike) -> Vec3:
     """Radiance of all constant lights."""
     constant = [light.radiance for light in lights if isinstance(light, ConstantLight)]
     return apart(sum(constant, jnp.zeros(3, dtype)))
 
 
-def lights_of(lights: Any, excluded: type[Light] = HeadLight) -> tuple[Light, ...]:
-    """One or several lights of any but the `excluded` kind, as a tuple; `ValueError` for anything else."""
-    several = (lights,) if isinstance(lights, Light) else lights
-    if not isinstance(several, tuple | list) or not several:
+def lights_of(lights: Light | Sequence[Light], excluded: type[Light] = HeadLight) -> tuple[Light, ...]:
+    """Convert to a tuple of lights of any but the `excluded` kind; `ValueError` for anything else."""
+    sources = (lights,) if isinstance(lights, Light) else lights
+    if not isinstance(sources, tuple | list) or not sources:
         raise ValueError(f"lights must be a light or a tuple of lights; got {lights!r}.")
-    for light in several:
+    for light in sources:
         if not isinstance(light, Light) or isinstance(light, excluded):
             raise ValueError(
                 f"lights must hold jaxvol lights, of any kind but {excluded.__name__}; got {light!r}."
             )
-    return tuple(several)
+    return tuple(sources)

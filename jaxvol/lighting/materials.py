@@ -1,8 +1,8 @@
-"""Materials: how they scatter light, and where in a volume they are."""
+"""Materials: their optical properties, and their shares at a point of a volume."""
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ class Material(eqx.Module):
         mean_free_path: λ, the mean distance between scatterings, world length, > 0; see
             `lighting.mean_free_path`.
         refractive_index: positive; 1 in air.
-        values: (low, high), the range of volume values that are this material, low < high.
+        values: (low, high), low < high, range of the volume's values in this material.
         label: the volume's label for this material. Without `values` or `label`, it is everywhere.
 
     Raises:
@@ -71,7 +71,7 @@ class Material(eqx.Module):
         refractive_index: Arrayable = 1.0,
         *,
         values: Arrayable | None = None,
-        label: int | None = None,
+        label: SupportsIndex | None = None,
     ):
         self.opacity = unit_interval("opacity", opacity, ())
         self.mean_free_path = number("mean_free_path", mean_free_path, above=0)
@@ -93,7 +93,7 @@ def mean_free_path(density: Arrayable, cross_section: Arrayable) -> Float[Array,
 
     Args:
         density: n, scatterers per volume, 1/length³, > 0.
-        cross_section: σ, the effective area of each, length², > 0.
+        cross_section: σ, effective area of a scatterer, length², > 0.
 
     Returns:
         The mean distance between scatterings, for `Material`.
@@ -105,20 +105,20 @@ def mean_free_path(density: Arrayable, cross_section: Arrayable) -> Float[Array,
     return 1 / (math.sqrt(2) * n * area)
 
 
-def materials_of(materials: Material | Sequence[Any]) -> tuple[Material, ...]:
-    """One or several materials as a tuple; `ValueError` for anything else."""
-    several = (materials,) if isinstance(materials, Material) else tuple(materials)
-    if not several:
+def materials_of(materials: Material | Sequence[Material]) -> tuple[Material, ...]:
+    """Convert to a tuple of materials; `ValueError` for anything else."""
+    materials = (materials,) if isinstance(materials, Material) else tuple(materials)
+    if not materials:
         raise ValueError("materials must hold at least one Material; got none.")
-    for each in several:
-        if not isinstance(each, Material):
-            raise ValueError(f"materials must hold jaxvol materials; got {each!r}.")
-    return several
+    for material in materials:
+        if not isinstance(material, Material):
+            raise ValueError(f"materials must hold jaxvol materials; got {material!r}.")
+    return materials
 
 
 def optics_of(materials: Sequence[Material]) -> Optics:
-    """The optics of several materials, stacked."""
-    return jax.tree.map(lambda *each: jnp.stack(each), *(material.optics for material in materials))
+    """Stack the optics of materials."""
+    return jax.tree.map(lambda *numbers: jnp.stack(numbers), *(material.optics for material in materials))
 
 
 def shares(
@@ -131,32 +131,32 @@ def shares(
     labels: Literal["nearest", "linear"] = "nearest",
 ) -> tuple[Scalar, ...]:
     """Shares of materials at a grid coordinate with this value: 1 for the first present; sum at most 1.
-    `edge`: part of the narrowest range over which they fade; above 0, shares by values are continuous (by
-    labels if `"linear"`)."""
-    remaining, each = jnp.ones_like(value), []
-    ranges = [one.values[1] - one.values[0] for one in materials if one.values is not None]
+    `edge`: fraction of the narrowest range over which they fade; above 0, shares by values are continuous
+    (by labels if `"linear"`)."""
+    remaining, fractions = jnp.ones_like(value), []
+    ranges = [m.values[1] - m.values[0] for m in materials if m.values is not None]
     width = edge * jax.lax.stop_gradient(jnp.min(jnp.stack(ranges))) if ranges else jnp.zeros_like(value)
-    for one in materials:
-        if one.label is not None and labels == "nearest":
-            share = (volume.label(coordinate) == one.label).astype(value.dtype)
-        elif one.label is not None:
-            share = volume.label_share(coordinate, one.label)
-        elif one.values is None:
+    for material in materials:
+        if material.label is not None and labels == "nearest":
+            share = (volume.label(coordinate) == material.label).astype(value.dtype)
+        elif material.label is not None:
+            share = volume.label_share(coordinate, material.label)
+        elif material.values is None:
             share = jnp.ones_like(value)
         else:
-            low, high = jax.lax.stop_gradient(one.values)
+            low, high = jax.lax.stop_gradient(material.values)
             if edge == 0:
                 share = step(value - low) * step(high - value)
             else:
                 share = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
-        # so that of two that follow each other, each has half where they meet
-        each.append(jnp.where(share > remaining, remaining, share))  # NaN stays NaN
-        remaining = remaining - each[-1]
-    return tuple(each)
+        # so that two materials of adjacent ranges have half each where they meet
+        fractions.append(jnp.where(share > remaining, remaining, share))  # NaN stays NaN
+        remaining = remaining - fractions[-1]
+    return tuple(fractions)
 
 
 def step(x: Scalar, at_0: float = 1.0) -> Scalar:
-    """0 below 0, `at_0` at 0, and 1 above. NaN stays NaN, where a comparison would give 0."""
+    """Step function: 0 below 0, `at_0` at 0, 1 above. NaN stays NaN (a comparison would make it 0)."""
     return jnp.where(x == 0, at_0, (jnp.sign(x) + 1) / 2)
 
 

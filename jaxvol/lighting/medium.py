@@ -1,4 +1,4 @@
-"""What scatters light at a point of the world, and how often? The medium of `path_trace`, with soft edges."""
+"""Scattering medium at a point of the world: that of `path_trace`, with soft edges of materials."""
 
 from typing import NamedTuple
 
@@ -11,15 +11,15 @@ from .shading import Surroundings
 
 
 FADE = 0.02
-"""Materials fade over this part of the narrowest value range, so that their edges have derivatives."""
+"""Materials fade over this fraction of the narrowest value range, so that their edges have derivatives."""
 
 
 class Scattering(NamedTuple):
-    """How light is scattered at a point.
+    """Scattering properties at a point.
 
     Attributes:
         extinction: 1/length; 0 where nothing is visible.
-        albedo: of single scattering, (r, g, b).
+        albedo: single-scattering albedo, (r, g, b).
     """
 
     extinction: Scalar
@@ -27,27 +27,26 @@ class Scattering(NamedTuple):
 
 
 def scattering_at(around: Surroundings, materials: tuple[Material, ...], point: Vec3) -> Scattering:
-    """How light is scattered at a world point: in a material of mean free path λ and opacity α, the
-    extinction is 1/λ and the albedo the colour times 1 - α; elsewhere, they are the transfer function's
-    extinction and colour. Where the transfer function shows nothing, there is nothing."""
+    """Scattering properties at a world point. In a material of mean free path λ and opacity α, the extinction
+    is 1/λ and the albedo is the colour times 1 - α; elsewhere, they are the transfer function's extinction
+    and colour. Where the transfer function shows nothing, the extinction is 0."""
     measured = around.measured(point)
-    there = around.classified(point, measured)
-    color, own = around.classification.classify(measured)
-    fractions = shares(materials, around.volume, there.coordinate, there.value, edge=FADE)
-    rate, rest, kept = jnp.zeros_like(own), jnp.ones_like(own), jnp.ones_like(own)
+    classified = around.classified(point, measured)
+    color, extinction = around.classification.classify(measured)
+    fractions = shares(materials, around.volume, classified.coordinate, classified.value, edge=FADE)
+    rate, remaining, kept = jnp.zeros_like(extinction), jnp.ones_like(extinction), jnp.ones_like(extinction)
     for fraction, material in zip(fractions, materials, strict=True):
         rate = rate + fraction / material.mean_free_path
-        rest = rest - fraction
+        remaining = remaining - fraction
         kept = kept - fraction * material.opacity
-    rate = rate + rest * own
-    visible = there.extinction > 0
+    rate = rate + remaining * extinction
     r, g, b = (clipped(c) * kept for c in color)
-    return Scattering(jnp.where(visible, rate * there.inside, 0), (r, g, b))
+    return Scattering(jnp.where(classified.extinction > 0, rate * classified.inside, 0), (r, g, b))
 
 
 @jax.custom_jvp
 def clipped(albedo: Scalar) -> Scalar:
-    """Clipped to [0, 1]; the derivative at 0 and 1 is that of the inside."""
+    """Clip to [0, 1]; the derivative at 0 and 1 is that inside the range."""
     return jnp.clip(albedo, 0, 1)
 
 

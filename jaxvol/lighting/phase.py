@@ -28,7 +28,7 @@ def sample_phase(anisotropy: Scalar, first: Scalar, second: Scalar) -> Vec3:
 
 
 def scattered(around_z: Vec3, direction: Vec3) -> Vec3:
-    """Direction after a scattering drawn by `sample_phase`, renormalized to first order, or errors add up."""
+    """Turn a direction by a draw of `sample_phase`. Renormalized to first order, or errors would add up."""
     x, y, z = turned(around_z, direction)
     scale = (3 - (x * x + y * y + z * z)) / 2  # 1 / sqrt(n), to first order around 1
     return x * scale, y * scale, z * scale

@@ -1,6 +1,7 @@
-"""Surface shading: how bright a sample is by the angle between the light and the gradient of the values."""
+"""Surface shading by the angles between the lights, the viewer and the gradient of the values."""
 
-from typing import Any, TypeAlias
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float, Int
@@ -14,12 +15,12 @@ from .shading import Sample, Shading, Surroundings
 
 
 Angles: TypeAlias = Float[Array, "..."] | Complex[Array, "..."]
-"""How a light falls on a sample: of a head light n·v; of others the pair n·l and n·v, packed in one array."""
+"""Angles of a light at a sample: n·v for a head light; for others n·l and n·v, packed in one array."""
 
 
 class Phong(Shading):
-    """Local illumination by the volume's gradient. With the normal n, the direction v to the viewer, and of
-    each light the direction l to it and the irradiance E, a sample of colour c gets the colour
+    """Local illumination by the volume's gradient. With the normal n, the direction v to the viewer, and
+    lights of directions l and irradiances E, a sample of colour c gets the colour
 
         c (ambient + diffuse Σ_lights n·l E) + specular Σ_lights (r·v)^specular_power E
 
@@ -62,7 +63,7 @@ class Phong(Shading):
 
     def __init__(
         self,
-        lights: Light | tuple[Light, ...] | Any | None = None,
+        lights: Light | Sequence[Light] | None = None,
         ambient: Arrayable = 0.1,
         diffuse: Arrayable = 0.7,
         specular: Arrayable = 0.2,
@@ -87,7 +88,7 @@ class Phong(Shading):
         return 1
 
     def begin(self, around: Surroundings, sample: Sample) -> list[tuple[Vec3, Vec3]]:
-        """For each light, the direction to it and its irradiance."""
+        """Compute the direction and the irradiance of each light."""
         arriving = [light.at(sample.point, sample.direction) for light in self.lights]
         return [(light.toward, light.irradiance) for light in arriving if light.toward is not None]
 
@@ -99,11 +100,10 @@ class Phong(Shading):
             space, place = around.space, sample.point
         gradient = world_gradient(around.volume, space, place)
         squared, toward_viewer = dot(gradient, gradient), -dot(gradient, sample.direction)
-        exists = ~(squared <= 0)  # also of NaN, which is to be seen
+        exists = ~(squared <= 0)  # true for NaN, which then shows in the image
         # 0 without a normal, so that it has no derivative
         side = jnp.where(exists, jnp.where(toward_viewer < 0, -1, 1), 0).astype(squared.dtype)
-        # Of each light there is one use of this, the last one: XLA stores what is expensive and has two, and
-        # then repeats the fetches.
+        # Used once per light, last: XLA would store a value of two uses, and then repeat the fetches.
         scale = 1 / jnp.sqrt(jnp.where(exists, squared, 1))
 
         return tuple(

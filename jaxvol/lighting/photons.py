@@ -1,4 +1,4 @@
-"""What does each photon of a template add to the light of a sample? `ScattererTemplates` lists the steps."""
+"""Light that the photons of a template add to a sample, by the steps that `ScattererTemplates` lists."""
 
 import functools
 import math
@@ -23,15 +23,15 @@ from .template import ScattererTemplate
 Occlusion = Literal["soft", "hard"]
 
 LIT_SIDE_COSINE = 0.25
-"""With soft occlusion, the cosine up to which a photon beyond the lit side still counts in part."""
+"""With soft occlusion, photons up to this cosine beyond the lit side count in part."""
 
 WHITE = 4 / (3 * math.pi)
-"""Factor from irradiance to radiance, by which opaque white matter that absorbs nothing is as bright as the
-light around it: half of the photons of a sample on its face are inside, so that E b (c + s) = 3/4 π L c."""
+"""Factor from irradiance to radiance. Opaque white matter that absorbs nothing is then as bright as the light
+around it: half of the photons of a sample on its face are inside, so that E b (c + s) = 3/4 π L c."""
 
 
 class PhotonsOfSample(NamedTuple):
-    """What a sample's photons share. `mixture`: shares of sum 1. `template`: the one in use, of several."""
+    """Values shared by a sample's photons. `mixture`: shares of sum 1. `template`: index, of several."""
 
     shares: tuple[Scalar, ...]
     mixture: tuple[Scalar, ...]
@@ -41,7 +41,7 @@ class PhotonsOfSample(NamedTuple):
 
 
 class Medium(NamedTuple):
-    """Medium at a photon: share of all materials, opacity over the sample's, and optics."""
+    """Medium at a photon. `share`: of all materials. `ratio`: opacity there over opacity at the sample."""
 
     share: Scalar
     ratio: Scalar
@@ -50,7 +50,7 @@ class Medium(NamedTuple):
 
 
 class PhotonShading(Shading):
-    """Templates of one image; each has `blended` ones, whose photons are skipped as in their own."""
+    """Shading by the templates of one image. `blended`: number of templates in each, for `cutoff`."""
 
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
@@ -72,12 +72,12 @@ class PhotonShading(Shading):
 
     def thresholds(self) -> Float[Array, " photons"]:
         intensity = jax.lax.stop_gradient(self.templates.intensity)
-        brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of all that are left
-        least = jnp.zeros_like(brightest)
+        brightest = jax.lax.cummax(jnp.max(intensity, axis=(0, 1)), reverse=True)  # of this and later photons
+        thresholds = jnp.zeros_like(brightest)
         if self.cutoff is not None:
-            # a little less, so that rounding leaves out no photon that `_photon` does not skip
-            least = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
-        return jnp.where(brightest <= 0, jnp.inf, least)  # padding
+            # lowered, so that rounding leaves out no photon that `_photon` does not skip
+            thresholds = (1 - 1e-5) * jax.lax.stop_gradient(self.cutoff) / (brightest * self.blended)
+        return jnp.where(brightest <= 0, jnp.inf, thresholds)  # padding
 
     @property
     def skips_hidden(self) -> bool:
@@ -98,42 +98,40 @@ class PhotonShading(Shading):
     def term(
         self, around: Surroundings, sample: Sample, shared: PhotonsOfSample, number: Int[Array, ""]
     ) -> Any:
-        # In stages, each of which is stored, since XLA would compute it again for each of its uses. Only the
-        # photon of a single template costs nothing, as it is the same for all samples.
-        several, medium = len(self.materials) > 1, None
-        if several or shared.template is not None:
+        # Stages are stored, since XLA would compute them again for each of their uses. Only the photon of a
+        # single template costs nothing, as it is the same for all samples.
+        mixed, medium = len(self.materials) > 1, None
+        if mixed or shared.template is not None:
             offset, intensity = around.stored(lambda: self._photon(sample, shared, number))
         else:
             offset, intensity = self._photon(sample, shared, number)
-        if several:
+        if mixed:
             offset, medium = self.refracted(around, sample, shared, offset)
 
         def places() -> list[Vec3]:
-            return [_displaced(sample, offset, times) for times in (1.0, *self.reach)]
+            return [_displaced(sample, offset, factor) for factor in (1.0, *self.reach)]
 
         def weights() -> tuple[Scalar, Scalar]:
-            """How much of the photon is seen, and how much the colour at its place counts."""
-            points = [around.classified(*each) for each in zip(places(), read, strict=True)]
-            there = self._medium(around, shared, points[0]) if medium is None else medium
+            """Visible intensity of the photon, and weight of the colour at its place."""
+            points = list(map(around.classified, places(), measured))
+            photon_medium = self._medium(around, shared, points[0]) if medium is None else medium
             extinctions = [point.extinction for point in points]
-            # soft: the opacity of one mean free path there
-            matter = (
-                -jnp.expm1(-extinctions[0] * there.mean_free_path)
-                if self._soft
-                else step(extinctions[0], 0.0)
-            )
-            seen = intensity * self._visible(offset, extinctions)
-            return self.counted(seen, intensity * matter * there.share, there.ratio)
+            if self._soft:  # the opacity of one mean free path
+                matter = -jnp.expm1(-extinctions[0] * photon_medium.mean_free_path)
+            else:
+                matter = step(extinctions[0], 0.0)
+            visible = intensity * self._visible(offset, extinctions)
+            return self.counted(visible, intensity * matter * photon_medium.share, photon_medium.ratio)
 
-        read = around.stored(lambda: [around.measured(place) for place in places()])
-        seen, shows = around.stored(weights)
-        brightness = tuple(seen * self.lit_side(offset, light) for light in shared.lights)
-        color, _ = around.classification.classify(read[0])
+        measured = around.stored(lambda: [around.measured(place) for place in places()])
+        visible, shows = around.stored(weights)
+        brightness = tuple(visible * self.lit_side(offset, light) for light in shared.lights)
+        color, _ = around.classification.classify(measured[0])
         return brightness, scaled(cast(Vec3, color), shows)
 
-    def color(self, sample: Sample, shared: PhotonsOfSample, sums: Any) -> Vec3:
+    def color(self, sample: Sample, shared: PhotonsOfSample, sums: tuple[tuple[Scalar, ...], Vec3]) -> Vec3:
         brightness, inner = sums
-        # 1 from a material's soft edge inwards, since an unlit part of the colour would look like emission
+        # 1 from the middle of a material's soft edge inwards: unlit colour would look like emission
         matter = _matter(shared.shares)
         scale = matter * WHITE * shared.optics.reflectance
         irradiance = [[light.irradiance[i] for light in shared.lights] for i in range(3)]
@@ -146,67 +144,68 @@ class PhotonShading(Shading):
     def lit(
         self, color: Scalar, inner: Scalar, brightness: Sequence[Scalar], irradiance: Sequence[Scalar]
     ) -> Scalar:
-        """One channel of a sample's light. Brightness and irradiance are those of each light."""
+        """One channel of a sample's light, by a brightness and an irradiance per light."""
         return (color + inner) * sum(b * light for b, light in zip(brightness, irradiance, strict=True))
 
-    def counted(self, seen: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
-        """How much a photon counts for brightness and inner colour, by the `ratio` of opacities there."""
-        return seen, shows * ratio
+    def counted(self, visible: Scalar, shows: Scalar, ratio: Scalar) -> tuple[Scalar, Scalar]:
+        """Weights of a photon for brightness and inner colour. `ratio`: see `Medium`."""
+        return visible, shows * ratio
 
     def _photon(self, sample: Sample, shared: PhotonsOfSample, number: Int[Array, ""]) -> tuple[Vec3, Scalar]:
-        """Offset and intensity of a photon, blended by the materials' shares; of intensity 0 if skipped."""
+        """Offset and intensity of a photon, blended by the materials' shares; intensity 0 if skipped."""
 
         def of_sample(of_templates: Float[Array, " templates"]) -> Scalar:
             return of_templates[0] if shared.template is None else gather(of_templates, shared.template)
 
         offset, light = self.templates.offset, self.templates.intensity
-        each = [
+        photons = [
             [*(of_sample(offset[m, :, number, i]) for i in range(3)), of_sample(light[m, :, number])]
             for m in range(len(self.materials))
         ]
-        x, y, z, intensity = each[0]
-        if len(each) > 1:
+        x, y, z, intensity = photons[0]
+        if len(photons) > 1:
             x, y, z, intensity = (
-                _sum([share * one for share, one in zip(shared.mixture, several, strict=True)])
-                for several in zip(*each, strict=True)
+                _sum([share * value for share, value in zip(shared.mixture, values, strict=True)])
+                for values in zip(*photons, strict=True)
             )
         return (x, y, z), self.unless_skipped(sample, intensity)
 
     def unless_skipped(self, sample: Sample, intensity: Scalar) -> Scalar:
-        """The intensity of a photon; 0 where it is below the cut-off."""
+        """The intensity of a photon, or 0 below the cut-off."""
         if self.cutoff is None:
             return intensity
         return jnp.where(sample.transmittance * intensity * self.blended < self.cutoff, 0, intensity)
 
     def refracted(
         self, around: Surroundings, sample: Sample, shared: PhotonsOfSample, offset: Vec3
-    ) -> tuple[Vec3, "Medium"]:
-        """Offset of a photon, refracted into the material at its place, and the medium there."""
-        read = around.stored(lambda: around.measured(_displaced(sample, offset)))
+    ) -> tuple[Vec3, Medium]:
+        """Refract the offset of a photon into the material at its place; and the medium at that place."""
+        measured = around.stored(lambda: around.measured(_displaced(sample, offset)))
 
         def moved() -> tuple[Vec3, Medium]:
-            there = self._medium(around, shared, around.classified(_displaced(sample, offset), read))
+            medium = self._medium(around, shared, around.classified(_displaced(sample, offset), measured))
             # the template is stretched by the ratio of the speeds of light
-            return scaled(offset, shared.optics.refractive_index / there.refractive_index), there
+            return scaled(offset, shared.optics.refractive_index / medium.refractive_index), medium
 
         return around.stored(moved)
 
-    def _medium(self, around: Surroundings, shared: PhotonsOfSample, there: ClassifiedPoint) -> "Medium":
-        """What scatters light at a place; the volume's outside has none of the materials."""
-        each = tuple(there.inside * share for share in self.shares(around, there.coordinate, there.value))
-        own, optics = shared.optics, _blend(self.optics, each, shared.optics)
-        ratio = jnp.ones_like(own.opacity)
+    def _medium(self, around: Surroundings, shared: PhotonsOfSample, point: ClassifiedPoint) -> Medium:
+        """The medium at a point; outside of the volume, materials have no share."""
+        fractions = self.shares(around, point.coordinate, point.value)
+        fractions = tuple(point.inside * fraction for fraction in fractions)
+        optics, opacity = _blend(self.optics, fractions, shared.optics), shared.optics.opacity
+        ratio = jnp.ones_like(opacity)
         if len(self.materials) > 1:
-            exists = own.opacity != 0
-            ratio = jnp.where(exists, optics.opacity / jnp.where(exists, own.opacity, 1), 0)
-        return Medium(_sum(each), ratio, optics.mean_free_path, optics.refractive_index)
+            exists = opacity != 0
+            ratio = jnp.where(exists, optics.opacity / jnp.where(exists, opacity, 1), 0)
+        return Medium(_sum(fractions), ratio, optics.mean_free_path, optics.refractive_index)
 
     def shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        how: Any = {"edge": EDGE, "labels": "linear"} if self._soft else {}
-        return shares_of(self.materials, around.volume, coordinate, value, **how)
+        edges: Any = {"edge": EDGE, "labels": "linear"} if self._soft else {}
+        return shares_of(self.materials, around.volume, coordinate, value, **edges)
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
-        """Visibility of a photon from the sample, from the extinctions at its place and at `reach`."""
+        """Visibility of a photon from the sample, by the extinctions at its place and at `reach`."""
         if not self._soft:
             return 1 - step(_sum(extinctions), 0.0)
         pieces = np.diff([0.0, 1.0, *self.reach])
@@ -214,7 +213,7 @@ class PhotonShading(Shading):
         return jnp.exp(-depth * _norm(offset))
 
     def lit_side(self, offset: Vec3, light: Arriving) -> Scalar:
-        """Whether a photon is nearer to the light than the sample is: 0 or 1, with a ramp if soft."""
+        """1 for a photon nearer to the light than the sample, else 0; with a ramp if soft."""
         if light.toward is None:
             return jnp.ones_like(offset[0])
         # for a light at a finite distance r: r - |r d - p|, in a form without cancellation
@@ -228,8 +227,8 @@ def _sum(terms: Sequence[Scalar]) -> Scalar:
     return functools.reduce(jnp.add, terms)
 
 
-def _displaced(sample: Sample, offset: Vec3, times: float = 1.0) -> Vec3:
-    return along(sample.point, offset, jnp.full_like(offset[0], times))
+def _displaced(sample: Sample, offset: Vec3, factor: float = 1.0) -> Vec3:
+    return along(sample.point, offset, jnp.full_like(offset[0], factor))
 
 
 def _matter(shares: tuple[Scalar, ...]) -> Scalar:
@@ -240,11 +239,11 @@ def _norm(offset: Vec3) -> Scalar:
     return jnp.sqrt(jnp.maximum(dot(offset, offset), jnp.finfo(offset[0].dtype).tiny ** 0.5))
 
 
-def _blend(optics: Optics, shares: tuple[Scalar, ...], rest: Optics) -> Optics:
-    """Optics averaged over the materials at a point, weighted by their shares; `rest` fills up to 1."""
+def _blend(optics: Optics, shares: tuple[Scalar, ...], default: Optics) -> Optics:
+    """Mean optics of materials, weighted by their shares; `default` has the remaining share."""
     remaining = 1 - sum(shares)
     blended = (
-        sum(share * each[m] for m, share in enumerate(shares)) + remaining * other
-        for each, other in zip(optics, rest, strict=True)
+        sum(share * values[m] for m, share in enumerate(shares)) + remaining * value
+        for values, value in zip(optics, default, strict=True)
     )
     return Optics(*blended)

@@ -1,6 +1,7 @@
-"""A scatterer template: how light spreads inside a material, as a few photons around a point."""
+"""A scatterer template: the spread of light inside a material, as a few photons around a point."""
 
 import math
+from typing import SupportsIndex
 
 import equinox as eqx
 import jax
@@ -14,23 +15,23 @@ class ScattererTemplate(eqx.Module):
     """Photons around a sample, brightest first; or several such sets, along leading axes.
 
     Attributes:
-        offset: from the sample, world length.
-        intensity: the fraction of the light that each photon holds; 0 for padding.
+        offset: offset of each photon from the sample, world length.
+        intensity: fraction of the light in each photon; 0 for padding.
     """
 
     offset: Float[Array, "*templates n 3"]
     intensity: Float[Array, "*templates n"]
 
     def sorted(self) -> "ScattererTemplate":
-        """The same photons, brightest first."""
+        """Sort the photons, brightest first."""
         order = jnp.argsort(-jax.lax.stop_gradient(self.intensity), axis=-1, stable=True)
         return ScattererTemplate(
             jnp.take_along_axis(self.offset, order[..., None], axis=-2),
             jnp.take_along_axis(self.intensity, order, axis=-1),
         )
 
-    def brightest(self, photons: int) -> "ScattererTemplate":
-        """The `photons` brightest photons, scaled to hold the energy of all."""
+    def brightest(self, photons: SupportsIndex) -> "ScattererTemplate":
+        """Keep the `photons` brightest photons, scaled to hold the energy of all."""
         count = min(integer("photons", photons, 1), self.intensity.shape[-1])
         kept, energy = self.intensity[..., :count], jnp.sum(self.intensity, axis=-1, keepdims=True)
         kept_energy = jnp.sum(kept, axis=-1, keepdims=True)
@@ -38,18 +39,18 @@ class ScattererTemplate(eqx.Module):
         return ScattererTemplate(self.offset[..., :count, :], kept * scale)
 
     def normalized(self) -> "ScattererTemplate":
-        """The same photons, scaled so that each template has energy 1. NaN for a template without energy."""
+        """Scale the photons so that each template has energy 1. NaN for a template without energy."""
         return ScattererTemplate(self.offset, self.intensity / self.intensity.sum(axis=-1, keepdims=True))
 
     def blended(self) -> "ScattererTemplate":
         """Merge the templates along the last leading axis into one with all their photons and mean energy."""
-        *rest, templates, n = self.intensity.shape
-        offset = self.offset.reshape(*rest, templates * n, 3)
-        intensity = self.intensity.reshape(*rest, templates * n) / templates
+        *axes, templates, n = self.intensity.shape
+        offset = self.offset.reshape(*axes, templates * n, 3)
+        intensity = self.intensity.reshape(*axes, templates * n) / templates
         return ScattererTemplate(offset, intensity).sorted()
 
     def clustered(self, distance: float) -> "ScattererTemplate":
-        """Sorted template in which the brightest photon within the distance gets the others' intensity."""
+        """Merge photons into the brightest one within the distance, and sort them."""
         offset = jax.lax.stop_gradient(self.offset)
         near = sum((offset[:, None, i] - offset[None, :, i]) ** 2 for i in range(3)) <= distance**2
         # Photons are sorted, so argmax finds the brightest. A host may have a host in turn; doubling follows

@@ -1,5 +1,5 @@
-"""Lighting by scatterer templates: which templates are used. `photons` says what each photon adds to a
-sample, and `transport` how light is carried by random walks.
+"""Lighting by scatterer templates: its options, and the templates in use. `photons` adds the light of photons
+to a sample, `transport` carries light by random walks.
 
 Lee, Kwon and Shin: Scattered light representation in accordance with the material using scatterer template in
 volume rendering (2016), sections 3.3 and 3.4.
@@ -7,15 +7,15 @@ volume rendering (2016), sections 3.3 and 3.4.
 
 import inspect
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal, SupportsIndex, get_args
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._util.checks import flag, integer, number
-from ..march.march import March, Transform
+from .._util.checks import Arrayable, flag, integer, number
+from ..march.march import March
 from ..scene.transfer import Transfer
 from ..scene.volume import Volume, without_voxels
 from ..xla.compiling import computed_now
@@ -56,10 +56,10 @@ class ScattererTemplates(Lighting):
        offset, and adds its colour with α' / α times its intensity.
     6. Photons are skipped if the ray's transmittance times their intensity is below `cutoff`.
 
-    As printed, steps 4 and 5 are others: a photon adds the light's colour times its intensity, however little
+    Steps 4 and 5 as printed differ: a photon adds the light's colour times its intensity, however little
     light reaches the sample, and in another material its intensity itself is scaled. Here s is lit like c, so
     that shadows stay dark, and only s is scaled, so that no sample gets more light than arrives.
-    (`experiments/printed_templates.py` has the printed ones, `paper_figs` shows both.)
+    (`experiments/printed_templates.py` has the printed steps, `paper_figs` shows both.)
 
     A sample in no material keeps its colour. With soft edges, a material's share is ½ at its edge; from there
     inwards, a sample is lit entirely as that material.
@@ -70,71 +70,71 @@ class ScattererTemplates(Lighting):
     1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`),
     and a head 1.3 times that of path tracing; under hard occlusion the head has 0.4 to 0.5 times. For darker
     colours, templates are too bright: in path tracing the colour darkens each of many scatterings, here it
-    darkens the sum once. Where it fails: `experiments/stability.py`, "long mean free paths", "short mean
-    free paths".
+    darkens the sum once. Limits: `experiments/stability.py`, "long mean free paths", "short mean free paths".
 
     **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths can be
-    found from path-traced images. The medium is that of `path_trace` with these materials: the extinction is
+    fitted to path-traced images. The medium is that of `path_trace` with these materials: the extinction is
     1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the transfer function's,
-    and samples in no material are lit, too. (Only the rays of the camera meet the transfer function's
-    extinction everywhere: let it be 1/λ for the same image.) The paper's photons become the vertices of
-    random walks: the sample itself counts; directions are uniform, not of refraction; a photon
-    counts only if all those that it descends from are inside; and the scale is that of scattering, not of a
-    half-space's reflectance. Flights are as long as the matter in front of them, seen at 16 places, lets them
-    be. Light that was scattered before is computed on a grid of `nodes`, of which each turns a template at
-    random, once for all images of a scene; direct light at each sample. Steps 1 to 6, refractive indices,
-    `blend`, `photons`, `occlusion`, `reach`, `cutoff` and `given` are of the published form alone. Its bias:
-    the light of the last `levels`, in materials at most `threshold` of all; the grid, which blurs light where
-    nodes are further apart than the mean free path (in thick matter, blotches are seen, of nodes whose walks
-    differ; fewer with more `packets`); places that flights see, which are farther apart the farther off they
-    are. Scattering is isotropic: of a material of anisotropy g, give the mean free path λ / (1 - g), which
-    spreads light as far (similarity). Steps of the march should be short against the mean free path, too: of
-    a third of it, they make images up to 3 % too bright. How near it comes to path tracing:
-    `experiments/transport.py`.
+    and samples in no material are lit, too. (Camera rays use the transfer function's extinction everywhere:
+    let it be 1/λ for the same image.) The paper's photons become the vertices of random walks: the sample
+    itself counts; directions are uniform, not refracted; a photon counts only if all its ancestors are
+    inside; and the scale is that of scattering, not of a half-space's reflectance. The lengths of flights
+    follow the extinction at 16 places in front of them. Light that was scattered before is computed on a grid
+    of `nodes`, by a template rotated at random at each node, once for all images of a scene; direct light at
+    each sample. Steps 1 to 6, refractive indices, `blend`, `photons`, `occlusion`, `reach`, `cutoff` and
+    `given` belong to the published form alone.
 
-    Its derivatives are those of the mean over all walks: under them walks stay where they are, and count
-    more or less. The image itself has small jumps, since a walk's ends pass surfaces as λ changes, so
-    that its differences show the derivative only over some 10 % of λ. If voxels change, edges of materials
-    move under the derivative, but not the surface at which the extinction becomes 0.
+    Bias of this form: the light after the last of `levels`, at most `threshold` of all light in materials;
+    the grid, which blurs light where nodes are farther apart than the mean free path (thick matter shows
+    blotches of nodes whose walks differ, fewer with more `packets`); and the places of flights, whose
+    distances grow with that from the start. Scattering is isotropic: for a material of anisotropy g, pass the
+    mean free path λ / (1 - g), which spreads light as far (similarity). Steps of the march should be short
+    against the mean free path, too: steps of a third of it make images up to 3 % too bright. Agreement with
+    path tracing: `experiments/transport.py`.
+
+    Its derivatives are those of the mean over all walks: places of walks are constant, and their weights
+    change. The image itself has small jumps, since the ends of walks cross surfaces as λ changes, so that
+    finite differences show the derivative only over some 10 % of λ. If voxels change, edges of materials move
+    under the derivative, but not the surface at which the extinction becomes 0.
 
     Templates are simulated for each image from the materials' current parameters, so that these have
-    gradients. At points of extinction 0, the gradient of the extinction lacks the light that the points would
+    gradients. At points of extinction 0, the gradient by the extinction lacks the light that the points would
     show, since invisible points are not lit.
 
     Args:
         materials: one or several. Where two overlap, the first counts. In a volume of colours
             (`RadianceField`), they are distinguished by labels.
         lights: one or several, of any kind but `HeadLight`.
-        templates: number per material, by default 8, of which each pixel uses one, chosen at random, which
-            shows as noise (the paper blends them). A single one has no noise, takes less time, and is
+        templates: number of templates per material, by default 8. Each pixel uses one, chosen at random,
+            which shows as noise (the paper blends them). A single one has no noise, takes less time, and is
             lopsided in the same way everywhere. With `"transport"`, each node of the grid uses one of 256, by
             default, and more take no more time.
-        blend: use all templates for every sample, instead, as the paper does against noise. This has less
-            noise, and takes as much longer as there are templates.
-        photons: keep this many of each template's brightest photons, scaled to the energy of all. By default
-            all.
+        blend: use all templates for every sample, as the paper does against noise; the time grows with their
+            number.
+        photons: number of the brightest photons of each template to keep, scaled to the energy of all; by
+            default all.
         occlusion: `"soft"`: v_j is the transmittance along p_j and on through `reach`, with the extinction of
             each segment taken at its far end; materials and the lit side have soft edges, and the image is
-            differentiable. `"hard"`: as published: a photon is hidden if anything is visible at one of these
+            differentiable. `"hard"`, as published: a photon is hidden if anything is visible at one of the
             points. The gradient with respect to λ, the light and the camera is then wrong, since it misses
             photons that become hidden or change their material.
         reach: multiples of a photon's offset, above 1 and increasing, at which occlusion is tested as well;
             for thin parts in front of others.
-        cutoff: by default 0.02 with hard occlusion, as published, and 0 with soft. Above 0, the gradient
-            misses the photons that are skipped.
-        seed: of the templates, and of their choice for each pixel.
-        nodes: of the grid of `"transport"`, along the volume's longest side; by default 48.
-        packets: of the templates, see `scatterer_template`; of `"transport"`, how many walks.
-        threshold: of the templates.
-        threshold_on: of the templates; the paper's is `"level"`.
-        levels: of the templates; one number, or one for each material (of the published form).
-        given: templates to use as they are instead of simulated ones, with leading axes (materials,
-            templates). Then nothing depends on the materials' mean free paths.
+        cutoff: of step 6, in [0, 1); by default 0.02 with hard occlusion, as published, and 0 with soft.
+            Above 0, the gradient misses the photons that are skipped.
+        seed: seed of the templates, and of their choice for each pixel.
+        nodes: number of nodes of the grid of `"transport"` along the volume's longest side; by default 48.
+        packets: packets of a template, see `scatterer_template`; walks of a template of `"transport"`.
+        threshold: as for `scatterer_template`.
+        threshold_on: as for `scatterer_template`; `"level"` in the paper.
+        levels: as for `scatterer_template`; one number, or a number for each material (published form only).
+        given: templates to use unchanged instead of simulated ones, with leading axes (materials, templates).
+            Nothing then depends on the materials' mean free paths.
         form: `"published"`, or `"transport"`: see above.
 
     Raises:
-        ValueError: for invalid arguments, missing `levels`, a material of which no photon is above the
-            threshold (if its opacity is traced, the image is NaN), and a grid that does not fit into memory.
+        ValueError: for invalid arguments, missing `levels`, a material without photons above the threshold
+            (if its opacity is traced, the image is NaN), and a grid that does not fit into memory.
     """
 
     materials: tuple[Material, ...]
@@ -156,37 +156,35 @@ class ScattererTemplates(Lighting):
 
     def __init__(
         self,
-        materials: Material | Sequence[Any],
-        lights: Light | tuple[Light, ...] | Any,
+        materials: Material | Sequence[Material],
+        lights: Light | Sequence[Light],
         *,
-        templates: int | None = None,
-        blend: bool | Any = False,
-        photons: int | None = None,
-        occlusion: Occlusion | Any = "soft",
+        templates: SupportsIndex | None = None,
+        blend: bool = False,
+        photons: SupportsIndex | None = None,
+        occlusion: Occlusion = "soft",
         reach: Sequence[float] = (2.0, 4.0),
-        cutoff: float | None = None,
-        seed: int = 0,
-        nodes: int | Any | None = None,
-        packets: int = 4,
-        threshold: float = 0.01,
-        threshold_on: ThresholdOn | Any = "photon",
-        levels: int | Sequence[int] | None = None,
-        given: ScattererTemplate | Any | None = None,
-        form: Form | Any = "published",
+        cutoff: Arrayable | None = None,
+        seed: SupportsIndex = 0,
+        nodes: SupportsIndex | None = None,
+        packets: SupportsIndex = 4,
+        threshold: Arrayable = 0.01,
+        threshold_on: ThresholdOn = "photon",
+        levels: SupportsIndex | Sequence[SupportsIndex] | None = None,
+        given: ScattererTemplate | None = None,
+        form: Form = "published",
     ):
         if form not in get_args(Form):
             raise ValueError(f"form must be one of {', '.join(get_args(Form))}; got {form!r}.")
         if form == "transport":
-            published = {
-                "threshold_on": threshold_on,
-                "blend": blend,
-                "photons": photons,
-                "occlusion": occlusion,
-                "reach": tuple(reach),
-            }
-            _check_unused({**published, "cutoff": cutoff, "given": given})
+            options: dict[str, Any] = {"threshold_on": threshold_on, "blend": blend, "photons": photons}
+            options |= {"occlusion": occlusion, "reach": tuple(reach), "cutoff": cutoff, "given": given}
+            known = inspect.signature(ScattererTemplates.__init__).parameters
+            for name, value in options.items():
+                if value is not (default := known[name].default) and value != default:
+                    raise ValueError(f'{name}={value!r} needs form="published"; got form="transport".')
         elif nodes is not None:
-            raise ValueError(f'nodes is of form="transport"; got {nodes!r} for form="published".')
+            raise ValueError(f'nodes={nodes!r} needs form="transport"; got form="published".')
         templates = (256 if form == "transport" else 8) if templates is None else templates
         self.form = form
         self.materials, self.lights = materials_of(materials), lights_of(lights)
@@ -211,8 +209,8 @@ class ScattererTemplates(Lighting):
         if given is None:
             self.levels = tree.levels_of(self.materials, levels)
             available = tree.capacity(max(self.levels))
-            if not tree.whole_levels and not is_traced([each.opacity for each in self.materials]):
-                opacities = [float(each.opacity) for each in self.materials]
+            if not tree.whole_levels and not is_traced([m.opacity for m in self.materials]):
+                opacities = [float(m.opacity) for m in self.materials]
                 available = min(available, max(tree.capacity(tree.levels(a), a) for a in opacities))
         else:
             if not isinstance(given, ScattererTemplate):
@@ -241,8 +239,8 @@ class ScattererTemplates(Lighting):
 
     def for_image(self, around: Surroundings) -> Shading:
         if self.form == "transport":
-            how = self.seed, self.templates, self.packets, *self.levels
-            return Transport(around, self.materials, self.lights, *how).solved(self.nodes)
+            sizes = self.seed, self.templates, self.packets, *self.levels
+            return Transport(around, self.materials, self.lights, *sizes).solved(self.nodes)
         return PhotonShading(
             *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
             blended=self.templates if self.blend else 1,
@@ -252,25 +250,22 @@ class ScattererTemplates(Lighting):
         )
 
     def simulated(self) -> ScattererTemplate:
-        """Templates in use, (materials, templates, photons); blended ones, one for each material."""
+        """Templates in use, (materials, templates, photons); with `blend`, one template per material."""
         templates = self.given
         if templates is None:
-            how: Any = {"packets": self.packets, "threshold": self.threshold, "levels": self.levels}
-            how |= {"count": self.templates, "threshold_on": self.threshold_on}
-            templates = scatterer_templates(self.materials, self.seed, **how)
-            templates = templates.normalized()  # restores the energy that the threshold has cut off
+            templates = scatterer_templates(
+                self.materials,
+                self.seed,
+                count=self.templates,
+                packets=self.packets,
+                threshold=self.threshold,
+                threshold_on=self.threshold_on,
+                levels=self.levels,
+            ).normalized()  # restores the energy that the threshold has cut off
         if not self.blend:
             return templates.brightest(self.photons)
         blended = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
         return blended.brightest(self.photons * self.templates)
-
-
-def _check_unused(options: dict[str, Any]) -> None:
-    """Raise `ValueError` for what the published form alone has."""
-    known = inspect.signature(ScattererTemplates.__init__).parameters
-    for name, value in options.items():
-        if value is not known[name].default and value != known[name].default:
-            raise ValueError(f'{name} is of form="published"; got {value!r} for form="transport".')
 
 
 @eqx.filter_jit
@@ -279,17 +274,17 @@ def _solved(lighting: ScattererTemplates, around: Surroundings) -> Shading:
 
 
 def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:
-    """The lighting, with light that lies on a grid computed once for all images of a scene. Where anything is
-    traced, it is computed for this image, by a program of its own, which JAX differentiates."""
+    """The lighting, with light on a grid computed once for all images of a scene. If an input is traced, the
+    light is computed for this image, by a separate program, which JAX differentiates."""
     if not isinstance(lighting, ScattererTemplates) or lighting.form == "published":
         return lighting
-    # of the march, only the transforms that locate points affect the light
-    spaces = [t for t in march.transforms if type(t).locate is not Transform.locate]
+    # only transforms of the march that locate points affect the light
+    spaces = march.overriding("locate")
     inputs = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
     if is_traced(inputs, volume.data):
         return _solved(lighting, Surroundings(volume, transfer, march.locate(volume)))
     cache = memoized(volume.data, _light_cache)
-    if not cache or not _same(cache["inputs"], inputs):
+    if not cache or not _equal(cache["inputs"], inputs):
         with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
             around = Surroundings(volume, transfer, march.locate(volume))
         cache.update(inputs=inputs, light=computed_now(_solved, lighting, around))
@@ -297,13 +292,13 @@ def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, mar
 
 
 def _light_cache(_: Array) -> dict[str, Any]:
-    """A volume's last light on a grid, and what it was computed from."""
+    """Empty cache of a volume's last light on a grid, and of its inputs."""
     return {}
 
 
-def _same(a: tuple[list[Any], Any], b: tuple[list[Any], Any]) -> bool:
-    """Whether two flattened trees are equal. Large leaves, such as labels, must be the same array."""
+def _equal(a: tuple[list[Any], Any], b: tuple[list[Any], Any]) -> bool:
+    """Compare two flattened trees. Large leaves, such as labels, must be the same array."""
     return a[1] == b[1] and all(
-        one is other or (np.size(one) <= 2**16 and np.array_equal(np.asarray(one), np.asarray(other)))
-        for one, other in zip(a[0], b[0], strict=True)
+        x is y or (np.size(x) <= 2**16 and np.array_equal(np.asarray(x), np.asarray(y)))
+        for x, y in zip(a[0], b[0], strict=True)
     )

@@ -1,6 +1,6 @@
 """Lighting by random walks: light scattered any number of times, as by `path_trace`. Radiance, which changes
-slowly, is computed on a grid of nodes, by a template's flights from each, turned at random; direct light,
-which changes fast at surfaces, at each sample."""
+slowly, is computed on a grid of nodes, by flights of a template, rotated at random at each node; direct
+light, which changes fast at surfaces, is computed at each sample."""
 
 import dataclasses
 import itertools
@@ -30,37 +30,37 @@ from .shading import Sample, Shading, Surroundings
 
 
 NEAR, FAR = 2, 3
-"""Nodes around visible ones with a radiance, and with optical depths, read farther towards lights."""
+"""Distance from visible nodes, in nodes, up to which radiance and optical depths are computed."""
 
 STEPS = 2
 """Steps from a node towards a light, per node of the grid's longest side. They grow with the distance."""
 
 LOCAL_STEPS = 6
-"""Steps from a sample towards a light, until the grid is fine enough for what lies beyond."""
+"""Steps from a sample towards a light, until the grid is fine enough."""
 
 LOCAL = 2.25
-"""Length of these, in the grid's spacing."""
+"""Length of the local steps together, in the grid's spacing."""
 
 LOOKS = 16
-"""Steps of a flight up to the volume's end, each as deep as the matter at one place in it."""
+"""Steps of a flight up to the volume's end; the extinction of a step is that at one place in it."""
 
 GOLDEN = (math.sqrt(5) - 1) / 2
-"""By which the places in steps differ, so that all depths of steps are seen."""
+"""Difference between the places in successive steps, so that all depths in steps are sampled."""
 
 SPREAD = 0.02
 """Share of flights that end in any of the steps, in matter or not, so that derivatives see thin matter."""
 
 COPIES = 3
-"""Of the radiance on the finer grid, that are held at once."""
+"""Copies of the radiance on the finer grid that are in memory at once."""
 
 NODES = 2**9, 2**12
-"""Nodes at a time for walks, and for what is simpler."""
+"""Nodes at a time, for walks, and for extinctions and optical depths."""
 
 EVEN = 3.0
-"""Most mean free paths by which places in a step are distributed, or none would lie in far parts."""
+"""Upper bound of a step's optical depth when its place is drawn, or none would lie in far parts of steps."""
 
-LEAST = 1e-6
-"""Least optical depth of a divisor, and share of flights that end anywhere though they meet no matter."""
+TINY = 1e-6
+"""Lower bound of optical depths in divisors, and share of flights that end where there is no matter."""
 
 
 _Way: TypeAlias = tuple[Vec3, Scalar, Bool[Array, ""]]
@@ -71,10 +71,10 @@ class ScatteredLight(Shading):
     """Light in a scene, on grids that span the volume's.
 
     Attributes:
-        radiance: at each node of a finer grid, of light that was scattered before, and of constant lights:
-            the mean over all directions.
-        depths: at each node, the optical depth up to each light that has a direction.
-        shape: of the grid of depths.
+        radiance: mean radiance over all directions, at the nodes of a finer grid, of light that was scattered
+            before and of constant lights.
+        depths: optical depth from each node to each light that has a direction.
+        shape: shape of the grid of depths.
     """
 
     radiance: Float[Array, "finer 3"]
@@ -89,54 +89,53 @@ class ScatteredLight(Shading):
 
     def begin(self, around: Surroundings, sample: Sample) -> _Begun:
         """Radiance from the grid; the share not absorbed; the way to each light; and the optical depth
-        towards it beyond the near steps (depths at surfaces are not linear between nodes)."""
+        towards each light beyond the local steps (depths at surfaces are not linear between nodes)."""
         coordinate = around.space.coordinate(sample.point)
         r, g, b = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
         fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=FADE)
         kept = jnp.ones_like(fractions[0])
         for fraction, material in zip(fractions, self.materials, strict=True):
             kept = kept - fraction * material.opacity
-        ways, beyond = self._ways(around, sample), []
-        for light_, (direction, reach, lit) in enumerate(ways):
+        ways, far_depths = self._ways(around, sample), []
+        for number, (direction, reach, lit) in enumerate(ways):
             point = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, point))
-            beyond.append(jnp.where(lit, 0, row[light_]))
-        return (r, g, b), kept, ways, tuple(beyond)
+            far_depths.append(jnp.where(lit, 0, row[number]))
+        return (r, g, b), kept, ways, tuple(far_depths)
 
     def term(
         self, around: Surroundings, sample: Sample, shared: _Begun, number: Int[Array, ""]
     ) -> tuple[Scalar, ...]:
-        """Optical depth near the sample towards all lights, read together, which takes less time."""
+        """Optical depths near the sample towards all lights, by one read, which takes less time."""
         _, _, ways, _ = shared
         steps = _growing(LOCAL_STEPS)
         places = [along(sample.point, to, middle * reach) for to, reach, _ in ways for _, middle in steps]
-        read = around.stored(lambda: [self._extinction(around, place) for place in places])
-        each = iter(read)
-        return tuple(reach * sum(width * next(each) for width, _ in steps) for _, reach, _ in ways)
+        extinctions = around.stored(
+            lambda: [scattering_at(around, self.materials, place).extinction for place in places]
+        )
+        values = iter(extinctions)
+        return tuple(reach * sum(width * next(values) for width, _ in steps) for _, reach, _ in ways)
 
-    def color(self, sample: Sample, shared: _Begun, sums: Any) -> Vec3:
-        light, kept, _, beyond = shared
-        for source, near, far in zip(located(self.lights), sums or (), beyond, strict=True):
+    def color(self, sample: Sample, shared: _Begun, sums: tuple[Scalar, ...] | None) -> Vec3:
+        light, kept, _, far_depths = shared
+        for source, near, far in zip(located(self.lights), sums or (), far_depths, strict=True):
             light = plus(light, arrived(source, sample.point, sample.direction, jnp.exp(-near - far)))
         r, g, b = (clipped(c) * kept for c in sample.color)
         return times((r, g, b), light)
 
-    def _extinction(self, around: Surroundings, point: Vec3) -> Scalar:
-        return scattering_at(around, self.materials, point).extinction
-
     def _ways(self, around: Surroundings, sample: Sample) -> list[_Way]:
-        """Of each light, the direction, how far steps go, and whether they reach it."""
+        """Direction of each light, length of the local steps, and whether they reach the light."""
         near = LOCAL * around.space.diagonal / math.hypot(*(n - 1 for n in self.shape))
-        found = []
+        ways = []
         for light in located(self.lights):
             direction, distance = _way(light, sample.point, sample.direction)
             reach = jnp.minimum(jnp.minimum(near, distance), _exit(around.space, sample.point, direction))
-            found.append((direction, reach, distance <= near))
-        return found
+            ways.append((direction, reach, distance <= near))
+        return ways
 
 
 def _exit(space: Space, point: Vec3, direction: Vec3) -> Scalar:
-    """Distance from a point in the volume to where a line leaves it."""
+    """Distance from a point in the volume to its exit along a line."""
     pixel = jnp.zeros((), jnp.int32)
     return enter(space.whole, point, direction, (pixel, pixel)).length
 
@@ -149,32 +148,32 @@ def _way(light: Light, point: Vec3, direction: Vec3) -> tuple[Vec3, Scalar]:
 
 
 def arrived(light: Light, point: Vec3, direction: Vec3, transmittance: Scalar) -> Vec3:
-    """Radiance that a light adds, scattered at a point into a ray of this direction; with albedo 1."""
+    """Radiance of a light that is scattered at a point into a ray of this direction, for albedo 1."""
     arriving = light.at(point, direction)
     assert arriving.toward is not None
     return scaled(arriving.irradiance, transmittance / (4 * math.pi))
 
 
-def interpolated(rows: Float[Array, "nodes channels"], at: tuple[Vec3, tuple[int, ...]]) -> Array:
-    """Trilinear interpolation of rows at a coordinate of a grid of this shape."""
+def interpolated(rows: Float[Array, "nodes channels"], position: tuple[Vec3, tuple[int, ...]]) -> Array:
+    """Interpolate rows trilinearly at a position: coordinate and shape of the grid, by `_on_grid`."""
     total = jnp.zeros((), rows.dtype)
-    for index, weight in corners(*at):
+    for index, weight in corners(*position):
         total = total + weight * gather(rows, index)
     return total
 
 
 def _on_grid(around: Surroundings, shape: tuple[int, ...], point: Vec3) -> tuple[Vec3, tuple[int, ...]]:
     ends = zip(around.space.coordinate(point), shape, around.volume.shape, strict=True)
-    x, y, z = (c * ((n - 1) / (whole - 1)) for c, n, whole in ends)
+    x, y, z = (c * ((n - 1) / (voxels - 1)) for c, n, voxels in ends)
     return (x, y, z), shape
 
 
 def refined(values: Float[Array, "nx ny nz channels"]) -> Float[Array, "fx fy fz channels"]:
-    """Values on a grid twice as fine, by cubic interpolation: light falls steeply behind surfaces."""
+    """Interpolate values cubically on a grid twice as fine, since light falls steeply behind surfaces."""
     for axis in range(3):
         n = values.shape[axis]
         ends = [(1, 1) if i == axis else (0, 0) for i in range(4)]
-        padded = jnp.pad(values, ends, mode="reflect", reflect_type="odd")  # exact for what is linear
+        padded = jnp.pad(values, ends, mode="reflect", reflect_type="odd")  # exact if linear
         a, b, c, d = (jax.lax.slice_in_dim(padded, i, i + n - 1, axis=axis) for i in range(4))
         middle = (9 * (b + c) - (a + d)) / 16
         last = jax.lax.slice_in_dim(values, n - 1, n, axis=axis)
@@ -185,12 +184,12 @@ def refined(values: Float[Array, "nx ny nz channels"]) -> Float[Array, "fx fy fz
 
 
 def _finer(shape: tuple[int, int, int]) -> tuple[int, ...]:
-    """The shape after `refined`."""
+    """Shape of `refined` values."""
     return tuple(2 * n - 1 for n in shape)
 
 
 def sum_neighbors(values: Float[Array, "nx ny nz c"]) -> Float[Array, "nx ny nz c"]:
-    """Sum over each node and its 26 neighbours."""
+    """Sum each node and its 26 neighbours."""
     for window in ((3, 1, 1, 1), (1, 3, 1, 1), (1, 1, 3, 1)):
         values = jax.lax.reduce_window(values, 0.0, jax.lax.add, window, (1, 1, 1, 1), "SAME")
     return values
@@ -203,7 +202,7 @@ def _growing(steps: int) -> list[tuple[float, float]]:
 
 
 class Transport(NamedTuple):
-    """What light is computed from: templates of so many `sets` of `walks`, of `levels` scatterings each."""
+    """Inputs of the light on a grid, which is computed by `sets` of `walks` with `levels` scatterings."""
 
     around: Surroundings
     materials: tuple[Material, ...]
@@ -214,8 +213,8 @@ class Transport(NamedTuple):
     levels: int
 
     def solved(self, nodes: int) -> ScatteredLight:
-        """The light on a grid of so many nodes along the axis of most voxels. NaN in any input makes all of
-        it NaN. **Raises** `ValueError` for grids that do not fit into memory."""
+        """Light on a grid of `nodes` nodes along the axis of most voxels, all NaN if any input is NaN.
+        **Raises** `ValueError` for grids that do not fit into memory."""
         volume = self.around.volume
         nx, ny, nz = (max(2, round(nodes * n / max(volume.shape))) for n in volume.shape)
         # the transfer function's tables are computed once, before all loops
@@ -230,11 +229,11 @@ class Transport(NamedTuple):
         depths = grid.depths(far)
         radiance = refined(grid.radiance(near, rates, depths).reshape(*grid.shape, 3))
         radiance = jnp.maximum(radiance, 0).reshape(-1, 3)
-        # checked here, since comparisons would hide a NaN
+        # comparisons would hide a NaN
         data = volume.data if jnp.issubdtype(volume.data.dtype, jnp.inexact) else None
         inputs = without_voxels(volume), data, self.around.transfer, self.materials, self.lights
         valid = all_finite(inputs)
-        radiance, depths = (jnp.where(valid, each, jnp.nan) for each in (radiance, depths))
+        radiance, depths = (jnp.where(valid, values, jnp.nan) for values in (radiance, depths))
         return ScatteredLight(radiance, depths, self.materials, self.lights, grid.shape)
 
     @property
@@ -242,7 +241,7 @@ class Transport(NamedTuple):
         return self.around.volume.spacing.dtype
 
     def flights(self) -> Float[Array, "flights 4"]:
-        """Direction and length, in mean free paths, of each flight: by level, walk and set."""
+        """Directions and lengths, in mean free paths, of flights, in the order of sets, walks and levels."""
         key = jax.random.key(self.seed)
         directions, lengths = unit_walks(key, self.sets, self.walks, self.levels)
         return jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(-1, 4)
@@ -252,7 +251,7 @@ class Transport(NamedTuple):
 
 
 class _State(NamedTuple):
-    """A walk: place, rate of collisions, share of its light that arrives at the begin, radiance gathered."""
+    """A walk: place, rate of collisions, share of its light that arrives at the start, radiance gathered."""
 
     point: Vec3
     rate: Scalar
@@ -261,7 +260,7 @@ class _State(NamedTuple):
 
 
 class _Grid(NamedTuple):
-    """The nodes at which light is computed."""
+    """Nodes at which light is computed."""
 
     transport: Transport
     shape: tuple[int, int, int]
@@ -270,52 +269,52 @@ class _Grid(NamedTuple):
     def size(self) -> int:
         return math.prod(self.shape)
 
-    def point(self, number: Int[Array, ""], beside: tuple[Any, Any, Any] = (0.0, 0.0, 0.0)) -> Vec3:
-        """World point of a node, or `beside` it, in units of the grid."""
+    def point(self, number: Int[Array, ""], offset: tuple[Any, Any, Any] = (0.0, 0.0, 0.0)) -> Vec3:
+        """World point at an offset from a node, in units of the grid."""
         around, dtype = self.transport.around, self.transport.dtype
         nodes = jnp.unravel_index(number, self.shape)
-        ends = zip(nodes, beside, self.shape, around.volume.shape, strict=True)
-        x, y, z = ((i.astype(dtype) + offset) * ((whole - 1) / (n - 1)) for i, offset, n, whole in ends)
+        ends = zip(nodes, offset, self.shape, around.volume.shape, strict=True)
+        x, y, z = ((i.astype(dtype) + d) * ((voxels - 1) / (n - 1)) for i, d, n, voxels in ends)
         return around.space.point((x, y, z))
 
-    def mapped(self, f: Callable[[Array], Array], nodes: Int[Array, " nodes"], together: int) -> Array:
-        """`f` of nodes, some `together`; 0 for all others. `nodes` may end with numbers past the last."""
-        together = min(together, self.size)
-        padded = jnp.pad(nodes, (0, -nodes.size % together), constant_values=self.size)
-        chunks = padded.reshape(-1, together)
+    def mapped(self, f: Callable[[Array], Array], nodes: Int[Array, " nodes"], size: int) -> Array:
+        """Apply `f` to nodes, `size` at a time; 0 for others. `nodes` may end with numbers past the last."""
+        size = min(size, self.size)
+        padded = jnp.pad(nodes, (0, -nodes.size % size), constant_values=self.size)
+        chunks = padded.reshape(-1, size)
 
-        @jax.checkpoint  # all that a backward pass needs of all nodes would not fit into memory
-        def of_chunk(chunk: Int[Array, " together"]) -> Array:
+        @jax.checkpoint  # a backward pass through all nodes would not fit into memory
+        def of_chunk(chunk: Int[Array, " size"]) -> Array:
             return jax.vmap(f)(jnp.minimum(chunk, self.size - 1))
 
-        kind = jax.eval_shape(of_chunk, chunks[0])
+        shape = jax.eval_shape(of_chunk, chunks[0])
 
-        def if_any(chunk: Int[Array, " together"]) -> Array:
-            def none(_: Any) -> Array:
-                return jnp.zeros(kind.shape, kind.dtype)
+        def if_any(chunk: Int[Array, " size"]) -> Array:
+            def zeros(_: Array) -> Array:
+                return jnp.zeros(shape.shape, shape.dtype)
 
-            return jax.lax.cond(chunk[0] < self.size, of_chunk, none, chunk)
+            return jax.lax.cond(chunk[0] < self.size, of_chunk, zeros, chunk)
 
-        found = jax.lax.map(if_any, chunks)
-        found = found.reshape(-1, *found.shape[2:])
-        whole = jnp.zeros((self.size, *found.shape[1:]), found.dtype)
-        return whole.at[chunks.reshape(-1)].set(found, mode="drop")
+        values = jax.lax.map(if_any, chunks)
+        values = values.reshape(-1, *values.shape[2:])
+        zeros = jnp.zeros((self.size, *values.shape[1:]), values.dtype)
+        return zeros.at[chunks.reshape(-1)].set(values, mode="drop")
 
     def matter(self) -> tuple[Float[Array, " nodes"], Int[Array, " nodes"], Int[Array, " nodes"]]:
-        """Rates of collisions around all nodes; padded indices of nodes near visible ones, and farther."""
+        """Rates of collisions around nodes; padded indices of nodes within NEAR and FAR of visible ones."""
         offsets = np.array([(0.5, 0.5, 0.5), *np.ndindex(2, 2, 2)]) / 2 - 0.25
 
-        def one(number: Int[Array, ""]) -> Array:
-            def there(offset: Float[Array, "3"]) -> Scattering:
-                return self.transport.at(self.point(number, apart(offset)))
+        def measure(number: Int[Array, ""]) -> Array:
+            def extinction_at(offset: Float[Array, "3"]) -> Scalar:
+                return self.transport.at(self.point(number, apart(offset))).extinction
 
-            around = jax.vmap(there)(jnp.asarray(offsets, self.transport.dtype))
-            seen = (around.extinction > 0).astype(around.extinction.dtype)
-            rate = jnp.sum(around.extinction) / jnp.maximum(jnp.sum(seen), 1)
-            return jnp.stack([rate, jnp.max(seen)])
+            extinction = jax.vmap(extinction_at)(jnp.asarray(offsets, self.transport.dtype))
+            visible = (extinction > 0).astype(extinction.dtype)
+            rate = jnp.sum(extinction) / jnp.maximum(jnp.sum(visible), 1)
+            return jnp.stack([rate, jnp.max(visible)])
 
-        found = self.mapped(one, jnp.arange(self.size, dtype=jnp.int32), NODES[1])
-        rate, known = (found[:, i].reshape(*self.shape, 1) for i in (0, 1))
+        measured = self.mapped(measure, jnp.arange(self.size, dtype=jnp.int32), NODES[1])
+        rate, known = (measured[:, i].reshape(*self.shape, 1) for i in (0, 1))
         reached = []
         for _ in range(FAR):
             total, number = sum_neighbors(rate * known), sum_neighbors(known)
@@ -331,7 +330,7 @@ class _Grid(NamedTuple):
             return jnp.zeros((self.size, 0), transport.dtype)
         steps = jnp.asarray(_growing(STEPS * max(self.shape)), transport.dtype)
 
-        def toward(point: Vec3, light: Light) -> Scalar:
+        def depth_toward(point: Vec3, light: Light) -> Scalar:
             direction, distance = _way(light, point, point)
             length = jnp.minimum(_exit(transport.around.space, point, direction), distance)
 
@@ -342,27 +341,27 @@ class _Grid(NamedTuple):
 
             return length * jax.lax.scan(add, jnp.zeros_like(length), steps)[0]
 
-        def one(number: Int[Array, ""]) -> Array:
-            return jnp.stack([toward(self.point(number), light) for light in sources])
+        def measure(number: Int[Array, ""]) -> Array:
+            return jnp.stack([depth_toward(self.point(number), light) for light in sources])
 
-        return self.mapped(one, nodes, NODES[1])
+        return self.mapped(measure, nodes, NODES[1])
 
     def radiance(
         self, near: Int[Array, " nodes"], rates: Float[Array, " nodes"], depths: Float[Array, "nodes lights"]
     ) -> Float[Array, "nodes 3"]:
-        """Radiance at nodes of light that was scattered before, or that comes from a constant light."""
+        """Radiance at nodes, of light that was scattered before and of constant lights."""
         transport, flights = self.transport, self.transport.flights()
         levels, walks, dtype = transport.levels, transport.walks, transport.dtype
         seed, zero = jnp.uint32(transport.seed), jnp.zeros((), transport.dtype)
 
-        def one(number: Int[Array, ""]) -> Array:
+        def gathered(number: Int[Array, ""]) -> Array:
             word = number.astype(jnp.uint32)
-            *turn, which = (u.astype(dtype) for u in hashed_uniforms_4(word, word, jnp.uint32(2**31), seed))
-            axes, chosen = _rotation(*turn), (which * transport.sets).astype(jnp.int32)
+            *turn, u = (u.astype(dtype) for u in hashed_uniforms_4(word, word, jnp.uint32(2**31), seed))
+            axes, chosen = _rotation(*turn), (u * transport.sets).astype(jnp.int32)
 
             def walk(index: Int[Array, ""]) -> Array:
                 def flight(level: Int[Array, ""]) -> tuple[Vec3, Scalar]:
-                    """Direction and length of a flight of the template, turned."""
+                    """Direction and length of a flight of the template, rotated."""
                     x, y, z, length = gather(flights, ((chosen * walks + index) * levels) + level)
                     a, b, c = (dot(axis, (x, y, z)) for axis in axes)
                     return (a, b, c), length
@@ -374,37 +373,38 @@ class _Grid(NamedTuple):
                     quantile = -jnp.expm1(-length)
                     return self.advanced(state, direction, quantile, u, depths), None
 
-                none, all_ = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
-                start = _State(self.point(number), rates[number], all_, none)
+                black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
+                start = _State(self.point(number), rates[number], white, black)
                 end, _ = jax.lax.scan(advance, start, jnp.arange(levels, dtype=jnp.int32))
                 return jnp.stack(end.light)
 
             return jnp.mean(jax.vmap(walk)(jnp.arange(walks, dtype=jnp.int32)), axis=0)
 
-        return self.mapped(one, near, NODES[0])
+        return self.mapped(gathered, near, NODES[0])
 
     def advanced(self, state: _State, direction: Vec3, quantile: Scalar, u: Scalar, depths: Array) -> _State:
-        """A walk after its next flight, and the light that it gathers. The flight ends where the matter in
-        front of it leaves a fraction 1 - `quantile` of those that it meets; `u` varies where it looks."""
+        """The walk after its next flight, which ends at a quantile of the collisions along it. `u` varies the
+        places at which the extinction is read."""
         transport, (point, rate, throughput, light) = self.transport, state
         looks = _looks(rate, _exit(transport.around.space, point, direction), u)
-        met = jax.vmap(lambda s: transport.at(along(point, direction, s)).extinction)(looks.places)
-        distance, weight = _ending(met, looks, quantile)
+        extinction = jax.vmap(lambda s: transport.at(along(point, direction, s)).extinction)(looks.places)
+        distance, weight = _ending(extinction, looks, quantile)
         end = along(point, direction, distance)
-        there = transport.at(end)
+        scattering = transport.at(end)
         # the mean of 1 - weight is the fraction of flights that leave
         light = plus(light, scaled(times(throughput, sky_of(transport.lights, transport.dtype)), 1 - weight))
-        throughput = times(scaled(throughput, weight), there.albedo)
+        throughput = times(scaled(throughput, weight), scattering.albedo)
         row = interpolated(depths, _on_grid(transport.around, self.shape, end))
         for i, source in enumerate(located(transport.lights)):
-            added = arrived(source, end, direction, jnp.exp(-row[i]))
-            light = plus(light, times(throughput, added))
-        return _State(end, jnp.where(there.extinction > 0, there.extinction, rate), throughput, light)
+            light = plus(light, times(throughput, arrived(source, end, direction, jnp.exp(-row[i]))))
+        rate = jnp.where(scattering.extinction > 0, scattering.extinction, rate)
+        return _State(end, rate, throughput, light)
 
 
 class _Looks(NamedTuple):
-    """Where a flight looks for matter: places and widths of its steps. `density` is 1, with the derivative of
-    the places' density: walks stay where they are, and their weights change, or jumps would be lacking."""
+    """Steps of a flight: widths, and places at which the extinction is read. `density` is 1, with the
+    derivative of the places' density: it changes the weights of walks, whose places stay, or jumps would be
+    missing."""
 
     places: Float[Array, "looks"]
     widths: Float[Array, "looks"]
@@ -412,28 +412,29 @@ class _Looks(NamedTuple):
 
 
 def _looks(rate: Scalar, length: Scalar, u: Scalar) -> _Looks:
-    """Steps grow with the distance beyond a mean free path; places in them are distributed as collisions."""
+    """Steps that grow with the distance beyond a mean free path, and places distributed as collisions."""
     fixed = jax.lax.stop_gradient(rate), jax.lax.stop_gradient(length)
-    number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(fixed[0] * fixed[1], LEAST)
+    number, depth = jnp.arange(LOOKS + 1, dtype=rate.dtype), jnp.maximum(fixed[0] * fixed[1], TINY)
     ends = jnp.expm1(number / LOOKS * jnp.log1p(depth)) / depth
     widths = jnp.diff(ends)
-    across = jnp.clip(widths * depth, 0, EVEN)
+    depths = jnp.clip(widths * depth, 0, EVEN)
     u = (u + GOLDEN * number[:-1]) % 1
-    within = -jnp.log1p(u * jnp.expm1(-across)) / across
-    across = jnp.where(across < EVEN, widths * jnp.maximum(rate * fixed[1], LEAST), EVEN)
-    density = across * jnp.exp(-across * within) / -jnp.expm1(-across)
-    places = fixed[1] * (ends[:-1] + within * widths)
+    offsets = -jnp.log1p(u * jnp.expm1(-depths)) / depths
+    depths = jnp.where(depths < EVEN, widths * jnp.maximum(rate * fixed[1], TINY), EVEN)
+    density = depths * jnp.exp(-depths * offsets) / -jnp.expm1(-depths)
+    places = fixed[1] * (ends[:-1] + offsets * widths)
     return _Looks(places, length * widths, density / jax.lax.stop_gradient(density))
 
 
 def _ending(extinction: Float[Array, "looks"], looks: _Looks, u: Scalar) -> tuple[Scalar, Scalar]:
-    """Distance of a flight, and its weight: probability of a collision in its last step over that drawn."""
+    """Distance of a flight, and its weight: probability of a collision in its last step over the probability
+    by which the step was drawn."""
     depths = extinction * looks.widths
-    each = -jnp.expm1(-depths) * jnp.exp(depths - jnp.cumsum(depths))
-    drawn = jax.lax.stop_gradient(each + (SPREAD * jnp.sum(each) + LEAST) / LOOKS)
+    collided = -jnp.expm1(-depths) * jnp.exp(depths - jnp.cumsum(depths))
+    drawn = jax.lax.stop_gradient(collided + (SPREAD * jnp.sum(collided) + TINY) / LOOKS)
     drawn = drawn / jnp.sum(drawn)
     chosen = jnp.arange(LOOKS) == jnp.sum(jnp.cumsum(drawn)[:-1] < u)
-    values = looks.places, looks.density * each / drawn
+    values = looks.places, looks.density * collided / drawn
     distance, weight = (jnp.sum(jnp.where(chosen, value, 0)) for value in values)
     return distance, weight
 

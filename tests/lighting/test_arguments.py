@@ -117,7 +117,7 @@ BAD = {
     "cutoff": (lit(cutoff=1.0), "cutoff must be"),
     "seed": (lit(seed=-1), "seed must be an integer"),
     "nodes": (lit(form="transport", nodes=1), "nodes must be an integer of at least 2"),
-    "nodes as published": (lit(nodes=9), 'nodes is of form="transport"'),
+    "nodes as published": (lit(nodes=9), 'nodes=9 needs form="transport"'),
     "a fine grid": (
         lambda: with_baked_light(lit(form="transport", nodes=10**5)(), VOLUME, TRANSFER, jv.March(0.1)),
         "nodes for nodes=100000.*asks for .* GiB",

@@ -21,7 +21,7 @@ from jaxvol.lighting import (
     ScattererTemplates,
     Shading,
 )
-from jaxvol.lighting.shading import TOGETHER, Shader, terms_needed
+from jaxvol.lighting.shading import TERMS_AT_ONCE, Shader, terms_needed
 
 from ..scenes import around, scaled_phantom, slow, soft_transfer
 from .samples import image_of_reference, program, sample_at, shaded, surroundings
@@ -36,7 +36,7 @@ class Fog(Shading):
 
     @property
     def terms(self):
-        return TOGETHER + 1
+        return TERMS_AT_ONCE + 1
 
     @property
     def skips_hidden(self):

@@ -142,7 +142,7 @@ BAD = {
         lambda: jax.grad(lambda t: jv.render(SPHERE, t, CAMERA, "auto").rgba.sum())(soft_transfer()),
         "outside of",
     ),
-    "tolerance without auto": (auto(march=jv.March(0.1), tolerance=0.1), "tolerance goes with"),
+    "tolerance without auto": (auto(march=jv.March(0.1), tolerance=0.1), "tolerance needs march"),
 }
 
 
