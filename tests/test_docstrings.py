@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import textwrap
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -137,3 +138,48 @@ def test_the_reference_holds_every_public_name_once():
         for name, value in public(module).items():
             count = sum(value is each for each in shown)
             assert count == 1, f"{module.__name__}.{name} is {count} times in docs/api"
+
+
+# ---- plain names and sentences ----
+
+VAGUE = re.findall(
+    r"\w+",
+    "each every own given told here there how what which whose whole other others same both alike apart "
+    "together beside behind along away so few many some most least seen left rest found made taken",
+)
+"""Pronouns, prepositions and adverbs, which name nothing."""
+OPENERS = re.findall(
+    r"\w+",
+    "of in at by with without from for as if where who why when whether how what which whose to its their "
+    "these those this that it they some so only both each every none nothing no",
+)
+KEPT = 21, 23
+"""At most so many definitions of vague names, of public keywords and of what many files share, and public
+parameters that are `Any`, where no type says what they may be."""
+
+
+def definitions(path):
+    """Names that a file defines, first words of its docstrings, and its public parameters that are `Any`."""
+    names, words, loose = [], [], []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (doc := ast.get_docstring(node)):
+            words.append(re.split(r"[\s,.;:]", doc)[0].strip("`\"'").lower())
+        if isinstance(node, ast.arg):
+            names.append(node.arg)
+        elif isinstance(node, ast.FunctionDef) or (
+            isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        ):
+            names.append(node.name if isinstance(node, ast.FunctionDef) else node.id)
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            annotated = (each.annotation for each in (*node.args.args, *node.args.kwonlyargs))
+            types = (ast.unparse(each) for each in annotated if each is not None)
+            loose += [kind for kind in types if re.search(r"\| Any\b|^Any$", kind)]
+    return names, words, loose
+
+
+def test_names_are_nouns_docstrings_open_with_verbs_or_nouns_and_parameters_have_types():
+    files = [definitions(path) for path in Path(jv.__file__).parent.rglob("*.py")]
+    assert not [word for _, words, _ in files for word in words if word in OPENERS]
+    vague = [name for names, _, _ in files for name in names if name.strip("_").lower() in VAGUE]
+    assert len(vague) <= KEPT[0], sorted(vague)
+    assert sum(len(loose) for _, _, loose in files) <= KEPT[1]
