@@ -2,6 +2,7 @@
 shading of noise."""
 
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from jaxvol.lighting import (
 
 from ..printed_templates import printed_templates
 from ..scenes import grid, on_cube
-from .entry import colors, entry, rms
+from .entry import colors, entry, grey, rms
 
 
 @entry(
@@ -144,6 +145,90 @@ def short_mean_free_paths(ratio: float, size: int) -> dict[str, float]:
     the template of a sample near a curved face has more photons outside than on the flat one that set its
     scale."""
     return balls(ratio, size)
+
+
+PATH = 0.1
+"""A mean free path, in a cube of side 2."""
+ROOF = 0.15
+"""Distance of a roof from the ground under it."""
+
+
+@cache
+def ground(roof: float) -> jv.Volume:
+    """Ground under z = 0, below a roof of this thickness, if any."""
+    z = grid(128)[2]
+    sheet = np.abs(z - ROOF - roof / 2) <= roof / 2
+    return on_cube((np.clip(0.5 - 63.5 * z, 0, 1) + sheet).astype(np.float32))
+
+
+def lit_ground(size: int, roof: float = 0.0, **options: Any) -> np.ndarray:
+    """Radiance of the ground, seen from under the roof and lit from above it."""
+    lights = DirectionalLight((0.0, 0.0, -1.0), (1.0, 1.0, 1.0))
+    options = {
+        "levels": 4,
+        "packets": 4,
+        "threshold_on": "level",
+        "occlusion": "hard",
+        "cutoff": 0.02,
+    } | options
+    lighting = ScattererTemplates(jv.Material(0.5, PATH, 1.0), lights, **options)
+    transfer = jv.TransferFunction([0.4, 0.6], np.ones((2, 3)), [0.0, 100.0])
+    camera = jv.Camera((0, 0, ROOF / 2), (0, 0, -1), (0, 1, 0), size=(size, size), parallel_scale=0.3)
+    return colors(ground(roof), transfer, camera, jv.March(1 / 64), lighting=lighting)[..., 0]
+
+
+TESTS = {
+    "at the photon alone": (1.0001,),
+    "reach = 2, 4": (2.0, 4.0),
+    "reach = 1.25 to 4": (1.25, 1.5, 2.0, 3.0, 4.0),
+}
+
+
+@entry(
+    "jaxvol.lighting.ScattererTemplates",
+    "thickness of a roof / mean free path",
+    (4.0, 2.0, 1.0, 0.5, 0.25),
+    "light that passes an opaque roof / light without it",
+    "reach = 2, 4",
+    limit=0.05,
+    size=8,
+)
+def thin_parts_between_tests(ratio: float, size: int) -> dict[str, float]:
+    """How thin may a part be that hides photons, for `reach` to find it?
+
+    Occlusion is tested at multiples of a photon's offset. A part that lies between two of them hides nothing,
+    and a photon tested at its own place alone is hidden by nothing else. Measured beside a thick roof that is
+    tested densely."""
+    blended = {"templates": 8, "blend": True}
+    bare, thick = (
+        lit_ground(size, roof, **blended, reach=TESTS["reach = 1.25 to 4"]).mean() for roof in (0.0, 0.4)
+    )
+    light = {n: lit_ground(size, ratio * PATH, **blended, reach=reach).mean() for n, reach in TESTS.items()}
+    return {name: float((passed - thick) / bare) for name, passed in light.items()}
+
+
+@entry(
+    "jaxvol.lighting.ScattererTemplates",
+    "templates of a material",
+    (1.0, 2.0, 4.0, 8.0, 16.0),
+    "noise on flat ground / mean",
+    "one for each pixel",
+    limit=0.05,
+    picture=lambda templates, size: grey(lit_ground(size, templates=int(templates)) * 2),
+    shows="flat ground, lit by one template for each pixel",
+    size=24,
+)
+def one_template_for_each_pixel(templates: float, size: int) -> dict[str, float]:
+    """From how many templates may each pixel take one before their choice shows as noise?
+
+    From a single one. A template is lopsided, so that neighbouring pixels differ by how two templates lean;
+    more templates do not lower that. `blend=True` uses all for every sample, as the paper does against
+    noise."""
+    noise = {
+        "one for each pixel": lit_ground(size, templates=int(templates)),
+        "blended": lit_ground(size, templates=int(templates), blend=True),
+    }
+    return {name: float(image.std() / image.mean()) for name, image in noise.items()}
 
 
 SIDE = 32

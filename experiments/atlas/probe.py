@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Array
 
 import jaxvol as jv
+from jaxvol.bricks import overlap_of
 
-from ..bricks import each_at_once
-from .entry import entry, finite, ray_opacities, rgba, signed, uniform
+from ..bricks import each_at_once, grid
+from ..bricks_once import EachOnce
+from .entry import LEVEL, entry, finite, ray_opacities, rgba, signed, uniform
 
 
 DEGREES = math.pi / 180
@@ -150,8 +152,11 @@ def scan(depth: float, size: int) -> tuple[Any, ...]:
     return volume, fog, camera, jv.March(1.5, (fan,))
 
 
+BRICKS = 1, 1, 3
+
+
 def by_bricks(depth: float, size: int, method: Any) -> np.ndarray:
-    how = {"bricks": (1, 1, 3), "method": method, "outputs": "rgba"}
+    how = {"bricks": BRICKS, "method": method, "outputs": "rgba"}
     return np.asarray(jv.render_bricks(*scan(depth, size), **how).rgba)
 
 
@@ -173,3 +178,25 @@ def wrong_order(depth: float, size: int) -> dict[str, float]:
     "reload" keep the order of the samples, and their error is that of rounding."""
     truth, methods = rgba(*scan(depth, size)), {"naive": each_at_once, "overlap": "overlap"}
     return {name: float(np.abs(by_bricks(depth, size, how) - truth).max()) for name, how in methods.items()}
+
+
+@entry(
+    "jaxvol.render_bricks",
+    "overlap / K* of the paper's formula",
+    (1.5, 1.0, 0.75, 0.5, 0.25, 0.0),
+    "share of rays that are incomplete",
+    "each brick read once",
+    limit=0.01,
+    size=24,
+)
+def overlaps_shorter_than_published(part: float, size: int) -> dict[str, float]:
+    """How short may the overlap of bricks be, against K*, if each brick is read once?
+
+    A ray that leaves a brick, and comes back to it farther on, is incomplete where the overlap does not hold
+    that part. "overlap" takes K*, and reads a brick again where that is too short: no ray is incomplete."""
+    volume, _, _, march = scan(1.0, size)
+    formula = overlap_of(march.transforms[0], grid(volume.shape, BRICKS))
+    once = EachOnce([part * overlap for overlap in formula])
+    by_bricks(1.0, size, once)
+    wrong = np.abs(by_bricks(1.0, size, "overlap") - rgba(*scan(1.0, size))).max(axis=-1) > LEVEL
+    return {"each brick read once": once.incomplete, '"overlap"': float(wrong.mean())}

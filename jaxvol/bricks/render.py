@@ -109,7 +109,8 @@ def render_bricks(
 
     Source: bricks and overlap by Kim, Kwon and Shin 2008, section 3, who left skipping empty bricks by ranges
     of values to future work. Here the overlap follows from the rays of the image; `bricks.overlap_of` is
-    their formula. Where it fails: `experiments/stability.py`, "wrong order".
+    their formula. Where it fails: `experiments/stability.py`, "wrong order",
+    "overlaps shorter than published".
     """
     if isinstance(source, list | tuple) or isinstance(transfer, list | tuple):
         raise ValueError(

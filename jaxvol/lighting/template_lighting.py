@@ -70,7 +70,8 @@ class ScattererTemplates(Lighting):
     1.6 times the exact radiance of multiple scattering, white spheres 0.7 to 0.9 times (`docs/methods.md`),
     and a head 1.3 times that of path tracing; under hard occlusion the head has 0.4 to 0.5 times. For darker
     colours, templates are too bright: in path tracing the colour darkens each of many scatterings, here it
-    darkens the sum once. Limits: `experiments/stability.py`, "long mean free paths", "short mean free paths".
+    darkens the sum once. Limits: `experiments/stability.py`, "long mean free paths", "short mean free paths",
+    "one template for each pixel", "thin parts between tests".
 
     **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths can be
     fitted to path-traced images. The medium is that of `path_trace` with these materials: the extinction is
