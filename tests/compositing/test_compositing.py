@@ -244,7 +244,10 @@ REFUSED = {
     "resolved, light": (gained_that_is_lit, "lighting must be None under Gained"),
     "grad of forward": (gradient_of_forward, 'adjoint="replay"'),
     **{
-        f"first hits, {name}": (first_hits_of(MODES[name]), f"first; {type(MODES[name]).__name__} may show")
+        f"first hits, {name}": (
+            first_hits_of(MODES[name]),
+            f"first visible sample; got compositing {type(MODES[name]).__name__}, which may show",
+        )
         for name in ("maximum", "minimum", "average", "isosurface")
     },
     **{

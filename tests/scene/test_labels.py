@@ -144,7 +144,7 @@ BAD = {
     "a colour": (lambda: jv.LabelTransferFunction([ONE, "red"]), r"functions\[1\] must be .*got 'red'"),
     "many labels": (
         lambda: jv.LabelTransferFunction([ONE] * 257),
-        "of labels 0 to 255; got a list of length 257",
+        "for labels 0 to 255; got a list of length 257",
     ),
     "a list to hide": (lambda: SINGLE.with_visibility([False]), "visible must be by label.*got a list"),
     "no function": (lambda: jv.LabelTransferFunction([None]), "functions must hold a TransferFunction"),
