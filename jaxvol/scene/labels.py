@@ -1,7 +1,7 @@
 """Transfer functions of segmented volumes: one for each label."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, SupportsIndex
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -47,9 +47,7 @@ class LabelTransferFunction(Transfer):
     shown: Bool[Array, " labels"]
     """Visibility by label: see `with_visibility`."""
 
-    def __init__(
-        self, functions: Mapping[SupportsIndex, TransferFunction | None] | Sequence[TransferFunction | None]
-    ):
+    def __init__(self, functions: Mapping[Any, TransferFunction | None] | Sequence[TransferFunction | None]):
         by_label = _by_label(functions)
         visible = [function for function in by_label if function is not None]
         if not visible:
@@ -65,9 +63,7 @@ class LabelTransferFunction(Transfer):
         self.opacity = jnp.asarray(np.ones(len(complete)), self.stacked.extinction.dtype)
         self.shown = jnp.asarray(np.ones(len(complete)), bool)
 
-    def with_visibility(
-        self, visible: Mapping[SupportsIndex, bool | np.bool_ | Array]
-    ) -> "LabelTransferFunction":
+    def with_visibility(self, visible: Mapping[Any, bool | np.bool_ | Array]) -> "LabelTransferFunction":
         """A copy with labels hidden or shown: `{3: False}` hides label 3, `{3: True}` shows it again.
 
         Raises:
@@ -79,7 +75,7 @@ class LabelTransferFunction(Transfer):
             result = result.at[label].set(shown if is_array else flag(f"visible[{label}]", shown))
         return eqx.tree_at(lambda transfer: transfer.shown, self, result)
 
-    def with_opacity(self, opacity: Mapping[SupportsIndex, Arrayable]) -> "LabelTransferFunction":
+    def with_opacity(self, opacity: Mapping[Any, Arrayable]) -> "LabelTransferFunction":
         """A copy with new factors f of labels' opacity: `{2: 0.3}` makes label 2 fainter. Other labels keep
         their factors, initially 1.
 
