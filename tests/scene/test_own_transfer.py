@@ -186,8 +186,16 @@ def refused() -> dict[str, tuple[Any, str]]:
     }
 
 
-@pytest.mark.parametrize("case", refused())
+CASES = (
+    *("no colours", "one number", "no extinction", "light", "light in bricks", "paths", "several"),
+    *("a background", "a window", "a file"),
+)
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_what_is_of_three_colours_says_so(case):
-    make, message = refused()[case]
+    cases = refused()
+    assert set(cases) == set(CASES)
+    make, message = cases[case]
     with pytest.raises(ValueError, match=message):
         make()
