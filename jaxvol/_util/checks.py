@@ -25,8 +25,8 @@ T = TypeVar("T")
 Arrayable: TypeAlias = Any
 """Argument that is converted to an array. `Any`: checked at run time, by errors that name the argument."""
 
-
 Flag: TypeAlias = bool | np.bool_
+"""Argument that is true or false; NumPy's comparisons give the second kind."""
 
 
 def described(value: object) -> str:
