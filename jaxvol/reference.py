@@ -81,6 +81,8 @@ def render_ray_reference(
     order = "render_ray_reference(volume, transfer, origin, direction, march)"
     grid, function = together(volume, transfer)
     check_arguments(order, volume=grid, transfer=function, march=march, lighting=lighting)
+    if lighting is not None:
+        function = lighting.medium(function)
     scene = Scene(grid, function, None, march, compositing_of(compositing), lighting)
     check_channels(grid, function, march, scene.compositing, lighting)
     length = steps_across(grid, march)

@@ -146,6 +146,8 @@ def render(
     elif tolerance is not None:
         raise ValueError(f'tolerance needs march="auto"; got tolerance={tolerance!r}, {described(march)}.')
     check_arguments(order, volume=grid, transfer=function, camera=camera, march=march, lighting=lighting)
+    if lighting is not None:
+        function = lighting.medium(function)
     _warn_of_step(grid, march)
     n, source = integer("antialias", antialias, 1), camera
     _warn_of_size(camera, n)
@@ -220,6 +222,8 @@ def render_rays(
     order = "render_rays(volume, transfer, origins, directions, march)"
     grid, function = together(volume, transfer)
     check_arguments(order, volume=grid, transfer=function, march=march, lighting=lighting)
+    if lighting is not None:
+        function = lighting.medium(function)
     origins = finite_array("origins", origins, (..., 3))
     directions = finite_array("directions", directions, (..., 3))
     if origins.shape != directions.shape:

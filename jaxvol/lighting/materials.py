@@ -1,8 +1,8 @@
 """Materials: their optical properties, and their shares at a point of a volume."""
 
 import math
-from collections.abc import Sequence
-from typing import Literal, NamedTuple, SupportsIndex
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, SupportsIndex
 
 import equinox as eqx
 import jax
@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, finite_array, integer, number, require, unit_interval
-from .._util.vec3 import Scalar, Vec3
-from ..scene.volume import Volume
+from .._util.vec3 import Scalar
 
 
 EDGE = 0.1
@@ -123,24 +122,20 @@ def optics_of(materials: Sequence[Material]) -> Optics:
 
 def shares(
     materials: tuple[Material, ...],
-    volume: Volume,
-    coordinate: Vec3,
+    labelled: Callable[[int], Scalar],
     value: Scalar,
     *,
     edge: float = 0.0,
-    labels: Literal["nearest", "linear"] = "nearest",
 ) -> tuple[Scalar, ...]:
-    """Shares of materials at a grid coordinate with this value: 1 for the first present; sum at most 1.
-    `edge`: fraction of the narrowest range over which they fade; above 0, shares by values are continuous
-    (by labels if `"linear"`)."""
+    """Shares of materials at a place with this value: 1 for the first present; sum at most 1. `labelled`:
+    the share of a label there. `edge`: fraction of the narrowest range over which materials fade; above 0,
+    shares by values are continuous."""
     remaining, fractions = jnp.ones_like(value), []
     ranges = [m.values[1] - m.values[0] for m in materials if m.values is not None]
     width = edge * jax.lax.stop_gradient(jnp.min(jnp.stack(ranges))) if ranges else jnp.zeros_like(value)
     for material in materials:
-        if material.label is not None and labels == "nearest":
-            share = (volume.label(coordinate) == material.label).astype(value.dtype)
-        elif material.label is not None:
-            share = volume.label_share(coordinate, material.label)
+        if material.label is not None:
+            share = labelled(material.label)
         elif material.values is None:
             share = jnp.ones_like(value)
         else:

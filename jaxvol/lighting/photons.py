@@ -201,8 +201,12 @@ class PhotonShading(Shading):
         return Medium(_sum(fractions), ratio, optics.mean_free_path, optics.refractive_index)
 
     def shares(self, around: Surroundings, coordinate: Vec3, value: Scalar) -> tuple[Scalar, ...]:
-        edges: Any = {"edge": EDGE, "labels": "linear"} if self._soft else {}
-        return shares_of(self.materials, around.volume, coordinate, value, **edges)
+        def labelled(label: int) -> Scalar:
+            if self._soft:
+                return around.volume.label_share(coordinate, label)
+            return (around.volume.label(coordinate) == label).astype(value.dtype)
+
+        return shares_of(self.materials, labelled, value, edge=EDGE if self._soft else 0.0)
 
     def _visible(self, offset: Vec3, extinctions: list[Scalar]) -> Scalar:
         """Visibility of a photon from the sample, by the extinctions at its place and at `reach`."""

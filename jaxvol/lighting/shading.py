@@ -139,6 +139,10 @@ class Lighting(eqx.Module):
         unknown or unbounded."""
         return None
 
+    def medium(self, transfer: Transfer) -> Transfer:
+        """The transfer function by which rays see the volume; by default, that of the scene."""
+        return transfer
+
     @abstractmethod
     def for_image(self, around: Surroundings) -> "Shading":
         """Make the shading of one image, with all that does not depend on the sample."""

@@ -23,6 +23,7 @@ from ..xla.memo import memoized
 from ..xla.platform import is_traced
 from .lights import Light, lights_of
 from .materials import Material, materials_of, optics_of
+from .medium import MediumTransfer
 from .packet_tree import PacketTree, ThresholdOn
 from .photons import Occlusion, PhotonShading
 from .random_walks import scatterings
@@ -74,10 +75,10 @@ class ScattererTemplates(Lighting):
     "one template for each pixel", "thin parts between tests".
 
     **`form="transport"`**, which is ours, carries light as `path_trace` does, so that mean free paths can be
-    fitted to path-traced images. The medium is that of `path_trace` with these materials: the extinction is
-    1/λ in a material, and the albedo its colour · (1 - opacity); elsewhere they are the transfer function's,
-    and samples in no material are lit, too. (Camera rays use the transfer function's extinction everywhere:
-    let it be 1/λ for the same image.) The paper's photons become the vertices of random walks: the sample
+    fitted to path-traced images. The medium is that of `path_trace` with these materials, for light and
+    camera rays alike: wherever the transfer function shows anything in a material, the extinction is 1/λ, and
+    the albedo its colour · (1 - opacity); elsewhere they are the transfer function's, and samples in no
+    material are lit, too. The paper's photons become the vertices of random walks: the sample
     itself counts; directions are uniform, not refracted; a photon counts only if all its ancestors are
     inside; and the scale is that of scattering, not of a half-space's reflectance. The lengths of flights
     follow the extinction at 16 places in front of them. Light that was scattered before is computed on a grid
@@ -238,10 +239,13 @@ class ScattererTemplates(Lighting):
         stretched = max(indices) / min(indices)  # by refraction
         return float(np.max(np.linalg.norm(offset, axis=-1))) * max(1.0, *self.reach) * stretched
 
+    def medium(self, transfer: Transfer) -> Transfer:
+        return transfer if self.form == "published" else MediumTransfer(transfer, self.materials)
+
     def for_image(self, around: Surroundings) -> Shading:
         if self.form == "transport":
             sizes = self.seed, self.templates, self.packets, *self.levels
-            return Transport(around, self.materials, self.lights, *sizes).solved(self.nodes)
+            return Transport(around, self.lights, *sizes).solved(self.nodes)
         return PhotonShading(
             *(self.materials, self.lights, self.simulated(), optics_of(self.materials), self.cutoff),
             blended=self.templates if self.blend else 1,

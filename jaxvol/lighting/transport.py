@@ -23,8 +23,7 @@ from ..scene.volume import without_voxels
 from ..scene.voxel_fetch import corners
 from ..xla.memory import gather
 from .lights import Light, located, sky_of
-from .materials import Material, shares
-from .medium import FADE, Scattering, clipped, scattering_at
+from .medium import Scattering, scattering_at
 from .random_walks import unit_walks
 from .shading import Sample, Shading, Surroundings
 
@@ -64,7 +63,7 @@ TINY = 1e-6
 
 
 _Way: TypeAlias = tuple[Vec3, Scalar, Bool[Array, ""]]
-_Begun: TypeAlias = tuple[Vec3, Scalar, list[_Way], tuple[Scalar, ...]]
+_Begun: TypeAlias = tuple[Vec3, list[_Way], tuple[Scalar, ...]]
 
 
 class ScatteredLight(Shading):
@@ -79,7 +78,6 @@ class ScatteredLight(Shading):
 
     radiance: Float[Array, "finer 3"]
     depths: Float[Array, "nodes lights"]
-    materials: tuple[Material, ...]
     lights: tuple[Light, ...]
     shape: tuple[int, int, int] = eqx.field(static=True)
 
@@ -88,40 +86,32 @@ class ScatteredLight(Shading):
         return 1 if self.depths.shape[-1] else 0
 
     def begin(self, around: Surroundings, sample: Sample) -> _Begun:
-        """Radiance from the grid; the share not absorbed; the way to each light; and the optical depth
-        towards each light beyond the local steps (depths at surfaces are not linear between nodes)."""
-        coordinate = around.space.coordinate(sample.point)
+        """Radiance from the grid; the way to each light; and the optical depth towards each light beyond the
+        local steps (depths at surfaces are not linear between nodes)."""
         r, g, b = interpolated(self.radiance, _on_grid(around, _finer(self.shape), sample.point))
-        fractions = shares(self.materials, around.volume, coordinate, sample.measured[0], edge=FADE)
-        kept = jnp.ones_like(fractions[0])
-        for fraction, material in zip(fractions, self.materials, strict=True):
-            kept = kept - fraction * material.opacity
         ways, far_depths = self._ways(around, sample), []
         for number, (direction, reach, lit) in enumerate(ways):
             point = along(sample.point, direction, reach)
             row = interpolated(self.depths, _on_grid(around, self.shape, point))
             far_depths.append(jnp.where(lit, 0, row[number]))
-        return (r, g, b), kept, ways, tuple(far_depths)
+        return (r, g, b), ways, tuple(far_depths)
 
     def term(
         self, around: Surroundings, sample: Sample, shared: _Begun, number: Int[Array, ""]
     ) -> tuple[Scalar, ...]:
         """Optical depths near the sample towards all lights, by one read, which takes less time."""
-        _, _, ways, _ = shared
+        _, ways, _ = shared
         steps = _growing(LOCAL_STEPS)
         places = [along(sample.point, to, middle * reach) for to, reach, _ in ways for _, middle in steps]
-        extinctions = around.stored(
-            lambda: [scattering_at(around, self.materials, place).extinction for place in places]
-        )
+        extinctions = around.stored(lambda: [scattering_at(around, place).extinction for place in places])
         values = iter(extinctions)
         return tuple(reach * sum(width * next(values) for width, _ in steps) for _, reach, _ in ways)
 
     def color(self, sample: Sample, shared: _Begun, sums: tuple[Scalar, ...] | None) -> Vec3:
-        light, kept, _, far_depths = shared
+        light, _, far_depths = shared
         for source, near, far in zip(located(self.lights), sums or (), far_depths, strict=True):
             light = plus(light, arrived(source, sample.point, sample.direction, jnp.exp(-near - far)))
-        r, g, b = (clipped(c) * kept for c in sample.color)
-        return times((r, g, b), light)
+        return times(sample.color, light)
 
     def _ways(self, around: Surroundings, sample: Sample) -> list[_Way]:
         """Direction of each light, length of the local steps, and whether they reach the light."""
@@ -205,7 +195,6 @@ class Transport(NamedTuple):
     """Inputs of the light on a grid, which is computed by `sets` of `walks` with `levels` scatterings."""
 
     around: Surroundings
-    materials: tuple[Material, ...]
     lights: tuple[Light, ...]
     seed: int
     sets: int
@@ -231,10 +220,10 @@ class Transport(NamedTuple):
         radiance = jnp.maximum(radiance, 0).reshape(-1, 3)
         # comparisons would hide a NaN
         data = volume.data if jnp.issubdtype(volume.data.dtype, jnp.inexact) else None
-        inputs = without_voxels(volume), data, self.around.transfer, self.materials, self.lights
+        inputs = without_voxels(volume), data, self.around.transfer, self.lights
         valid = all_finite(inputs)
         radiance, depths = (jnp.where(valid, values, jnp.nan) for values in (radiance, depths))
-        return ScatteredLight(radiance, depths, self.materials, self.lights, grid.shape)
+        return ScatteredLight(radiance, depths, self.lights, grid.shape)
 
     @property
     def dtype(self) -> Any:
@@ -247,7 +236,7 @@ class Transport(NamedTuple):
         return jnp.concatenate([directions, lengths[..., None]], axis=-1).reshape(-1, 4)
 
     def at(self, point: Vec3) -> Scattering:
-        return scattering_at(self.around, self.materials, point)
+        return scattering_at(self.around, point)
 
 
 class _State(NamedTuple):

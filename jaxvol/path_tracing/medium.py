@@ -133,7 +133,12 @@ class Medium(NamedTuple):
             measured = classification.measure(coordinate)
             if not materials:
                 return measured
-            return (*shares(materials, volume, coordinate, measured[0]), *measured)
+            value = measured[0]
+
+            def labelled(label: int) -> Scalar:
+                return (volume.label(coordinate) == label).astype(value.dtype)
+
+            return (*shares(materials, labelled, value), *measured)
 
         def classify(measured: Measured) -> tuple[Scalar, Vec3]:
             fractions, measured = measured[: len(materials)], measured[len(materials) :]

@@ -146,6 +146,8 @@ def plan(
     check_arguments(order, volume=volume, transfer=transfer, camera=camera, lighting=lighting)
     gradients, once = flag("gradients", gradients), flag("once", once)
     transfer = sized(transfer, volume)
+    if lighting is not None:
+        transfer = lighting.medium(transfer)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, fixed = _checked(tolerance, transforms, scene)
     place = Place.of(March(1.0, fixed), volume)

@@ -23,7 +23,7 @@ from jaxvol.lighting import (
     transport,
 )
 from jaxvol.lighting.materials import shares
-from jaxvol.lighting.medium import FADE, scattering_at
+from jaxvol.lighting.medium import FADE, MediumTransfer, scattering_at
 from jaxvol.lighting.random_walks import unit_walks
 from jaxvol.lighting.shading import Surroundings
 from jaxvol.lighting.template_lighting import with_baked_light
@@ -83,9 +83,8 @@ def image(volume: Any, function: Any, lighting: Any, adjoint: Any = "replay") ->
 
 
 def test_where_two_materials_meet_nothing_is_in_neither():
-    volume = nested()
     values = np.linspace(5, 190, 400, dtype=np.float32)
-    each = jax.jit(jax.vmap(lambda v: shares(materials(1, 1), volume, (v, v, v), v, edge=FADE)))(values)
+    each = jax.jit(jax.vmap(lambda v: shares(materials(1, 1), lambda _: v, v, edge=FADE)))(values)
     np.testing.assert_allclose(np.sum(each, axis=0)[values > 13], 1, rtol=1e-6)
     assert np.interp(60, values, each[0]) == pytest.approx(0.5, abs=0.1)
 
@@ -94,10 +93,11 @@ def test_two_labels_of_one_material_are_one():
     labels = np.where(np.indices(SHAPE)[0] < 5, 1, 2).astype(np.uint8)
     volume = jv.Volume(np.ones(SHAPE, np.uint8), nested().spacing, nested().origin, labels)
     one = jv.TransferFunction([0, 1], [(0.8, 0.5, 0.9)] * 2, [5.0, 5.0])
-    around = Surroundings(volume, jv.LabelTransferFunction({1: one, 2: one}), MARCH.locate(volume))
     of_labels = tuple(Material(0.3, 0.5, label=label) for label in (1, 2))
+    medium = MediumTransfer(jv.LabelTransferFunction({1: one, 2: one}), of_labels)
+    around = Surroundings(volume, medium, MARCH.locate(volume))
     places = np.random.default_rng(0).uniform(-0.95, 0.95, (3, 300)).astype(np.float32)
-    found = jax.jit(jax.vmap(lambda x, y, z: scattering_at(around, of_labels, (x, y, z))))(*places)
+    found = jax.jit(jax.vmap(lambda x, y, z: scattering_at(around, (x, y, z))))(*places)
     for albedo, color in zip(found.albedo, (0.8, 0.5, 0.9), strict=True):
         np.testing.assert_allclose(albedo, 0.7 * color, rtol=1e-6)
     np.testing.assert_allclose(found.extinction, 2, rtol=1e-6)
@@ -151,8 +151,10 @@ def test_in_a_white_furnace_matter_is_as_bright_as_the_sky():
 
 
 def compared(lights: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Light of the whole image relative to path tracing, by channel, and the standard error of that."""
-    volume, function, of_materials = nested(), transfer(2.0), materials(0.5, 0.25)
+    """Light of the whole image relative to path tracing, by channel, and the standard error of that. The
+    transfer function's extinction, which has ramps at the edges of matter, is not that of the materials."""
+    volume, of_materials = nested(), materials(0.5, 0.25)
+    function = jv.TransferFunction((0.0, 40.0, 60.0, 80.0, 100.0), [(0.8, 0.5, 0.9)] * 5, (0.0, 0.5, 1, 9, 9))
     lighting = light_of(of_materials, lit(*lights))
     found = np.asarray(image(volume, function, lighting))
     traced = jv.path_trace(volume, function, CAMERA, lit(*lights), materials=of_materials, paths=3072)
@@ -175,10 +177,11 @@ def test_light_is_that_of_the_whole_volume_where_it_is_clipped():
 
     @eqx.filter_jit
     def light(march: Any) -> Any:
-        around = Surroundings(volume, function, march.locate(volume))
+        medium = MediumTransfer(function, of_materials)
+        around = Surroundings(volume, medium, march.locate(volume))
         half, near, zero, one = (jnp.float32(number) for number in (0.5, 0.999, 0, 1))
         outwards = transport._exit(around.space, (half, half, near), (zero, zero, one))
-        found = transport.Transport(around, of_materials, lights, 0, 4, 4, 4).solved(6)
+        found = transport.Transport(around, lights, 0, 4, 4, 4).solved(6)
         return found.radiance, found.depths, outwards
 
     whole, clipped = light(MARCH), light(jv.March(0.1, (jv.Clip(box=(-1, 0, -1, 1, -1, 1)),)))
@@ -206,14 +209,15 @@ def test_light_between_nodes_is_that_of_a_cubic_and_at_faces_of_a_line():
 def test_light_changes_with_the_mean_free_path_as_its_derivative_says():
     """Where the extinction jumps at surfaces, and flights end behind them."""
     volume = nested()
-    around = Surroundings(volume, transfer(2.5), MARCH.locate(volume))
 
     @jax.jit
     def light(path: Any) -> Any:
         how: tuple[Any, ...] = (lit(SUN, SKY), 0, 64, 16, LEVELS)
 
         def total(path: Any) -> Any:
-            return jnp.mean(transport.Transport(around, (Material(0.2, path),), *how).solved(12).radiance)
+            medium = MediumTransfer(transfer(2.5), (Material(0.2, path),))
+            around = Surroundings(volume, medium, MARCH.locate(volume))
+            return jnp.mean(transport.Transport(around, *how).solved(12).radiance)
 
         return jax.jvp(total, (path,), (jnp.ones_like(path),))
 
@@ -235,10 +239,10 @@ def test_light_changes_in_the_mean_over_walks_as_its_derivatives_say():
         path, extinction, data = (at + way * by for at, way, by in zip(start, ways, moved, strict=True))
         inside = eqx.tree_at(lambda volume: volume.data, volume, data)
         shown = eqx.tree_at(lambda function: function.extinction, function, extinction)
-        around = Surroundings(inside, shown, MARCH.locate(volume))
         how: tuple[Any, ...] = (lit(SUN, SKY), seed, 16, 8, LEVELS)
-        of_material = (Material(0.2, path, values=(60, 200)),)
-        return jnp.mean(transport.Transport(around, of_material, *how).solved(10).radiance)
+        medium = MediumTransfer(shown, (Material(0.2, path, values=(60, 200)),))
+        around = Surroundings(inside, medium, MARCH.locate(volume))
+        return jnp.mean(transport.Transport(around, *how).solved(10).radiance)
 
     value, gradient = jax.jit(light), jax.jit(jax.grad(light))
     steps, seeds = np.array([0.05, 0.04, 0.1], np.float32), range(24)
