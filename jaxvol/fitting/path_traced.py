@@ -290,10 +290,9 @@ class SampledRun(eqx.Module):
     @property
     def triangles(self) -> Triangles:
         """Triangles of the mean residual and Jacobian of the averaged samples."""
-        rows = np.asarray(self.window.rows)
-        scores = np.sum(rows[..., :-1] * rows[..., -1:], axis=1)
-        matrices = rows.reshape(-1, rows.shape[-1]), scores
-        return Triangles(*(jnp.asarray(np.linalg.qr(matrix, "r")) for matrix in matrices))
+        *matrices, informed = Triangles.of(self.window.rows)
+        both = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in matrices)
+        return Triangles(*both, informed)
 
     @property
     def settled(self) -> bool:

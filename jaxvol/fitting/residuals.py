@@ -216,10 +216,19 @@ class Triangles(NamedTuple):
         residual: the triangle R of [J r], whose last column replaces the residual.
         scores: the triangle S of the scores, the gradients of each pixel's part of the loss (that is, Σ Jᵢ rᵢ
             over its entries i): SᵀS is the sum of their outer products.
+        informed: number of entries whose row of the Jacobian is not 0.
     """
 
     residual: Float[Array, "numbers numbers"]
     scores: Float[Array, "rows free"]
+    informed: Float[Array, ""]
+
+    @classmethod
+    def of(cls, rows: Float[Array, "pixels channels numbers"]) -> "Triangles":
+        """Matrices of rows [J r], before their triangles are taken."""
+        scores = jnp.sum(rows[..., :-1] * rows[..., -1:], axis=1)
+        informed = jnp.sum(jnp.any(rows[..., :-1] != 0, axis=-1), dtype=rows.dtype)
+        return cls(rows.reshape(-1, rows.shape[-1]), scores, informed)
 
 
 Residual: TypeAlias = ImageResidual | Callable[[Any], PyTree]
@@ -317,23 +326,23 @@ class Problem(eqx.Module):
                 def residual(flat: Array) -> Array:
                     return function(self.free.forward(unravel(flat)), item, "forward").astype(flat.dtype)
 
-                rows = jacobian(residual, flat)
-                scores = jnp.sum(rows[..., :-1] * rows[..., -1:], axis=1)
-                pairs = zip(triangles, (rows.reshape(-1, flat.size + 1), scores), strict=True)
-                return Triangles(*(jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs))
+                matrices = Triangles.of(jacobian(residual, flat))
+                pairs = zip(triangles[:2], matrices[:2], strict=True)
+                both = (jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs)
+                return Triangles(*both, triangles.informed + matrices.informed)
 
-            zeros = (jnp.zeros((n, n), flat.dtype) for n in (flat.size + 1, flat.size))
-            triangle, scores = self._accumulate(add, Triangles(*zeros))
+            zeros = [jnp.zeros((n, n), flat.dtype) for n in (flat.size + 1, flat.size)]
+            triangle, scores, informed = self._accumulate(add, Triangles(*zeros, jnp.zeros((), flat.dtype)))
             # QR's row signs are arbitrary; fix them, so that they do not jump from step to step
             signs = jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
-            return Triangles(triangle * signs, scores)
+            return Triangles(triangle * signs, scores, informed)
 
         @condensed.defjvp
         def _(primal: tuple[FreeVariables], tangent: tuple[FreeVariables]) -> tuple[Triangles, Triangles]:
-            triangle, scores = condensed(*primal)
-            change = triangle[:, :-1] @ ravel_pytree(*tangent)[0]
-            changes = jnp.zeros_like(triangle).at[:, -1].set(change), jnp.zeros_like(scores)
-            return Triangles(triangle, scores), Triangles(*changes)
+            triangles = condensed(*primal)
+            change = triangles.residual[:, :-1] @ ravel_pytree(*tangent)[0]
+            still = jax.tree.map(jnp.zeros_like, triangles)
+            return triangles, still._replace(residual=still.residual.at[:, -1].set(change))
 
         return condensed(free)
 

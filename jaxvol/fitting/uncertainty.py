@@ -4,9 +4,10 @@ To first order, a fit errs by (JᵀJ)⁻¹ Jᵀ e if the references err by e. So
 (JᵀJ)⁻¹ Jᵀ cov(e) J (JᵀJ)⁻¹, with JᵀJ = RᵀR. For noise that is independent from pixel to pixel, Jᵀ cov(e) J is
 estimated by Σ gₚ gₚᵀ · m / (m - n), with the scores gₚ = Σ Jᵢ rᵢ over the entries of pixel p, whatever the
 variance of each entry, and however the colours of a pixel are correlated: the "sandwich" (Huber 1967; White
-1980; for clusters, Liang and Zeger 1986). If all entries are independent and of equal variance σ², estimated
-by Σ r² / (m - n), the covariance is σ² (JᵀJ)⁻¹. The covariance of the parameters follows from the Jacobian of
-the bijections.
+1980; for clusters, Liang and Zeger 1986). Here m counts the entries that depend on a parameter: a fit makes
+their residuals smaller than the noise, and no others. If all entries are independent and of equal variance
+σ², estimated by Σ r² / (m - n) over all entries, the covariance is σ² (JᵀJ)⁻¹. The covariance of the
+parameters follows from the Jacobian of the bijections.
 """
 
 import warnings
@@ -82,7 +83,7 @@ class Spreads(NamedTuple):
 
 def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
     """Spreads by the triangles of `count` entries. `scale`: norm of the data."""
-    factor, scores = (np.asarray(triangle, np.float64) for triangle in triangles)
+    factor, scores, informed = (np.asarray(triangle, np.float64) for triangle in triangles)
     n = scores.shape[1]
     _, singular, directions = np.linalg.svd(factor[:n, :n])
     # a singular value within rounding of the largest one, or of the data, determines nothing
@@ -91,7 +92,8 @@ def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
     freedom = max(count - n, 1)
     unequal = (inverse / singular[determined]) @ (directions[determined] @ scores.T)
     equal = inverse * np.sqrt(np.sum(factor[:, -1] ** 2) / freedom)
-    return Spreads(unequal * np.sqrt(count / freedom), equal, directions[~determined])
+    shrunk = max(informed - np.count_nonzero(determined), 1) / max(informed, 1)
+    return Spreads(unequal / np.sqrt(shrunk), equal, directions[~determined])
 
 
 def uncertainty(

@@ -12,6 +12,8 @@ import jaxvol as jv
 from experiments.coverage import NOISES, Model, coverage, mean_free_path, three_opacities
 from experiments.mean_free_path import lights
 from jaxvol.fitting.noise import Noise, path_traced_view
+from jaxvol.fitting.residuals import Triangles
+from jaxvol.fitting.uncertainty import spreads
 
 
 @pytest.fixture(scope="module")
@@ -143,3 +145,20 @@ def test_the_truth_lies_within_two_standard_errors_in_85_of_100_fits(model, nois
     assert found["false alarms"] == 0
     if noise != "equal":
         assert covered["covariance_of_equal_noise"] < 0.7
+
+
+def test_standard_errors_are_those_of_many_parameters_beside_a_background():
+    """Of a linear model of 90 entries and 40 parameters, and 600 entries that depend on none."""
+    random = np.random.default_rng(0)
+    jacobian = np.concatenate([random.normal(size=(90, 40)), np.zeros((600, 40))])
+    project = np.linalg.pinv(jacobian)
+    off = []
+    for _ in range(200):
+        noise = random.normal(0, 0.01, 690)
+        found = project @ noise
+        rows = np.concatenate([jacobian, (noise - jacobian @ found)[:, None]], axis=1)[:, None]
+        residual, scores, informed = Triangles.of(jnp.asarray(rows, jnp.float32))
+        both = (np.linalg.qr(np.asarray(matrix), "r") for matrix in (residual, scores))
+        spread = spreads(Triangles(*map(jnp.asarray, both), informed), 690, 1.0).unequal
+        off.append(found / np.linalg.norm(spread, axis=1))
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1, abs=0.08)
