@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from os import PathLike
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -32,6 +32,9 @@ UNDETERMINED = ".*directions are not determined"
 
 LEARNING_RATE = 0.03
 """Learning rate of `"adam"`, in free variables, which are of order 1."""
+
+NEAR = 0.03
+"""Distance from the minimum, in standard errors, at which a least-squares fit has converged."""
 
 CHECKPOINTS = 1 / 10
 """Fraction of the time that a fit spends on writing checkpoints."""
@@ -124,7 +127,8 @@ def fit(
         where: free parameters, `where(parameters)` as for `equinox.tree_at`; all others stay fixed. For
             example `lambda transfer: transfer.extinction`, or a function that returns a tuple.
         rtol: relative tolerance. A fit has converged when neither the free variables nor the residual change
-            in a step by more than `atol + rtol * size`; with a `PathTracedResidual`, when the standard error
+            in a step by more than `atol + rtol * size`, or, by least squares, within 3 % of a standard error
+            of the minimum; with a `PathTracedResidual`, when the standard error
             due to its paths is within this limit, or at most half of that due to noise of the references.
         atol: absolute tolerance: see `rtol`.
         max_steps: maximum number of steps. Each evaluates residual and derivative, even if it is rejected.
@@ -254,12 +258,23 @@ class _Run(eqx.Module):
             return Outcome.nonfinite
         if self.done or self.result != optx.RESULTS.successful:
             return Outcome.promote(self.result)
+        if self.triangles is not None and self._offset(problem) <= NEAR:
+            return Outcome.successful
         earlier, late = losses[: -limits.patience], losses[-limits.patience :]
         if earlier and min(late) >= (1 - limits.rtol) * min(earlier):
             return Outcome.stalled
         if len(losses) >= limits.max_steps:
             return Outcome.nonlinear_max_steps_reached
         return None
+
+    def _offset(self, problem: Problem) -> float:
+        """Distance of the best point from the minimum of the linear model: in standard errors, root mean
+        square over all directions. Source: the relative offset of Bates and Watts 1981."""
+        *reducible, rest = np.asarray(cast(Triangles, self.triangles).residual[:, -1], np.float64)
+        freedom = problem.count - len(reducible)
+        if freedom <= 0 or rest == 0:
+            return math.inf
+        return math.sqrt(np.mean(np.square(reducible)) / (rest**2 / freedom))
 
 
 @eqx.filter_jit

@@ -12,7 +12,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import curve_fit
+from scipy.optimize import curve_fit, least_squares
 
 import jaxvol as jv
 from jaxvol.fitting import Outcome
@@ -215,9 +215,10 @@ def test_what_a_mask_leaves_counts_as_the_cropped_image_does():
     for scene, of_view, weights in ((thicker, (view, wrong), [mask]), (listed, part, None)):
         residual = jv.ImageResidual(scene, [of_view], noise=0.02, weights=weights)
         problem = Problem.of(residual, free, y, 2**20, True)
-        squares = [np.asarray(factor).T @ np.asarray(factor) for factor in triangles(problem, y)]
+        *factors, informed = triangles(problem, y)
+        squares = [np.asarray(factor).T @ np.asarray(factor) for factor in factors]
         noise = [float(part) for part in jax.tree.leaves(residual.references.noise)[:2]]
-        found.append([*squares, problem.count, problem.scale, noise])
+        found.append([*squares, informed, problem.count, problem.scale, noise])
     for masked, cropped in zip(*found, strict=True):
         np.testing.assert_allclose(masked, cropped, rtol=1e-4)
 
@@ -440,6 +441,23 @@ def test_a_step_to_where_the_residual_is_not_finite_is_taken_back():
     assert float(result.parameters[0]) == pytest.approx(0.01, rel=1e-3)
     assert result.uncertainty is not None
     assert np.all(result.uncertainty.covariance == np.inf)
+
+
+def test_a_fit_to_noise_ends_at_the_minimum():
+    """Within a small part of a standard error of it, and without steps that change nothing."""
+    x = np.linspace(0, 1, 200)
+    noisy = np.exp(-3 * x) + np.random.default_rng(0).normal(0, 0.05, x.shape)
+
+    def residual(rate):
+        return jnp.exp(-rate * x) - noisy
+
+    fit = jv.fit(residual, jnp.float32(1.0))
+    assert fit.success
+    assert len(fit.losses) <= 8
+    exact = least_squares(lambda rate: np.exp(-rate * x) - noisy, 1.0, xtol=1e-12).x[0]
+    assert fit.uncertainty is not None
+    (error,) = fit.uncertainty.standard_errors.values()
+    assert abs(float(fit.parameters) - exact) < 0.05 * error
 
 
 def test_the_callback_is_told_every_step():
