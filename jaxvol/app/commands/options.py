@@ -123,11 +123,14 @@ def _of_picture(command: Parser, path: Path) -> dict[str, Any]:
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     """Refuse to write a file that is read, such as a slice of the volume, or the file of another option."""
-    from ...io.formats import files_of
+    from ...io.formats.dicom import dicom_files
+    from ...io.formats.tiff import slice_files
 
     read = [getattr(options, name, None) for name in ("file", "labels", "transfer")]
     read += [Path(row[0]) for row in getattr(options, "others", [])]
-    used = [file for path in read if path for file in (path, *(files_of(path) if path.is_dir() else []))]
+    used = [path for path in read if path]
+    for folder in filter(Path.is_dir, used[:]):
+        used += dicom_files(folder) or slice_files(folder)
     for name in names:
         path = getattr(options, name)
         if path is not None and realpath(path) in map(realpath, used):

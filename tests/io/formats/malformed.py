@@ -14,7 +14,6 @@ import tempfile
 import time
 import tracemalloc
 from pathlib import Path
-from typing import Any
 
 import h5py
 import mrcfile
