@@ -13,7 +13,6 @@ from .._util.checks import Arrayable, described
 from .._util.image_record import warn_caller
 from .._util.srgb import from_srgb
 from .._util.voxels import faces_of, is_flat
-from ..bricks import VoxelSource
 from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
 from ..scene.presets import colormap
@@ -116,7 +115,7 @@ def unit_of(volume: Volume) -> float:
     return float(np.linalg.norm(across)) / 100
 
 
-def preset_unit(volume: Volume | VoxelSource) -> float:
+def preset_unit(volume: Volume) -> float:
     """Length to which a preset's opacities refer: 1 mm, or the voxel size if that is far smaller."""
     size = float(voxel_size(volume))
     return size if size < SMALL else 1.0

@@ -110,9 +110,9 @@ BAD_FILES = {
     "render good.npy -o circle_2x2x2_uint8.raw/a.png": "--output: .* cannot be written",
     "render good.npy --size 99999999999999999999 8": "size must be .* fewer than",
     "animate good.npy --frames " + "9" * 400: "--frames must be an integer from 1 to",
-    "render names --memory 1M": "_ARRAY_DIMENSIONS must be names",
-    "render chunks --memory 1M": "chunks that are not much larger than it",
-    "render large --memory 1M": "asks for .* GiB of memory",
+    "info names": "_ARRAY_DIMENSIONS must be names",
+    "info chunks": "chunks that are not much larger than it",
+    "info large": "asks for .* GiB of memory",
 }
 
 

@@ -20,14 +20,6 @@ def test_a_file_is_needed_unless_a_picture_names_one(capsys):
         assert "the following arguments are required: " in capsys.readouterr().err
 
 
-def test_memory_is_a_number_of_bytes():
-    for text, count in (("1000", 1000), ("256M", 2**28), ("2g", 2**31), ("0.5K", 512)):
-        assert options("plan", "a.raw", "--memory", text).memory == count
-    for text in ("much", "", "-1", "0", "nan", "inf", "1e999", "9" * 400, "5T"):
-        with pytest.raises(ValueError, match="argument --memory: must be a number of bytes"):
-            options("plan", "a.raw", f"--memory={text}")
-
-
 BAD = {
     "text": ("--step long", "argument --step: invalid float value: 'long'"),
     "too few": ("--view-up 3", "argument --view-up: expected 3 arguments"),

@@ -118,7 +118,6 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn, monkeypatc
         (volume, {"size": "big"}, r"size must be \(width, height\) in whole pixels"),
         (volume, {"camera": camera, "size": 9}, "camera is a Camera, which has its own size; leave size out"),
         (volume, {"shade": "no"}, "shade must be True or False; got 'no'"),
-        (volume, {"memory": "512M"}, "memory is of files; volume is a Volume"),
         (volume, {"compositing": jv.lighting.Phong()}, "compositing must be a name; got a Phong"),
         (volume, {"opacity": 0.3}, "show has no option 'opacity'. Did you mean transfer"),
         (volume, {"labels": [1]}, r"labels must be a file; got .* jv.Volume\(data, labels="),
