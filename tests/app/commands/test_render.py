@@ -328,60 +328,6 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
     assert expected in said
 
 
-BAD = {
-    "EXR": (["FILE", "-o", "x.exr"], "--output: a file of colours must end in one of .png, .jpg"),
-    "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of one channel must end in one of .tif"),
-    "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
-    "clim of a file": (
-        ["FILE", "--transfer", "t.json", "--clim", "0", "1"],
-        "transfer and clim exclude",
-    ),
-    "direction": (["FILE", "--camera", *"123456", "--direction", *"123"], "camera and direction exclude"),
-    "no file": (["nowhere.raw"], "error: there is no file"),
-    "cmap": (["FILE", "--cmap", "moon"], "cmap must be"),
-    "background": (
-        ["nowhere.raw", "--background", "200", "0", "0"],
-        "background must be three numbers from 0 to 1 (linear RGB); got 200 0 0. 8-bit",
-    ),
-    "a colour's name": (
-        ["nowhere.raw", "--background", "whit"],
-        "--background must be a colour's name, such",
-    ),
-    "level": (["FILE", "--window", "3"], "window and level go together; one is missing"),
-    "window": (["FILE", "--window", "3", "--clim", "0", "1"], "clim and window exclude each other"),
-    "preset": (["FILE", "--preset", "CT-Bnes"], "got 'CT-Bnes'. Did you mean CT-Bones"),
-    "raw": (["DIR/headless.raw"], "are not known. Give --shape nx ny nz and --dtype uint8, or name it"),
-    "with": (["FILE", "--with", "FILE", "hot", "1"], "others are FILE, FILE CMAP or FILE CMAP LOW HIGH"),
-    "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
-    "size": (["FILE", "--size", "0x5"], "size must be"),
-    "pixels": (["FILE", "--size", "40000", "40000"], "size 40000 x 40000: asks for"),
-    "colours": (["DIR/rgb.npy"], "3 values in each voxel: choose one by channel, 0 to 2"),
-    "what others call light": (["FILE", "--lighting"], "--lighting. Did you mean --shade"),
-    "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
-    "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
-    "nothing to turn": (["FILE", "--clip-inside-out"], "clip_inside_out goes with clip_box or"),
-    "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
-    "no isovalue": (["FILE", "--compositing", "isosurface"], "isosurface and isovalue go together"),
-    "isovalue": (["FILE", "--isovalue", "9"], "isosurface and isovalue go together; one is missing"),
-    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "step and tolerance exclude each other"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
-    arguments, message = BAD[case]
-    arguments = [a.replace("FILE", str(volume_file)).replace("DIR", str(tmp_path)) for a in arguments]
-    (tmp_path / "headless.raw").write_bytes(bytes(8))
-    np.save(tmp_path / "rgb.npy", np.zeros((3, 4, 5, 3), np.uint8))
-    monkeypatch.setattr("jaxvol.app.picture.render", None)  # fails if it is called
-    assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
-    printed = capsys.readouterr()
-    assert printed.err.count("\n") == 1
-    assert printed.err.startswith("jaxvol render: error: ")
-    assert message in printed.err
-    assert not (tmp_path / "x.png").exists()
-
-
 def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     before = volume_file.read_bytes()

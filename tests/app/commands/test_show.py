@@ -53,14 +53,11 @@ def test_without_a_display_it_writes_a_file_and_says_where(volume_file, tmp_path
         assert imread(tmp_path / f"jaxvol-{number}.png").shape == (16, 16, 3)
 
 
-def test_editors_complete_its_options():
-    assert {*inspect.signature(jv.show).parameters} == {"volume", *DEFAULTS}
-
-
-def test_it_has_the_options_of_the_command():
+def test_it_has_the_options_of_the_command_and_editors_complete_them():
     found = parsed(parser_of_all(), ["render", "x.raw"]).defaults
     own = {"file", "like", "output", "transparent", "depth"}
     assert {name: found[name] for name in found.keys() - own} == DEFAULTS
+    assert {*inspect.signature(jv.show).parameters} == {"volume", *DEFAULTS}
 
 
 def test_labels_are_shown_in_what_is_around_them(volume_file, tmp_path, drawn):
