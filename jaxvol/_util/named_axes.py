@@ -92,11 +92,23 @@ def _vtk(image: Any) -> ImageRecord:
     scalars = image.GetCellData().GetScalars() if of_cells else scalars
     ensure(scalars is not None, "data must be an image with scalars at its points or cells; got one without.")
     data = np.ravel(memoryview(scalars)).reshape(-1, scalars.GetNumberOfComponents())
-    first, last = np.reshape(image.GetExtent(), (3, 2)).T
-    sizes = np.maximum(last - first + (not of_cells), 1)[::-1]
-    columns = np.reshape(image.GetDirectionMatrix().GetData(), (3, 3)) * image.GetSpacing()
-    grid = grid_of(np.column_stack([columns, image.GetOrigin() + columns @ (first + 0.5 * of_cells)]))
-    data, several = data.reshape(*sizes, -1), data.shape[1] > 1
+    place = image.GetSpacing(), image.GetOrigin(), image.GetDirectionMatrix().GetData()
+    return vtk_record(data, image.GetExtent(), of_cells, place)
+
+
+def vtk_sizes(extent: Sequence[Any], of_cells: bool) -> list[int]:
+    """Numbers of points, or of cells, of a VTK extent along x, y, z."""
+    first, last = np.array(extent, int).reshape(3, 2).T
+    return np.maximum(last - first + (not of_cells), 1).tolist()
+
+
+def vtk_record(data: np.ndarray, extent: Sequence[Any], of_cells: bool, place: Sequence[Any]) -> ImageRecord:
+    """Record of values [voxel, component], x fastest, on an extent; `place`: spacing, origin, direction."""
+    spacing, origin, turn = (np.array(numbers, float) for numbers in place)
+    columns, first = turn.reshape(3, 3) * spacing, np.array(extent, int)[::2] + 0.5 * of_cells
+    grid = grid_of(np.column_stack([columns, origin + columns @ first]))
+    data = data.reshape(*vtk_sizes(extent, of_cells)[::-1], data.shape[1])
+    several = data.shape[3] > 1
     return ImageRecord(data if several else data[..., 0], "zyx" + "s" * several, **grid)
 
 

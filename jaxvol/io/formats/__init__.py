@@ -23,12 +23,13 @@ from .dicom import dicom_files, folders_below, is_dicom, read_dicom
 from .kretz import MAGIC, read_kretz
 from .save import save as save
 from .text_headers import read_metaimage, read_nrrd
+from .vtk_files import read_vtk
 
 
 READERS: dict[str, Callable[..., ImageRecord]] = {".npy": read_npy, ".npz": read_npz}
 READERS |= dict.fromkeys((".nrrd", ".nhdr"), read_nrrd) | dict.fromkeys((".mha", ".mhd"), read_metaimage)
 READERS |= dict.fromkeys(known.NIFTI, known.read_nifti) | dict.fromkeys(tiff.ENDINGS, tiff.read_tiff)
-READERS |= dict.fromkeys(known.MRC, known.read_mrc)
+READERS |= dict.fromkeys(known.MRC, known.read_mrc) | dict.fromkeys((".vti", ".vtk"), read_vtk)
 READERS |= dict.fromkeys(known.HDF5, known.read_hdf5)
 VAGUE = (".img", ".hdf", *known.MRC[1:])  # endings of raw voxels, too, if `shape` and `dtype` describe them
 
@@ -53,9 +54,9 @@ def load(
     """Load a volume from a file, in the format of the ending of its name, or from a folder of slices.
 
     Formats: raw voxels (`name_XxYxZ_dtype.raw`, `.raw.gz`, or of any name with `shape` and `dtype`), `.npy`,
-    `.npz`, NIfTI, Analyze, MGH, MINC, NRRD, MetaImage, TIFF, MRC, HDF5 and NetCDF (`file.h5::/name`), DICOM,
-    folders of slices (DICOM, TIFF, PNG, JPEG), Zarr and OME-Zarr. The page "Files" of the documentation lists
-    the metadata that is read of every format, and of the JSON file of raw voxels.
+    `.npz`, NIfTI, Analyze, MGH, MINC, NRRD, MetaImage, TIFF, MRC, VTK's images, HDF5 and NetCDF
+    (`file.h5::/name`), DICOM, folders of slices (DICOM, TIFF, PNG, JPEG), Zarr and OME-Zarr. The page "Files"
+    of the documentation lists the metadata that is read of every format, and of the JSON file of raw voxels.
 
     Values are scaled as the file says (CT in HU), lengths are converted to mm if their unit is known, and
     axes are exchanged and reversed so that x, y, z increase along the world's: for medical images, towards
@@ -161,8 +162,6 @@ def _unknown(path: Path) -> str:
             use = "Use volume, probe = jv.load_ultrasound(path), and March(step, (probe, ...))"
             return f"is ultrasound as acquired, whose voxels a probe places. {use}."
     hint = "For voxels without a header, give shape=(nx, ny, nz) and dtype."
-    if path.suffix.lower() in (".vti", ".vtk"):
-        hint = "Read it by VTK, and pass its image: jv.Volume(reader.GetOutput())."
     expected = f"expected a folder of slices, or a file ending in {', '.join(sorted((*endings, '.dcm')))}"
     return f"has an unknown ending; {expected}. {hint}"
 

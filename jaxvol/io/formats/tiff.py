@@ -13,6 +13,7 @@ import numpy as np
 
 from ..._util.files import MOST_COMPRESSED, MOST_VOXELS, check, check_size, file_size, library, refusing
 from ..._util.image_record import ImageRecord
+from ..._util.units import AXES
 
 
 ENDINGS = (".tif", ".tiff")
@@ -134,11 +135,10 @@ def _words(file: Path) -> list[Any]:
 
 
 def read_slices(folder: Path) -> ImageRecord:
-    """Reader of a folder of images of one size and type, in the order of the numbers in their names. Refuses
-    missing numbers."""
-    files = slice_files(folder)
-    _check_numbers(folder, files)
-    record, planes = ImageRecord(None, "z"), list[np.ndarray]()
+    """Reader of a folder of images of one size and type, in the order of the numbers in their names, one of
+    which may count channels or times. Refuses missing numbers."""
+    axes, counts, files = _counted(folder, slice_files(folder))
+    record, planes = ImageRecord(None, axes), list[np.ndarray]()
     for file in files:
         image = read_tiff(file) if file.suffix.lower() in ENDINGS else _picture(file)
         plane = image.decode(np.asarray(image.data))[0]
@@ -150,8 +150,8 @@ def read_slices(folder: Path) -> ImageRecord:
         is_image = image.axes in ("ZYX", "ZYXS") and len(plane) == 1
         is_alike = is_image and first == last and len(files) * plane.size <= MOST_VOXELS
         check(is_alike, f"{must} voxels in all; {got}")
-    record.data = np.concatenate(planes)
-    record.axes = "zyxs"[: record.data.ndim]
+    record.data = np.concatenate(planes).reshape(*counts, *planes[0].shape[1:])
+    record.axes = axes + "yxs"[: record.data.ndim - len(axes)]
     return record
 
 
@@ -167,21 +167,28 @@ def _picture(path: Path) -> ImageRecord:
     return ImageRecord(data[None], "ZYXS"[: data.ndim + 1])
 
 
-def _check_numbers(folder: Path, files: Sequence[Path]) -> None:
-    """Refuse files whose names do not differ by one number that counts evenly."""
-    words, hint = [_words(file) for file in files], "Put every series into a folder by itself."
-    patterns = Counter("#".join(parts[::2]) for parts in words)
+def _counted(folder: Path, files: Sequence[Path]) -> tuple[str, list[int], Sequence[Path]]:
+    """Axes counted by numbers in the names of files, sizes along them, and the files in order."""
+    words, hint = {file: _words(file) for file in files}, "Put every series into a folder by itself."
+    patterns = Counter("#".join(parts[::2]) for parts in words.values())
     names = ", ".join(f"{count} named {pattern}" for pattern, count in patterns.most_common(4))
     is_one = len(patterns) == 1 or min(patterns.values()) == 1
     check(is_one, f"holds {len(patterns)} series of images: {names}. {hint}")
-    if len(patterns) > 1:
-        return
-    columns = [column for column in zip(*(parts[1::2] for parts in words), strict=True) if len({*column}) > 1]
-    counters = [column for column in columns if len({*column}) == len(files)]
-    ends = f"{files[0].name} and {files[-1].name}"
-    is_counted = counters or len(columns) < 2
-    check(is_counted, f"holds several series: names such as {ends} count by {len(columns)} numbers. {hint}")
-    steps = np.diff(np.array(counters[-1], float)).tolist() if counters else [1]
+    numbers = [] if len(patterns) > 1 else [*zip(*(parts[1::2] for parts in words.values()), strict=True)]
+    sizes = {k: len({*column}) for k, column in enumerate(numbers) if len({*column}) > 1}
+    unique = [k for k, size in sizes.items() if size == len(files)]
+    if len(sizes) > 1 and not unique:
+        before = [([*re.findall("[a-z]+", words[files[0]][2 * k]), ""][-2:])[0] for k in sizes]
+        axes = ["c" if name == "w" else AXES.get(name, "z") for name in before]
+        axes = [axis if axis in "ct" else "z" for axis in axes]
+        n = max(sizes.values())
+        names = f"names such as {files[0].name} and {files[-1].name} count by {len(sizes)} numbers"
+        is_grid = len({*axes}) == len(axes) and math.prod(sizes.values()) == len(files)
+        check(is_grid, f"holds {len(files) // n} series of {n} images: {names}. {hint}")
+        files = sorted(files, key=lambda file: [words[file][2 * k + 1] for k in sizes])
+        return "".join(axes), [*sizes.values()], files
+    steps = np.diff(np.array(numbers[unique[-1]], float)).tolist() if unique else [1]
     before, after = (files[min(steps.index(max(steps)) + k, len(files) - 1)].name for k in (0, 1))
     is_whole = len({*steps}) <= 1 or min(steps) <= 0
     check(is_whole, f"path: slices are missing in {folder}: {before} is followed by {after}.")
+    return "z", [len(files)], files

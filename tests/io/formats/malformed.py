@@ -21,9 +21,11 @@ import nibabel
 import numpy as np
 import tensorstore  # noqa: F401  (before the limit of memory is set)
 import tifffile
+import vtk
 import xarray
 import zarr
 from PIL import Image
+from vtk.util.numpy_support import numpy_to_vtk  # pyright: ignore[reportMissingImports]
 
 import jaxvol as jv
 from jaxvol import bricks
@@ -114,6 +116,30 @@ def ome_zarr(folder):
     return folder / "a.zarr"
 
 
+def vtk_grid(data):
+    image = vtk.vtkImageData()
+    image.SetDimensions(*data.shape)
+    image.GetPointData().SetScalars(numpy_to_vtk(data.ravel(order="F").copy(), deep=True))
+    return image
+
+
+def vtk_image(ending, mode: Any = "Ascii", compress: Any = False):
+    def write(folder):
+        is_xml = ending == ".vti"
+        writer = vtk.vtkXMLImageDataWriter() if is_xml else vtk.vtkStructuredPointsWriter()
+        writer.SetFileName(str(folder / f"a{ending}"))
+        writer.SetInputData(vtk_grid(ramp("int16")))
+        if is_xml:
+            getattr(writer, f"SetDataModeTo{mode}")()
+            getattr(writer, f"SetCompressorTypeTo{'ZLib' if compress else 'None'}")()
+        else:
+            getattr(writer, f"SetFileTypeTo{'Binary' if mode != 'Ascii' else 'ASCII'}")()
+        writer.Write()
+        return folder / f"a{ending}"
+
+    return write
+
+
 def hdf5(folder):
     with h5py.File(folder / "a.h5", "w") as file:
         file.create_dataset("v", data=ramp("int16"), chunks=(2, 4, 3), compression="gzip")
@@ -171,6 +197,8 @@ FILES = [
     *((tiff(compression=how), loaded) for how in ("zlib", "lzw")),
     (tiff(imagej=True, metadata={"spacing": 2.0}), loaded),
     (tiff(ome=True, metadata={"axes": "ZYX", "PhysicalSizeX": 2.0}), loaded),
+    *((vtk_image(".vti", *how), loaded) for how in (("Ascii",), ("Binary", True), ("Appended",))),
+    *((vtk_image(".vtk", mode), loaded) for mode in ("Ascii", "Binary")),
     *((kind, loaded) for kind in (hdf5, netcdf("scipy"), netcdf("h5netcdf"), mrc, pictures)),
     (nibabel_image(nibabel.AnalyzeImage, ".img"), loaded),
     (nibabel_image(nibabel.MGHImage, ".mgz"), loaded),

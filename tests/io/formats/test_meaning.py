@@ -136,18 +136,31 @@ def test_what_tifffile_knows_of_axes_is_asked_for(tmp_path, axes):
         jv.load(tmp_path / "b.tif")
 
 
-def test_names_that_count_twice_or_differ_in_words_are_refused(tmp_path):
-    for folder, name, message in (
-        ("a", "stack_z{z:03d}_c{c}.png", r"several series: .*z000_c1\.png and .*z002_c2\.png count by 2"),
-        ("b", "{word}{z:03d}.png", "holds 2 series of images: 3 named dapi#, 3 named gfp#"),
-    ):
+def test_names_that_count_twice_are_channels_or_times_or_refused(tmp_path):
+    def write(folder, name):
         (tmp_path / folder).mkdir()
         for z in range(3):
-            for c, word in ((1, "dapi"), (2, "gfp")):
-                image = Image.fromarray(np.full((5, 6), z, np.uint8))
-                image.save(tmp_path / folder / name.format(z=z, c=c, word=word))
-        with pytest.raises(ValueError, match=message):
-            jv.load(tmp_path / folder)
+            for c in (1, 2):
+                image = Image.fromarray(np.full((5, 6), 10 * c + z, np.uint8))
+                image.save(tmp_path / folder / name.format(z=z, c=c))
+        return tmp_path / folder
+
+    for folder, name, how in (
+        ("a", "stack_z{z:03d}_c{c}.png", "channel"),
+        ("b", "c{c}_z{z:03d}.png", "channel"),
+        ("c", "t{c:02d}_{z:04d}.png", "time"),
+    ):
+        path = write(folder, name)
+        with pytest.raises(ValueError, match=f"{how} must be given, from 0 to 1"):
+            jv.load(path)
+        assert np.asarray(jv.load(path, **of(how, 1)).data)[0, 0].tolist() == [20, 21, 22]
+    with pytest.raises(ValueError, match="holds 2 series of 3 images"):
+        jv.load(write("d", "{c}_{z:04d}.png"))
+    path = write("e", "x{z:03d}_{c}.png")
+    for file in [*path.iterdir()]:
+        file.rename(path / file.name.replace("_1.", "_gfp.").replace("_2.", "_dapi."))
+    with pytest.raises(ValueError, match=r"holds 2 series of images: 3 named .*gfp"):
+        jv.load(path)
 
 
 def test_a_chunk_that_is_left_out_has_the_fill_value(tmp_path):
