@@ -1,7 +1,7 @@
 """Records of images of xarray, nibabel, SimpleITK, itk, VTK and Zarr, none of which is imported here."""
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
