@@ -13,7 +13,6 @@ from .._util.checks import Arrayable, described
 from .._util.image_record import warn_caller
 from .._util.srgb import from_srgb
 from .._util.voxels import faces_of, is_flat
-from ..bricks import VoxelSource
 from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction
 from ..scene.presets import colormap
@@ -116,7 +115,7 @@ def unit_of(volume: Volume) -> float:
     return float(np.linalg.norm(across)) / 100
 
 
-def preset_unit(volume: Volume | VoxelSource) -> float:
+def preset_unit(volume: Volume) -> float:
     """Length to which a preset's opacities refer: 1 mm, or the voxel size if that is far smaller."""
     size = float(voxel_size(volume))
     return size if size < SMALL else 1.0
@@ -148,7 +147,10 @@ def automatic_transfer(volume: Volume) -> TransferFunction:
     check_known("automatic_transfer", volume)
     with jax.ensure_compile_time_eval():  # also inside jax.jit, of a volume from outside
         has_arrays = all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(volume))
-        return _warned(memoized_of(volume, _of_histogram) if has_arrays else _of_histogram(volume))
+        transfer, warnings = memoized_of(volume, _of_histogram) if has_arrays else _of_histogram(volume)
+    for warning in warnings:
+        warn_caller(warning)
+    return transfer
 
 
 def check_known(caller: str, *values: Any) -> None:
@@ -157,43 +159,27 @@ def check_known(caller: str, *values: Any) -> None:
         raise ValueError(f"{caller} needs numbers, and some arguments are traced: call it outside jax.jit.")
 
 
-def transfer_of_bricks(copy: Volume, source: VoxelSource) -> TransferFunction:
-    """`automatic_transfer` from a copy, and from the middle of its source, which shows grain."""
-    low = [max(0, (n - 128) // 2) for n in source.shape]
-    high = [min(n, begin + 128) for n, begin in zip(source.shape, low, strict=True)]
-    return _warned(_of_histogram(copy, np.asarray(source.read(low, high))))
-
-
-def _warned(result: tuple[TransferFunction, list[str]]) -> TransferFunction:
-    for warning in result[1]:
-        warn_caller(warning)
-    return result[0]
-
-
-def _of_histogram(
-    copy: Volume, part: Shaped[np.ndarray, "nx ny nz"] | None = None
-) -> tuple[TransferFunction, list[str]]:
-    """The transfer function, and warnings. `part`: voxels at full resolution, by default those of `copy`."""
-    part = np.asarray(copy.data) if part is None else part
-    spread = spread_of(sampled(copy))
+def _of_histogram(volume: Volume) -> tuple[TransferFunction, list[str]]:
+    """The transfer function, and warnings."""
+    spread = spread_of(sampled(volume))
     notes = [spread.warning] if spread.warning else []
     if notes:
-        tame = jnp.asarray(spread.tame(np.asarray(copy.data)))
-        copy, part = eqx.tree_at(lambda v: v.data, copy, tame), spread.tame(part)
-    values = sampled(copy).ravel().astype(np.float32)
+        volume = eqx.tree_at(lambda v: v.data, volume, jnp.asarray(spread.tame(np.asarray(volume.data))))
+    values = sampled(volume).ravel().astype(np.float32)
     low, high = float(values.min()), float(values.max())
-    if side := side_of_distance(copy):
+    if side := side_of_distance(volume):
         notes.append("values on both sides of 0 with a slope of one are a distance: shown where they are 0")
-        d = side * float(voxel_size(copy)) / 2
+        d = side * float(voxel_size(volume)) / 2
         points = [(-d, BRIGHT, 0.9), (d, DENSE, 0.0)][::side]
     elif not low < high:
         points = [(low, TISSUE, 0.5), (low + max(abs(low), 1.0), TISSUE, 0.5)]
     else:
         first, second = thresholds(values)
+        data = np.asarray(volume.data)
         d = (second - first) / 4
         points = [(second, DENSE, 0.45), (max((second + high) / 2, second + d / 2), BRIGHT, 0.9)]
-        if np.mean(faces_of(np.asarray(copy.data)) > first) < CUT and is_body(part, first, second):
-            depth, usual = depth_of_object(copy, first, second)
+        if np.mean(faces_of(data) > first) < CUT and is_body(data, first, second):
+            depth, usual = depth_of_object(volume, first, second)
             w = min(first - low, second - first) / 3
             border = [(first - w, EDGE, 0.0), (first, SKIN, 0.3), (first + w, SKIN, max(0.07, depth))]
             if depth > THIN:  # such as leaves: no border, which noise also crosses
@@ -209,7 +195,7 @@ def _of_histogram(
         points += [(last + (high - low) * s, BRIGHT, level) for s, level in ((0.01, opacity), (0.02, 0.0))]
     at, colors, opacities = zip(*points, strict=True)
     linear = np.asarray(from_srgb(np.array(colors) / 255))
-    return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(copy))), notes
+    return TransferFunction(np.array(at), linear, extinction_of(opacities, unit_of(volume))), notes
 
 
 def side_of_distance(volume: Volume) -> int:

@@ -1,6 +1,5 @@
 """Builds the scene that options of a command or of `show` describe, plans its march, and renders it."""
 
-import math
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -11,11 +10,10 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .._util.checks import Arrayable, described, finite_array, flag, integer, number
+from .._util.checks import Arrayable, described, finite_array, flag, number
 from .._util.memory import require_room
 from .._util.srgb import linear_color
 from .._util.voxels import faces_of
-from ..bricks import VoxelSource, levels_of, render_bricks
 from ..compositing.blending import Compositing, Over
 from ..compositing.isosurface import Isosurface
 from ..compositing.modes import MODES, compositing_of
@@ -33,7 +31,6 @@ from ..scene.several import with_others
 from ..scene.transfer import Transfer, TransferFunction
 from ..scene.volume import Volume
 from .automatic import (
-    SAMPLED,
     automatic_transfer,
     brightest_mean,
     labels_if_any,
@@ -42,8 +39,6 @@ from .automatic import (
     range_of_object,
     sampled,
     spread_of,
-    stride_of,
-    transfer_of_bricks,
     unit_of,
     xray_transfer,
 )
@@ -53,7 +48,6 @@ from .settings import COLOR_OPTIONS, header_of
 
 
 PIXEL = 160  # bytes per pixel of an image while it is rendered and written
-IN_MEMORY = 9  # most bytes of `render` per byte of voxels: on host and device, packed, and the blocks' ranges
 
 
 def quick_march(step: Arrayable, transforms: Sequence[Transform] = ()) -> March:
@@ -62,8 +56,8 @@ def quick_march(step: Arrayable, transforms: Sequence[Transform] = ()) -> March:
 
 
 class PictureRequest(NamedTuple):
-    """Arguments of `render`. `volume` is a coarser copy of `source`, if that is read in bricks with `memory`
-    bytes. `extra_pairs`: more volumes with their transfer functions. `march`: None until it is planned."""
+    """Arguments of `render`. `march`: None until it is planned. `extra_pairs`: further volumes, each with its
+    transfer function."""
 
     volume: Volume
     transfer: Transfer
@@ -72,27 +66,14 @@ class PictureRequest(NamedTuple):
     lighting: Lighting | None
     background: tuple[float, float, float]
     transforms: tuple[Transform, ...]
-    source: VoxelSource | None = None
-    memory: int | None = None
     march: Any = None
     extra_pairs: tuple[tuple[Volume, Transfer], ...] = ()
 
-    @property
-    def coarser(self) -> float:
-        """Voxel size of `volume` over that of `source`; 1 without a source."""
-        spacing = np.min(np.asarray(self.volume.spacing))
-        return 1.0 if self.source is None else float(spacing / np.min(self.source.spacing))
-
     def render(self, camera: Camera) -> Rendering:
         """Render an image with `march`."""
-        kwargs: dict[str, Any] = {"compositing": self.compositing, "lighting": self.lighting}
-        if self.source is None:
-            pair = with_others(self.volume, self.transfer, self.extra_pairs)
-            rendering = render(*pair, camera, self.march, **kwargs)
-        else:
-            kwargs["memory"] = self.memory
-            rendering = render_bricks(self.source, self.transfer, camera, self.march, **kwargs)
-        return jax.block_until_ready(rendering)
+        pair = with_others(self.volume, self.transfer, self.extra_pairs)
+        look: dict[str, Any] = {"compositing": self.compositing, "lighting": self.lighting}
+        return jax.block_until_ready(render(*pair, camera, self.march, **look))
 
     def picture(self, quiet: bool) -> Rendering:
         """Render the image of `camera`, with progress on stderr."""
@@ -129,32 +110,14 @@ def scene_of(options: Namespace, orbit: Callable[[Camera], Sequence[Camera]] | N
         raise ValueError("clip_inside_out goes with clip_box or clip_plane.")
 
     several = options.others if isinstance(options.others, list | tuple) else [options.others]
-    source, pairs = None, tuple(map(other_of, several))
-    if options.memory is None:
-        name = "volume" if isinstance(options.file, Volume) else options.file
-        with progress(f"reading {name}", quiet=options.quiet):
-            volume, transfer = look_of(options)
-    else:
-        if options.labels is not None or pairs:
-            raise ValueError("memory reads one volume, without labels and others.")
-        if isinstance(options.file, Volume):
-            raise ValueError("memory is of files; volume is a Volume.")
-        integer("memory", options.memory, 1)
-        header = {name: value for name, value in header_of(options).items() if value is not None}
-        try:
-            source = levels_of(options.file, **header)[0]
-        except TypeError as fault:  # such as a shape for another kind than raw
-            raise ValueError(f"{', '.join(header)}: not for {options.file} ({fault}).") from fault
-        volume = copy_of(source, options.memory)
-        automatic = is_automatic(options)
-        transfer = transfer_of_bricks(volume, source) if automatic else transfer_of(options, volume, source)
-        if IN_MEMORY * source.dtype.itemsize * math.prod(source.shape) <= options.memory:
-            volume, source = source.subsampled(1), None
-
+    pairs = tuple(map(other_of, several))
+    name = "volume" if isinstance(options.file, Volume) else options.file
+    with progress(f"reading {name}", quiet=options.quiet):
+        volume, transfer = look_of(options)
     warn_of_gap(volume, pairs)
     lighting = _lighting(options, mode, alone=not pairs)
     camera = _camera(options, [(volume, transfer), *pairs], orbit, planes).zoom(options.zoom)
-    look = mode, lighting, background, transforms, source, options.memory
+    look = mode, lighting, background, transforms
     return PictureRequest(volume, transfer, camera, *look, extra_pairs=pairs)
 
 
@@ -246,12 +209,9 @@ def with_march(scene: PictureRequest, options: Namespace, cameras: Sequence[Came
     shortest = min(plans, key=lambda plan: float(plan.march.step))
     # a view that needs preintegration needs it at any step
     integrated = any(plan.march.quadrature == "preintegrated" for plan in plans)
-    march, transforms = shortest.march, shortest.march.transforms
-    if scene.source is not None and not any(isinstance(t, SpaceLeaping) for t in transforms):
-        transforms = (*transforms, SpaceLeaping())  # a copy proves no block empty
-    if integrated or scene.source is not None:
-        quadrature = "preintegrated" if integrated else march.quadrature
-        march = March(float(march.step) / scene.coarser, transforms, quadrature)
+    march = shortest.march
+    if integrated:
+        march = March(march.step, march.transforms, "preintegrated")
     if not all(plan.within for plan in plans):
         bound = f"an RMSE of {shortest.tolerance:.2g}"
         warnings.warn(f"not proven to be within {bound}; jaxvol plan tells more", stacklevel=3)
@@ -290,8 +250,8 @@ def background_of(options: Namespace) -> tuple[float, float, float]:
     return red, green, blue
 
 
-def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None = None) -> Transfer:
-    """The transfer function of the options. `volume` is a coarser copy of `source`, if there is one."""
+def transfer_of(options: Namespace, volume: Volume) -> Transfer:
+    """The transfer function of the options."""
     if options.recorded_transfer is not None:
         return options.recorded_transfer
     if options.transfer is not None:
@@ -308,8 +268,8 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
         if clim is None:
             clim, warning = fitted_range(options.preset, sampled(volume))
             if warning:
-                warnings.warn(warning, stacklevel=5 if source is None else 4)
-        return preset(options.preset, clim, preset_unit(source or volume) if unit is None else unit)
+                warnings.warn(warning, stacklevel=5)
+        return preset(options.preset, clim, preset_unit(volume) if unit is None else unit)
     if clim is None:
         data = np.asarray(volume.data)
         ends = [data.min(), data.max()]  # which `sampled` may leave out
@@ -322,7 +282,7 @@ def transfer_of(options: Namespace, volume: Volume, source: VoxelSource | None =
         clim = clim[0], brightest_mean(volume, clim[0])
     if options.compositing == "integral" and unit is None:
         return xray_transfer(volume, cmap, clim)
-    return colormap(cmap, clim, unit_distance=(source or volume) if unit is None else unit)
+    return colormap(cmap, clim, unit_distance=volume if unit is None else unit)
 
 
 def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lighting | None:
@@ -334,11 +294,3 @@ def _lighting(options: Namespace, mode: Compositing[Any], *, alone: bool) -> Lig
         shows_surfaces = is_automatic(options) or (options.preset and preset_name(options.preset) in SHADED)
         shade = alone and ((shows_surfaces and isinstance(mode, Over)) or isinstance(mode, Isosurface))
     return Phong() if shade else None
-
-
-def copy_of(source: VoxelSource, memory: int) -> Volume:
-    """A copy of every n-th voxel that fits into memory, stretched to the bounds of the source."""
-    max_voxels = min(SAMPLED, max(8, memory // (IN_MEMORY * source.dtype.itemsize)))
-    copy = source.subsampled(min(stride_of(source.shape, max_voxels), min(source.shape) // 2))
-    axes = zip(source.shape, source.spacing, copy.shape, strict=True)
-    return Volume(copy.data, [(n - 1) * s / (m - 1) for n, s, m in axes], copy.origin)

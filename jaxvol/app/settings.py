@@ -7,7 +7,7 @@ from typing import Any
 FILE_OPTIONS = "shape", "dtype", "spacing", "nan", "time", "channel", "offset"
 COLOR_OPTIONS = "preset", "cmap", "transfer", "clim", "window", "level", "unit_distance"
 VIEW_OPTIONS = "camera", "direction", "view_up", "clip_box", "background", "isovalue", "shade"
-RENDER_OPTIONS = "labels", "memory", "step", "tolerance"
+RENDER_OPTIONS = "labels", "step", "tolerance"
 DEFAULTS: dict[str, Any] = dict.fromkeys((*FILE_OPTIONS, *COLOR_OPTIONS, *VIEW_OPTIONS, *RENDER_OPTIONS))
 DEFAULTS |= {"compositing": "over", "size": (512, 512), "others": [], "quiet": False}
 DEFAULTS |= {"view_angle": 30.0, "parallel": False, "zoom": 1.0, "clip_plane": [], "clip_inside_out": False}

@@ -53,8 +53,7 @@ def show(
             it, a colormap, and optionally its range. Look: `compositing`, `isovalue`, `shade`, `background`.
             Camera: `camera`, a `Camera` or six numbers, `direction`, `view_up`, `view_angle`, `parallel`,
             `zoom`, `size`. Clipping: `clip_box`, `clip_plane`, `clip_inside_out`. Computation: `step` or
-            `tolerance`, `memory`, `quiet`. For raw files: `shape`, `dtype`, `offset`, `spacing`, `nan`,
-            `time`, `channel`.
+            `tolerance`, `quiet`. For files: `shape`, `dtype`, `offset`, `spacing`, `nan`, `time`, `channel`.
 
     Returns:
         The `Rendering`. In a notebook it is shown as the last line of a cell; elsewhere it has been shown in
@@ -107,7 +106,7 @@ show.__signature__ = inspect.Signature([*_positional, *_known])  # pyright: igno
 
 def why_empty(scene: PictureRequest, rendering: Rendering) -> str | None:
     """Explain an image that shows nothing; None if a pixel is more opaque than `FAINT`."""
-    volume, opacity = scene.source or scene.volume, float(np.asarray(rendering.rgba)[..., 3].max())
+    opacity = float(np.asarray(rendering.rgba)[..., 3].max())
     alone = scene.volume.field is None and scene.volume.labels is None and not scene.extra_pairs
     if alone and (data := np.asarray(scene.volume.data)).min() == data.max():
         return f"all voxels have the value {float(data.flat[0]):g}: there is nothing to see in the volume"
@@ -118,7 +117,7 @@ def why_empty(scene: PictureRequest, rendering: Rendering) -> str | None:
         low = f"hardly anything is visible: no pixel differs from the background by more than {differs:.2g}"
         return None if differs > FAINT / 2 else f"{low}. Use another clim, background or compositing."
     if opacity > 0:
-        size = f"voxels have the size {voxel_size(volume):.3g}"
+        size = f"voxels have the size {voxel_size(scene.volume):.3g}"
         change = f"a shorter unit_distance ({size}) or another clim"
         return f"hardly anything is visible: the opacity is at most {opacity:.2g}. Use {change}."
     return f"nothing is visible: {_why_nothing(scene)}"

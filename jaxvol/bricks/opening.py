@@ -167,7 +167,7 @@ def read_zarr(path: Path) -> ImageRecord:
             return record
     raise ValueError(
         f"path: {path} must fit into {room / 2**30:.3g} GiB, a quarter of the memory; got {tuple(sizes)} "
-        "voxels. Read it in bricks: jv.render_bricks, --memory."
+        "voxels. Read it in bricks: jv.render_bricks."
     )
 
 

@@ -1,7 +1,6 @@
 """Does a transfer function that is guessed from a histogram show what is there?"""
 
 import itertools
-import math
 
 import jax
 import numpy as np
@@ -11,19 +10,15 @@ from scipy.ndimage import gaussian_filter
 import jaxvol as jv
 from jaxvol.app.automatic import (
     INSIDE,
-    SAMPLED,
     is_body,
     labels_if_any,
     preset_unit,
     range_of_object,
     spread_of,
     thresholds,
-    transfer_of_bricks,
 )
 from jaxvol.app.commands.animate import turned
 from jaxvol.app.framing import MARGIN, clipped_points, framed, visible_points
-from jaxvol.app.picture import copy_of
-from jaxvol.bricks import source_of
 from jaxvol.lighting import Phong
 
 
@@ -97,21 +92,6 @@ def test_an_object_that_the_faces_cut_is_no_block_and_few_values_are_shown_too()
         extinction = np.asarray(jv.automatic_transfer(jv.Volume(data)).extinction)
         assert np.isfinite(extinction).all()
         assert extinction.max() > 0
-
-
-def test_of_a_large_volume_a_copy_tells_the_same_if_grain_is_looked_at_as_it_is():
-    data = np.asarray(jv.phantom("head", 160).data, np.float32)[:, :140, :130]
-    waves = 20 * np.sin(np.pi / 3 * np.add.outer(np.arange(160), np.arange(140)))[..., None]
-    volume = jv.Volume(np.where(data > 60, data + waves, data), (1, 1, 2))
-    assert math.prod(volume.shape) > SAMPLED
-    source = source_of(volume)
-    copy = copy_of(source, 2**28)
-    assert max(copy.shape) <= 80
-    whole, found = jv.automatic_transfer(volume), transfer_of_bricks(copy, source)
-    for name in ("values", "colors", "extinction"):
-        np.testing.assert_allclose(getattr(found, name), getattr(whole, name), rtol=1e-5)
-    # waves of six voxels are grain to those who see every second voxel alone
-    assert jv.automatic_transfer(copy).values.shape != whole.values.shape
 
 
 def test_what_is_no_volume_or_a_traced_one_is_refused():

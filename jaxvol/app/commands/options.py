@@ -123,25 +123,19 @@ def _of_picture(command: Parser, path: Path) -> dict[str, Any]:
 
 def refuse_to_replace(options: argparse.Namespace, *names: str) -> None:
     """Refuse to write a file that is read, such as a slice of the volume, or the file of another option."""
-    from ...io.formats import files_of
+    from ...io.formats.dicom import dicom_files
+    from ...io.formats.tiff import slice_files
 
     read = [getattr(options, name, None) for name in ("file", "labels", "transfer")]
     read += [Path(row[0]) for row in getattr(options, "others", [])]
-    used = [file for path in read if path for file in (path, *(files_of(path) if path.is_dir() else []))]
+    used = [path for path in read if path]
+    for folder in filter(Path.is_dir, used[:]):
+        used += dicom_files(folder) or slice_files(folder)
     for name in names:
         path = getattr(options, name)
         if path is not None and realpath(path) in map(realpath, used):
             raise ValueError(f"--{name}: {path} is read, or written by another option; write another.")
         used += [] if path is None else [path]
-
-
-def memory_size(text: str) -> int:
-    """A number of bytes, such as 1000000, 256M or 2G (powers of 1024)."""
-    match = re.fullmatch(r"(\d{1,15}(?:\.\d*)?|\.\d+)([KMG]?)", text.strip().upper())
-    count = int(float(match[1]) * 1024 ** " KMG".index(match[2] or " ")) if match else 0
-    if count < 1:
-        raise argparse.ArgumentTypeError(f"must be a number of bytes, such as 256M or 2G; got {text!r}")
-    return count
 
 
 def add_option(group: argparse._ActionsContainer, flag: str, names: str, help: str, **kwargs: Any) -> None:
@@ -228,8 +222,6 @@ def add_scene(parser: Parser) -> None:
     add_size(parser)
     add_others(parser)
     add_option(parser, "--like", "PNG", "a picture that jaxvol wrote: take its options", type=Path)
-    text = "read the volume in bricks, with this memory for them, such as 256M: .raw, .npy and Zarr"
-    add_option(parser, "--memory", "BYTES", text, type=memory_size)
     text = "RMSE of linear colours, for the choice of step and transforms (default: 1/255; not with --step)"
     add_option(parser, "--tolerance", "TOLERANCE", text)
     add_transfer(parser)

@@ -57,16 +57,11 @@ def legend(volume: Volume, transfer: LabelTransferFunction) -> str:
 def _print_facts(path: Path, scene: PictureRequest, rendering: Rendering, spent: str) -> None:
     device = jax.devices()[0]
     millions = np.asarray(rendering.samples).sum(dtype=np.int64) / 1e6
-    shape = scene.volume.shape if scene.source is None else scene.source.shape
-    pixels = rendering.rgba.shape[1::-1]
+    pixels, shape = rendering.rgba.shape[1::-1], scene.volume.shape
     print(
         f"{path}: {' x '.join(map(str, pixels))} pixels of {' x '.join(map(str, shape))} voxels, "
         f"{millions:.1f} million samples in {spent}, on {device.device_kind} ({device.platform})"
     )
-    if scene.source is not None:
-        bricks = rendering.bricks
-        counts = " x ".join(map(str, bricks.counts))
-        print(f"{path}: {bricks.loads} of {counts} bricks read, {bricks.bytes_read} bytes")
     if np.asarray(rendering.exhausted).any():
         print(f"{path}: incomplete: rays used up their {scene.march.most_samples} samples; use a longer step")
 
@@ -89,8 +84,6 @@ def run_plan(options: argparse.Namespace) -> None:
     with progress("planning", quiet=options.quiet):
         plans = scene.plans([scene.camera], options.tolerance)
     print(*plans)
-    if scene.source is not None:
-        print(f"for a copy with voxels {scene.coarser:.3g} times as long: render divides the step by that")
 
 
 def add_plan(parser: Parser) -> None:

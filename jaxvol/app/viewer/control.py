@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Control:
-    """A control: "buttons", "number", "checkbox", "color", "slider", "log slider", "range", "dropdown", or
+    """A control: "buttons", "number", "checkbox", "color", "slider", "range", "dropdown", or
     "pad": HTML for drags, with boxes `data-pad` (their name) of elements `data-part`."""
 
     kind: str

@@ -121,5 +121,5 @@ def _march_controls(model: Model) -> list[Control]:
         model.change(step=min(max(step, MIN_STEP), MAX_STEP))
 
     limits = (MIN_STEP, MAX_STEP, MIN_STEP)
-    step = Control("log slider", "step (voxels)", lambda: model.state.step, set_step, limits)
+    step = Control("slider", "step (voxels)", lambda: model.state.step, set_step, limits)
     return [step, *(switch(type(transform).__name__) for transform in model.scene.transforms)]

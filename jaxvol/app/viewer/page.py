@@ -202,7 +202,7 @@ def _widget(gui: viser.GuiApi, control: Control) -> Any:
     value = _value(control)
     if control.kind == "range":
         return gui.add_multi_slider(label, *control.limits, value)
-    if control.kind in ("slider", "log slider"):
+    if control.kind == "slider":
         return gui.add_slider(label, *control.limits, value)
     if control.kind == "dropdown":
         return gui.add_dropdown(label, tuple(control.choices), initial_value=value)

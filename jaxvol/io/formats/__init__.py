@@ -18,11 +18,11 @@ from ..._util.voxels import WHOLE, within
 from ...march.transforms import ToroidalMap
 from ...scene.volume import Volume
 from . import library_formats as known, tiff
-from .arrays import RAW, raw_json, read_npy, read_npz, read_raw
-from .dicom import dicom_files, folders_below, is_dicom, read_dicom, series_headers
+from .arrays import RAW, read_npy, read_npz, read_raw
+from .dicom import dicom_files, folders_below, is_dicom, read_dicom
 from .kretz import MAGIC, read_kretz
 from .save import save as save
-from .text_headers import metaimage_header, nrrd_header, read_metaimage, read_nrrd
+from .text_headers import read_metaimage, read_nrrd
 from .vtk_files import read_vtk
 
 
@@ -195,25 +195,6 @@ def _corners(volume: Volume) -> np.ndarray:
     direction = np.eye(3) if volume.direction is None else np.asarray(volume.direction)
     edges = direction * np.asarray(volume.spacing) * (np.array(volume.shape) - 1)
     return np.asarray(volume.origin) + np.vstack([np.zeros(3), edges.T])
-
-
-def files_of(path: Path) -> list[Path]:
-    """Files that `load` reads for a volume: slices, header and data file, or a DICOM series; else none."""
-    path = Path(str(path).partition("::")[0])
-    if path.is_dir():
-        return dicom_files(path) or tiff.slice_files(path)
-    if not path.is_file():  # a device may have no end
-        return []
-    name = path.name.lower()
-    if name.endswith(RAW):
-        return [path, *raw_json(path)]
-    if name.endswith((".hdr", ".img")):
-        return sorted(file for ending in (".hdr", ".img") if (file := path.with_suffix(ending)).is_file())
-    with refusing(path):
-        if name.endswith((".mhd", ".nrrd", ".nhdr")):
-            data = (metaimage_header if name.endswith(".mhd") else nrrd_header)(path)[2]
-            return [path, data] if data != path and data.is_file() else [path]
-        return list(series_headers(path)) if is_dicom(path) else [path]
 
 
 def load_ultrasound(path: str | os.PathLike[str]) -> tuple[Volume, ToroidalMap]:

@@ -90,15 +90,13 @@ def read_raw(path: Path, shape: object = None, dtype: object = None, offset: int
     return ImageRecord(data, "xyz", also={name: part for name, part in fields.items() if part is not None})
 
 
-def raw_json(path: Path) -> list[Path]:
-    """JSON file of a raw file, if it exists: its name with `.json` appended, or as the ending."""
-    stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
-    return [file for name in (path.name, stem) if (file := path.with_name(f"{name}.json")).is_file()][:1]
-
-
 def _json_fields(path: Path) -> dict[str, Any]:
-    """Fields of a raw file's JSON file, under the names of `load`'s arguments."""
-    for file in raw_json(path):
+    """Fields of a raw file's JSON file, under the names of `load`'s arguments. Its name is that of the file
+    with `.json` appended, or as the ending."""
+    stem = re.sub(r"\.raw(\.gz)?$", "", path.name, flags=re.IGNORECASE)
+    for file in (path.with_name(f"{name}.json") for name in (path.name, stem)):
+        if not file.is_file():
+            continue
         try:
             fields = json.loads(file.read_text(encoding="utf-8"))
         except (ValueError, RecursionError) as fault:

@@ -58,17 +58,11 @@ def _sizes(text: str, channels: int = 1) -> list[int]:
     return sizes
 
 
-def nrrd_header(path: Path) -> tuple[dict[str, str], int, Path]:
-    """Fields of an NRRD file, in lower case without blanks, magic first; first byte and file of voxels."""
-    header, end = text_header(path, ":", "", LONGEST)
-    fields = {key.lower().replace(" ", ""): value for key, value in header.items()}
-    data_file = fields.get("datafile")
-    return (fields, end, path) if data_file is None else (fields, 0, path.parent / data_file)
-
-
 def read_nrrd(path: Path) -> ImageRecord:
     """Reader of `.nrrd` and `.nhdr`, whose space may be a patient's, with lengths in `space units`."""
-    fields, begin, source = nrrd_header(path)
+    header, begin = text_header(path, ":", "", LONGEST)
+    fields = {key.lower().replace(" ", ""): value for key, value in header.items()}
+    begin, source = (0, path.parent / fields["datafile"]) if "datafile" in fields else (begin, path)
     encoding, magic = fields.get("encoding", "").lower(), next(iter(fields), "")
     must = "a NRRD file holds its voxels, or names one file of them, in the encoding raw or gzip"
     got = f"{shortened(magic)}, {shortened(encoding)}, {shortened(str(source))}"
@@ -123,17 +117,12 @@ def read_nrrd(path: Path) -> ImageRecord:
     return record
 
 
-def metaimage_header(path: Path) -> tuple[dict[str, str], int, Path]:
-    """Fields of the header, the position of its end, and the file of the voxels, which may be missing."""
-    fields, end = text_header(path, "=", "ElementDataFile")
-    check("ElementDataFile" in fields, "cannot be read: its header must end in the field ElementDataFile.")
-    data_file = fields["ElementDataFile"]
-    return fields, end, path if data_file.upper() == "LOCAL" else path.parent / data_file
-
-
 def read_metaimage(path: Path) -> ImageRecord:
     """Reader of `.mha` and `.mhd` with binary voxels, in LPS."""
-    fields, begin, source = metaimage_header(path)
+    fields, begin = text_header(path, "=", "ElementDataFile")
+    check("ElementDataFile" in fields, "cannot be read: its header must end in the field ElementDataFile.")
+    data_file = fields["ElementDataFile"]
+    source = path if data_file.upper() == "LOCAL" else path.parent / data_file
     channels = fields.get("ElementNumberOfChannels", "1")
     channels = int(channels) if re.fullmatch("[1-9][0-9]{0,8}", channels) else 0
     shape = _sizes(fields.get("DimSize", ""), channels)

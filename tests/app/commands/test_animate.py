@@ -1,7 +1,6 @@
 """Does a volume turn?"""
 
 import itertools
-import sys
 
 import numpy as np
 import pytest
@@ -76,27 +75,3 @@ def test_an_mp4_holds_all_frames(volume_file, tmp_path, drawn):
     reader = imageio_ffmpeg.read_frames(str(output))
     assert tuple(next(reader)["size"]) == (16, 16)
     assert np.frombuffer(next(reader), np.uint8).std() > 5
-
-
-BAD = {
-    "ending": (["-o", "a.avi"], "--output: must end in .gif or .mp4; got a.avi"),
-    "frames": (["--frames", "0"], "--frames must be an integer from 1 to"),
-    "fps": (["--fps", "0"], "--fps of a .gif must be from 0.01 to 50"),
-    "fps of a gif": (["--fps", "60"], "--fps of a .gif must be from 0.01 to 50; got 60"),
-    "odd size": (["-o", "a.mp4", "--size", "15", "16"], "--size of an .mp4 must be even; got 15 x 16"),
-    "no ffmpeg": (["-o", "a.mp4"], 'pip install "jaxvol[video]"'),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_errors_are_one_line(case, volume_file, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words, message = BAD[case]
-    if case == "no ffmpeg":
-        monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert main(["animate", str(volume_file), *SEEN, *words]) == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith("jaxvol animate: error: ")
-    assert printed.count("\n") == 1
-    assert message in printed
-    assert [path.name for path in tmp_path.iterdir()] == [volume_file.name]

@@ -65,33 +65,6 @@ def test_an_interrupted_fit_resumes_and_finds_what_makes_the_pictures(volume_fil
     assert jv.read_transfer("folder/t.json").values.shape == (8,)
 
 
-BAD = {
-    "no cameras": ({"--cameras": ["nowhere.json"]}, "nowhere.json"),
-    "too deep": ({"--cameras": ["deep.json"]}, "deep.json is not JSON"),
-    "no picture": ({"--images": ["nowhere.png", "1.png"]}, "there is no file nowhere.png"),
-    "no picture's file": ({"--images": ["cameras.json"] * 2}, "cannot be read as a picture"),
-    "no JSON": ({"--cameras": ["0.png"]}, "0.png is not JSON"),
-    "one camera short": ({"--images": ["0.png", "1.png", "1.png"]}, "a camera for each of 3 images; got 2"),
-    "points": ({"--points": ["1"]}, "points must be an integer of at least 2"),
-    "checkpoint": ({"--checkpoint": ["0.png/x"]}, "checkpoint: 0.png/x cannot be written"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_errors_are_one_line_and_exit_code_2(case, volume_file, seen, tmp_path, capsys, monkeypatch):
-    (tmp_path / "deep.json").write_text("[" * 5000)
-    changed, message = BAD[case]
-    options = {"--images": seen, "--cameras": ["cameras.json"], **changed}
-    words = [w for name, values in options.items() for w in (name, *values)]
-    monkeypatch.setattr("jaxvol.fitting.driver._Run", None)  # fails if the fit begins
-    assert main(["fit", str(volume_file), *words, "-o", "x.json"]) == 2
-    printed = capsys.readouterr().err
-    assert printed.startswith("jaxvol fit: error: ")
-    assert printed.count("\n") == 1
-    assert message in printed
-    assert not (tmp_path / "x.json").exists()
-
-
 def test_pictures_cameras_and_transfer_functions_are_read_as_they_were_written(seen, tmp_path):
     views = jv.read_views(seen, tmp_path / "cameras.json")
     assert [camera.size for camera, _ in views] == [(16, 16)] * 2

@@ -109,7 +109,7 @@ def test_the_command_line_overrides_the_picture(volume_file, tmp_path, monkeypat
 
 def test_every_option_is_recorded(volume_file, tmp_path):
     words = "--size 40 30 --step 1 --view-up 0 -1.5e-05 0 --cmap #ff0000 --compositing maximum --no-shade "
-    words += "--parallel --clip-plane 1 2 3 0 0 1 --clip-plane 4 5 6 1 0 0 --memory 2M --zoom 1.25"
+    words += "--parallel --clip-plane 1 2 3 0 0 1 --clip-plane 4 5 6 1 0 0 --zoom 1.25"
     given = options("render", str(volume_file), *words.split())
     transfer = jv.colormap("red", (0, 1))
     png(tmp_path / "a.png", text_of_options(given, transfer)[KEYWORD])

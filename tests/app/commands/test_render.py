@@ -2,7 +2,6 @@
 
 import re
 
-import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from jaxvol.compositing.blending import Over
 from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import Phong
 from jaxvol.planning import Part, Plan
-from jaxvol.scene.rendering import BrickReport
 
 from ...scenes import same_trees
 
@@ -320,7 +318,7 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
     transfer, expected = HIDING[case]
     volume = jv.Volume(np.linspace(20, 90, 8, dtype=np.float32).reshape(2, 2, 2))
     camera, march = jv.Camera.looking_at(volume, size=(8, 8)), jv.March(0.1)
-    scene = PictureRequest(volume, transfer, camera, Over(), None, (1, 1, 1), (), None, None, march)
+    scene = PictureRequest(volume, transfer, camera, Over(), None, (1, 1, 1), (), march)
     empty = jv.Rendering(*jax.device_put((np.zeros((8, 8, 4), np.float32), np.zeros((8, 8), bool))))
     said = why_empty(scene, empty)
     assert said is not None
@@ -328,106 +326,6 @@ def test_the_values_that_are_shown_are_compared_with_those_there_are(case):
         "nothing is visible: the volume's values run from 20 to 90, and the transfer function"
     )
     assert expected in said
-
-
-def test_with_a_budget_of_memory_bricks_are_rendered(volume_file, tmp_path, monkeypatch, capsys, drawn):
-    asked = {}
-
-    def render_bricks(source, transfer, camera, march, **how):
-        asked.update(how, source=source, transfer=transfer)
-        report = BrickReport((2, 2, 1), 4, 3, 0, 99, (9, 9, 9), 99)
-        return eqx.tree_at(
-            lambda r: r.details.bricks,
-            drawn(source, transfer, camera, march),
-            report,
-            is_leaf=lambda leaf: leaf is None,
-        )
-
-    monkeypatch.setattr("jaxvol.app.picture.render_bricks", render_bricks)
-    words = ["--preset", "engine", "-o", tmp_path / "x.npy", "--memory"]
-    assert render(volume_file, *words, "100K") == 0
-    assert asked["memory"] == 100 * 2**10
-    assert isinstance(asked["lighting"], Phong)
-    assert asked["source"].shape == (24, 24, 24)
-    assert "3 of 2 x 2 x 1 bricks read, 99 bytes" in capsys.readouterr().out
-    assert render(volume_file, *words, "100K", "--time", "1", "--nan", "0") == 2
-    assert "time" in capsys.readouterr().err
-    assert render(volume_file, *GRAY, *words[2:], "9K") == 0
-    assert same(
-        asked["transfer"], jv.colormap("gray", (-100, 255), unit_distance=1.0)
-    )  # of voxels, and not of their copy's
-    jv.save(jv.phantom("linear", 8), tmp_path / "v.npz")
-    assert render(tmp_path / "v.npz", "--memory", "1M") == 2
-    assert "is not of a kind" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_bricks_are_rendered_where_the_volume_does_not_fit(tmp_path, capsys):
-    np.save(tmp_path / "engine.npy", np.asarray(jv.phantom("engine", 64).data))
-    words = [str(tmp_path / "engine.npy"), "--size", "16", "16", "--preset", "engine", "--memory"]
-    assert main(["render", *words, "1G", "-o", str(tmp_path / "x.png")]) == 0
-    assert "bricks read" not in capsys.readouterr().out
-    assert main(["render", *words, "1M", "-o", str(tmp_path / "x.png")]) == 0
-    assert "bricks read" in capsys.readouterr().out
-    assert main(["render", "--like", str(tmp_path / "x.png"), "-o", str(tmp_path / "y.png")]) == 0
-    np.testing.assert_array_equal(imread(tmp_path / "x.png"), imread(tmp_path / "y.png"))
-    assert main(["render", *words, "10", "-o", str(tmp_path / "z.png")]) == 2
-    assert "memory must" in capsys.readouterr().err
-
-
-BAD = {
-    "EXR": (["FILE", "-o", "x.exr"], "--output: a file of colours must end in one of .png, .jpg"),
-    "depth in PNG": (["FILE", "--depth", "x.png"], "--depth: a file of one channel must end in one of .tif"),
-    "no folder": (["FILE", "-o", "FILE/x.png"], "x.png cannot be written"),
-    "clim of a file": (
-        ["FILE", "--transfer", "t.json", "--clim", "0", "1"],
-        "transfer and clim exclude",
-    ),
-    "direction": (["FILE", "--camera", *"123456", "--direction", *"123"], "camera and direction exclude"),
-    "no file": (["nowhere.raw"], "error: there is no file"),
-    "cmap": (["FILE", "--cmap", "moon"], "cmap must be"),
-    "background": (
-        ["nowhere.raw", "--background", "200", "0", "0"],
-        "background must be three numbers from 0 to 1 (linear RGB); got 200 0 0. 8-bit",
-    ),
-    "a colour's name": (
-        ["nowhere.raw", "--background", "whit"],
-        "--background must be a colour's name, such",
-    ),
-    "level": (["FILE", "--window", "3"], "window and level go together; one is missing"),
-    "window": (["FILE", "--window", "3", "--clim", "0", "1"], "clim and window exclude each other"),
-    "preset": (["FILE", "--preset", "CT-Bnes"], "got 'CT-Bnes'. Did you mean CT-Bones"),
-    "raw": (["DIR/headless.raw"], "are not known. Give --shape nx ny nz and --dtype uint8, or name it"),
-    "with": (["FILE", "--with", "FILE", "hot", "1"], "others are FILE, FILE CMAP or FILE CMAP LOW HIGH"),
-    "labels and memory": (["FILE", "--with", "FILE", "--memory", "1M"], "memory reads one volume, without"),
-    "step": (["FILE", "--step", "0"], "step must be greater than 0; got 0"),
-    "size": (["FILE", "--size", "0x5"], "size must be"),
-    "pixels": (["FILE", "--size", "40000", "40000"], "size 40000 x 40000: asks for"),
-    "colours": (["DIR/rgb.npy"], "3 values in each voxel: choose one by channel, 0 to 2"),
-    "what others call light": (["FILE", "--lighting"], "--lighting. Did you mean --shade"),
-    "spacing": (["FILE", "--spacing", "1", "1", "-1"], "spacing must be positive"),
-    "a flat box": (["FILE", "--clip-box", *"010100"], "box must be (x_min, x_max, y_min, y_max, z_min,"),
-    "nothing to turn": (["FILE", "--clip-inside-out"], "clip_inside_out goes with clip_box or"),
-    "dtype": (["FILE", "--dtype", "uint7"], "dtype must be"),
-    "no isovalue": (["FILE", "--compositing", "isosurface"], "isosurface and isovalue go together"),
-    "isovalue": (["FILE", "--isovalue", "9"], "isosurface and isovalue go together; one is missing"),
-    "both": (["FILE", "--tolerance", "0.1", "--step", "1"], "step and tolerance exclude each other"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_errors_are_one_line_and_exit_code_2(case, volume_file, tmp_path, capsys, monkeypatch):
-    arguments, message = BAD[case]
-    arguments = [a.replace("FILE", str(volume_file)).replace("DIR", str(tmp_path)) for a in arguments]
-    (tmp_path / "headless.raw").write_bytes(bytes(8))
-    np.save(tmp_path / "rgb.npy", np.zeros((3, 4, 5, 3), np.uint8))
-    monkeypatch.setattr("jaxvol.app.picture.render", None)  # fails if it is called
-    assert main(["render", "-o", str(tmp_path / "x.png"), *arguments]) == 2
-    printed = capsys.readouterr()
-    assert printed.err.count("\n") == 1
-    assert printed.err.startswith("jaxvol render: error: ")
-    assert message in printed.err
-    assert not (tmp_path / "x.png").exists()
 
 
 def test_the_volume_is_not_replaced_by_a_picture_of_it(volume_file, tmp_path, monkeypatch, capsys):

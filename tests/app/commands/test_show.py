@@ -53,14 +53,11 @@ def test_without_a_display_it_writes_a_file_and_says_where(volume_file, tmp_path
         assert imread(tmp_path / f"jaxvol-{number}.png").shape == (16, 16, 3)
 
 
-def test_editors_complete_its_options():
-    assert {*inspect.signature(jv.show).parameters} == {"volume", *DEFAULTS}
-
-
-def test_it_has_the_options_of_the_command():
+def test_it_has_the_options_of_the_command_and_editors_complete_them():
     found = parsed(parser_of_all(), ["render", "x.raw"]).defaults
     own = {"file", "like", "output", "transparent", "depth"}
     assert {name: found[name] for name in found.keys() - own} == DEFAULTS
+    assert {*inspect.signature(jv.show).parameters} == {"volume", *DEFAULTS}
 
 
 def test_labels_are_shown_in_what_is_around_them(volume_file, tmp_path, drawn):
@@ -118,7 +115,6 @@ def test_what_is_wrong_is_said_in_words_of_python(volume_file, drawn, monkeypatc
         (volume, {"size": "big"}, r"size must be \(width, height\) in whole pixels"),
         (volume, {"camera": camera, "size": 9}, "camera is a Camera, which has its own size; leave size out"),
         (volume, {"shade": "no"}, "shade must be True or False; got 'no'"),
-        (volume, {"memory": "512M"}, "memory is of files; volume is a Volume"),
         (volume, {"compositing": jv.lighting.Phong()}, "compositing must be a name; got a Phong"),
         (volume, {"opacity": 0.3}, "show has no option 'opacity'. Did you mean transfer"),
         (volume, {"labels": [1]}, r"labels must be a file; got .* jv.Volume\(data, labels="),

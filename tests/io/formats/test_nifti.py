@@ -80,6 +80,10 @@ def test_voxels_lie_and_are_scaled_as_nibabel_says(tmp_path_factory, data):
     expected = places(image.get_fdata(), unit * np.diag([-1, -1, 1, 1]) @ affine)
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-4, atol=1e-3 * unit)
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-6, atol=1e-6)
+    same = Volume(image)  # its axes stay in the file's order
+    again = places(np.asarray(same.data, float), affine_of(same))
+    np.testing.assert_allclose(again[0], found[0], rtol=1e-4, atol=1e-3 * unit)
+    np.testing.assert_allclose(again[1], found[1], rtol=1e-6, atol=1e-6)
 
 
 BAD = {

@@ -6,7 +6,6 @@ from typing import Any
 
 import h5py
 import mrcfile
-import nibabel
 import numpy as np
 import pytest
 import SimpleITK as sitk
@@ -24,7 +23,6 @@ from .test_dicom import turned
 
 
 UNITS = {"mm": 1.0, "micrometer": 1e-3, "nanometer": 1e-6, "cm": 10.0}
-TO_LPS = np.diag([-1.0, -1, 1, 1])
 
 
 def box(draw):
@@ -75,35 +73,6 @@ def by_simple_itk(draw, folder, data, spacing, origin, turn):
     sitk.WriteImage(image, str(path), draw(st.booleans()))
     check(jv.load(path), data, affine_of(spacing, origin, turn))
     check(jv.Volume(sitk.ReadImage(str(path))), data, affine_of(spacing, origin, turn))
-
-
-def by_nibabel(draw, folder, data, spacing, origin, turn):
-    affine, unit = affine_of(spacing, origin, turn), draw(st.sampled_from(["mm", "micron", "meter"]))
-    image = nibabel.Nifti1Image(data, TO_LPS @ affine)
-    image.header.set_xyzt_units(unit)
-    path = folder / draw(st.sampled_from(["a.nii", "a.nii.gz", "a.img"]))
-    scale = (
-        draw(st.sampled_from([(1.0, 0.0), (0.5, -3.0), (2.0, 10.0)]))
-        if data.dtype.kind != "f"
-        else (1.0, 0.0)
-    )
-    image = nibabel.Nifti1Pair(data, image.affine, image.header) if path.suffix == ".img" else image
-    image.header.set_slope_inter(*scale)
-    nibabel.save(image, path)
-    stored: Any = nibabel.load(path)
-    length = {"mm": 1.0, "micron": 1e-3, "meter": 1e3}[unit]
-    found, values = jv.load(path), stored.get_fdata()
-    expected = length * (TO_LPS @ stored.affine)[:3]
-    bright = values.max()
-    turn = np.eye(3) if found.direction is None else np.asarray(found.direction, float)
-    own = affine_of(np.asarray(found.spacing, float), np.asarray(found.origin, float), turn)
-    np.testing.assert_allclose(
-        center(np.asarray(found.data, float), own, bright),
-        center(values, np.vstack([expected, [0, 0, 0, 1]]), bright),
-        rtol=1e-4,
-        atol=1e-3 * length,
-    )
-    np.testing.assert_allclose(np.unique(found.data), np.unique(values), rtol=1e-6)
 
 
 def by_tifffile(draw, folder, data, spacing, origin, turn):
@@ -240,7 +209,6 @@ def by_h5py(draw, folder, data, spacing, origin, turn):
 
 WRITERS = (
     by_simple_itk,
-    by_nibabel,
     by_tifffile,
     by_zarr,
     by_tensorstore,
