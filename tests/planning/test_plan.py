@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing.blending import Over
 from jaxvol.metrics import rmse
 from jaxvol.planning import search
-from jaxvol.planning.plan import _checked, _occupied, chosen_transforms
-from jaxvol.scene.occupancy import Blocks
+from jaxvol.planning.plan import _checked, chosen_transforms
 
 from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
 
@@ -104,15 +102,6 @@ def test_an_empty_image_is_planned():
     found = plan_of(uniform_transfer(0.0))
     assert found.within
     assert found.error < TOLERANCE / 4
-
-
-def test_visible_blocks_of_all_shapes_are_found_by_one_program():
-    classify = jax.jit(lambda blocks: soft_transfer().visible(blocks))
-    for volume in (SPHERE, SPHERE[:9, :, 3:17]):
-        blocks = Blocks.of(volume)
-        found = _occupied(Over(), soft_transfer(), blocks)
-        np.testing.assert_array_equal(found, classify(blocks))
-        assert 0 < found.sum() < found.size
 
 
 def test_transforms_that_are_part_of_the_scene_are_kept():
