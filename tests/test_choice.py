@@ -175,6 +175,30 @@ def test_materials_share_what_they_have_in_common():
     assert [material.values.tolist() for material in two.expand(split)] == [[0, 1], [1, 2], [2, 3]]
 
 
+@pytest.mark.slow
+def test_control_points_are_counted_from_images():
+    """Candidates of 2 and 3 points, with only their extinction free; the truth has 3. The loss of an image is
+    half its mean square error, and that of several is their mean."""
+    volume = jv.Volume(np.linspace(0, 1, 6**3, dtype=np.float32).reshape(6, 6, 6), (0.4,) * 3, (-1.0,) * 3)
+    march = jv.March(0.4, (jv.AlphaCorrection(),), "midpoint")
+
+    def scene(transfer, camera):
+        return volume, transfer, camera, march
+
+    truth = jv.TransferFunction([0, 0.5, 1], np.full((3, 3), 0.5), [0.2, 2.0, 0.5])
+    directions = ((1, 0.3, 0.2), (-0.2, 1, 0.4), (0.3, -0.2, 1), (-1, -0.6, 0.5))
+    cameras = [jv.Camera.looking_at(volume, direction, size=(7, 6)) for direction in directions]
+    views = [(camera, np.asarray(jv.render(*scene(truth, camera)).image())) for camera in cameras]
+    models = nested_points(PLAIN, (2, 3), where=lambda transfer: transfer.extinction)
+    residual = lambda some: jv.ImageResidual(scene, some)  # noqa: E731
+    choice = choose(residual, models, views[2:], views=views[:2], max_steps=20)
+    assert choice.name == "3 points"
+    np.testing.assert_allclose(choice.parameters.extinction, truth.extinction, rtol=1e-3)
+    row = choice.candidates[0]
+    errors = [jv.render(*scene(row.fit.parameters, camera)).image() - image for camera, image in views[2:]]
+    assert row.held_out_loss == pytest.approx(np.mean(np.square(errors)) / 2, rel=1e-3)
+
+
 def test_candidates_that_do_not_grow_and_views_of_both_sets_are_refused():
     noisy = views_of(2, 0.1, 0)
     with pytest.raises(ValueError, match=r"candidates must be in order, .*'a' has 2 after 2"):
