@@ -92,9 +92,9 @@ def plan(
 ) -> Plan:
     """Finds the cheapest march that renders a scene within a tolerance, by rendering patches of the image.
 
-    At most 128 patches of 8 x 8 pixels (32 if the image has fewer than 512) are rendered by the midpoint
-    rule, with steps of two voxels, one, a half, and so on. Each step is compared with half of it, until one
-    is within the tolerance. The plan then decides on:
+    At most 128 patches of 8 x 8 pixels (32 if the image has fewer than 512), seven of eight from where a
+    coarse image shows anything, are rendered by the midpoint rule, with steps of two voxels, one, a half, and
+    so on. Each step is compared with half of it, until one is within the tolerance. The plan then decides on:
 
     - **step**: the longest within the tolerance, between two of the steps, or up to four voxels.
     - **quadrature**: `"preintegrated"` is tried if rays take many samples, or if the midpoint rule fails, or
