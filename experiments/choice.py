@@ -13,8 +13,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,7 +23,6 @@ from jaxtyping import Array
 
 import jaxvol as jv
 from jaxvol import Fit, ImageResidual, fit
-from jaxvol._util.checks import described, integer, not_negative
 from jaxvol.fitting.constraints import Free, Where, size
 from jaxvol.fitting.driver import UNDETERMINED
 from jaxvol.fitting.uncertainty import MISFIT
@@ -36,24 +33,10 @@ RESOLUTION = 1e-4
 """Residuals below this fraction of the data's norm count as equal."""
 
 
-def refined(transfer: jv.TransferFunction, points: int | Any) -> jv.TransferFunction:
-    """The same transfer function with more control points.
-
-    All points are kept. Each new one goes where the gap is widest, and those of one gap divide it evenly:
-    even points become even ones again from n to 2n - 1, as 2, 3, 5, 9, and nearly even ones otherwise.
-
-    Args:
-        transfer: the transfer function.
-        points: their number, at least that of `transfer`.
-
-    Returns:
-        A `TransferFunction` that shows the same.
-
-    Raises:
-        ValueError: for fewer points than `transfer` has.
-    """
+def refined(transfer: jv.TransferFunction, points: int) -> jv.TransferFunction:
+    """The same transfer function with more control points: each new one goes where the gap is widest, and
+    those of one gap divide it evenly, so that even points stay even from n to 2n - 1."""
     values = np.asarray(transfer.values)
-    points = integer("points", points, len(values))
     gaps = np.diff(values.astype(float))
     pieces = np.ones(len(gaps), int)
     for _ in range(points - len(values)):
@@ -90,29 +73,13 @@ class Candidate(NamedTuple):
 
 
 def nested_points(
-    start: jv.TransferFunction | Any, points: Sequence[int] | Any = (2, 4, 8, 16), **of_each: Any
+    start: jv.TransferFunction, points: Sequence[int] = (2, 4, 8, 16), **fields: Any
 ) -> list[Candidate]:
-    """Candidates that are transfer functions of more and more control points.
-
-    Args:
-        start: where the first fit starts, such as `flat_grey(volume, 2)`. It is `refined` to the first number
-            of points.
-        points: increasing numbers of control points. Each candidate keeps those of the one before.
-        of_each: other fields of each `Candidate`, such as `constraints`.
-
-    Returns:
-        The candidates, for `choose`, from the fewest points to the most.
-
-    Raises:
-        ValueError: for numbers that do not increase, or fewer than `start` has.
-    """
-    if not isinstance(start, jv.TransferFunction):
-        raise ValueError(f"start must be a TransferFunction; got {described(start)}.")
-    numbers = [integer("points", number, 2) for number in points]
-    if not numbers or any(b <= a for a, b in pairwise(numbers)):
-        raise ValueError(f"points must be increasing numbers of control points; got {points!r}.")
-    first = Candidate(f"{numbers[0]} points", refined(start, numbers[0]), **of_each)
-    larger = (Candidate(f"{n} points", grow=partial(refined, points=n), **of_each) for n in numbers[1:])
+    """Candidates that are transfer functions of increasing numbers of control points, each of which keeps
+    those of the one before. `start`: as the first fit starts, but for its number of points. `fields`: of each
+    `Candidate`."""
+    first = Candidate(f"{points[0]} points", refined(start, points[0]), **fields)
+    larger = (Candidate(f"{n} points", grow=partial(refined, points=n), **fields) for n in points[1:])
     return [first, *larger]
 
 
@@ -174,14 +141,13 @@ class Choice(NamedTuple):
 
 
 def choose(
-    residual: Callable[[Sequence[Any]], Any] | Any,
-    candidates: Sequence[Candidate] | Any,
-    held_out: Sequence[Any] | Any,
+    residual: Callable[[list[Any]], Any],
+    candidates: Sequence[Candidate],
+    held_out: Sequence[Any],
     *,
-    views: Sequence[Any] | Any,
-    errors: float | Any = 2.0,
-    block: int | Any = 4,
-    checkpoint: str | PathLike[str] | None = None,
+    views: Sequence[Any],
+    errors: float = 2.0,
+    block: int = 4,
     **options: Any,
 ) -> Choice:
     """Fit nested models and choose the smallest that agrees with held-out views as well as the best does.
@@ -214,7 +180,6 @@ def choose(
             both models hold the truth, the larger one seems better by more than 2 in at most 2.3 % of trials.
         block: pixels along a side of blocks within which noise may be correlated: 1 for noise of single
             pixels, more for pictures that were smoothed or compressed.
-        checkpoint: a file name. Each fit has its own: `fit-1.ckpt`, `fit-2.ckpt` for `fit.ckpt`.
         options: others of `fit`, such as `max_steps`, for all candidates.
 
     Returns:
@@ -223,30 +188,19 @@ def choose(
         fits is in `fit.uncertainty.reduced_chi_squared`.
 
     Raises:
-        ValueError: for no candidates, candidates that do not grow or have no start, no views, a view that is
-            in both sets, and as `fit` does.
+        ValueError: for candidates that do not grow, a view that is in both sets, and as `fit` does.
     """
-    errors, block = float(not_negative("errors", errors)), integer("block", block, 1)
-    if wrong := {"constraints", "where"} & set(options):
-        raise ValueError(f"{' and '.join(sorted(wrong))} must be given with each Candidate, not to choose.")
-    candidates, held_out = _list("candidates", candidates), _list("held_out", held_out)
-    views = _list("views", views)
-    if isinstance(residual, ImageResidual) or not callable(residual):
-        raise ValueError(f"residual must be a function of a list of views; got {described(residual)}.")
     if any(eqx.tree_equal(view, other) for view in held_out for other in views):
         raise ValueError("held_out must not be among the views that are fitted; one of them is.")
     _check(candidates)
-    training: Any = residual(views)
+    training: Any = residual(list(views))
     validation: list[Any] = [residual([view]) for view in held_out]
 
     fits: list[Fit] = []
     found: list[list[np.ndarray]] = []
-    for at, candidate in enumerate(candidates):
+    for candidate in candidates:
         start = candidate.start if candidate.grow is None else candidate.grow(fits[-1].parameters)
         how = {**options, "constraints": candidate.constraints, "where": candidate.where}
-        if checkpoint is not None:
-            path = Path(checkpoint)
-            how["checkpoint"] = path.with_name(f"{path.stem}-{at + 1}{path.suffix}")
         with warnings.catch_warnings():
             for message in (UNDETERMINED, MISFIT):
                 warnings.filterwarnings("ignore", message=message)
@@ -255,8 +209,6 @@ def choose(
         found.append([np.asarray(each, np.float64) for each in entries])
 
     losses = [sum(float(np.sum(each**2)) for each in of_views) / 2 / len(of_views) for of_views in found]
-    if not any(map(math.isfinite, losses)):
-        raise ValueError("held_out must have finite residuals for one candidate at least; got none.")
     best, images = int(np.nanargmin(losses)), isinstance(training, ImageResidual)
     count = sum(view.references.count for view in validation) if images else None
     norm = training.references.scale() if images else math.sqrt(2 * fits[0].losses[0])
@@ -316,24 +268,14 @@ def _entries(residual: Any, parameters: PyTree) -> Array:
     return entries.reshape(residual.references.groups[0][1].shape[1:])
 
 
-def _list(name: str, given: Any) -> list[Any]:
-    if not isinstance(given, list | tuple) or isinstance(given, Candidate) or not given:
-        raise ValueError(f"{name} must be a list of at least one; got {described(given)}.")
-    return list(given)
-
-
-def _check(candidates: list[Any]) -> None:
-    """Check candidates before any is fitted, by growing each from the start of the one before."""
+def _check(candidates: Sequence[Candidate]) -> None:
+    """Checks that candidates grow before any is fitted, from the start of the one before."""
     start, numbers = None, 0
-    for at, candidate in enumerate(candidates):
-        if not isinstance(candidate, Candidate):
-            raise ValueError(f"candidates[{at}] must be a Candidate; got {described(candidate)}.")
-        if (candidate.start is None) == (candidate.grow is None) or (at == 0 and candidate.start is None):
-            raise ValueError(f"candidates[{at}] must have a start, or, after the first, grow.")
+    for candidate in candidates:
         start = candidate.start if candidate.grow is None else candidate.grow(start)
         before, numbers = numbers, size(Free.of(start, candidate.constraints, candidate.where)[1])
         if numbers <= before:
             raise ValueError(
                 "candidates must be in order, each with more free parameters than the one before; "
-                f"number {at}, {candidate.name!r}, has {numbers} after {before}."
+                f"{candidate.name!r} has {numbers} after {before}."
             )

@@ -3,7 +3,7 @@
 Chae and Shin, Figs. 5 and 6: a perspective camera inside a cavity, where rays run along walls and leaps by a
 distance map are short. Measured are the distance map alone, starts taken from the corner rays of cells of R x
 R pixels ("min_distance", as published), starts proven from the whole cell ("beam"), and empty stretches of
-beams ("hierarchy"). Distances are those of blocks of 4³ voxels, found in every image; and, for the map and
+beams ("blocks"). Distances are those of blocks of 4³ voxels, found in every image; and, for the map and
 the published starts, also those of voxels (and, for the map, of blocks of 2³), found before the image, as the
 paper has them. "speed-up" is off the map of the same distances: only with those of voxels it is off what the
 paper's is off.
@@ -100,7 +100,7 @@ def named(method: str, cell: int) -> str:
 
 def measure(scene: Scene, cells: Sequence[int], repetitions: int) -> dict[str, dict[str, Any]]:
     """CPU seconds, error and wrong pixels of a scene's image under every method."""
-    leaps = {MAP: jv.SpaceLeaping("distance"), HIERARCHY: jv.SpaceLeaping(HIERARCHY)}
+    leaps = {MAP: jv.SpaceLeaping("distance"), HIERARCHY: jv.SpaceLeaping("blocks")}
     leaps[OF_TWO] = jv.SpaceLeaping("distance", block=2)
     leaps[VOXELS] = jv.SpaceLeaping("distance", block=1)
     for cell in cells:

@@ -67,7 +67,7 @@ def sheets_thinner_than_a_cell_of_rays(ratio: float, size: int) -> dict[str, flo
     it?
 
     Under "min_distance", a sheet that passes between the corners of a cell is leapt over. Choose R no larger
-    than the thinnest structure is wide, in pixels, or take "beam" or "hierarchy", which lose nothing."""
+    than the thinnest structure is wide, in pixels, or take "beam" or "blocks", which lose nothing."""
     found = {}
     methods: list[tuple[Method, int]] = [
         ("min_distance", 4),
@@ -111,7 +111,7 @@ def distance_maps_along_a_wall(angle: float, size: int) -> dict[str, float]:
 
     The nearest voxel is that of the wall, so that a ray at a small angle to it takes many short leaps; the
     image stays right. Counted per ray. With "min_distance", rays begin where the nearest corner of a cell met
-    the wall, which saves most of these leaps; "hierarchy" leaps over the stretches of a beam instead."""
+    the wall, which saves most of these leaps; "blocks" leaps over the stretches of a beam instead."""
     scene = above_a_wall(angle, size)
     marcher = Marcher(scene)
     alone = marcher.count(scene.camera)

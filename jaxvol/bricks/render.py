@@ -160,7 +160,7 @@ def scene_of(
     if isinstance(transfer, LabelTransferFunction):
         raise ValueError("transfer must not be of labels: bricks have no labels. Use jv.render.")
     if any(isinstance(t, SpaceLeaping) and t.method == "min_distance" for t in march.transforms):
-        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "hierarchy".')
+        raise ValueError('march: SpaceLeaping("min_distance") needs the whole volume; use "blocks".')
     if march.block_side != BLOCK:
         raise ValueError(
             f"march: SpaceLeaping(block={march.block_side}) needs the whole volume; use {BLOCK}."

@@ -353,7 +353,7 @@ def _index(inputs: tuple[Scene, VolumeAcceleration]) -> EmptySpaceIndex | None:
     transfer: Any = scene.transfer
     (leap, *seams), blocks = transforms, acceleration.blocks
     plain = scene.volume.field is None and scene.volume.first is None
-    if seams or not plain or leap.method != "hierarchy" or not isinstance(blocks, Blocks):
+    if seams or not plain or leap.method != "blocks" or not isinstance(blocks, Blocks):
         return _index_by_jax(inputs)
     visible = visible_in_numpy(scene.compositing, transfer, blocks)
     if visible is None or blocks.low.committed:

@@ -2,11 +2,11 @@
 
 import math
 import time
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
@@ -23,11 +23,11 @@ from ..scene.camera import Camera
 from ..scene.occupancy import Blocks
 from ..scene.rendering import Rendering
 from ..scene.several import Several
-from ..scene.transfer import Transfer, sized, with_shared_points
+from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume
 from ..xla.platform import is_traced
-from .probe import UNSEEN, Candidates, Probe, is_empty, rendered
-from .search import COARSEST, Part, Search, Trial
+from .probe import UNSEEN, Probe, is_empty, likely_patches, rendered
+from .search import COARSEST, Part, Search, Trial, integrable
 
 
 MARGIN = 0.95  # fraction of the tolerance that a plan uses
@@ -92,9 +92,9 @@ def plan(
 ) -> Plan:
     """Finds the cheapest march that renders a scene within a tolerance, by rendering patches of the image.
 
-    At most 128 patches of 8 x 8 pixels (32 if the image has fewer than 512) are rendered by the midpoint
-    rule, with steps of two voxels, one, a half, and so on. Each step is compared with half of it, until one
-    is within the tolerance. The plan then decides on:
+    At most 128 patches of 8 x 8 pixels (32 if the image has fewer than 512), seven of eight from where a
+    coarse image shows anything, are rendered by the midpoint rule, with steps of two voxels, one, a half, and
+    so on. Each step is compared with half of it, until one is within the tolerance. The plan then decides on:
 
     - **step**: the longest within the tolerance, between two of the steps, or up to four voxels.
     - **quadrature**: `"preintegrated"` is tried if rays take many samples, or if the midpoint rule fails, or
@@ -150,33 +150,35 @@ def plan(
         transfer = lighting.medium(transfer)
     scene = Scene(volume, transfer, camera, March(1.0), compositing_of(compositing), lighting)
     tolerance, fixed = _checked(tolerance, transforms, scene)
-    place = Place.of(March(1.0, fixed), volume)
     shown, mode = transfer, scene.compositing
     if mode.resolves:
         shown, _ = mode.marched(transfer, March(1.0, fixed), volume)
-    visible = _occupied(mode, shown, Blocks.of(volume, slopes=shown.reads_gradient))
-    candidates, seed = Candidates.of(camera, place, visible), integer("seed", seed, 0)
-    proven, parts = chosen_transforms(visible, fixed)
-    voxel = place.voxel(visible.shape)
+    blocks = Blocks.of(volume, slopes=shown.reads_gradient)
+    visible = visible_in_numpy(mode, shown, blocks)
+    visible = np.asarray(_occupied(mode, shown, blocks)) if visible is None else visible
+    seed, (proven, parts) = integer("seed", seed, 0), chosen_transforms(visible, fixed)
+    voxel = Place.of(March(1.0, fixed), volume).voxel(visible.shape)
 
-    over = isinstance(mode, Over)
+    shows, over = bool(visible.any()), isinstance(mode, Over)
     ends = min(tolerance * ENDS, GRADIENTS_END if gradients else math.inf)
 
-    def search(ends: float, goal: float, known: dict[tuple[float, Quadrature], Trial]) -> Search:
-        ending = (EarlyTermination(ends),) if over else ()
-        return Search(probe, scene, goal, tolerance, voxel, (*fixed, *proven, *ending), known)
+    def trials(ends: float) -> tuple[Transform, ...]:
+        # The plan drops EarlyTermination if few rays become opaque. Trials keep it, to share programs.
+        return (*fixed, *proven, *((EarlyTermination(ends),) if over else ()))
 
-    # The plan drops EarlyTermination if few rays become opaque. Trials keep it, so that they share programs.
-    probe = Probe.of(candidates, seed)
+    def search(ends: float, goal: float, known: dict[tuple[float, Quadrature], Trial]) -> Search:
+        return Search(probe, scene, goal, tolerance, voxel, trials(ends), known)
+
+    def survey(quadrature: Quadrature) -> Bool[np.ndarray, " patches"]:
+        march = March(COARSEST * voxel, trials(ends), quadrature)
+        return likely_patches(camera, partial(rendered, scene=scene, march=march))
+
+    likely = survey("midpoint")
+    if shows and not likely.any() and integrable(scene):  # what shows may lie between samples
+        likely = survey("preintegrated")
+    probe = Probe.of(camera, likely, seed)
     first = search(ends, tolerance, {})
     coarse = first.render(COARSEST, "midpoint").image
-    shows = bool(visible.any())
-    if shows and is_empty(coarse):  # visible parts lie in other patches, or between samples
-        quadrature = "preintegrated" if first.integrable else "midpoint"
-        march = March(COARSEST * voxel, first.transforms, quadrature)
-        probe = Probe.of(candidates.narrowed(lambda rays: rendered(rays, scene, march)), seed)
-        first = search(ends, tolerance, {})
-        coarse = first.render(COARSEST, "midpoint").image
     between = shows and is_empty(coarse)
     opaque = probe.mean(np.asarray(coarse.opacity) >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
@@ -232,25 +234,9 @@ def chosen_transforms(
     return (*leaps, *added), [Part("AlphaCorrection", True, why), proof]
 
 
-def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[np.ndarray, "bx by bz"]:
-    """Mask of the blocks that may change a pixel. JAX takes them as a row padded to a power of 8, so that
-    volumes share programs."""
-    if (known := visible_in_numpy(mode, transfer, blocks)) is not None:
-        return known
-    count = math.prod(blocks.shape)
-    length = 8 ** max(4, -(-(count - 1).bit_length() // 3))
-
-    def in_a_row(leaf: Array) -> Array:
-        row = np.asarray(leaf).reshape(*leaf.shape[:-3], count)
-        row = np.append(row, row[..., -1:].repeat(length - count, axis=-1), axis=-1)
-        return jnp.asarray(row[..., None, None], leaf.dtype)
-
-    row = _occupied_in_a_row(mode, with_shared_points(transfer), jax.tree.map(in_a_row, blocks))
-    return np.asarray(row).reshape(-1)[:count].reshape(blocks.shape)
-
-
 @eqx.filter_jit
-def _occupied_in_a_row(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[Array, "n 1 1"]:
+def _occupied(mode: Compositing[Any], transfer: Transfer, blocks: Blocks) -> Bool[Array, "bx by bz"]:
+    """Mask of the blocks that may change a pixel."""
     return mode.occupied(transfer, blocks)
 
 

@@ -1,26 +1,22 @@
 """Estimates of an image's error and cost from the pixels of some patches."""
 
 import math
-from collections.abc import Callable, Iterator
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._util.vec3 import Scalar, along, apart
 from ..engine.image import render_scene
 from ..engine.rays import RayTiles
-from ..engine.stages import Place
 from ..engine.tiling import Tiling
 from ..march.march import March
 from ..ray import Scene
 from ..scene.camera import Camera, GivenRays, axes_of
-from ..scene.occupancy import BLOCK
 from ..scene.rendering import Rendering
-from ..xla.kept_programs import kept
+from ..xla.trees import unchecked
 
 
 SIDE = 8  # pixels along the side of a patch, as of the engine's beams, so that its samples are the image's
@@ -29,10 +25,7 @@ SIDE = 8  # pixels along the side of a patch, as of the engine's beams, so that 
 # SMALL_PATCHES, since their plan takes as long as several images.
 PATCHES, SMALL, SMALL_PATCHES = 128, 512, 32
 
-# Fraction of the patches chosen from those with visible blocks on or near their middle ray; the others are
-# chosen from those that meet the volume.
-LIKELY = 7 / 8
-POINTS, NEAR = 256, 2  # points of the middle ray that are tested, and blocks around each
+LIKELY = 7 / 8  # fraction of the patches chosen from those that are likely to be visible
 
 # Standard errors added to a mean square of patches. If patches were normally distributed, 93 % of estimates
 # would not be too low; fewer where a few patches hold most of the error.
@@ -43,68 +36,61 @@ FASTEST, SLOWEST = 0.25, 0.9
 
 UNSEEN = 3.0  # if n pixels are empty, at most UNSEEN / n of all are not, with a confidence of 95 %
 ROUNDING = 1e-6  # differences of images that may be due to rounding
-RAYS, LINES = 2**15, 2**10  # rays, and lines of POINTS, per call of a program that images of all sizes share
 
 
-class Candidates(NamedTuple):
-    """Patches of a camera's image: masks of those that meet the volume, and of those likely to be visible."""
+def wanted(camera: Camera) -> int:
+    """Number of patches of a probe: one of two, so that images of all sizes share programs."""
+    across, down = _patches(camera)
+    return PATCHES if across * down >= SMALL else SMALL_PATCHES
 
-    camera: Camera
-    hit: Bool[np.ndarray, " patches"]
-    likely: Bool[np.ndarray, " patches"]
 
-    @classmethod
-    def of(cls, camera: Camera, place: Place, visible: Bool[np.ndarray, "bx by bz"]) -> "Candidates":
-        """Candidates of a camera. `visible`: mask of the blocks that may hold anything visible."""
-        from scipy.ndimage import maximum_filter  # imported late, so that a first image does not wait for it
+def likely_patches(camera: Camera, render: Callable[[GivenRays], Rendering]) -> Bool[np.ndarray, " patches"]:
+    """Mask of the patches in or near which a coarse image, of as many pixels as a probe, shows anything."""
+    from scipy.ndimage import maximum_filter  # imported late, so that a first image does not wait for it
 
-        (width, height), (across, down) = camera.size, _patches(camera)
+    count, (across, down), (width, height) = wanted(camera), _patches(camera), camera.size
+    columns = min(max(round(math.sqrt(count * width / height)), 1), count, across)
+    rows = min(count // columns, down)
+    size = min(columns * SIDE, width), min(rows * SIDE, height)
+    coarse = unchecked(camera, size=size, corner=np.zeros(2))
+    rays = rays_of(coarse, *pixels_of(coarse, np.resize(np.arange(columns * rows), count)))
+    shown, ratio = np.asarray(render(rays).rgba).any(axis=-1), np.divide(camera.size, size)
+    column, row = ((np.asarray(rays.pixels)[shown] + 0.5) * ratio // SIDE).astype(int).T
+    likely = np.zeros((down, across), bool)
+    likely[row, column] = True
+    return maximum_filter(likely, 2 * math.ceil(ratio.max() / SIDE) + 1, mode="constant").reshape(-1)
 
-        def hits(pixels: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-            enters, leaves = _intervals(place, *_rays(camera, pixels % width, pixels // width))
-            return leaves > np.maximum(enters, 0)
 
-        parts = np.split(np.arange(width * height), range(RAYS, width * height, RAYS))
-        hit = np.concatenate(list(map(hits, parts))).reshape(height, width)
-        hit = np.pad(hit, ((0, down * SIDE - height), (0, across * SIDE - width)))
-        hit = hit.reshape(down, SIDE, across, SIDE).any(axis=(1, 3)).reshape(-1)
-        near = maximum_filter(visible, 2 * NEAR + 1, mode="constant")
-        likely = hit & _passes(camera, place, near)
-        hit[0] |= not hit.any()
-        return cls(camera, hit, likely)
+def pixels_of(
+    camera: Camera, patches: Int[np.ndarray, " n"]
+) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n m"]]:
+    """Columns and rows of patches' pixels, in the order of the engine's beams."""
+    half = SIDE // 2
+    down, across, y, x = np.unravel_index(np.arange(SIDE**2), (2, 2, half, half))
+    row, column = np.divmod(patches, _patches(camera)[0])
+    return column[:, None] * SIDE + across * half + x, row[:, None] * SIDE + down * half + y
 
-    @property
-    def wanted(self) -> int:
-        """Number of patches of a probe."""
-        return PATCHES if self.hit.size >= SMALL else SMALL_PATCHES
 
-    def pixels(self, chosen: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, "n m"], Int[np.ndarray, "n m"]]:
-        """Columns and rows of patches' pixels, in the order of the engine's beams."""
-        half = SIDE // 2
-        down, across, y, x = np.unravel_index(np.arange(SIDE**2), (2, 2, half, half))
-        y, x = down * half + y, across * half + x
-        row, column = np.divmod(chosen, _patches(self.camera)[0])
-        return column[:, None] * SIDE + x, row[:, None] * SIDE + y
-
-    def rays(self, column: Int[np.ndarray, "*n"], row: Int[np.ndarray, "*n"]) -> GivenRays:
-        """Rays of pixels, clamped to the image."""
-        ends = zip((column, row), self.camera.size, strict=True)
-        column, row = (np.minimum(index, n - 1).reshape(-1) for index, n in ends)
-        origins, directions = _rays(self.camera, column, row)
-        pixels = np.stack([column, row], axis=-1) + np.round(np.asarray(self.camera.corner)).astype(int)
-        arrays = origins, directions, pixels.astype(np.int32)
-        return GivenRays(*(jnp.asarray(array, array.dtype) for array in arrays))
-
-    def narrowed(self, render: Callable[[GivenRays], Rendering]) -> "Candidates":
-        """Restricts `likely` to patches that are not empty in a rendering of as many pixels as a probe has,
-        spread evenly over the likely patches, or else over `hit`. Unchanged if all are empty."""
-        patches = np.flatnonzero(self.likely if self.likely.any() else self.hit)
-        spread = np.linspace(0, patches.size * SIDE**2 - 1, self.wanted * SIDE**2).astype(int)
-        column, row = (index.reshape(-1)[spread] for index in self.pixels(patches))
-        shown = np.asarray(render(self.rays(column, row)).rgba).any(axis=-1)
-        likely = np.zeros_like(self.likely)
-        likely[patches[spread[shown] // SIDE**2]] = True
-        return self._replace(likely=likely) if shown.any() else self
+def rays_of(camera: Camera, column: Int[np.ndarray, "*n"], row: Int[np.ndarray, "*n"]) -> GivenRays:
+    """Rays of pixels, clamped to the image, as by `Camera.ray`, in NumPy."""
+    ends = zip((column, row), camera.size, strict=True)
+    column, row = (np.minimum(index, n - 1).reshape(-1) for index, n in ends)
+    known = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), camera)
+    (x0, x1, y0, y1), (width, height) = known.window, camera.size
+    x = x0 + (x1 - x0) * (column + 0.5) / width
+    y = y1 - (y1 - y0) * (row + 0.5) / height
+    across, up, forward = axes_of(known, np)
+    offset = x[:, None] * across + y[:, None] * up
+    if camera.parallel_scale is not None:
+        origins, directions = known.position + known.parallel_scale * offset, forward + 0 * offset
+    else:
+        directions = forward + np.tan(np.deg2rad(known.view_angle) / 2) * offset
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        origins = known.position + 0 * offset
+    dtype = np.dtype(camera.position.dtype)
+    pixels = np.stack([column, row], axis=-1) + np.round(np.asarray(camera.corner)).astype(int)
+    arrays = origins.astype(dtype), directions.astype(dtype), pixels.astype(np.int32)
+    return GivenRays(*(jnp.asarray(array, array.dtype) for array in arrays))
 
 
 class Probe(NamedTuple):
@@ -125,28 +111,27 @@ class Probe(NamedTuple):
     pixels: int
 
     @classmethod
-    def of(cls, candidates: Candidates, seed: int) -> "Probe":
-        """Random patches of an image; all if they are few, and the first if no ray meets the volume."""
-        groups = np.flatnonzero(candidates.likely), np.flatnonzero(candidates.hit & ~candidates.likely)
-        reserved = min(groups[1].size, round(candidates.wanted * (1 - LIKELY)))
-        first = min(groups[0].size, candidates.wanted - reserved)
-        second = min(groups[1].size, candidates.wanted - first)
+    def of(cls, camera: Camera, likely: Bool[np.ndarray, " patches"], seed: int) -> "Probe":
+        """Random patches of an image; all if they are few. `likely`: those that are likely to be visible."""
+        count, groups = wanted(camera), (np.flatnonzero(likely), np.flatnonzero(~likely))
+        reserved = min(groups[1].size, round(count * (1 - LIKELY)))
+        first = min(groups[0].size, count - reserved)
+        second = min(groups[1].size, count - first)
         random, chosen, strata = np.random.default_rng(seed), [], []
-        for group, count in zip(groups, (first, second), strict=True):
-            edges = np.linspace(0, group.size, count + 1).astype(int)
+        for group, number in zip(groups, (first, second), strict=True):
+            edges = np.linspace(0, group.size, number + 1).astype(int)
             chosen.append(group[random.integers(edges[:-1], edges[1:])])
             strata.append(np.diff(edges))
         chosen, strata = np.concatenate(chosen), np.concatenate(strata).astype(float)
-        # one of two numbers of rays, so that images of all sizes share programs
-        more = candidates.wanted - chosen.size
+        more = count - chosen.size
         chosen, strata = np.pad(chosen, (0, more), mode="edge"), np.pad(strata, (0, more))
-        likely, (width, height) = np.arange(candidates.wanted) < first, candidates.camera.size
-        column, row = candidates.pixels(chosen)
+        column, row = pixels_of(camera, chosen)
+        width, height = camera.size
         inside = ((column < width) & (row < height)).astype(float)
-        return cls(candidates.rays(column, row), strata, likely, inside, width * height)
+        return cls(rays_of(camera, column, row), strata, np.arange(count) < first, inside, width * height)
 
     def mean(self, values: np.ndarray | Array) -> float:
-        """Estimate of a mean over the image by values of pixels; patches that miss the volume count as 0."""
+        """Estimate of a mean over the image by values of pixels."""
         return float(self.strata @ self._totals(values) / self.pixels)
 
     def _totals(self, values: np.ndarray | Array) -> Float[np.ndarray, " patches"]:
@@ -154,7 +139,7 @@ class Probe(NamedTuple):
 
     def render(self, scene: Scene, march: March) -> Rendering:
         """Renders the probe's pixels of the scene's image under another march."""
-        return rendered(self.source, scene, march, squares=True)
+        return rendered(self.source, scene, march)
 
     def mean_square(self, difference: Float[np.ndarray, "pixels 3"]) -> tuple[float, float]:
         """Estimate of the mean square over the image, and its standard error."""
@@ -167,11 +152,11 @@ class Probe(NamedTuple):
         return self.mean(square), float(np.sqrt(error)) / self.pixels
 
 
-def rendered(rays: GivenRays, scene: Scene, march: March, *, squares: bool = False) -> Rendering:
-    """Renders a probe's number of rays of a scene under another march. `squares`: as in `Tiling`."""
+def rendered(rays: GivenRays, scene: Scene, march: March) -> Rendering:
+    """Renders the rays of a probe's number of patches of a scene under another march."""
     tiling = Tiling.of_backend()
     if isinstance(scene.source, Camera):  # by the program of its image
-        tiling = tiling._replace(least=RayTiles.shared(scene.source, tiling)[0], squares=squares)
+        tiling = tiling._replace(least=RayTiles.shared(scene.source, tiling)[0], squares=True)
     return render_scene(scene._replace(source=rays, march=march), "all", "replay", tiling)
 
 
@@ -240,74 +225,3 @@ def _patches(camera: Camera) -> tuple[int, int]:
     """Number of patches across and down an image."""
     width, height = camera.size
     return -(-width // SIDE), -(-height // SIDE)
-
-
-def _in_parts(program: Callable[..., Any], size: int, *arrays: np.ndarray) -> Iterator[Any]:
-    """Results, as NumPy arrays, of a program of `size` elements of arrays at a time."""
-    for begin in range(0, len(arrays[0]), size):
-        parts = [array[begin : begin + size] for array in arrays]
-        count = len(parts[0])
-        padding = [((0, size - count), *((0, 0),) * (part.ndim - 1)) for part in parts]
-        results = program(*map(partial(np.pad, mode="edge"), parts, padding))
-        yield jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], results)
-
-
-def _rays(camera: Camera, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and unit directions of pixels' rays, as by `Camera.ray`, in NumPy."""
-    known = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), camera)
-    (x0, x1, y0, y1), (width, height) = known.window, camera.size
-    x = x0 + (x1 - x0) * (column + 0.5) / width
-    y = y1 - (y1 - y0) * (row + 0.5) / height
-    across, up, forward = axes_of(known, np)
-    offset = x[:, None] * across + y[:, None] * up
-    if camera.parallel_scale is not None:
-        origins, directions = known.position + known.parallel_scale * offset, forward + 0 * offset
-    else:
-        directions = forward + np.tan(np.deg2rad(known.view_angle) / 2) * offset
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        origins = known.position + 0 * offset
-    dtype = np.dtype(camera.position.dtype)
-    return origins.astype(dtype), directions.astype(dtype)
-
-
-@kept
-def _interval(place: Place, origins: Array, directions: Array) -> tuple[Array, Array]:
-    return place.space.interval(tuple(origins.T), tuple(directions.T))
-
-
-def _intervals(place: Place, *rays: np.ndarray) -> list[np.ndarray]:
-    """Depths at which rays enter and leave the volume."""
-    parts = _in_parts(partial(_interval, place), RAYS, *rays)
-    return [np.concatenate(ends) for ends in zip(*parts, strict=True)]
-
-
-def _passes(
-    camera: Camera, place: Place, blocks: Bool[np.ndarray, "bx by bz"]
-) -> Bool[np.ndarray, " patches"]:
-    """Mask of the patches whose middle ray passes through a marked block."""
-    across, down = _patches(camera)
-    row, column = (SIDE * index + (SIDE - 1) / 2 for index in np.divmod(np.arange(across * down), across))
-    rays = _rays(camera, column, row)
-    lines = *rays, *_intervals(place, *rays)
-    last, masks = np.array(blocks.shape) - 1, []
-    for at, crosses in _in_parts(partial(_line_points, place), LINES, *lines):
-        i, j, k = np.clip(np.floor(at / BLOCK).T, 0, last[:, None, None]).astype(int)
-        masks.append(crosses & blocks[i, j, k].any(axis=0))
-    return np.concatenate(masks)
-
-
-@kept
-def _line_points(
-    place: Place, origins: Array, directions: Array, nears: Array, fars: Array
-) -> tuple[Array, Array]:
-    """Grid coordinates of `POINTS` points along each ray, and whether the ray meets the volume."""
-    space, parts = place.space, (jnp.arange(POINTS, dtype=nears.dtype) + 0.5) / POINTS
-
-    def at(origin: Array, direction: Array, entry: Scalar, leave: Scalar, part: Scalar) -> Array:
-        line = apart(origin), apart(direction)
-        return jnp.stack(space.coordinate(along(*line, entry + (leave - entry) * part)))
-
-    entries = jnp.maximum(nears, 0)
-    over_parts = jax.vmap(at, in_axes=(None, None, None, None, 0))
-    points = jax.vmap(over_parts, in_axes=(0, 0, 0, 0, None))(origins, directions, entries, fars, parts)
-    return points, fars > entries

@@ -11,7 +11,6 @@ from ..compositing.blending import Over
 from ..march.march import March, Quadrature, Transform
 from ..ray import Scene
 from ..scene.rendering import Rendering
-from ..scene.transfer import Transfer
 from .probe import Probe, Reference
 
 
@@ -66,18 +65,14 @@ class Search:
     transforms: tuple[Transform, ...]
     rendered: dict[tuple[float, Quadrature], Trial] = field(default_factory=dict)  # by step in voxels
 
-    @property
-    def integrable(self) -> bool:
-        """True if cells can be integrated between their ends."""
-        return isinstance(self.scene.compositing, Over) and integrates(self.scene.transfer)
-
     def cheapest(self, *, once: bool, between: bool = False) -> tuple[Trial, Reference, list[Part]]:
         """The cheapest march within the goal, the reference, and the decisions. `once`: as for `plan`.
         `between`: features may lie between samples, so that cells must be integrated."""
-        integrable, between = self.integrable, between and self.integrable
+        can_integrate = integrable(self.scene)
+        between = between and can_integrate
         first: Quadrature = "preintegrated" if between else "midpoint"
-        trial, reference = self._longest(first, last=between or not integrable)
-        if first == "midpoint" and trial.error > self.goal and integrable and math.isfinite(trial.error):
+        trial, reference = self._longest(first, last=between or not can_integrate)
+        if first == "midpoint" and trial.error > self.goal and can_integrate and math.isfinite(trial.error):
             trial, reference = self._longest("preintegrated", last=True)
         if trial.march.quadrature == "preintegrated" and trial.error <= self.goal:
             trial = min(trial, self._midpoint(trial, reference), key=lambda trial: trial.cost)
@@ -97,7 +92,7 @@ class Search:
             why = f"{trial.samples:.1f} samples a pixel: too few to save any"
         elif once:
             why = "not tried for one image: an extra program takes longer to compile than it saves"
-        elif not integrable:
+        elif not can_integrate:
             why = "these cells cannot be integrated"
         elif integrated := self._integrated(trial.step, reference):
             fewer = f"{integrated.samples:.1f} samples a pixel for {trial.samples:.1f}"
@@ -182,10 +177,10 @@ class Search:
         return longest
 
 
-def integrates(transfer: Transfer) -> bool:
-    """Tests whether a transfer function's cells can be integrated between their ends."""
-    leaves, structure = jax.tree.flatten(transfer)
-    return _integrates(structure, *map(jax.typeof, leaves))
+def integrable(scene: Scene) -> bool:
+    """Tests whether a scene's cells can be integrated between their ends."""
+    leaves, structure = jax.tree.flatten(scene.transfer)
+    return isinstance(scene.compositing, Over) and _integrates(structure, *map(jax.typeof, leaves))
 
 
 @cache

@@ -67,7 +67,7 @@ def computed_now(function: Callable[..., Any], *args: Any) -> Any:
     """`function(*args)` of concrete arrays, computed immediately even while a larger program is traced."""
     if not is_traced(_probe()):
         return function(*args)
-    # not by `jax.ensure_compile_time_eval`, inside which jax 0.7 cannot compile a loop
+    # not by `jax.ensure_compile_time_eval`, inside which each operation is a program of its own
     jitted: Any = eqx.filter_jit(function)
     return jitted.lower(*args).compile()(*args)
 

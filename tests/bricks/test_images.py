@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from experiments.bricks import each_at_once
 from experiments.bricks_once import EachOnce
 from jaxvol.bricks import BrickGrid, VoxelSource, overlap_of
 from jaxvol.lighting import DirectionalLight, Phong, ScattererTemplates
@@ -132,22 +131,17 @@ def test_bricks_look_like_the_whole_where_rays_leave_them_and_come_back(method):
 ARRAY = np.ascontiguousarray(balls())
 BAD: list[tuple[dict[str, Any], str]] = [
     ({"memory": 1000}, "memory must be at least .* got 1000"),
-    ({"memory": -1}, "memory must be an integer of at least 1, a number of bytes; got -1"),
     ({"memory": "512M"}, "memory must be an integer of at least 1, a number of bytes; got '512M'"),
-    ({"bricks": (2, 2)}, "bricks must be three numbers"),
-    ({"bricks": (0, 1, 1)}, r"bricks must be three numbers, each .* at least 1; got \(0, 1, 1\)"),
     ({"bricks": (2, 1.5, 2)}, "bricks must be three numbers, .* got .*1.5"),
     (
         {"bricks": (1000, 1000, 1000), "source": np.broadcast_to(np.uint8(0), (41, 42, 43))},
         r"bricks must be no more than 65536 in all; got \(1000, 1000, 1000\), 68880",
     ),
-    ({"method": np.array(["overlap", "reload"])}, "method must be one of overlap, reload"),
     ({"method": "fast"}, "method must be one of overlap, reload; got 'fast'"),
     ({"level": 1}, 'level must be an integer from 0 to 0, or "auto"; got 1'),
     ({"outputs": "depth"}, "outputs must be one of all, rgba"),
     ({"source": "no_such.raw"}, "no_such.raw"),
     ({"source": None}, "source must be an array, a Volume, .* got None"),
-    ({"source": {}}, "source must be an array, a Volume, "),
     ({"transfer": 3}, "transfer must be a transfer function"),
     ({"transfer": jv.LabelTransferFunction({1: TRANSFER})}, "bricks have no labels"),
     ({"march": jv.March(1.0, (jv.SpaceLeaping("min_distance"),))}, "min_distance"),
@@ -162,10 +156,6 @@ BAD: list[tuple[dict[str, Any], str]] = [
     ),
     ({"compositing": "over!"}, "compositing must be one of"),
     ({"progress": 5}, "progress must be a function"),
-    (
-        {"devices": jax.devices(), "march": jv.March(1.0, (jv.EmptySpaceJitter(0),))},
-        "devices, which own bricks, do not go with EmptySpaceJitter",
-    ),
 ]
 
 
@@ -228,6 +218,10 @@ def test_bricks_of_a_real_volume_look_like_the_whole_in_every_way(engine, way):
     march, options = WAYS[way]
     options = {"transfer": TRANSFER} | options
     camera = jv.Camera((400, 300, 500), engine.center, (0, 1, 0), 30.0, size=(48, 48))
+    if way == "jittered, by beams":
+        camera = jv.Camera((133, 80, 90), engine.center, (0, 1, 0.1), 60.0, size=(48, 48))  # from within
+    elif way == "residual, clipped":
+        camera = jv.Camera((400, 300, 500), engine.center, (0, 1, 0), parallel_scale=100.0, size=(48, 48))
     one = jv.render(engine, camera=camera, march=march, **options)
     # kept in memory in another order than the whole
     data = np.asarray(engine.data).transpose(1, 2, 0).copy().transpose(2, 0, 1)
@@ -238,23 +232,6 @@ def test_bricks_of_a_real_volume_look_like_the_whole_in_every_way(engine, way):
     assert np.all(np.less(found.bricks.stored, engine.shape)[:2])  # or no margin would be seen
     if way == "isosurface":
         np.testing.assert_allclose(found.normal, one.normal, rtol=0, atol=2e-5)
-
-
-@pytest.mark.slow
-def test_random_splits_and_cameras_look_like_the_whole(engine):
-    rng, center = np.random.default_rng(0), np.asarray(engine.center)
-    march = jv.March(0.9, (jv.SpaceLeaping(), jv.EmptySpaceJitter(3)))
-    cameras = [
-        jv.Camera(
-            center + rng.normal(size=3) * far, center + rng.normal(size=3), (0, 1, 0.1), 60.0, size=(32, 32)
-        )
-        for far in (5, 400)
-    ]
-    cameras += [jv.Camera((400, 300, 500), center, (0, 1, 0), parallel_scale=100.0, size=(32, 32))]
-    for camera in cameras:
-        bricks = tuple(int(n) for n in rng.integers(1, 5, 3))
-        one = jv.render(engine, TRANSFER, camera, march)
-        assert_same(jv.render_bricks(engine, TRANSFER, camera, march, bricks=bricks), one)
 
 
 HALF = math.pi / 2
@@ -291,22 +268,6 @@ def test_a_toroidal_volume_is_rendered_within_its_memory():
         assert np.any(np.less(found.bricks.stored, SCAN))
     with pytest.raises(ValueError, match=r"memory must be at least \d+ bytes.*got 150000"):
         jv.render_bricks(data, transfer, camera, jv.March(1.0, (probe,)), memory=150_000)
-
-
-@pytest.mark.slow
-def test_the_naive_order_is_visibly_wrong():
-    """Where rays pass by the probe and come back into a brick."""
-    data, transfer, probe = probe_fog(10.0, 20.0)
-    camera = jv.Camera((300, 10, 55), (0, 0, 55), (0, 0, 1), 25.0, size=(24, 24))
-    march = jv.March(0.5, (probe, jv.Jitter(0)))
-    one = jv.render(jv.Volume(data), transfer, camera, march)
-    naive = jv.render_bricks(data, transfer, camera, march, bricks=(1, 1, 4), method=each_at_once)
-    assert naive.bricks.loads == 4
-    wrong = np.abs(np.asarray(naive.rgba - one.rgba))[..., :3].max(-1)
-    assert wrong.max() > 0.1
-    assert np.mean(wrong > 0.02) > 0.01
-    # only the order is wrong: what is hidden behind what, not how much is
-    np.testing.assert_allclose(naive.rgba[..., 3], one.rgba[..., 3], atol=2e-5)
 
 
 @pytest.mark.slow

@@ -39,18 +39,11 @@ def test_voxels_are_no_larger_than_a_pixel_at_the_nearest_corner():
         assert level_for(levels(), camera(distance, (pixels, pixels))) == expected
     assert level_for(levels(), camera(201, (100, 200))) == 1  # the smaller side of a pixel counts
     assert level_for(levels(), camera(-5)) == 0  # from within
+    flat = [VoxelSource(np.zeros((N, N // f, N // f), np.uint8), (4.0, f, f)) for f in (1, 2)]
+    assert level_for(flat, camera(150)) == 1  # an axis along which levels are as fine does not count
     parallel = camera(9000, parallel_scale=101.0)
     assert level_for(levels(), parallel) == 1
-    half = parallel.crop(0, 0, 50, 50)
-    assert level_for(levels(), half) == 1  # pixels are as large
-
-
-def test_an_axis_along_which_levels_are_as_fine_does_not_count():
-    flat = [
-        VoxelSource(np.zeros((N, N // f, N // f), np.uint8), (4.0, float(f), float(f)), (0, 0, 0))
-        for f in (1, 2)
-    ]
-    assert level_for(flat, camera(150)) == 1
+    assert level_for(levels(), parallel.crop(0, 0, 50, 50)) == 1  # pixels are as large
 
 
 def test_an_image_of_ome_zarr_takes_the_level_of_its_pixels_or_the_one_that_is_asked_for(tmp_path):

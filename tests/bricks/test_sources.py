@@ -65,7 +65,7 @@ def x_fastest(path, data):
 # ---- files and arrays ----
 
 
-@pytest.mark.parametrize("dtype", ["uint8", "int8", "uint16", "int16", "float16", "float32", "bfloat16"])
+@pytest.mark.parametrize("dtype", ["uint8", "int16", "float32", "bfloat16"])
 def test_arrays_and_files_of_every_type(dtype, tmp_path):
     data = voxels(dtype)
     for given in (np.asfortranarray(data), data[::-1, ::2], jax.device_put(data), jv.Volume(data)):
@@ -106,19 +106,14 @@ def kinds_of_arrays(data, folder):
     yield OfOurOwn(data)
     yield zarr.create_array({}, data=data, chunks=(8, 9, 10))
     yield tensorstore.array(turned).transpose((1, 2, 0))
+    yield tensorstore.array(np.pad(data, ((2, 0), (1, 0), (0, 0))))[2:, 1:]  # whose domain begins at 2 and 1
     dask, h5py = pytest.importorskip("dask.array"), pytest.importorskip("h5py")
     yield dask.from_array(turned, chunks=(8, 9, 10)).transpose(1, 2, 0)
     with h5py.File(folder / "a.h5", "w") as file:
         yield file.create_dataset("a", data=data, chunks=(8, 9, 10))
-        yield file.create_dataset("b", data=data)
-
-
-def test_an_array_of_a_file_that_is_closed_is_refused(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        array = file.create_dataset("a", data=voxels())
+        yield (contiguous := file.create_dataset("b", data=data))
     with pytest.raises(ValueError, match=r"source must be an array that can be read; .*Keep its file open"):
-        source_of(array)
+        source_of(contiguous)
 
 
 def test_anything_with_a_shape_a_type_and_boxes_is_a_source(tmp_path, monkeypatch):
@@ -148,7 +143,7 @@ def test_axes_beside_space_are_not_what_is_read_in_layers(monkeypatch):
     assert_reads(source, stack.data[1].T)
 
 
-def test_what_an_array_returns_is_checked():
+def test_what_an_array_returns_is_checked_and_xarray_is_taken_by_its_names():
     data = voxels("uint8", (8, 8, 8))
 
     class Clipped(OfOurOwn):
@@ -160,16 +155,14 @@ def test_what_an_array_returns_is_checked():
     masked = OfOurOwn(np.ma.masked_equal(data, data[1, 2, 3]))
     with pytest.raises(ValueError, match=r"from \(0, 0, 0\) to \(8, 8, 8\) are masked"):
         source_of(masked).read((0, 0, 0), (8, 8, 8))
-    view = tensorstore.array(data)[2:, 1:]  # whose domain begins at 2 and 1
-    assert_reads(source_of(view), data[2:, 1:])
-    bad: list[tuple[Any, dict[str, Any], str]] = [
-        (data, {"spacing": (1, 2)}, "spacing must have"),
-        (source_of(data), {}, "source must be an array"),
-    ]
-    for array, options, message in bad:
-        with pytest.raises(ValueError, match=message):
-            VoxelSource(array, **options)
-    named = pytest.importorskip("xarray").DataArray(data, dims=("z", "y", "x"))
+    with pytest.raises(ValueError, match="source must be an array"):
+        VoxelSource(source_of(data))
+    xarray = pytest.importorskip("xarray")
+    at = {"xyz"[i]: 5.0 - i + (i + 0.5) * np.arange(8) for i in range(3)}
+    named = xarray.DataArray(data, dims=("x", "y", "z"), coords=at).transpose("z", "x", "y")
+    source = source_of(named)
+    assert_reads(source, data)
+    assert (source.spacing, source.origin) == ((0.5, 1.5, 2.5), (5, 4, 3))
     with pytest.raises(ValueError, match=r"channel: .* has no such axis; it holds x 8, y 8, z 8"):
         source_of(named, channel=1)
 
@@ -189,11 +182,6 @@ def test_memory_maps_are_read_and_not_held(tmp_path):
         found = source.read((0, 0, 0), source.shape, source.order)
         assert not np.shares_memory(found, mapped)
         assert found.ctypes.data % 64 == 0  # as JAX uses it in place
-    (tmp_path / "new").write_bytes(b"header" + (data + 1).tobytes())
-    source = source_of(mapped)
-    (tmp_path / "new").replace(path)
-    with pytest.raises(ValueError, match="changed after it was opened"):
-        source.read((0, 0, 0), (1, 1, 1))
     source = source_of(mapped)
     path.unlink()
     assert_reads(source, data)  # the map has the old voxels
@@ -219,14 +207,6 @@ def test_spacing_and_origin(tmp_path):
             source_of(path, spacing=wrong)
 
 
-def test_an_array_of_xarray_is_taken_by_its_names():
-    xarray, data = pytest.importorskip("xarray"), voxels()
-    at = {"xyz"[i]: 5.0 - i + (i + 0.5) * np.arange(n) for i, n in enumerate(SHAPE)}
-    source = source_of(xarray.DataArray(data, dims=("x", "y", "z"), coords=at).transpose("z", "x", "y"))
-    assert_reads(source, data)
-    assert (source.spacing, source.origin) == ((0.5, 1.5, 2.5), (5, 4, 3))
-
-
 # ---- types ----
 
 
@@ -247,7 +227,6 @@ def test_types_that_no_volume_has_are_converted_or_refused():
     [
         (np.int64, 2**24 + 1, r"from -2\*\*24 to 2\*\*24.*from 0 to 16777217 from \(19, 2, 0\)"),
         (np.float16, np.nan, r"must be finite.* from \(19, 2, 0\)"),
-        (np.float32, np.inf, r"must be finite.* from \(19, 2, 0\)"),
         (ml_dtypes.bfloat16, -np.inf, r"must be finite.* from \(19, 2, 0\)"),
         (np.float64, 1e39, "must be finite in float32"),
     ],
@@ -283,7 +262,6 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
     for name, content in (
         ("data.raw", bytes(99)),
         ("data.raw.gz", b"1"),
-        ("data.nii", b"1"),
         ("data.h5", b"1"),
     ):
         (tmp_path / name).write_bytes(content)
@@ -293,21 +271,16 @@ def test_files_and_things_that_are_no_source_are_refused_with_what_to_do(tmp_pat
     np.save(tmp_path / "data.npy", np.zeros(SHAPE))
     bad: list[tuple[Any, dict[str, Any], str]] = [
         ("data.raw", {"shape": (10**4, 10**5, 10**5)}, "cut short: it holds 99 bytes"),
-        ("data.raw", {"shape": (4, 4, 4)}, "oversized"),
         ("cut.npy", {}, r"is cut short"),
         ("flat.npy", {}, r"data must be data\[x, y, z\] with at least 2 voxels"),
-        (np.zeros((1, 4, 4)), {}, r"data must be data\[x, y, z\] with at least 2 voxels"),
         ("data.raw.gz", {"shape": (2, 2, 2)}, r"not of a kind that is read box by box.*gunzip"),
-        ("data.nii", {}, r"not of a kind that is read box by box.*jv\.load"),
         ("folder", {}, r"not of a kind that is read box by box.*DICOM slices"),
-        ("nothing.raw", {}, "there is no file"),
         (3, {}, "source must be an array, a Volume, a VoxelSource or a path"),
         (jv.Volume(np.zeros(SHAPE), labels=np.zeros(SHAPE, np.uint8)), {}, "a Volume without labels"),
         ("data.npy", {"shape": SHAPE}, "shape and dtype are for raw files"),
         ("data.h5", {}, "data.h5 cannot be read"),
         (np.zeros((*SHAPE, 2)), {}, r"array must be data\[x, y, z\]; .* Choose a channel first"),
         (np.zeros(SHAPE), {"channel": 1}, "unexpected keyword argument 'channel'"),
-        ([[[1, 2], [3, 4]]], {}, "source must be an array, .* got "),
         (source_of(np.zeros(SHAPE)), {"channel": 0}, "^channel: a VoxelSource takes no options"),
     ]
     for thing, options, message in bad:

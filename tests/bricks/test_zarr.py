@@ -65,9 +65,7 @@ def test_zarr_arrays_of_every_layout_and_their_damage(layout, tmp_path):
         source_of(path).read((0, 0, 0), SHAPE)
 
 
-@pytest.mark.parametrize(
-    "dtype", ["int8", "float16", "float32", "float64", "int64", "bool", "bfloat16", ">u2"]
-)
+@pytest.mark.parametrize("dtype", ["float16", "float64", "int64", "bool", "bfloat16", ">u2"])
 def test_zarr_arrays_of_other_types_are_read_layer_by_layer(dtype, tmp_path, monkeypatch):
     monkeypatch.setattr(sources, "AT_ONCE", 2**13)
     read = {"float64": "float32", "int64": "float32", "bool": "uint8", ">u2": "uint16"}.get(dtype, dtype)
@@ -199,18 +197,9 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        ({"axes": None}, "does not follow OME-Zarr"),
         ({"axes": ["z", "y", "x"]}, "does not follow OME-Zarr"),
-        (
-            {"axes": [{"name": a, "type": "space"} for a in "abc"]},
-            "must have axes x, y and z; got",
-        ),
-        ({"datasets": []}, "does not follow OME-Zarr"),
+        ({"axes": [{"name": a, "type": "space"} for a in "abc"]}, "must have axes x, y and z; got"),
         ({"datasets": [{"path": "../other"}]}, "does not follow OME-Zarr.*not a valid Zarr node name"),
-        ({"datasets": [{"path": "5"}]}, "does not follow OME-Zarr"),
-        ({"datasets": [{}]}, "does not follow OME-Zarr"),
-        ({"coordinateTransformations": [{"type": "affine"}]}, "does not follow OME-Zarr"),
-        ({"coordinateTransformations": [{"type": "scale", "scale": [1, 2]}]}, "does not follow OME-Zarr"),
         ({"coordinateTransformations": [{"type": "scale", "path": "s"}]}, "does not follow OME-Zarr"),
         (
             {"coordinateTransformations": [{"type": "scale", "scale": [1, 0, 1]}]},
@@ -218,12 +207,12 @@ def test_levels_of_ome_zarr(version, axes, tmp_path):
         ),
     ],
 )
-def test_metadata_that_do_not_follow_ome_zarr_are_refused(fault, message, tmp_path):
-    for version in ("0.4", "0.5"):
-        image = ome_written(tmp_path / version, [voxels()], version, axes="zyx")
-        write_image(tmp_path / version, image | fault, version)
-        with pytest.raises(ValueError, match=message):
-            source_of(tmp_path / version)
+@pytest.mark.parametrize("version", ["0.4", "0.5"])
+def test_metadata_that_do_not_follow_ome_zarr_are_refused(fault, message, version, tmp_path):
+    image = ome_written(tmp_path / version, [voxels()], version, axes="zyx")
+    write_image(tmp_path / version, image | fault, version)
+    with pytest.raises(ValueError, match=message):
+        source_of(tmp_path / version)
 
 
 def test_load_reads_the_finest_level_that_fits(tmp_path, monkeypatch):
@@ -255,15 +244,11 @@ def test_load_knows_zarr_before_anything_else_of_jaxvol_is_used(tmp_path):
     assert ran.stdout.strip() == "(3, 4, 5)", ran.stderr[-500:]
 
 
-def test_levels_must_become_coarser(tmp_path):
-    data = voxels("uint8", (16, 16, 16))
-    image = ome_written(tmp_path, pyramid(data, 3), "0.5", axes="zyx")
-    first, second, third = image["datasets"]
-    finer_along_y = {"path": "1", "coordinateTransformations": [{"type": "scale", "scale": [2.0, 0.2, 0.3]}]}
-    for order in ([second, first, third], [first, third, second], [first, finer_along_y]):
-        write_image(tmp_path, image | {"datasets": order}, "0.5")
-        with pytest.raises(ValueError, match="not ordered from highest to lowest resolution"):
-            levels_of(tmp_path)
+def test_levels_become_coarser_and_none_is_missing(tmp_path):
+    image = ome_written(tmp_path, pyramid(voxels("uint8", (16, 16, 16)), 3), "0.5", axes="zyx")
+    write_image(tmp_path, image | {"datasets": image["datasets"][::-1]}, "0.5")
+    with pytest.raises(ValueError, match="not ordered from highest to lowest resolution"):
+        levels_of(tmp_path)
     shutil.rmtree(tmp_path / "1")
     write_image(tmp_path, image, "0.5")
     with pytest.raises(ValueError, match="1 is no Zarr array within the group"):

@@ -102,8 +102,8 @@ MAPS = {"average": "voxels"}
 @pytest.mark.parametrize(
     ("name", "method", "dtype"),
     [
-        *((name, MAPS.get(name, "hierarchy"), TYPES.get(name, "float32")) for name in PLAIN),
-        *slow(*((name, "hierarchy", TYPES[name]) for name in SIMILAR)),
+        *((name, MAPS.get(name, "blocks"), TYPES.get(name, "float32")) for name in PLAIN),
+        *slow(*((name, "blocks", TYPES[name]) for name in SIMILAR)),
         *slow(("maximum", "distance", "float32"), ("isosurface", "beam", "uint8")),
     ],
 )

@@ -362,7 +362,7 @@ def test_rays_that_are_not_finite_are_nan_in_a_program_and_no_others():
 USUAL = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.EarlyTermination(0.05))
 
 
-def with_and_without_leaps(*transforms, method=("hierarchy", 8)):
+def with_and_without_leaps(*transforms, method=("blocks", 8)):
     """These transforms and leaps, and these alone, by one program."""
     return tuple((*transforms, switch.switch(jv.SpaceLeaping(*method), on)) for on in (True, False))
 

@@ -58,7 +58,7 @@ def views(inside=False):
 PLANE = (np.array([1.0, -0.2, 1.3]), np.array([-0.6, 0.8, -0.3]))
 
 MARCHES = {
-    "hierarchy": lambda cut, leaps: (switch(jv.SpaceLeaping(), leaps), jv.AlphaCorrection()),
+    "blocks": lambda cut, leaps: (switch(jv.SpaceLeaping(), leaps), jv.AlphaCorrection()),
     "jittered": lambda cut, leaps: (jv.SpaceLeaping(), jv.EmptySpaceJitter(4), jv.AlphaCorrection()),
     "clipped, distance": lambda cut, leaps: (
         *(jv.Clip(planes=[cut]), jv.SpaceLeaping("distance")),
@@ -87,13 +87,13 @@ SPARSE = jv.TransferFunction.from_points(
 @pytest.mark.parametrize(
     ("name", "inside"),
     [
-        ("hierarchy", False),
+        ("blocks", False),
         *slow(("clipped, distance", False), ("hollowed", True)),
     ],
 )
 def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):
     scenes = zip(march_pair(name), (STRAIGHT, TURNED), views(inside), strict=True)
-    lit = None if name == "hierarchy" else Phong()
+    lit = None if name == "blocks" else Phong()
     expected, rendering = (
         jv.render(volume, SPARSE, camera, march, lighting=lit) for march, volume, camera in scenes
     )
@@ -104,7 +104,7 @@ def test_a_turned_volume_under_a_turned_camera_looks_the_same(name, inside):
     assert different.max() < 4e-5
     seen = np.asarray(expected.rgba)[..., 3] > 0.5
     np.testing.assert_allclose(np.asarray(rendering.depth)[seen], np.asarray(expected.depth)[seen], rtol=1e-4)
-    if name == "hierarchy":  # what is leapt over does not show
+    if name == "blocks":  # what is leapt over does not show
         plain = jv.render(TURNED, SPARSE, views()[1], march_pair(name, leaps=False)[1])
         np.testing.assert_allclose(rendering.rgba, plain.rgba, rtol=0, atol=1e-6)
         # an optimiser passes by the constructor: axes in a plane place nothing

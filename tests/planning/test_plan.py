@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing.blending import Over
 from jaxvol.metrics import rmse
 from jaxvol.planning import search
-from jaxvol.planning.plan import _checked, _occupied, chosen_transforms
-from jaxvol.scene.occupancy import Blocks
+from jaxvol.planning.plan import _checked, chosen_transforms
 
 from ..scenes import scaled_phantom, soft_transfer, uniform_transfer
 
@@ -69,17 +67,12 @@ def test_something_that_lies_beside_all_patches_is_found():
     assert any(part.name == "visible" for part in found.parts)
 
 
-def test_it_is_within_its_tolerance(planned):
+def test_it_is_within_its_tolerance_and_says_what_follows_from_the_scene(planned):
     assert planned.within
     error = error_of(planned, finer=32)
     assert TOLERANCE / 2 < error <= TOLERANCE
     assert 0.9 * planned.error < error < 1.03 * planned.error
-
-
-def test_what_it_decides_follows_from_the_scene(planned):
-    """Empty space is leapt over, and it says why."""
-    assert "SpaceLeaping" in transforms_of(planned)
-    assert "AlphaCorrection" in transforms_of(planned)
+    assert {"SpaceLeaping", "AlphaCorrection"} <= transforms_of(planned)
     assert all(part.why for part in planned.parts)
     for word in ("AlphaCorrection", "SpaceLeaping", "EarlyTermination", "RMSE"):
         assert word in str(planned)
@@ -104,15 +97,6 @@ def test_an_empty_image_is_planned():
     found = plan_of(uniform_transfer(0.0))
     assert found.within
     assert found.error < TOLERANCE / 4
-
-
-def test_visible_blocks_of_all_shapes_are_found_by_one_program():
-    classify = jax.jit(lambda blocks: soft_transfer().visible(blocks))
-    for volume in (SPHERE, SPHERE[:9, :, 3:17]):
-        blocks = Blocks.of(volume)
-        found = _occupied(Over(), soft_transfer(), blocks)
-        np.testing.assert_array_equal(found, classify(blocks))
-        assert 0 < found.sum() < found.size
 
 
 def test_transforms_that_are_part_of_the_scene_are_kept():
@@ -153,33 +137,29 @@ def test_bad_input_is_named(case):
         call()
 
 
+FULL = jv.Volume(0.3 + 0.5 * SPHERE.data, SPHERE.spacing, SPHERE.origin)
+CLIP = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
+# how a scene is planned, how it is rendered, and whether blocks hold nothing that shows
+SCENES: dict[str, tuple[dict[str, Any], dict[str, Any], bool]] = {
+    "average": ({"compositing": "average"}, {"compositing": "average"}, False),
+    "maximum": ({"compositing": "maximum"}, {"compositing": "maximum"}, True),
+    "isosurface": ({"compositing": jv.Isosurface(0.4)}, {"compositing": jv.Isosurface(0.4)}, True),
+    "full": ({"volume": FULL}, {"volume": FULL}, False),
+    "clipped": ({"transforms": (CLIP,)}, {"clip": (CLIP,)}, True),
+    "lit": ({"lighting": jv.lighting.Phong(), "once": True}, {"lighting": jv.lighting.Phong()}, True),
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", ["average", "maximum", jv.Isosurface(0.4)])
-def test_other_modes_are_planned(mode):
-    """They leap where the mode says that nothing shows."""
-    found = plan_of(compositing=mode, tolerance=0.02)
+@pytest.mark.parametrize("scene", SCENES)
+def test_other_scenes_are_within_their_tolerance_and_leap_where_nothing_shows(scene):
+    """All pixels are known, but what the shortest step errs by is an estimate."""
+    how, shown, leaps = SCENES[scene]
+    found = plan_of(**how)
     assert found.within
-    assert ("SpaceLeaping" in transforms_of(found)) == (mode != "average")
-    assert error_of(found, finer=32, compositing=mode) <= 0.02
-
-
-@pytest.mark.slow
-def test_a_full_volume_is_aligned_and_not_leapt_over():
-    full = jv.Volume(0.3 + 0.5 * SPHERE.data, SPHERE.spacing, SPHERE.origin)
-    found = plan_of(volume=full)
+    assert ("SpaceLeaping" in transforms_of(found)) == leaps
     assert "AlphaCorrection" in transforms_of(found)
-    assert "SpaceLeaping" not in transforms_of(found)
-    assert error_of(found, volume=full) <= TOLERANCE
-
-
-@pytest.mark.slow
-def test_a_clipped_scene_is_within_its_tolerance():
-    clip = jv.Clip(planes=[((0.1, 0.0, 0.1), (-0.5, 1.0, 0.3))])
-    found = plan_of(transforms=(clip,))
-    assert {"Clip", "AlphaCorrection"} <= transforms_of(found)
-    # all pixels are known, but what the shortest step errs by is an estimate
-    assert error_of(found, clip=(clip,)) <= min(1.02 * found.error, TOLERANCE)
-    assert found.within
+    assert error_of(found, finer=32, **shown) <= min(1.02 * found.error, TOLERANCE)
 
 
 @pytest.mark.slow
@@ -236,10 +216,3 @@ def test_what_cannot_be_reached_is_said(monkeypatch):
     assert "RMSE unknown" in str(found)
     with pytest.warns(UserWarning, match="may not be within"):
         auto(march="auto", tolerance=2e-4)()
-
-
-@pytest.mark.slow
-def test_light_is_in_the_error():
-    light = jv.lighting.Phong()
-    found = plan_of(tolerance=TOLERANCE / 2, lighting=light, once=True)
-    assert TOLERANCE / 20 < error_of(found, finer=32, lighting=light) <= found.error <= TOLERANCE / 2

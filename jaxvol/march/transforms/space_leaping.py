@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ..._util.checks import integer
+from ..._util.image_record import warn_caller
 from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import BLOCK, FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
@@ -20,7 +21,7 @@ from ..beams import Box, EmptySpaceIndex, Skips, Stretches, View, stretches
 from ..march import Transform
 
 
-Method: TypeAlias = Literal["hierarchy", "distance", "min_distance", "beam"]
+Method: TypeAlias = Literal["blocks", "distance", "min_distance", "beam"]
 
 LEAPS = 4
 """Leaps from block to block between two segments."""
@@ -35,12 +36,12 @@ class SpaceLeaping(Transform):
 
     Args:
         method: how what is empty is found.
-            `"hierarchy"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
+            `"blocks"`: the rays of 8 x 8 pixels leap together, over each stretch of their beam whose
             bounding box holds no visible block of 4³ voxels. Blocks have one level; a table of their sums
             tells of a box of any size whether it is empty, as coarser levels would.
             `"distance"`: each ray leaps as far as a map of chessboard distances to the nearest visible block
             proves empty. Leaps are short where a ray runs along a surface. In a cavity, with blocks of 1, it
-            is the fastest that misses nothing; elsewhere `"hierarchy"` is.
+            is the fastest that misses nothing; elsewhere `"blocks"` is.
             `"min_distance"`: as `"distance"`, from a start that `cell` x `cell` pixels share: the nearest of
             the first hits of their four corner rays. **It is not a bound**: what is thinner than these
             pixels, and nearer than what their corners hit, is missing in the image.
@@ -67,7 +68,7 @@ class SpaceLeaping(Transform):
             rendering several volumes with another block than 4, and, with the last two methods, rays of
             one's own (`render_rays`).
 
-    Source: Chae and Shin for `"distance"` and `"min_distance"`, with blocks of 1; `"hierarchy"` stands for
+    Source: Chae and Shin for `"distance"` and `"min_distance"`, with blocks of 1; `"blocks"` stands for
     the octree of the KISTI report 2005; `"beam"` is unpublished.
     """
 
@@ -76,8 +77,15 @@ class SpaceLeaping(Transform):
     block: int = eqx.field(static=True)
 
     def __init__(
-        self, method: Method = "hierarchy", cell: SupportsIndex = 8, *, block: SupportsIndex = BLOCK
+        self,
+        method: Method | Literal["hierarchy"] = "blocks",
+        cell: SupportsIndex = 8,
+        *,
+        block: SupportsIndex = BLOCK,
     ):
+        if method == "hierarchy":
+            warn_caller('SpaceLeaping("hierarchy") is called SpaceLeaping("blocks") now.')
+            method = "blocks"
         if method not in get_args(Method):
             raise ValueError(f"method must be one of {', '.join(get_args(Method))}; got {method!r}.")
         self.method = method
@@ -96,14 +104,14 @@ class SpaceLeaping(Transform):
 
     def empty_space(self, occupancy: Occupancy, view: View | None) -> EmptySpaceIndex:
         occupancy = jax.lax.stop_gradient(occupancy)
-        if self.method == "hierarchy":
+        if self.method == "blocks":
             return self.index_of(occupancy, Sums.of(occupancy.occupied))
         distances = _Distances(occupancy, occupancy.distance(), None, None, self.cell)
         if self.method == "distance":
             return distances
         if view is None:
             name = f'SpaceLeaping("{self.method}")'
-            raise ValueError(f'{name} needs neighbouring pixels; for rays use "hierarchy" or "distance".')
+            raise ValueError(f'{name} needs neighbouring pixels; for rays use "blocks" or "distance".')
         columns, rows = (jnp.arange(-(-n // self.cell) + 1) * self.cell for n in view.size)
         if self.method == "beam":
             starts = self._beam_starts(occupancy, view, *jnp.meshgrid(columns[:-1], rows[:-1]))
@@ -114,7 +122,7 @@ class SpaceLeaping(Transform):
         return replace(distances, starts=jax.lax.stop_gradient(starts), corner=view.corner)
 
     def index_of(self, occupancy: Occupancy, sums: Sums) -> EmptySpaceIndex:
-        """The index of `"hierarchy"`, from sums of occupied cells."""
+        """The index of `"blocks"`, from sums of occupied cells."""
         return _Beams(occupancy, sums)
 
     def _beam_starts(self, occupancy: Occupancy, view: View, column: Array, row: Array) -> Array:

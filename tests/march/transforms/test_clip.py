@@ -218,7 +218,7 @@ def test_with_labels_cells_are_cut_at_labels_and_cuts(inside_out, quadrature):
 # ---- empty space ----
 
 
-@pytest.mark.parametrize("method", ["hierarchy", *slow("beam")])
+@pytest.mark.parametrize("method", ["blocks", *slow("beam")])
 def test_what_is_cut_away_is_leapt_over(method):
     """In a volume that is visible everywhere, there is nothing else to leap over."""
     box = (-0.7, 0.7) * 3

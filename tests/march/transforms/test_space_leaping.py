@@ -92,10 +92,10 @@ KINDS = st.sampled_from(["noise", "sparse", "half", "blobs"])
 SEEDS = st.integers(0, 10**6)
 
 
-@pytest.mark.parametrize("method", ["hierarchy", "voxels", *slow("beam", "distance")])
+@pytest.mark.parametrize("method", ["blocks", "voxels", *slow("beam", "distance")])
 def test_leaping_does_not_show(method):
     """In random scenes, each volume after another one, so that nothing stale is used; and saves samples."""
-    transforms = MOVING if method == "hierarchy" else MOVING[:1]
+    transforms = MOVING if method == "blocks" else MOVING[:1]
 
     def compared(volume, transfer, camera, step):
         """The numbers of samples, without leaps and with them."""
@@ -202,7 +202,7 @@ def random_rays(spacing, data, transfer, seed):
     return (target * spacing - away * direction).astype(np.float32), direction.astype(np.float32)
 
 
-@pytest.mark.parametrize("method", ["hierarchy", *slow("distance")])
+@pytest.mark.parametrize("method", ["blocks", *slow("distance")])
 def test_no_ray_misses_what_is_seen(method):
     for seed, (case, (data, transfer)) in enumerate(ADVERSARIAL.items()):
         spacing = SPACINGS[seed % 2]
@@ -216,7 +216,7 @@ def test_no_ray_misses_what_is_seen(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "cell"), [("hierarchy", 8), ("beam", 5), ("beam", 32)])
+@pytest.mark.parametrize(("method", "cell"), [("blocks", 8), ("beam", 5), ("beam", 32)])
 def test_no_beam_misses_what_is_seen(cell, method):
     for number, (data, transfer) in enumerate(ADVERSARIAL.values()):
         volume = jv.Volume(data, SPACINGS[number % 2])
@@ -255,13 +255,13 @@ def test_min_distance_misses_a_voxel_between_the_corners_of_a_cell():
 @pytest.mark.parametrize("method", ["beam", "min_distance"])
 def test_rays_of_ones_own_have_no_neighbours(method):
     march = jv.March(0.2, (jv.SpaceLeaping(method),))
-    with pytest.raises(ValueError, match=rf'SpaceLeaping\("{method}"\) needs .* "hierarchy" or "distance"'):
+    with pytest.raises(ValueError, match=rf'SpaceLeaping\("{method}"\) needs .* "blocks" or "distance"'):
         jv.render_rays(jv.Volume(voxel(3, 3, 3)), BRIGHT, [[-1.0, 0, 0]], [[1.0, 0, 0]], march)
 
 
 def test_bad_arguments_are_named():
     for arguments, message in {
-        ("octree",): "method must be one of hierarchy, distance, min_distance, beam; got 'octree'",
+        ("octree",): "method must be one of blocks, distance, min_distance, beam; got 'octree'",
         ("beam", 1): "cell .* 1",
         ("beam", 2.5): "cell .* 2.5",
     }.items():
@@ -273,13 +273,15 @@ def test_bad_arguments_are_named():
     ):
         with pytest.raises(ValueError, match=message):
             jv.SpaceLeaping(method, block=block)
+    with pytest.warns(UserWarning, match='is called SpaceLeaping."blocks".'):
+        assert jv.SpaceLeaping("hierarchy") == jv.SpaceLeaping()
 
 
 # ---- other spaces, other transfer functions ----
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["hierarchy", "beam"])
+@pytest.mark.parametrize("method", ["blocks", "beam"])
 def test_leaping_does_not_show_under_a_toroidal_map(method):
     seen = 0
     for name in ("spheres", "shells"):
@@ -310,7 +312,7 @@ def test_labels_that_are_hidden_are_leapt_over():
     for shown in ([see, None, None], [None, see, None], [None, None, see]):
         transfer = jv.LabelTransferFunction(shown)
         whole, leapt = (
-            jv.render(volume, transfer, camera, jv.March(0.017, leaping(transforms, "hierarchy", on)))
+            jv.render(volume, transfer, camera, jv.March(0.017, leaping(transforms, "blocks", on)))
             for on in (False, True)
         )
         assert_same(leapt, whole)
@@ -326,7 +328,7 @@ def test_inside_jit_data_and_transfer_function_are_those_of_the_call():
     @eqx.filter_jit
     def image(data, transfer, on):
         updated = eqx.tree_at(lambda v: v.data, volume, data)
-        return jv.render(updated, transfer, camera, jv.March(0.02, leaping((), "hierarchy", on)))
+        return jv.render(updated, transfer, camera, jv.March(0.02, leaping((), "blocks", on)))
 
     for seed in range(4):
         arguments = np.float32(contents("blobs", 70 + seed)), table(seed, 1.0)
@@ -387,7 +389,7 @@ def test_a_beam_holds_all_pixels_of_its_cell():
     assert seen > 10
 
 
-@pytest.mark.parametrize("method", ["hierarchy", *slow("distance", "beam")])
+@pytest.mark.parametrize("method", ["blocks", *slow("distance", "beam")])
 def test_leaps_show_in_no_image_of_a_turned_and_sheared_volume(method):
     """In float32, as users render, by a function of many points."""
     rng = np.random.default_rng(5)
