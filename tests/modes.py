@@ -13,8 +13,7 @@ from jaxvol.fitting.bijections import Bijection, Fixed
 from jaxvol.fitting.constraints import _default
 
 from . import oracle
-from .scenes import LEAVES, RESOLUTION, soft_transfer
-from .test_agreement import random_numbers
+from .scenes import LEAVES, RESOLUTION, random_numbers, soft_transfer
 
 
 class Additive(jv.Weighting):

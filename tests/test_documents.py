@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
+from docs import registry
 
 from .reference import ROOT
 
@@ -48,6 +49,11 @@ def assert_tells_something(value):
     floats = [leaf for leaf in leaves if np.issubdtype(leaf.dtype, np.inexact)]
     assert all(np.isfinite(leaf).all() for leaf in floats)
     assert any(leaf.any() for leaf in floats)
+
+
+def test_the_table_of_transforms_in_readme_is_that_of_their_docstrings():
+    """`python -m docs.registry` writes it."""
+    assert registry.of_readme() in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_first_example_of_readme_runs(tmp_path, monkeypatch):
