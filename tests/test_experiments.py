@@ -4,11 +4,10 @@ import importlib
 from argparse import Namespace
 from pathlib import Path
 
-import jax
 import pytest
 from skimage.io import imread
 
-from experiments import charts, gradient_errors, record, redraw
+from experiments import charts, record, redraw
 from experiments.harness import experiment, recorded
 
 
@@ -57,17 +56,6 @@ def test_what_is_not_measured_again_is_kept_with_its_commit_if_it_is_of_the_same
     assert recorded(chosen, "rows", ["b"], {"size": 4}) == {}
     chosen.quick = True
     assert recorded(chosen, "rows", ["b"], {"size": 3}) == {}
-
-
-@pytest.mark.slow
-def test_gradients_miss_jumps_at_the_exit_alone(tmp_path):
-    gradient_errors.main(["--quick", "--output", str(tmp_path)])
-    jax.clear_caches()
-    rows = record.read(tmp_path / "gradient_errors.json")["result"]["relative errors"]["left"]
-    plain, aligned = rows["ray casting"], rows["ray casting" + gradient_errors.CUT]
-    assert plain["position"][0] < 1e-6  # a short difference crosses no jump
-    assert aligned["position"][-1] < 0.05 < 0.5 < plain["position"][-1]
-    assert plain["colours"][-1] < 1e-6
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
