@@ -1,7 +1,7 @@
 """Draws charts and pages from their records; nothing is measured.
 
 `python -m experiments.redraw` draws all, `--only speed kisti` some. They are not kept beside the records, and
-the documentation draws its own; pictures of scenes are. `pareto.html` has those that its experiment left here.
+the documentation draws its own; pictures of scenes are. `pareto.html` has those that were left here.
 
 To measure a result again, run the `command` of its record, on a machine that does nothing else; at its
 commit, if its experiment is in the tree no longer.
