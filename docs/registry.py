@@ -22,7 +22,7 @@ SEAMS = "locate", "clip", "start", "shift", "empty_space", "cut", "stop"
 
 def subclasses(base: type) -> list[type[Any]]:
     """Public classes that are finished subclasses of a public one."""
-    public = [getattr(jv, name) for name in jv.__all__]
+    public = [getattr(jv, name) for name in dir(jv)]
     kinds = [kind for kind in public if inspect.isclass(kind) and issubclass(kind, base)]
     return [kind for kind in kinds if kind is not base and not inspect.isabstract(kind)]
 
