@@ -4,8 +4,8 @@
   places: a page of `docs/` names `../paper_figs/README.md`, as it must where the repository is read.
 - Charts and pages of records are drawn from these, as `python -m experiments.redraw` does.
 - `<!-- section FILE: HEADING -->` is replaced by the text under that heading of a Markdown file.
-- `<!-- table failures -->`, `<!-- table pictures -->`, `<!-- table records -->` and `<!-- table references
-  -->` are replaced by tables, made from the failure atlas' record, all records, and CITATION.cff.
+- `<!-- table NAME -->` is replaced by a table: `failures` and `pictures` from the failure atlas' record,
+  `records` from all, `references` from CITATION.cff, the others from docstrings (`docs/registry.py`).
 """
 
 import json
@@ -24,6 +24,10 @@ from mkdocs.structure.files import File
 
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+from docs import registry  # noqa: E402
+
+
 DOCS = "docs"
 OUTSIDE = (
     "CONTRIBUTING.md",
@@ -72,7 +76,7 @@ def drawn() -> "TemporaryDirectory[str]":
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
-    here = page.file.src_uri
+    here, markdown = page.file.src_uri, registry.with_entries(markdown)
     outside = not (ROOT / DOCS / here).is_file()
     names = {file.src_uri for file in files}
     markdown = relinked(markdown, here if outside else f"{DOCS}/{here}", here, names)
@@ -193,6 +197,7 @@ def commits_since(commit: str) -> str:
 
 
 TABLES = {"failures": failures, "pictures": pictures, "records": records, "references": references}
+TABLES |= {"transforms": registry.transforms, "modes": registry.modes}
 
 
 def on_post_build(config: Any) -> None:

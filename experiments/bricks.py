@@ -44,7 +44,6 @@ A, B = 70.04, 338.11
 """Of the probe, mm."""
 BETA, SIGMA = math.radians(57.29), math.radians(103.64)
 """Ranges of angles."""
-PIXELS = 375
 BEST = 2, 4, 2
 
 NEAR, DEEP = 245.0, 349.0

@@ -54,10 +54,6 @@ def _scene(volume: jv.Volume, points: list[Any], unit_distance: float) -> Scene:
     return volume, jv.TransferFunction.from_points(points, unit_distance), march
 
 
-def head(folder: Path | None, resolution: int) -> Scene:
-    return _scene(jv.phantom("head", resolution), HEAD_POINTS, 0.1)
-
-
 def engine(folder: Path, resolution: int) -> Scene:
     """Real data, subsampled to about `resolution` voxels along the longest axis."""
     whole = jv.load(folder / ENGINE)
@@ -127,7 +123,8 @@ def draw(result: dict[str, Any]) -> Any:
 
 @experiment(size=96, resolution=96, quick={"size": 24, "resolution": 24})
 def main(chosen: Namespace) -> dict[str, Any]:
-    folder, scenes = harness.data(), {"head phantom": measure(head(None, chosen.resolution), chosen.size)}
+    head = _scene(jv.phantom("head", chosen.resolution), HEAD_POINTS, 0.1)
+    folder, scenes = harness.data(), {"head phantom": measure(head, chosen.size)}
     if folder is not None and not chosen.quick:
         scenes["engine"] = measure(engine(folder, chosen.resolution), chosen.size)
     return {"goal": GOAL, "scenes": scenes}

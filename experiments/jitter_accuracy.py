@@ -3,21 +3,14 @@
 *By step*: five marches on two scenes, a block whose left half is cut by the box's faces and whose right half
 is an inclined plane (its comb of rings has a known frequency), and the head phantom, its crown cut off, in
 perspective. Measured against a converged image are wood grain, noise on cut faces and the whole error (RMSE);
-also, the samples that are taken, over those of ray casting (`overhead` has times). The head's wood grain is
-measured off its cut face, where empty-space jitter must not act, and again off where rays leave it, too,
-which alone alignment changes.
+also, samples over those of ray casting (`overhead` has times). The head's wood grain is measured off its cut
+face, where empty-space jitter must not act, and again off where rays leave it, which alignment changes.
 
 *Conditions*: the same on skin, of the phantom and of CT as in the pictures of Kye's Fig. 9, unlit, by Phong's
 shading (the paper's base method shades), pre-integrated, and lit with leaps and early ends.
 
 *Alignment*: which part of the pixels of the pictures of Kye's Figs. 9 to 12 it changes, with and without
-early ends and leaps, which are why the paper expects "not many"; and by which quadrature it lowers what it
-raises by the left rule, whose cells show too little where rays enter material, and whose last ones, where
-they reach past the exit, make up for it.
-
-Jitter turns structure into noise and does not make an image more accurate: off the cut face its RMSE is about
-that of ray casting. On the face, where the first sample of every ray lies at its entry under ray casting,
-plain jitter can be nearer to the truth in the mean, or farther; it is noisier in any case.
+early ends and leaps; and by which quadrature it lowers what it raises by the left rule.
 """
 
 import textwrap
@@ -36,13 +29,7 @@ from .pictures import kye
 from .scenes import Scene, cropped
 
 
-METHODS = {
-    marches.PLAIN: "k-",
-    marches.JITTER: "C3--",
-    marches.EMPTY: "C0-",
-    marches.ALIGNED: "C2:",
-    marches.BOTH: "C1-.",
-}
+METHODS = dict(zip(marches.NAMES, ("k-", "C3--", "C0-", "C2:", "C1-."), strict=True))
 """With their styles in the chart."""
 STEPS = (4.3, 2.3, 1.3, 0.7)
 """In voxels. Not whole or half ones: in the orthographic view the samples of all rays would then lie alike on
@@ -109,10 +96,14 @@ def skin(scene: Scene) -> Faced:
     return Faced(scene, grain, face)
 
 
+def colors(rendering: jv.Rendering) -> np.ndarray:
+    return np.asarray(rendering.rgba[..., :3], np.float64)
+
+
 def by_march(
-    of: Faced, step: float, truth: np.ndarray, how: tuple[Any, ...], seed: int
+    of: Faced, step: float, truth: np.ndarray, how: tuple[Any, ...], seed: int, exits: Any = None
 ) -> dict[str, dict[str, Any]]:
-    """Measures of the image of every march, at a step in voxels."""
+    """Measures of the image of every march, at a step in voxels; the mean error of pixels at `exits`."""
     (scene, grain, face), (lighting, quadrature, more) = of, how
     length, rows, plain = step * scene.step, {}, 0
     for name in METHODS:
@@ -121,18 +112,15 @@ def by_march(
         error = colors(rendering) - truth
         samples = int(np.sum(np.asarray(rendering.samples), dtype=np.int64))
         plain = plain or samples
-        rows[name] = {
-            **grain(error, length),
+        rows[name] = grain(error, length) | {
             "boundary noise": boundary_noise(error, face),
             "rmse": float(np.sqrt(np.mean(error**2))),
             "rmse off the face": float(np.sqrt(np.mean(error[~face] ** 2))),
             "samples / ray casting": samples / plain,
         }
+        if exits is not None:
+            rows[name]["mean error where rays leave through material"] = float(error[exits].mean())
     return rows
-
-
-def colors(rendering: jv.Rendering) -> np.ndarray:
-    return np.asarray(rendering.rgba[..., :3], np.float64)
 
 
 def by_step(of: Faced, chosen: Namespace) -> list[dict[str, Any]]:
@@ -178,18 +166,11 @@ def aligned_shares(chosen: Namespace) -> dict[str, Any]:
 
 
 def alignment_by_quadrature(of: Faced, chosen: Namespace) -> dict[str, Any]:
-    """At the shortest step: wood grain, and the mean error of the pixels that alignment changes."""
-    scene, grain, _ = of
-    step = min(chosen.steps) * scene.step
-    truth, exits = colors(frame(scene, marches.converged(step))), left(scene)
-    found: dict[str, Any] = {}
-    for quadrature in ("left", "midpoint"):
-        for name in (marches.PLAIN, marches.ALIGNED):
-            march = jv.March(step, marches.transforms(name), quadrature)
-            error = colors(frame(scene, march)) - truth
-            mean = {"mean error where rays leave through material": float(error[exits].mean())}
-            found.setdefault(quadrature, {})[name] = grain(error, step) | mean
-    return found
+    """At the shortest step: the measures, with the mean error of the pixels that alignment changes."""
+    step = min(chosen.steps)
+    truth, exits = colors(frame(of.scene, marches.converged(step * of.scene.step))), left(of.scene)
+    rules = ("left", "midpoint")
+    return {rule: by_march(of, step, truth, (None, rule, ()), chosen.seed, exits) for rule in rules}
 
 
 def draw(result: dict[str, Any]) -> Any:

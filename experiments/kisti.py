@@ -8,9 +8,8 @@ report's best, 4.55, everywhere without shading, and the report's own speed-up i
 The report's empty-space skipping fetches every sample and skips the shading of those that are transparent:
 "shading skipped" here; ours does not fetch them either. It tests early termination every 16 slices; so
 segments of 1, 4, 8 and 16 samples, between which ended rays are looked for, are measured, too. Its transfer
-functions are of value and gradient; it does not print them, so that ours are by value, and once by both.
-Steps are one voxel long. Without the folder JAXVOL_DATA of real volumes, the phantoms of a head and an engine
-stand in.
+functions are of value and gradient, and not printed: ours are by value, and once by both. Steps are one voxel
+long. Without the folder JAXVOL_DATA of real volumes, phantoms stand in.
 """
 
 import math

@@ -6,8 +6,8 @@ RMSE against one that blends many templates under soft occlusion and lights all 
 
 Times are multiples of the unlit frame. The paper's own, 2.2 (Lee, Kwon and Shin 2016: 20-24 frames per
 second in place of 42-56), is of several materials and 56-63 photons a template, where there are one and 16-19
-here: `published_light.py` measures under its conditions. Rows of the record of light that was baked, or
-deferred, are by an earlier commit, which had these.
+here: `published_light.json` is under its conditions. Rows of the record of light that was baked, or deferred,
+are by an earlier commit, which had these.
 """
 
 from argparse import Namespace

@@ -1,19 +1,10 @@
-"""The marches that Kye 2013 compares: the four columns of its Table 1, and alignment alone.
-
-Alignment corrects the exit whether or not the samples are jittered. Alone, it shows its own share of the gain
-of both proposed methods, as the paper's Fig. 12 does.
-"""
+"""The marches that Kye 2013 compares: the columns of its Table 1, and alignment alone, as in its Fig. 12."""
 
 import jaxvol as jv
 
 
-PLAIN, JITTER, EMPTY, ALIGNED, BOTH = (
-    "ray casting",
-    "jittered",
-    "empty-space jittered",
-    "aligned",
-    "empty-space jittered, aligned",
-)
+NAMES = "ray casting", "jittered", "empty-space jittered", "aligned", "empty-space jittered, aligned"
+PLAIN, JITTER, EMPTY, ALIGNED, BOTH = NAMES
 
 
 def transforms(name: str, seed: int = 0) -> tuple[jv.Transform, ...]:

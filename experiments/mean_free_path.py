@@ -48,18 +48,9 @@ MATERIALS = {
     "ball": (60.0, 256.0, COLOR, 2 * RADIUS, 0.2),
     "ball, opacity 50 %": (60.0, 256.0, COLOR, 2 * RADIUS, 0.5),
     "CT of a head": (500.0, 5000.0, COLOR, 0.3, 0.5),
-    "flesh": (50.0, 170.0, (0.75, 0.35, 0.27), 0.3, 0.3),
-    "bone": (170.0, 256.0, (0.9, 0.88, 0.8), 0.2, 0.1),
-    "skin": (50.0, 105.0, (0.85, 0.6, 0.5), 0.5, 0.2),
-    "muscle": (105.0, 170.0, (0.75, 0.35, 0.27), 0.3, 0.3),
 }
 """Low and high value, colour, mean free path and opacity; balls are one mean free path thick."""
-MARKS = {
-    TRANSPORT + KNOWN: "C0^",
-    TRANSPORT + TIED: "C9^",
-    PATHS: "C2o",
-    STAGES: "ko",
-}
+MARKS = {TRANSPORT + KNOWN: "C0^", TRANSPORT + TIED: "C9^", PATHS: "C2o", STAGES: "ko"}
 PER_PATH = 3
 """Nodes of templates by transport per mean free path of the ball, as long as there are few."""
 
@@ -219,11 +210,8 @@ def told(found: jv.Fit, truth: dict[str, Any], start: dict[str, Any]) -> dict[st
     }
 
 
-def from_paths(
-    scene: Scene, truth: dict[str, Any], chosen: Namespace, *, known: bool = True
-) -> dict[str, dict[str, Any]]:
-    """Fit mean free paths to path-traced views, in all ways; or in those of an extinction that is not
-    `known`."""
+def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[str, dict[str, Any]]:
+    """Fit mean free paths to path-traced views, in all ways."""
     views = scene.views(truth, chosen.size, chosen.paths)
     transport = jv.ImageResidual(scene.transport, views, (0, 0, 0))
     paths = jv.PathTracedResidual(scene.traced, views, (0, 0, 0), paths=16, key=scene.seed)
@@ -234,8 +222,6 @@ def from_paths(
     ]
     rows: dict[str, dict[str, Any]] = {}
     for names, residuals, tied in ways:
-        if tied == 0 and not known:
-            continue
         start, begun = times(1 / 3, truth) | {"tied": jnp.float32(tied)}, time.perf_counter()
         how = {"constraints": FIXED, "max_steps": chosen.steps, "patience": 3, "rtol": 1e-3}
         with warnings.catch_warnings(record=True) as caught:

@@ -5,10 +5,8 @@ casting, jittered, empty-space jittered, and both proposed methods. Frames of al
 and times are given as the median of their ratios to ray casting, with each image's RMSE against a converged
 one, and the part of its pixels that alignment changes. The goal is a ratio of at most 1.02 for both proposed
 methods, in the geometric mean. Two of the volumes end in air on all sides, so that alignment would do nothing
-there: a part of each is shown, enlarged, as the paper does.
-
-The same again as in the paper: where all four marches leap over empty space and end rays early. Frames are
-then shorter, and the goal is 1.05.
+there: a part of each is shown, enlarged, as the paper does. The same again as in the paper, where all four
+marches leap over empty space and end rays early: frames are then shorter, and the goal is 1.05.
 """
 
 from argparse import Namespace
@@ -23,8 +21,7 @@ from .harness import chosen_scenes, compare, experiment, geometric_mean, some_of
 from .scenes import PHANTOM, SCENES, cut
 
 
-METHODS = {marches.PLAIN: "k", marches.JITTER: "C3", marches.EMPTY: "C0", marches.BOTH: "C1"}
-"""With their colours in the chart."""
+METHODS = {marches.PLAIN: "k", marches.JITTER: "C3", marches.EMPTY: "C0", marches.BOTH: "C1"}  # with colours
 CUT: dict[str, Any] = {
     "engine": ((0.4, 0, 0), (1, 1, 0.6), 1.5),
     "aneurism": ((0, 0, 0), (1, 0.4, 1), 2.5, (0.45, 0.45)),
@@ -39,8 +36,6 @@ CONDITIONS: dict[str, tuple[tuple[jv.Transform, ...], float]] = {
     "as in the paper": ((jv.SpaceLeaping(), jv.EarlyTermination(1 / 255)), 1.05),
 }
 """Transforms of all marches, and the goal."""
-SHOWN = {"as in the paper": "leaps and early ends, as in the paper"}
-"""How a condition is called in the chart, where not as in the record."""
 
 
 def draw(result: dict[str, Any]) -> Any:
@@ -57,8 +52,7 @@ def draw(result: dict[str, Any]) -> Any:
                 charts.interval(panel, rows[name]["ratio"], number + 0.22 * (shift - 1), color, label)
         panel.axvline(1, color="k", linewidth=0.8)
         panel.axvline(goal, color="k", linewidth=0.8, linestyle=":")
-        said = SHOWN.get(condition, condition)
-        panel.set_title(f"{said},\n{pixels} x {pixels} pixels; dotted: goal, {goal}")
+        panel.set_title(f"{condition},\n{pixels} x {pixels} pixels; dotted: goal, {goal}")
         panel.set_yticks(range(volumes), list(measured))
     axes[0, 0].invert_yaxis()
     figure.supxlabel("time of a frame / that of ray casting: median of paired ratios, 95 % interval")

@@ -24,7 +24,6 @@ import numpy as np
 import jaxvol as jv
 
 from . import harness
-from .fit_pose import coarse_to_fine
 from .harness import experiment
 
 
@@ -62,6 +61,15 @@ class Scene(eqx.Module):
     def __call__(self, probe: jv.ToroidalMap, camera: jv.Camera) -> Any:
         march = jv.March(self.step, (probe, jv.AlphaCorrection()), "midpoint")
         return self.volume, self.transfer, camera, march
+
+
+def coarse_to_fine(residual: jv.ImageResidual, start: Any, blurs: Any, **options: Any) -> list[jv.Fit]:
+    """Fits to images blurred less and less, each from where the last one ended."""
+    fits: list[jv.Fit] = []
+    for blur in blurs:
+        start = fits[-1].parameters if fits else start
+        fits.append(jv.fit(residual.blurred(blur), start, **options))
+    return fits
 
 
 def phantom(

@@ -1,12 +1,13 @@
 """Draws charts and pages from their records; nothing is measured.
 
 `python -m experiments.redraw` draws all, `--only speed kisti` some. They are not kept beside the records, and
-the documentation draws its own. `path_traced.webp`, `transport.webp`, `tomography.png` and `lit.png` are
-drawn by their experiments alone. `pareto.html` holds images only if its experiment left some here.
+the documentation draws its own; pictures of scenes are. `pareto.html` has those that were left here.
 
-To measure a result again, run the `command` of its record, on a machine that does nothing else.
+To measure a result again, run the `command` of its record, on a machine that does nothing else; at its
+commit, if its experiment is in the tree no longer.
 """
 
+import re
 from argparse import Namespace
 from pathlib import Path
 
@@ -14,25 +15,17 @@ from . import charts, record
 from .harness import command, some_of
 
 
+def is_drawn(name: str) -> bool:
+    """Whether the experiment of a record is in the tree, and draws it from what it holds."""
+    module = record.read(record.RESULTS / f"{name}.json")["command"].split()[2]
+    file = Path(__file__).parent.parent / f"{module.replace('.', '/')}.py"
+    return file.is_file() and bool(
+        re.search(r"^(def )?draw\b", file.read_text(encoding="utf-8"), re.MULTILINE)
+    )
+
+
 NAMES = sorted(file.stem for file in record.RESULTS.glob("*.json"))
-IMAGES = {"path_traced", "tomography", "transport"}
-"""Records whose charts show images that no record holds."""
-OTHERS = {
-    *(
-        "adaptive_error",
-        "bricks",
-        "bricks_once",
-        "compare",
-        "compare_avx512",
-        "compare_gpu",
-        "compare_small",
-        "compare_untuned",
-    ),
-    *("gradient_agreement", "gradient_agreement_gpu", "octree", "out_of_core", "probe_geometry", "shading"),
-    *("viewer_latency", "visible_shading"),
-}
-"""Records without a chart."""
-DRAWN = [name for name in NAMES if name not in IMAGES | OTHERS]
+DRAWN = [name for name in NAMES if is_drawn(name)]
 
 
 @command(

@@ -6,21 +6,14 @@ threads as there are cores, or JAX's GPU. Frames are drawn in turn: a ratio is t
 program's time over ours. Beside each time stands the RMSE of its image, over white, against one converged
 image of ours; VTK's image is compared with that image as VTK's display would show it.
 
-Also measured: our frame as a program under `jax.jit`, without what Python does before it; the time from the
-start of a fresh process to its first image; and, with --gradients, an image with the gradient of every entry
-of a transfer function (256 for 8-bit data), and with that of every voxel as float32, relative to the image
-alone and to Dr.Jit's replay adjoint, with the relative difference of the two gradients.
+Also measured: our frame as a program under `jax.jit`, without what Python does before it; and, with
+--gradients, an image with the gradient of every entry of a transfer function (256 for 8-bit data), and with
+that of every voxel as float32, relative to the image alone and to Dr.Jit's replay adjoint, with the relative
+difference of the two gradients. Records until e296103 have the time to a process' first image, too.
 """
 
-import json
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from argparse import Namespace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import equinox as eqx
@@ -118,49 +111,6 @@ def gradients(
     return found
 
 
-CHILD = """
-import json, sys, time
-begun, voxels, size, left = sys.argv[1:]
-import numpy as np
-import jax
-import jaxvol as jv
-imported = time.time()
-from experiments.scenes import seen_head
-data = np.load(voxels)
-volume = jv.Volume(data, (2 / (data.shape[0] - 1),) * 3, (-1.0,) * 3)
-scene = seen_head(volume, int(size))
-march = jv.March(scene.step, (jv.SpaceLeaping(), jv.EarlyTermination(float(left))))
-ready = time.time()
-jax.block_until_ready(jv.render(*scene[:3], march, outputs="rgba"))
-times = [at - float(begun) for at in (imported, ready, time.time())]
-print(json.dumps(dict(zip(("import", "scene", "image"), times))))
-"""
-
-
-def first_image(size: int, resolution: int, repetitions: int) -> dict[str, Any]:
-    """Seconds from the start of a process until import, scene and image of the head phantom are done: without
-    a compilation cache, and where programs were compiled before."""
-    found: dict[str, Any] = {"pixels": size, "voxels": resolution}
-    with tempfile.TemporaryDirectory() as folder:
-        voxels = Path(folder) / "voxels.npy"
-        np.save(voxels, np.asarray(jv.phantom("head", resolution).data))
-
-        def child(more: dict[str, str]) -> dict[str, float]:
-            settings = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"} | more
-            words = [sys.executable, "-c", CHILD, str(time.time()), str(voxels), str(size), str(LEFT)]
-            root = Path(__file__).parent.parent
-            return json.loads(
-                subprocess.check_output(words, cwd=root, env=settings, text=True).splitlines()[-1]
-            )
-
-        warm = {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        child(warm)  # fills the cache
-        for name, more in (("nothing kept", {}), ("compiled before", warm)):
-            times = [child(more) for _ in range(repetitions)]
-            found[name] = {part: timing.median([t[part] for t in times]) for part in times[0]}
-    return found
-
-
 def draw(result: dict[str, Any]) -> Any:
     """Each program's time over ours, scene by scene."""
     sizes, volumes = result["sizes"], result["volumes"]
@@ -197,8 +147,7 @@ def draw(result: dict[str, Any]) -> Any:
     gradients={"action": "store_true", "help": "measure gradients, too, at the first size"},
     resolution=256,
     steps={"type": int, "default": 1, "help": "steps to a voxel"},
-    processes={"type": int, "default": 5, "help": "fresh processes, each of which draws a first image"},
-    quick={"sizes": (32, 48), "repetitions": 2, "resolution": 32, "processes": 1},
+    quick={"sizes": (32, 48), "repetitions": 2, "resolution": 32},
 )
 def main(chosen: Namespace) -> dict[str, Any]:
     there = programs.peers()
@@ -220,7 +169,6 @@ def main(chosen: Namespace) -> dict[str, Any]:
         "goal": GOAL,
         "peers": there,
         "geometric means": means,
-        "first image": first_image(chosen.sizes[0], chosen.resolution, chosen.processes),
         "volumes": volumes,
         "gradients": slopes,
     }

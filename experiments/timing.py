@@ -1,8 +1,7 @@
 """How much longer does one program take than another? Both run in turn, and each pair of runs gives a ratio.
 
-The speed of a machine drifts by more than the differences that are measured here. Consecutive runs see the
-same machine, so their ratio is stable where their times are not, and the median of the ratios ignores runs
-that something else disturbed.
+The speed of a machine drifts, but consecutive runs see the same one: their ratio is stable where their times
+are not, and the median of the ratios ignores runs that something else disturbed.
 """
 
 import time

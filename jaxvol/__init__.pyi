@@ -41,15 +41,12 @@ from .io.phantoms import colon_path as colon_path, phantom as phantom, toroidal_
 from .io.scan_conversion import scan_convert as scan_convert
 from .lighting import Material as Material, scatterer_template as scatterer_template
 from .march.march import March as March, Transform as Transform
-from .march.transforms import (
-    AlphaCorrection as AlphaCorrection,
-    Clip as Clip,
-    EarlyTermination as EarlyTermination,
-    EmptySpaceJitter as EmptySpaceJitter,
-    Jitter as Jitter,
-    SpaceLeaping as SpaceLeaping,
-    ToroidalMap as ToroidalMap,
-)
+from .march.transforms.alpha_correction import AlphaCorrection as AlphaCorrection
+from .march.transforms.clip import Clip as Clip
+from .march.transforms.early_termination import EarlyTermination as EarlyTermination
+from .march.transforms.jitter import EmptySpaceJitter as EmptySpaceJitter, Jitter as Jitter
+from .march.transforms.space_leaping import SpaceLeaping as SpaceLeaping
+from .march.transforms.toroidal_map import ToroidalMap as ToroidalMap
 from .path_tracing import PathTraced as PathTraced, path_trace as path_trace
 from .planning import Plan as Plan, plan as plan
 from .reference import render_ray_reference as render_ray_reference

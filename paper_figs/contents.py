@@ -310,7 +310,7 @@ ENTRIES = (
         "A head and a frog, as phantoms, and CT and labels below each, in place of Visible Korean, under "
         "hard occlusion: unlit; 8 templates blended, the paper's remedy against noise; one of 8 for each "
         "pixel; one a material. Times, under the paper's conditions: 21, 6.4 and 5.2 times the plain, unlit "
-        "frame (`experiments/published_light.py`).",
+        "frame (`published_light.json`).",
         data=True,
     ),
     Entry(

@@ -1,6 +1,7 @@
 """Compositing modes: what pixels show of values along rays, in NumPy; gradients by central differences."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,12 +10,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 import jaxvol as jv
+from docs.registry import subclasses
 from jaxvol.fitting.bijections import Bijection, Fixed
 from jaxvol.fitting.constraints import _default
 
 from . import oracle
-from .scenes import LEAVES, RESOLUTION, soft_transfer
-from .test_agreement import random_numbers
+from .scenes import LEAVES, RESOLUTION, random_numbers, soft_transfer
 
 
 class Additive(jv.Weighting):
@@ -41,20 +42,6 @@ class FoggedSurface(jv.Isosurface):
 
 VALUE = 0.45
 """Of the isosurface, for values from 0 to 1."""
-
-MODES: dict[str, jv.Weighting | jv.Selection] = {
-    "over": jv.Over(),
-    "additive": Additive(),
-    "average": jv.Average(0.5),
-    "integral": jv.LineIntegral(),
-    "maximum": jv.Maximum(0.5),
-    "minimum": jv.Minimum(0.5),
-    "first visible": jv.FirstVisible(),
-    "isosurface": jv.Isosurface(VALUE),
-}
-
-QUADRATURE: dict[str, Any] = {"average": "midpoint"}
-"""By which marches of a mode sample; else "left"."""
 
 
 def ball_in_a_corner():
@@ -128,65 +115,34 @@ class Rays:
         return front, np.clip(self.length[:, None] - front, 0, step)
 
 
-def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
-    """What pixels show under a mode of `MODES`, by NumPy, with `EmptySpaceJitter` and cells that are cut at
-    the exit: rgba, distance, and how many samples the rays have. `value`: of the isosurface."""
-    rays = Rays(volume, camera)
+class Cells(NamedTuple):
+    """What NumPy knows of the cells of rays, arrays (rays, cells); `value`: of the isosurface."""
 
-    def crosses(front, width):
-        return (rays.value(front) >= value) != (rays.value(front + width) >= value)
+    rays: Rays
+    transfer: jv.TransferFunction
+    front: np.ndarray
+    width: np.ndarray
+    depth: np.ndarray
+    values: np.ndarray
+    value: float
 
-    def empty(front, width):
-        if name == "isosurface":
-            return ~crosses(front, width)
-        return classified(transfer, rays.value(front))[1] == 0
+    @property
+    def extinction(self):
+        return classified(self.transfer, self.values)[1]
 
-    start = None if name == "average" else random_numbers(jitter, camera)
-    front, width = rays.cells(step, start, None if name == "average" else empty)
-    depth, valid = front + width / 2 * (name == "average"), width > 0
-    values = rays.value(depth)
-    color, extinction = classified(transfer, values)
-    alpha = -np.expm1(-extinction * width)
-    if name in ("over", "additive", "average", "integral"):
-        hidden = np.concatenate([np.ones((len(alpha), 1)), np.cumprod(1 - alpha, axis=1)[:, :-1]], axis=1)
-        weight = {
-            "over": hidden * alpha,
-            "additive": 0.01 * alpha,
-            "average": width,
-            "integral": extinction * width,
-        }[name]
-        opacity = weight.sum(axis=1)
-        whole = np.where(opacity > 0, opacity, 1)
-        depth = np.where(opacity > 0, (weight * depth).sum(axis=1) / whole, np.inf)
-        premultiplied = (weight[..., None] * color).sum(axis=1)
-        if name == "average":
-            premultiplied, opacity = layer(transfer, (weight * values).sum(axis=1) / whole, rays.hit)
-        elif name == "integral":
-            opacity = -np.expm1(-opacity)
-    else:
-        least = np.where(valid, values, -np.inf if name == "maximum" else np.inf)
-        chosen = {
-            "maximum": np.argmax(least, axis=1),
-            "minimum": np.argmin(least, axis=1),
-            "first visible": np.argmax(alpha > 0, axis=1),
-            "isosurface": np.argmax(crosses(front, width), axis=1),
-        }[name]
-        at = np.arange(len(chosen)), chosen
-        depth, visible = depth[at], rays.hit
-        if name == "first visible":
-            visible = alpha[at] > 0
-        if name == "isosurface":
-            visible = crosses(front, width)[at]
-            depth = bisected(rays, front[at], (front + width)[at], value)
-        if name in ("first visible", "isosurface"):
-            seen = value if name == "isosurface" else rays.value(depth[:, None])[:, 0]
-            premultiplied, opacity = visible[:, None] * classified(transfer, seen)[0], visible.astype(float)
-        else:
-            premultiplied, opacity = layer(transfer, rays.value(depth[:, None])[:, 0], visible)
-        depth = np.where(opacity > 0, depth, np.inf)
-    shape = camera.size[::-1]
-    rgba = np.concatenate([premultiplied, opacity[:, None]], axis=1).reshape(*shape, 4)
-    return rgba, (rays.t_in + depth).reshape(shape), np.sum(valid)
+    @property
+    def optical_depth(self):
+        return self.extinction * self.width
+
+    @property
+    def alpha(self):
+        return -np.expm1(-self.optical_depth)
+
+    @property
+    def crosses(self):
+        ends = self.front, self.front + self.width
+        first, last = (self.rays.value(end) >= self.value for end in ends)
+        return first != last
 
 
 def layer(transfer, value, visible, thickness=0.5):
@@ -204,6 +160,121 @@ def bisected(rays, near, far, value):
         behind = (rays.value(middle[:, None])[:, 0] >= value) == rises
         near, far = np.where(behind, near, middle), np.where(behind, middle, far)
     return near
+
+
+def weighted(weight_of, finished=None):
+    """The formula of a weighting, by its weights; `finished`: what becomes of the sums."""
+
+    def pixel(cells):
+        weight, color = weight_of(cells), classified(cells.transfer, cells.values)[0]
+        opacity = weight.sum(axis=1)
+        whole = np.where(opacity > 0, opacity, 1)
+        depth = np.where(opacity > 0, (weight * cells.depth).sum(axis=1) / whole, np.inf)
+        premultiplied = (weight[..., None] * color).sum(axis=1)
+        if finished is not None:
+            premultiplied, opacity = finished(
+                cells, premultiplied, opacity, (weight * cells.values).sum(axis=1)
+            )
+        return premultiplied, opacity, depth
+
+    return pixel
+
+
+def behind_others(cells):
+    alpha = cells.alpha
+    hidden = np.cumprod(1 - alpha, axis=1)[:, :-1]
+    return alpha * np.concatenate([np.ones((len(alpha), 1)), hidden], axis=1)
+
+
+def of_mean(cells, premultiplied, length, sums):
+    return layer(cells.transfer, sums / np.where(length > 0, length, 1), cells.rays.hit)
+
+
+def extreme(sign):
+    """The formula of the greatest value of a ray, or by a sign of -1 of the least."""
+
+    def pixel(cells):
+        best = np.argmax(np.where(cells.width > 0, sign * cells.values, -np.inf), axis=1)
+        depth = cells.depth[np.arange(len(best)), best]
+        premultiplied, opacity = layer(cells.transfer, cells.rays.value(depth[:, None])[:, 0], cells.rays.hit)
+        return premultiplied, opacity, np.where(opacity > 0, depth, np.inf)
+
+    return pixel
+
+
+def first_visible(cells):
+    seen = cells.alpha > 0
+    depth = cells.depth[np.arange(len(seen)), np.argmax(seen, axis=1)]
+    return opaque(cells, cells.rays.value(depth[:, None])[:, 0], seen.any(axis=1), depth)
+
+
+def surface(cells):
+    crosses = cells.crosses
+    at = np.arange(len(crosses)), np.argmax(crosses, axis=1)
+    depth = bisected(cells.rays, cells.front[at], (cells.front + cells.width)[at], cells.value)
+    return opaque(cells, cells.value, crosses.any(axis=1), depth)
+
+
+def opaque(cells, value, visible, depth):
+    premultiplied = visible[:, None] * classified(cells.transfer, value)[0]
+    return premultiplied, visible.astype(float), np.where(visible, depth, np.inf)
+
+
+class Known(NamedTuple):
+    """A mode, and what its pixels show by NumPy.
+
+    Attributes:
+        formula: premultiplied colour, opacity, and depth past the entry, of `Cells`.
+        dtype: voxels with which its image is compared.
+        quadrature: by which marches sample.
+        shifts: whether `EmptySpaceJitter` shifts samples, at a first cell that is `empty`.
+    """
+
+    mode: jv.Weighting | jv.Selection
+    formula: Callable[[Cells], tuple[np.ndarray, np.ndarray, np.ndarray]]
+    dtype: str = "float32"
+    quadrature: Any = "left"
+    shifts: bool = True
+    empty: Callable[[Cells], np.ndarray] = lambda cells: cells.extinction == 0
+
+
+KNOWN = {
+    "over": Known(jv.Over(), weighted(behind_others), "int16"),
+    "additive": Known(Additive(), weighted(lambda cells: 0.01 * cells.alpha), "uint8"),
+    "average": Known(
+        jv.Average(0.5), weighted(lambda cells: cells.width, of_mean), quadrature="midpoint", shifts=False
+    ),
+    "integral": Known(
+        jv.LineIntegral(),
+        weighted(lambda cells: cells.optical_depth, lambda _, rgb, depth, sums: (rgb, -np.expm1(-depth))),
+    ),
+    "maximum": Known(jv.Maximum(0.5), extreme(1), "uint8"),
+    "minimum": Known(jv.Minimum(0.5), extreme(-1), "uint16"),
+    "first visible": Known(jv.FirstVisible(), first_visible, "uint8"),
+    "isosurface": Known(jv.Isosurface(VALUE), surface, empty=lambda cells: ~cells.crosses),
+}
+MODES = {name: known.mode for name, known in KNOWN.items()}
+assert {*map(type, MODES.values())} >= {*subclasses(jv.Compositing)}, "each public mode has a formula"
+
+
+def shown(name, volume, transfer, camera, step, jitter, value=VALUE):
+    """What pixels show under a mode of `KNOWN`, by NumPy, with `EmptySpaceJitter` and cells that are cut at
+    the exit: rgba, distance, and how many samples the rays have. `value`: of the isosurface."""
+    rays, known = Rays(volume, camera), KNOWN[name]
+
+    def cells_of(front, width):
+        depth = front + width / 2 * (known.quadrature == "midpoint")
+        return Cells(rays, transfer, front, width, depth, rays.value(depth), value)
+
+    if known.shifts:
+        empty = lambda front, width: known.empty(cells_of(front, width))  # noqa: E731
+        cells = cells_of(*rays.cells(step, random_numbers(jitter, camera), empty))
+    else:
+        cells = cells_of(*rays.cells(step))
+    premultiplied, opacity, depth = known.formula(cells)
+    shape = camera.size[::-1]
+    rgba = np.concatenate([premultiplied, opacity[:, None]], axis=1).reshape(*shape, 4)
+    return rgba, (rays.t_in + depth).reshape(shape), np.sum(cells.width > 0)
 
 
 def same_image(found, rgba, depth):

@@ -5,6 +5,8 @@ t < t_out, each representing the cell behind it.
 """
 
 import itertools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -76,78 +78,72 @@ def mean_between(first, second, values, colors, extinction):
     )
 
 
-def march(
-    data,
-    spacing,
-    origin,
-    points,
-    origins,
-    directions,
-    d,
-    *,
-    quadrature="left",
-    align=False,
-    opacity_left=None,
-    start: float | np.ndarray = 0.0,
-    front_residual=False,
-    empty_jump=None,
-    planes=(),
-    inside_out=False,
-):
+class Rays(NamedTuple):
+    """Entry and exit of (n,) rays, and the ends of the gap of each, (2, n), in which nothing is seen."""
+
+    t_in: np.ndarray
+    t_out: np.ndarray
+    gap: np.ndarray | None = None
+
+
+def whole_cell(begin, end, rays):
+    """The pieces of a cell that nothing cuts."""
+    return [(begin, end)]
+
+
+class Meaning(NamedTuple):
+    """What a transform does to a march, for all rays at once; by default nothing.
+
+    Attributes:
+        clip: the part of each ray that is seen, from (n, 3) origins and directions and the `Rays` before.
+        start: (n,) offsets of the first samples, in steps.
+        jump: (n,) distance from the first transparent sample to the next one, in steps; None for one step.
+        cut: the pieces of a cell, front to back, from its ends and the `Rays`. One of width 0 is no sample.
+        stop: which rays end at a transmittance.
+    """
+
+    clip: Callable[..., Rays] = lambda origins, directions, rays: rays
+    start: float | np.ndarray = 0.0
+    jump: np.ndarray | None = None
+    cut: Callable[..., list[tuple[np.ndarray, np.ndarray]]] = whole_cell
+    stop: Callable[[np.ndarray], Any] = lambda transmittance: False
+
+
+def march(data, spacing, origin, points, origins, directions, d, *, quadrature="left", meanings=()):
     """(n, 4) premultiplied colour and opacity, and the (n,) numbers of samples.
 
     - `quadrature`: a sample stands for its cell at the front of it ("left"), in the middle ("midpoint"), or
       cells are integrated as if the value were linear along them ("preintegrated").
     - `points`: control points (values, colors, extinction), each a NumPy array.
-    - `align`: cut the last cell at the exit.
-    - `opacity_left`: end a ray once its transmittance is this low.
-    - `start`: (n,) offsets of the first samples, in steps. With `front_residual`, the part before the first
-      sample is a cell of its own.
-    - `empty_jump`: (n,) distance from the first transparent sample to the next one, in steps.
-    - `planes`: pairs (origin, normal). Only what lies on the sides of all their normals is seen; or, with
-      `inside_out`, only what does not. A ray begins with the first point of it that is seen, and ends with
-      the last one. `align` also cuts cells at the ends of what is not seen in between.
+    - `meanings`: of the transforms, in their order.
     """
     data, spacing, origin = (np.asarray(a, np.float64) for a in (data, spacing, origin))
     origins, directions = (np.asarray(a, np.float64).reshape(-1, 3) for a in (origins, directions))
     values, colors, extinction = (np.asarray(a, np.float64) for a in points)
-    t_in, t_out = box_interval(origins, directions, origin, origin + (np.array(data.shape) - 1) * spacing)
-
-    n = len(origins)
-    gap = np.full((2, n), np.inf)
-    if planes:
-        first, last = side_interval(origins, directions, planes)
-        if not inside_out:
-            t_in, t_out = np.maximum(t_in, first), np.minimum(t_out, last)
-        else:
-            crosses = (first < last) & (first < t_out) & (last > t_in)
-            gap = np.where(crosses & (first > t_in) & (last < t_out), (first, last), np.inf)
-            starts, stops = crosses & (first <= t_in), crosses & (last >= t_out)
-            t_in, t_out = np.where(starts, last, t_in), np.where(stops, first, t_out)
+    corner = origin + (np.array(data.shape) - 1) * spacing
+    rays, n = Rays(*box_interval(origins, directions, origin, corner)), len(origins)
+    for meaning in meanings:
+        rays = meaning.clip(origins, directions, rays)
+    ended = rays.t_out <= rays.t_in
+    rays = Rays(np.where(ended, 0, rays.t_in), np.where(ended, 0, rays.t_out), rays.gap)
     color, transmittance, samples = np.zeros((n, 3)), np.ones(n), np.zeros(n, int)
-    ended = t_out <= t_in
-    t_in, t_out = (np.where(ended, 0, t) for t in (t_in, t_out))
-    front = t_in + (np.asarray(start, np.float64) - front_residual) * d
-    jumps = np.zeros(n, bool) if empty_jump is None else np.ones(n, bool)
+    front = rays.t_in + sum(np.asarray(meaning.start, np.float64) for meaning in meanings) * d
+    (jump,) = [meaning.jump for meaning in meanings if meaning.jump is not None] or [1.0]
+    jumps = np.ones(n, bool)
 
     def sampled(begin, end):
         return begin if quadrature == "left" else begin + np.maximum(end - begin, 0) / 2
 
     for _ in range(1_000_000):
-        begin = np.maximum(front, t_in) if front_residual else front
-        end = front + d
-        if align:
-            end = np.minimum(end, t_out)
-        parts = [(begin, end)]
-        if align and planes and inside_out:
-            first, last = (np.clip(each, begin, np.maximum(begin, end)) for each in gap)
-            parts = [(begin, first), (first, last), (last, end)]
-        whole, empty = ended | (sampled(begin, end) >= t_out), np.ones(n, bool)
+        parts = [(front, front + d)]
+        for meaning in meanings:
+            parts = [piece for part in parts for piece in meaning.cut(*part, rays)]
+        whole, empty = ended | (sampled(parts[0][0], parts[-1][1]) >= rays.t_out), np.ones(n, bool)
         if whole.all():
             return np.concatenate([color, 1 - transmittance[:, None]], axis=1), samples
         for begin, end in parts:
             width, t = np.maximum(end - begin, 0), sampled(begin, end)
-            past = ended | (t >= t_out)
+            past = ended | (t >= rays.t_out)
 
             def value(t, past=past):
                 where = (origins + np.where(past, 0, t)[:, None] * directions - origin) / spacing
@@ -155,20 +151,20 @@ def march(
 
             if quadrature == "preintegrated":
                 rgb, sigma = mean_between(
-                    value(begin), value(np.minimum(end, t_out)), values, colors, extinction
+                    value(begin), value(np.minimum(end, rays.t_out)), values, colors, extinction
                 )
             else:
                 rgb = np.stack([np.interp(value(t), values, c) for c in colors.T], axis=1)
                 sigma = np.interp(value(t), values, extinction)
-            alpha = np.where(past | ((gap[0] <= t) & (t < gap[1])), 0, 1 - np.exp(-sigma * width))
+            unseen = past if rays.gap is None else past | ((rays.gap[0] <= t) & (t < rays.gap[1]))
+            alpha = np.where(unseen, 0, 1 - np.exp(-sigma * width))
             color += (transmittance * alpha)[:, None] * rgb
             transmittance *= 1 - alpha
             samples += ~past & ((width > 0) | (len(parts) == 1))
             empty &= alpha == 0
+        front = front + d * np.where(jumps & empty, jump, 1)
+        jumps &= ~empty
         ended = whole
-        jump = jumps & empty
-        front = front + d * np.where(jump, 0 if empty_jump is None else empty_jump, 1)
-        jumps &= ~jump
-        if opacity_left is not None:
-            ended = ended | (transmittance <= opacity_left)
+        for meaning in meanings:
+            ended = ended | meaning.stop(transmittance)
     raise AssertionError("the march never ended")

@@ -4,6 +4,8 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+from docs.registry import with_entries
+
 
 ROOT = Path(__file__).parent.parent
 
@@ -12,7 +14,7 @@ def entries() -> dict[str, Any]:
     """By path, such as `jaxvol.scene.camera.Camera`, the objects that the pages of docs/api show."""
     found: dict[str, Any] = {}
     for page in sorted((ROOT / "docs" / "api").glob("*.md")):
-        for line in page.read_text(encoding="utf-8").splitlines():
+        for line in with_entries(page.read_text(encoding="utf-8")).splitlines():
             if line.startswith("::: "):
                 module, _, name = line.removeprefix("::: ").rpartition(".")
                 assert f"{module}.{name}" not in found, f"{line} stands twice in docs/api"

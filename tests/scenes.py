@@ -143,3 +143,28 @@ def to_float64(tree):
         return leaf
 
     return jax.tree.map(double, tree)
+
+
+@eqx.filter_jit
+def drawn(noise, column, row, dtype):
+    return jax.vmap(lambda c, r: noise((c, r), dtype))(column, row)
+
+
+def random_numbers(transform, camera):
+    """The transform's random number for every pixel, row by row."""
+    width, height = camera.size
+    row, column = (index.reshape(-1).astype(np.int32) for index in np.mgrid[:height, :width])
+    return np.asarray(drawn(transform.noise, column, row, camera.position.dtype), np.float64)
+
+
+@eqx.filter_jit
+def reference_image(volume, transfer, camera, march):
+    """Every pixel by the reference engine."""
+
+    def one(column, row):
+        origin, direction = (jnp.stack(part) for part in camera.ray(column, row))
+        return jv.render_ray_reference(volume, transfer, origin, direction, march, pixel=(column, row))
+
+    width, height = camera.size
+    across = jax.vmap(one, in_axes=(0, None))
+    return jax.vmap(across, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))

@@ -11,15 +11,12 @@ from functools import cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from hypothesis import strategies as st
 from jaxtyping import Array, Bool
 
 import jaxvol as jv
 from jaxvol.march.beams import EmptySpaceIndex, Skips
 from jaxvol.scene.occupancy import BLOCK
 from jaxvol.scene.space import Space
-
-from .scenes import BOX, PLANE
 
 
 def either(on, new, old):
@@ -188,44 +185,3 @@ def switch(transform: jv.Transform, on, part: str = "") -> jv.Transform:
         raise ValueError("a space is static: compare marches with and without it.")
     on = jax.device_put(np.asarray(on, bool)) if isinstance(on, bool) else jnp.asarray(on, bool)
     return _class(type(transform), part)(transform, on)
-
-
-ALONE = ("jitter", "residual"), ("clip", "hollow")
-"""Of each of these, a subset has one at most."""
-
-NAMES = ("jitter", "residual", "shift", "clip", "hollow", "alignment", "leaping", "termination")
-
-SUBSETS = st.frozensets(st.sampled_from(NAMES)).filter(
-    lambda on: all(not on.issuperset(pair) for pair in ALONE)
-)
-"""Names of transforms that are on, drawn by hypothesis."""
-
-
-MOST = frozenset({"jitter", "shift", "clip", "alignment", "leaping", "termination"})
-OTHERS = frozenset({"residual", "shift", "hollow", "alignment", "leaping"})
-"""Between them, these contain every transform."""
-
-
-def transforms(seed=3, left=0.05, box=BOX, planes=(PLANE,)) -> dict[str, jv.Transform]:
-    """Every transform but those with a space of their own."""
-    return {
-        "jitter": jv.Jitter(seed),
-        "residual": jv.Jitter(seed, "blue", front_residual=True),
-        "shift": jv.EmptySpaceJitter(seed),
-        "clip": jv.Clip(box, planes),
-        "hollow": jv.Clip(box, planes, inside_out=True),
-        "alignment": jv.AlphaCorrection(),
-        "leaping": jv.SpaceLeaping(),
-        "termination": jv.EarlyTermination(left),
-    }
-
-
-def switched(on, without=(), **values) -> tuple[jv.Transform, ...]:
-    """All of `transforms(**values)`, of which those named in `on` are on; some may be left out."""
-    every = transforms(**values).items()
-    return tuple(switch(each, name in on, name.title()) for name, each in every if name not in without)
-
-
-def plain(on, **values) -> tuple[jv.Transform, ...]:
-    """The same as users give them: those that are on."""
-    return tuple(each for name, each in transforms(**values).items() if name in on)

@@ -10,87 +10,19 @@ from hypothesis import example, given, settings, strategies as st
 
 import jaxvol as jv
 
-from . import oracle, switch
 from .scenes import (
     CAMERAS,
     QUADRATURES,
     VOLUMES,
     around,
     in_float64,
+    reference_image,
     rendered,
     slow,
     soft_transfer,
     to_float64,
 )
-
-
-def oracle_image(volume, transfer, camera, march):
-    """Image and numbers of samples by the independent marcher, for the camera's rays."""
-    origins, directions = camera.rays()
-    kinds = {type(t): t for t in march.transforms}
-    ending, jitter, jump = (kinds.get(t) for t in (jv.EarlyTermination, jv.Jitter, jv.EmptySpaceJitter))
-    rgba, samples = oracle.march(
-        volume.data,
-        volume.spacing,
-        volume.origin,
-        (transfer.values, transfer.colors, transfer.extinction),
-        origins,
-        directions,
-        float(march.step),
-        quadrature=march.quadrature,
-        align=jv.AlphaCorrection in kinds,
-        opacity_left=None if ending is None else float(ending.opacity_left),
-        start=0.0 if jitter is None else random_numbers(jitter, camera),
-        front_residual=jitter is not None and jitter.front_residual,
-        empty_jump=None if jump is None else random_numbers(jump, camera),
-        **clipped_by(kinds.get(jv.Clip)),
-    )
-    shape = origins.shape[:-1]
-    return rgba.reshape(*shape, 4), samples.reshape(shape)
-
-
-def clipped_by(clip):
-    """Arguments of the independent marcher for a `Clip`, or None."""
-    if clip is None:
-        return {}
-    planes = oracle.planes_of(clip.box, zip(*map(np.asarray, (clip.origins, clip.normals)), strict=True))
-    return {"planes": planes, "inside_out": clip.inside_out}
-
-
-@eqx.filter_jit
-def drawn(noise, column, row, dtype):
-    return jax.vmap(lambda c, r: noise((c, r), dtype))(column, row)
-
-
-def random_numbers(transform, camera):
-    """The transform's random number for every pixel, row by row."""
-    width, height = camera.size
-    row, column = (index.reshape(-1).astype(np.int32) for index in np.mgrid[:height, :width])
-    return np.asarray(drawn(transform.noise, column, row, camera.position.dtype), np.float64)
-
-
-def compare(rendering, rgba, samples, *, tolerance, left=0.0):
-    """Assert agreement within the tolerance in pixels with equal numbers of samples. Where rounding changes
-    the number, by at most one, the images may differ by `left`, the contribution of that sample."""
-    off = np.abs(np.asarray(rendering.rgba) - rgba).max(axis=-1)
-    moved = np.asarray(rendering.samples) != samples
-    assert np.abs(np.asarray(rendering.samples) - samples).max() <= 1
-    assert moved.mean() < 0.01
-    assert off[~moved].max() <= tolerance
-    assert not moved.any() or off[moved].max() <= max(left, tolerance)
-
-
-@eqx.filter_jit
-def reference_image(volume, transfer, camera, march):
-    """Every pixel by the reference engine."""
-
-    def one(column, row):
-        origin, direction = (jnp.stack(part) for part in camera.ray(column, row))
-        return jv.render_ray_reference(volume, transfer, origin, direction, march, pixel=(column, row))
-
-    width, height = camera.size
-    across = jax.vmap(one, in_axes=(0, None))
-    return jax.vmap(across, in_axes=(None, 0))(jnp.arange(width), jnp.arange(height))
+from .transforms import MOST, OTHERS, SUBSETS, oracle_image, plain, switched
 
 
 SCENES = {
@@ -112,9 +44,9 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
     compile."""
 
     @settings(max_examples=10)
-    @given(on=switch.SUBSETS, **SCENES)
-    @example(on=switch.MOST, seed=1, step=0.1, volume="noise", view="around", left=0.05)
-    @example(on=switch.OTHERS, seed=2, step=0.2, volume="sphere", view="inside", left=0.05)
+    @given(on=SUBSETS, **SCENES)
+    @example(on=MOST, seed=1, step=0.1, volume="noise", view="around", left=0.05)
+    @example(on=OTHERS, seed=2, step=0.2, volume="sphere", view="inside", left=0.05)
     def check(on, seed, step, volume, view, left):
         with in_float64():
             volume, transfer = to_float64(VOLUMES[volume]()), to_float64(soft_transfer())
@@ -125,12 +57,12 @@ def test_every_subset_of_transforms_means_the_same_in_both_engines_and_to_an_ind
 
             scene = volume, transfer, camera
             on = on.difference(without)
-            rgba, samples = oracle_image(*scene, march(switch.plain(on, **values)))
-            switched = switch.switched(on, without, **values)
-            fast = rendered(*scene, march(switched))
+            rgba, samples = oracle_image(*scene, march(plain(on, **values)))
+            all_of_them = switched(on, without, **values)
+            fast = rendered(*scene, march(all_of_them))
             assert fast.rgba.dtype == jnp.float64
             np.testing.assert_allclose(fast.rgba, rgba, atol=1e-10, rtol=0)
-            reference = reference_image(*scene, march(switched, 80))
+            reference = reference_image(*scene, march(all_of_them, 80))
             assert not np.asarray(reference.exhausted).any()
             np.testing.assert_allclose(reference.rgba, rgba, atol=1e-10, rtol=0)
             np.testing.assert_array_equal(reference.samples, samples)

@@ -1,14 +1,14 @@
 """Do the scripts of experiments/ run, at tiny sizes, and write what it takes to run them again?"""
 
 import importlib
+import re
 from argparse import Namespace
 from pathlib import Path
 
-import jax
 import pytest
 from skimage.io import imread
 
-from experiments import charts, gradient_errors, record, redraw
+from experiments import charts, record, redraw
 from experiments.harness import experiment, recorded
 
 
@@ -59,17 +59,6 @@ def test_what_is_not_measured_again_is_kept_with_its_commit_if_it_is_of_the_same
     assert recorded(chosen, "rows", ["b"], {"size": 3}) == {}
 
 
-@pytest.mark.slow
-def test_gradients_miss_jumps_at_the_exit_alone(tmp_path):
-    gradient_errors.main(["--quick", "--output", str(tmp_path)])
-    jax.clear_caches()
-    rows = record.read(tmp_path / "gradient_errors.json")["result"]["relative errors"]["left"]
-    plain, aligned = rows["ray casting"], rows["ray casting" + gradient_errors.CUT]
-    assert plain["position"][0] < 1e-6  # a short difference crosses no jump
-    assert aligned["position"][-1] < 0.05 < 0.5 < plain["position"][-1]
-    assert plain["colours"][-1] < 1e-6
-
-
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_every_experiment_takes_its_options(name, capsys):
     with pytest.raises(SystemExit) as ended:
@@ -78,10 +67,16 @@ def test_every_experiment_takes_its_options(name, capsys):
     assert "--quick" in capsys.readouterr().out
 
 
-def test_every_record_has_a_chart_that_can_be_drawn(tmp_path):
-    assert set(redraw.DRAWN) - COMPARE == RECORDS - redraw.IMAGES - redraw.OTHERS
-    for name in redraw.DRAWN:  # a record of another name is of the experiment of its command
-        module = record.read(record.RESULTS / f"{name}.json")["command"].split()[2]
-        assert hasattr(importlib.import_module(module), "draw")
+def test_charts_that_pages_show_can_be_drawn(tmp_path):
+    drawn = set(redraw.DRAWN)
+    for name in redraw.DRAWN:
+        module = importlib.import_module(record.read(record.RESULTS / f"{name}.json")["command"].split()[2])
+        assert callable(module.draw)
+        drawn |= set(getattr(module, "more", {}))
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md"), *(ROOT / "paper_figs").glob("*.md")]
+    shown = {name for page in pages for name in re.findall(r"results/(\w+)\.png", page.read_text("utf-8"))}
+    kept = {path.stem for path in record.RESULTS.glob("*.png")}
+    assert shown <= drawn | kept
+    assert "speed" in shown
     redraw.main(["--only", "overhead", "--output", str(tmp_path)])
     assert min(imread(tmp_path / "overhead.png").shape[:2]) >= 256

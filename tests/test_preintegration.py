@@ -17,7 +17,7 @@ from jaxvol.scene.transfer import Transfer
 from . import oracle
 from .modes import Rays, ball_in_a_corner, classified, scaled_transfer
 from .scenes import around, in_float64, scaled_phantom, slow, soft_transfer, to_float64, with_voxels
-from .test_agreement import random_numbers
+from .transforms import oracle_image
 
 
 # ---- means ----
@@ -223,19 +223,8 @@ def test_small_types_leaps_and_tiles_do_not_show():
     scene = Scene(volume, transfer, camera, march, jv.Over())
     rgba = np.asarray(render_scene(scene, "all", "replay", Tiling(batch=4, tile=2)).rgba)
     assert 0.05 < np.mean(rgba[..., 3] > 0) < 0.95
-    expected, _ = oracle.march(
-        *(
-            volume.data,
-            volume.spacing,
-            volume.origin,
-            (transfer.values, transfer.colors, transfer.extinction),
-        ),
-        *(*camera.rays(), 0.11),
-        quadrature="preintegrated",
-        align=True,
-        empty_jump=random_numbers(jitter, camera),
-    )
-    np.testing.assert_allclose(np.asarray(rgba).reshape(-1, 4), expected, atol=2e-5)
+    expected, _ = oracle_image(volume, transfer, camera, march)
+    np.testing.assert_allclose(rgba, expected, atol=2e-5)
 
 
 class Own(Transfer):

@@ -5,11 +5,8 @@ import math
 import numpy as np
 import pytest
 
-import jaxvol as jv
 from experiments.atlas.leaping import EYE, WALL, above_a_wall
-from experiments.octree import DOWN, UP, count
 from experiments.ray_leaps import Counts, Marcher, Saved, grid_of
-from experiments.scenes import Scene
 
 
 @pytest.mark.parametrize("angle", [90.0, 35.0, 8.0])
@@ -40,18 +37,3 @@ def test_starts_are_the_nearest_of_four_corners_and_what_lies_before_them_is_lat
     alone = Counts(np.full((5, 5), 4), np.full((5, 5), 2), hit, np.full((5, 5), 20))
     started = alone._replace(leaps=np.full((5, 5), 1))
     assert Saved.of(alone, started, grid) == pytest.approx((3 / 4, 1 / 2, 1 / 25))
-
-
-@pytest.mark.parametrize(
-    ("levels", "skips", "down", "up"),
-    [(1, 7, 7 + 4, 7 + 4), (2, 4, 3 + 2 + 4 * 2, 3 * 2 + 2 + 4), (3, 3, 1 + 2 + 3 + 4 * 3, 3 + 3 + 2 + 4)],
-)
-def test_an_octree_skips_its_largest_empty_blocks(levels, skips, down, up):
-    """32 cells along a ray, of which the last four show something: four samples."""
-    volume = jv.Volume(np.broadcast_to((np.arange(33) >= 29)[:, None, None], (33,) * 3).astype(np.float32))
-    camera = jv.Camera((-3, 2.3, 2.3), (0, 2.3, 2.3), (0, 0, 1), parallel_scale=0.1, size=(1, 1))
-    transfer = jv.TransferFunction([0.5, 0.51], np.ones((2, 3)), [0.0, 1.0])
-    marcher = Marcher(Scene(volume, transfer, camera, 1.0))
-    for order, looked_up in ((DOWN, down), (UP, up)):
-        found = count(marcher, camera, levels, order)
-        assert found == {"skips": skips, "blocks looked up": looked_up, "samples": 4}

@@ -14,9 +14,9 @@ import jaxvol as jv
 from jaxvol.io.phantoms.canvas import FAR, Canvas
 from jaxvol.io.phantoms.shapes import Shape, capsule, ellipsoid, tube
 from jaxvol.lighting import ConstantLight, DirectionalLight, HeadLight, Lighting, Phong, ScattererTemplates
+from jaxvol.metrics import boundary_noise
 
 from ..lighting import FLESH, UNLIT, march
-from ..published_light import ALIKE, BLENDED as BLENDS, EACH, noise
 from ..scenes import CT_HEAD, SCENES, Scene, cropped, grid, on_cube, skin_head
 from . import BLACK, Panel, Panels, panel
 
@@ -24,6 +24,11 @@ from . import BLACK, Panel, Panels, panel
 Color = tuple[float, float, float]
 REACH = (2, 4, 8)
 """Photons are also tested at these multiples of their distance."""
+KINDS: dict[str, dict[str, Any]] = {
+    "8 templates blended": {"blend": True},
+    "one of 8 for each pixel": {},
+    "one template a material": {"templates": 1},
+}
 BLENDED = {"templates": 4, "blend": True, "packets": 16, "threshold": 0.004, "reach": REACH}
 
 
@@ -198,6 +203,12 @@ def ct_head(folder: Path, size: int) -> Subject:
     return Subject(Scene(volume, transfer, camera, 0.5), [flesh, bone], (-0.9, 0.7, 0.6))
 
 
+def noise(rgba: np.ndarray) -> float:
+    """Standard deviation of the noise of what is mostly opaque, over its mean."""
+    color, opaque = rgba[..., :3], rgba[..., 3] > 0.5
+    return float(np.sqrt(boundary_noise(color, opaque) / 3) / color[opaque].mean())
+
+
 def lee_fig6(chosen: Namespace) -> Panels:
     sizes = chosen.size, chosen.resolution
     subjects = {"the head phantom": head(*sizes)}
@@ -206,13 +217,12 @@ def lee_fig6(chosen: Namespace) -> Panels:
     subjects["a frog phantom"] = frog(*sizes)
     if folder:
         subjects["a frog (labels)"] = tissues(folder, sizes[0])
-    kinds = {BLENDS: {"blend": True}, EACH: {}, ALIKE: {"templates": 1}}
     hard = {"occlusion": "hard", "threshold_on": "level"}
     rows: Panels = []
     for name, (scene, materials, direction) in subjects.items():
         lights, row = (DirectionalLight(direction, (40.0, 40.0, 40.0)), ConstantLight((1.3, 1.3, 1.3))), []
         lightings = {
-            kind: ScattererTemplates(materials, lights, **hard, **how) for kind, how in kinds.items()
+            kind: ScattererTemplates(materials, lights, **hard, **how) for kind, how in KINDS.items()
         }
         for title, lighting in {UNLIT: None, **lightings}.items():
             rgba = jv.render(*scene[:3], march(scene), lighting=lighting, outputs="rgba").rgba

@@ -82,7 +82,7 @@ def _unit(word: Word, dtype: DTypeLike) -> Float[Array, "..."]:
 
 
 def blue_tile() -> Float[Array, "side side"]:
-    """Tile of blue noise in (0, 1), periodic; its ranks are made by `experiments/blue_noise.py`."""
+    """Tile of blue noise in (0, 1), periodic; its ranks are by void and cluster (Ulichney 1993)."""
     ranks = np.load(Path(__file__).with_name("blue_noise.npy"))
     with jax.ensure_compile_time_eval():
         return jnp.asarray((ranks + 0.5) / ranks.size, jnp.float32)

@@ -21,7 +21,11 @@ from ..fitting import read_transfer
 from ..io.formats import labelled, load
 from ..lighting import Lighting, Phong
 from ..march.march import March, Transform
-from ..march.transforms import AlphaCorrection, Clip, EarlyTermination, EmptySpaceJitter, SpaceLeaping
+from ..march.transforms.alpha_correction import AlphaCorrection
+from ..march.transforms.clip import Clip
+from ..march.transforms.early_termination import EarlyTermination
+from ..march.transforms.jitter import EmptySpaceJitter
+from ..march.transforms.space_leaping import SpaceLeaping
 from ..planning import Plan, plan
 from ..render import PLANNED, render
 from ..scene.camera import Camera, image_size

@@ -12,7 +12,7 @@ from .._util.checks import Arrayable, integer, shortened
 from .._util.files import MOST_VOXELS
 from .._util.vec3 import Vec3, apart
 from ..march.march import March
-from ..march.transforms import ToroidalMap
+from ..march.transforms.toroidal_map import ToroidalMap
 from ..ray import Scene
 from ..scene.camera import Camera, axes_of
 from ..scene.occupancy import BLOCK

@@ -20,7 +20,8 @@ from ..engine.resolve import resolve_image, with_pixels
 from ..engine.tiling import RenderOptions
 from ..lighting.shading import Lighting
 from ..march.march import March
-from ..march.transforms import SpaceLeaping, ToroidalMap
+from ..march.transforms.space_leaping import SpaceLeaping
+from ..march.transforms.toroidal_map import ToroidalMap
 from ..ray import Scene, bands_of, check_arguments
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction

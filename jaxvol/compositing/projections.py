@@ -95,7 +95,9 @@ class Maximum(Extreme):
 class Minimum(Extreme):
     """The least value along a ray (minimum intensity projection), looked up in the transfer function.
 
-    Otherwise as `Maximum`, with less for greater. Source: VTK's MINIMUM_INTENSITY_BLEND.
+    Otherwise as `Maximum`, with less for greater.
+
+    Source: VTK's MINIMUM_INTENSITY_BLEND.
 
     Args:
         thickness: as for `Maximum`.
@@ -125,7 +127,9 @@ class Average(OpticalDepths):
     With `AlphaCorrection`, the mean of values that are linear along the ray is exact up to rounding under
     `"midpoint"` and `"preintegrated"`; under `"left"` it errs by half their change over one step; and
     gradients are complete. Without it, the last cell has the full width, and gradients miss the jumps of the
-    exit (`render`). Source: VTK's AVERAGE_INTENSITY_BLEND.
+    exit (`render`).
+
+    Source: VTK's AVERAGE_INTENSITY_BLEND.
 
     Args:
         thickness: thickness of a layer of the mean value, world length, > 0, as in `Maximum`.

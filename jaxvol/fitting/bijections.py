@@ -12,7 +12,7 @@ from jax.scipy.special import logit
 from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, described, finite_array, number, require
-from ..march.transforms import ToroidalMap
+from ..march.transforms.toroidal_map import ToroidalMap
 from ..scene.camera import Camera, axes_of
 from ..xla.trees import PyTree
 

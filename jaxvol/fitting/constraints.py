@@ -10,7 +10,7 @@ import numpy as np
 
 from ..lighting import Material
 from ..march.march import March
-from ..march.transforms import ToroidalMap
+from ..march.transforms.toroidal_map import ToroidalMap
 from ..scene.camera import Camera
 from ..scene.labels import LabelTransferFunction
 from ..scene.transfer import TransferFunction

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from .._util.checks import Arrayable, described, finite_array, integer
 from ..march.march import March
-from ..march.transforms import AlphaCorrection
+from ..march.transforms.alpha_correction import AlphaCorrection
 from ..metrics import standardized
 from ..ray import check_arguments
 from ..render import Adjoint, render

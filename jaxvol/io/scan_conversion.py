@@ -11,7 +11,7 @@ from .._util.checks import Arrayable, described, finite_array, integer, require
 from .._util.files import MOST_VOXELS
 from .._util.image_record import holds
 from .._util.memory import require_room
-from ..march.transforms import ToroidalMap
+from ..march.transforms.toroidal_map import ToroidalMap
 from ..scene.volume import Volume, check_one_channel
 
 

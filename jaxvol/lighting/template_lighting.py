@@ -92,7 +92,7 @@ class ScattererTemplates(Lighting):
     distances grow with that from the start. Scattering is isotropic: for a material of anisotropy g, pass the
     mean free path λ / (1 - g), which spreads light as far (similarity). Steps of the march should be short
     against the mean free path, too: steps of a third of it make images up to 3 % too bright. Agreement with
-    path tracing: `experiments/transport.py`.
+    path tracing: `experiments/results/transport.json`.
 
     Its derivatives are those of the mean over all walks: places of walks are constant, and their weights
     change. The image itself has small jumps, since the ends of walks cross surfaces as λ changes, so that

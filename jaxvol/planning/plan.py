@@ -17,7 +17,9 @@ from ..engine.acceleration import visible_in_numpy
 from ..engine.stages import Place
 from ..lighting.shading import Lighting
 from ..march.march import March, Quadrature, Transform
-from ..march.transforms import AlphaCorrection, EarlyTermination, SpaceLeaping
+from ..march.transforms.alpha_correction import AlphaCorrection
+from ..march.transforms.early_termination import EarlyTermination
+from ..march.transforms.space_leaping import SpaceLeaping
 from ..ray import Scene, check_arguments
 from ..scene.camera import Camera
 from ..scene.occupancy import Blocks

@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 import pytest
 
-from experiments.peak_memory import STATUS
+from .peak_memory import STATUS
 
 
 SIDE = 461
@@ -19,7 +19,7 @@ BESIDE = 48
 IMAGES = """
     import sys
     import jax, jaxvol as jv
-    from experiments.peak_memory import forget_peak, held, peak
+    from tests.bricks.peak_memory import forget_peak, held, peak
     from jaxvol.bricks.sources import VoxelSource
     path, n, budget = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
     transfer = jv.TransferFunction([0, 255], [[1, 1, 1]] * 2, [1e-3, 1e-3])

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from jaxvol.compositing import blending
+from jaxvol.compositing import blending, modes
 from jaxvol.compositing.blending import Fragment
-from jaxvol.compositing.modes import compositing_of
 from jaxvol.lighting import ConstantLight, Material, ScattererTemplates
 from jaxvol.march.march import Cell
 from jaxvol.scene.occupancy import Blocks
@@ -121,7 +120,7 @@ def test_selections_choose_what_numpy_does(fragments, composited):
 def test_slopes_are_those_of_jax():
     """The derivative of Σ w q by the optical depth of every cell; of Σ w q alone behind what is opaque."""
     random = np.random.default_rng(1)
-    modes = [MODES[name] for name in ("over", "additive", "average")]
+    weightings = [mode for mode in MODES.values() if isinstance(mode, jv.Weighting)]
     with in_float64():
         depths, worths = jax.device_put([*random.uniform(0.1, 2, (2, 7))])
 
@@ -141,7 +140,7 @@ def test_slopes_are_those_of_jax():
         @jax.jit
         def compared(depths):
             slope_of_jax = jax.grad(lambda depths, mode: sums(mode, depths)[0][1])
-            return [(slopes(mode, depths), slope_of_jax(depths, mode)) for mode in modes]
+            return [(slopes(mode, depths), slope_of_jax(depths, mode)) for mode in weightings]
 
         for found, expected in compared(depths):
             np.testing.assert_allclose(found, expected, rtol=1e-12)
@@ -231,12 +230,12 @@ def gradient_of_forward():
 
 REFUSED = {
     "unknown": (
-        lambda: compositing_of("under"),
+        lambda: modes.compositing_of("under"),
         r'must be one of "over", "maximum", .* or Selection; got \'under\'',
     ),
-    "a class": (lambda: compositing_of(jv.Over), "got the class Over"),
+    "a class": (lambda: modes.compositing_of(jv.Over), "got the class Over"),
     "a field": (
-        lambda: compositing_of(Scaled(0.1, 2.0)),
+        lambda: modes.compositing_of(Scaled(0.1, 2.0)),
         "must be a Weighting with static fields only.*a Scaled has",
     ),
     "average, labels": (average_of_labels, "value alone; LabelTransferFunction reads more"),
@@ -270,9 +269,9 @@ def test_what_is_refused_is_named(case):
 
 
 def test_names_stand_for_modes():
-    for name in ("over", "maximum", "minimum", "average", "integral"):
-        assert type(compositing_of(name)) is type(MODES[name])
-        assert all(float(leaf) == 1 for leaf in jax.tree.leaves(compositing_of(name)))  # thicknesses
+    for name in modes.MODES:
+        assert type(modes.compositing_of(name)) is type(MODES[name])
+        assert all(float(leaf) == 1 for leaf in jax.tree.leaves(modes.compositing_of(name)))  # thicknesses
 
 
 class Wrong(jv.FirstVisible):

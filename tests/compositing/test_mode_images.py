@@ -14,8 +14,8 @@ from jaxvol.ray import Scene
 
 from .. import oracle
 from ..modes import (
+    KNOWN,
     MODES,
-    QUADRATURE,
     VALUE,
     Additive,
     FoggedSurface,
@@ -41,14 +41,6 @@ from ..scenes import (
 
 STEP = 0.11
 JITTER = jv.EmptySpaceJitter(4)
-TYPES = {
-    "over": "int16",
-    "additive": "uint8",
-    "maximum": "uint8",
-    "minimum": "uint16",
-    "first visible": "uint8",
-}
-"""Of voxels; else float32."""
 SIMILAR = "minimum", "first visible"
 """To the maximum, and to the isosurface."""
 TOPS = {"uint8": 255, "uint16": 60_000, "int16": 4000, "float32": 1}
@@ -70,7 +62,11 @@ def scene_of(name, volume, dtype):
 
 def march_of(name, *transforms, step=STEP):
     ending = () if name == "over" else (jv.EarlyTermination(0.05),)  # under which other rays never end
-    return jv.March(step, (JITTER, jv.AlphaCorrection(), *ending, *transforms), QUADRATURE.get(name, "left"))
+    return jv.March(
+        step,
+        (JITTER, jv.AlphaCorrection(), *ending, *transforms),
+        KNOWN[name].quadrature,
+    )
 
 
 def test_of_equal_values_the_nearest_is_the_greatest():
@@ -102,8 +98,8 @@ MAPS = {"average": "voxels"}
 @pytest.mark.parametrize(
     ("name", "method", "dtype"),
     [
-        *((name, MAPS.get(name, "blocks"), TYPES.get(name, "float32")) for name in PLAIN),
-        *slow(*((name, "blocks", TYPES[name]) for name in SIMILAR)),
+        *((name, MAPS.get(name, "blocks"), KNOWN[name].dtype) for name in PLAIN),
+        *slow(*((name, "blocks", KNOWN[name].dtype) for name in SIMILAR)),
         *slow(("maximum", "distance", "float32"), ("isosurface", "beam", "uint8")),
     ],
 )
@@ -177,7 +173,7 @@ def test_nan_is_passed_on():
 
 THICKNESS, LEVEL = {"thickness": lambda scene: scene[4].thickness}, {"value": lambda scene: scene[4].value}
 GRADIENTS = {
-    "surface": (FoggedSurface, LEVEL, {"normals": True}),
+    "isosurface": (FoggedSurface, LEVEL, {"normals": True}),
     "average": (jv.Average, THICKNESS, {}),
     "additive": (lambda part: Additive(part), {}, {}),
 }
@@ -186,7 +182,7 @@ GRADIENTS = {
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "adjoint"),
-    [("surface", "replay"), ("surface", "forward"), ("average", "replay"), ("additive", "direct")],
+    [("isosurface", "replay"), ("isosurface", "forward"), ("average", "replay"), ("additive", "direct")],
 )
 def test_gradients_are_central_differences(name, adjoint):
     """And 0 of an image of nothing."""
@@ -195,7 +191,7 @@ def test_gradients_are_central_differences(name, adjoint):
         noise = anisotropic_noise()
         volume = jv.Volume(np.asarray(noise.data, np.float64), noise.spacing, noise.origin)
         transforms = jv.AlphaCorrection(), jv.SpaceLeaping()
-        march = jv.March(STEP, transforms, QUADRATURE.get(name, "left"), max_samples=64)
+        march = jv.March(STEP, transforms, KNOWN[name].quadrature, max_samples=64)
         scene = volume, soft_transfer(), around(volume), march, make(VALUE)
         check_gradients(scene, parameters, adjoint, **options)
 

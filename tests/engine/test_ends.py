@@ -13,8 +13,10 @@ import pytest
 import jaxvol as jv
 from jaxvol.scene.rendering import Details, pooled
 
-from .. import oracle, switch
+from .. import oracle
 from ..scenes import in_float64, to_float64, uniform_transfer
+from ..switch import switch
+from ..transforms import transforms
 from .test_gradients import scene_of, weighed
 
 
@@ -85,7 +87,7 @@ HOLLOW = 0.4, 1.2, 0.3, 1.1, 0.3, 1.1
 """A plane through the scene of `test_gradients`, and a normal toward its camera."""
 
 
-EVERY = switch.transforms(box=HOLLOW, planes=()) | {"clip": jv.Clip(planes=[CUT])}
+EVERY = transforms(box=HOLLOW, planes=()) | {"clip": jv.Clip(planes=[CUT])}
 
 
 @cache  # what checks numbers is not found in JAX's cache
@@ -111,7 +113,7 @@ def in_both_ways(adjoint, on):
     program = in_one_program(adjoint)
     for clips in (True, False):
         chosen = on | ({"clip"} if clips else set())
-        given = [switch.switch(each, name in chosen, name.title()) for name, each in EVERY.items()]
+        given = [switch(each, name in chosen, name.title()) for name, each in EVERY.items()]
         scene = scene_of(tuple(given), "float64", most=128)
         (_, seen), found = jax.device_get(program(jax.device_put((scene, CUT)), np.asarray(clips)))
         yield seen, jax.tree.leaves((found[0][:3], found[0][3].step, found[1]))

@@ -19,9 +19,9 @@ from hypothesis import example, given, settings, strategies as st
 import jaxvol as jv
 from experiments import scenes as real_scenes
 
-from .. import switch
+from .. import transforms as every
 from ..scenes import LEAVES, in_float64, to_float64, with_voxels
-from ..test_agreement import oracle_image
+from ..switch import switch
 
 
 SHAPE = (26, 21, 31)
@@ -71,7 +71,7 @@ def scene_of(
 
 def switched(on, **values):
     """All but a clip that is inside out, which divides each cell and doubles the time to compile."""
-    return switch.switched(on, box=BOX, planes=(PLANE,), without=("hollow",), **values)
+    return every.switched(on, box=BOX, planes=(PLANE,), without=("hollow",), **values)
 
 
 def loss(scene, adjoint="replay"):
@@ -175,7 +175,7 @@ def assert_same(found, expected, tolerance, context="", rounding=0.0):
 
 
 RANDOM = {
-    "on": switch.SUBSETS.map(lambda on: on - {"hollow"}),
+    "on": every.SUBSETS.map(lambda on: on - {"hollow"}),
     "seed": st.integers(0, 2**32 - 1),
     "camera": st.sampled_from(sorted(CAMERAS)),
 }
@@ -204,12 +204,12 @@ def test_the_usual_march_is_that_of_switches_and_float32_that_of_an_independent_
     image, found = gradient(scene)
     assert 0.05 < np.mean(image[..., 3] > 0) < 0.95
     assert image[..., 3].max() > 0.95
-    given = scene_of(switch.plain(on))
+    given = scene_of(every.plain(on))
     usual, expected = gradient(given)
     np.testing.assert_allclose(image, usual, atol=1e-6)
     shared = {name for name in expected if "transforms" not in name}
     assert_same(chosen(found, shared), chosen(expected, shared), 1e-5)
-    rgba, _ = oracle_image(*given)
+    rgba, _ = every.oracle_image(*given)
     # where rounding decides of a sample, a ray ends or shifts at another one
     off = np.abs(image - rgba).max(axis=-1) > 2e-5
     assert np.mean(off) < 0.01
@@ -221,8 +221,8 @@ def double_scene(on, camera="inside", **values):
 
 @settings(max_examples=1)
 @given(**RANDOM, left=st.floats(0.01, 0.3))
-@example(on=switch.MOST, seed=1, camera="outside", left=0.05)
-@example(on=switch.OTHERS - {"hollow"}, seed=2, camera="inside", left=0.05)
+@example(on=every.MOST, seed=1, camera="outside", left=0.05)
+@example(on=every.OTHERS - {"hollow"}, seed=2, camera="inside", left=0.05)
 def test_every_adjoint_has_the_same_derivatives(on, seed, camera, left):
     """Of every leaf in float64: replay and forward mode of the fast engine, JAX's own of the reference."""
     with in_float64():
@@ -236,8 +236,8 @@ def test_every_adjoint_has_the_same_derivatives(on, seed, camera, left):
 
 @settings(max_examples=1)
 @given(on=RANDOM["on"], seed=st.integers(0, 2**32 - 1))
-@example(on=switch.MOST, seed=1)
-@example(on=switch.OTHERS - {"hollow"}, seed=2)
+@example(on=every.MOST, seed=1)
+@example(on=every.OTHERS - {"hollow"}, seed=2)
 def test_gradients_are_central_differences(on, seed):
     """In a scene without jumps: the last cell is cut at the exit, no ray ends early, and the camera is in
     empty space, so that the first transparent sample of each ray stays the same. Every leaf by itself."""
@@ -279,7 +279,8 @@ def test_nan_and_infinity_reach_image_and_gradient():
         scene = double_scene({"alignment", "leaping", "termination"}, "outside")
         whole = {name: where for name, where in LEAVES.items() if name != "voxels"}
         whole["values"] = lambda scene: scene[1].values
-        whole["opacity_left"] = lambda scene: scene[3].transforms[-1].inner.opacity_left
+        ends = [isinstance(each.inner, jv.EarlyTermination) for each in scene[3].transforms].index(True)
+        whole["opacity_left"] = lambda scene: scene[3].transforms[ends].inner.opacity_left
         for number, (name, where) in enumerate(whole.items()):
             # in the reference, of which each image takes as long as ten others, every third
             direct = [(np.nan, "direct")] if number % 3 == 0 else []
@@ -364,7 +365,7 @@ USUAL = (jv.EmptySpaceJitter(4), jv.AlphaCorrection(), jv.SpaceLeaping(), jv.Ear
 
 def with_and_without_leaps(*transforms, method=("blocks", 8)):
     """These transforms and leaps, and these alone, by one program."""
-    return tuple((*transforms, switch.switch(jv.SpaceLeaping(*method), on)) for on in (True, False))
+    return tuple((*transforms, switch(jv.SpaceLeaping(*method), on)) for on in (True, False))
 
 
 def test_a_gradient_of_some_leaves_is_that_of_all():

@@ -12,7 +12,7 @@ import jaxvol as jv
 from jaxvol.march.march import Cell
 from jaxvol.scene.space import Affine
 
-from ..scenes import around, rendered_rays, scaled_phantom, soft_transfer, uniform_transfer
+from ..scenes import rendered_rays, soft_transfer, uniform_transfer
 from ..switch import switch
 
 
@@ -127,27 +127,6 @@ def test_locate_replaces_the_space():
     rays = np.concatenate([origins, origins + 10]), directions.repeat(2, 0)
     rgba = np.asarray(rendered_rays(BOX, OPAQUE, *rays, march).rgba)
     np.testing.assert_allclose(rgba[:, 3], [0, 1 - np.exp(-2)], atol=1e-5)
-
-
-def test_early_termination_errs_by_less_than_what_is_left():
-    volume, transfer = scaled_phantom("head"), soft_transfer(0.1)
-    camera = around(volume)
-
-    def image(*transforms):
-        found = jv.render(volume, transfer, camera, jv.March(0.05, transforms))
-        return np.asarray(found.rgba), np.asarray(found.samples)
-
-    full, most = image()
-    for left in (1 / 255, 0.1):
-        ended, samples = image(jv.EarlyTermination(left))
-        off = full - ended
-        assert (off > -1e-6).all()
-        assert 0 < off.max() <= left
-        assert (samples <= most).all()
-        assert samples.sum() < most.sum()
-    sooner, as_many = image(jv.EarlyTermination(0.1, interval=3))
-    np.testing.assert_allclose(sooner, ended, atol=1e-6)
-    np.testing.assert_array_equal(as_many, samples)
 
 
 def test_a_march_that_runs_out_of_samples_says_so():

@@ -17,8 +17,16 @@ from jaxvol.scene.occupancy import BLOCK, Blocks
 from jaxvol.scene.transfer import classification_of
 
 from ..modes import Rays, check_gradients, free_leaves, scaled_transfer
-from ..scenes import RESOLUTION, around, in_float64, slow, soft_transfer, to_float64, with_voxels
-from ..test_agreement import random_numbers
+from ..scenes import (
+    RESOLUTION,
+    around,
+    in_float64,
+    random_numbers,
+    slow,
+    soft_transfer,
+    to_float64,
+    with_voxels,
+)
 
 
 def random_table(n: int, m: int, seed: int = 0) -> jv.TransferFunction2D:

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ...compositing.modes import MODES
 from ...io.phantoms import phantom
 from ...render import render
 from ...scene.transfer import Transfer
@@ -25,10 +26,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "orthographic": {"parallel": True},
     "a preset": {"preset": "engine"},
     "clipped": {"clip_box": (-0.5, 1.0, -1.0, 1.0, -1.0, 1.0)},
-    "maximum": {"compositing": "maximum"},
-    "minimum": {"compositing": "minimum"},
-    "average": {"compositing": "average"},
-    "X-ray": {"compositing": "integral"},
+    **{name: {"compositing": name} for name in MODES if name != "over"},
     "isosurface": {"compositing": "isosurface", "isovalue": 60.0},
 }
 """Pictures of 8-bit voxels: name, and options of `jaxvol render`."""

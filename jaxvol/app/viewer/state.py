@@ -20,14 +20,11 @@ from ...engine.stages import Place
 from ...lighting import Phong
 from ...lighting.shading import Lighting
 from ...march.march import March, Transform
-from ...march.transforms import (
-    AlphaCorrection,
-    Clip,
-    EarlyTermination,
-    EmptySpaceJitter,
-    Jitter,
-    SpaceLeaping,
-)
+from ...march.transforms.alpha_correction import AlphaCorrection
+from ...march.transforms.clip import Clip
+from ...march.transforms.early_termination import EarlyTermination
+from ...march.transforms.jitter import EmptySpaceJitter, Jitter
+from ...march.transforms.space_leaping import SpaceLeaping
 from ...ray import check_arguments
 from ...scene.camera import Camera
 from ...scene.occupancy import BLOCK

@@ -15,7 +15,7 @@ from ..._util.checks import Arrayable, described
 from ..._util.files import ensure, file_size, refusing
 from ..._util.image_record import ImageRecord, numbered, volume_arguments
 from ..._util.voxels import WHOLE, within
-from ...march.transforms import ToroidalMap
+from ...march.transforms.toroidal_map import ToroidalMap
 from ...scene.volume import Volume
 from . import library_formats as known, tiff
 from .arrays import RAW, read_npy, read_npz, read_raw

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..._util.files import MOST_VOXELS, check, file_size, refusing
-from ...march.transforms import ToroidalMap
+from ...march.transforms.toroidal_map import ToroidalMap
 
 
 MAGIC = b"KRETZFILE 1.0   "

@@ -27,7 +27,7 @@ LIMIT = 2**15
 
 
 class AlphaCorrection(Transform):
-    """Cut the cells of a ray at the faces that they cross.
+    """Cut cells at the exit, and optionally at faces of labels: back faces are smooth, gradients complete.
 
     A ray's last sample then represents only the width e up to the exit, and back faces are smooth: its
     opacity is `1 - exp(-extinction e)`, the paper's `1 - (1 - α)^(e/d)`. A volume of constant extinction is

@@ -23,7 +23,8 @@ class Clip(Transform):
 
     A ray enters and leaves the volume at the cuts: its first sample lies on the cut face, and
     `AlphaCorrection` cuts its last cell there. With `inside_out`, what is cut away is a gap of the ray, at
-    whose ends `AlphaCorrection` cuts cells, too. Values and light stay those of the whole volume.
+    whose ends `AlphaCorrection` cuts cells, too; where a gap comes to reach a ray's entry, the image jumps by
+    the error of the step. Values and light stay those of the whole volume.
 
     Args:
         box: (x_min, x_max, y_min, y_max, z_min, z_max), as `Volume.bounds` has it; world coordinates.

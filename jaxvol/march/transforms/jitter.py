@@ -52,8 +52,9 @@ class Noise(eqx.Module):
 
 
 class Jitter(Transform):
-    """Start each ray a random fraction ξ of a step past its entry: it leaves out the first ξ d, which adds
-    noise where the volume's bounds cut through material.
+    """Start each ray a random fraction ξ of a step past its entry: wood grain becomes noise.
+
+    It leaves out the first ξ d, which adds noise where the volume's bounds cut through material.
 
     Args:
         seed: an integer in [0, 2³²), or a key of `jax.random`. It may be traced and vmapped over.
@@ -92,10 +93,11 @@ class Jitter(Transform):
 
 
 class EmptySpaceJitter(Transform):
-    """Advance by a random fraction ξ of a step at a ray's first transparent sample, of extinction 0.
+    """Advance by a random fraction ξ of a step at a ray's first transparent sample: wood grain becomes noise,
+    while faces where the volume's bounds cut material stay smooth.
 
-    So wood grain turns into noise, while faces where the volume's bounds cut material stay smooth. The image
-    jumps where a ray's first transparent sample changes; gradients do not include these jumps.
+    Transparent is a sample of extinction 0; a ray without one keeps its wood grain. The image jumps where a
+    ray's first transparent sample changes; gradients do not include these jumps.
 
     Args:
         seed: as in `Jitter`; the random numbers are independent of `Jitter`'s.

@@ -68,8 +68,8 @@ class SpaceLeaping(Transform):
             rendering several volumes with another block than 4, and, with the last two methods, rays of
             one's own (`render_rays`).
 
-    Source: Chae and Shin for `"distance"` and `"min_distance"`, with blocks of 1; `"blocks"` stands for
-    the octree of the KISTI report 2005; `"beam"` is unpublished.
+    Source: Chae and Shin for `"min_distance"`, and, after Zuiderveld et al. 1992, `"distance"`, with blocks
+    of 1; `"blocks"` stands for the octree of the KISTI report 2005; `"beam"` is unpublished.
     """
 
     method: Method = eqx.field(static=True)

@@ -33,7 +33,7 @@ CUBES = 48
 
 
 class ToroidalMap(Transform):
-    """Interpret `data[x, y, z]` as samples at (β, σ, γ) of a swept fan, evenly spaced over the ranges.
+    """Render swept ultrasound as acquired: `data[x, y, z]` are samples at (β, σ, γ) of a fan, evenly spaced.
 
     The volume's own spacing and origin have no meaning under this map, and it must have no direction; world
     coordinates are the probe's, with the origin on the motor axis. Of the gaps in which a ray is outside the

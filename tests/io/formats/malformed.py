@@ -30,6 +30,7 @@ from vtk.util.numpy_support import numpy_to_vtk  # pyright: ignore[reportMissing
 
 import jaxvol as jv
 from jaxvol import bricks
+from jaxvol.io.formats import READERS
 
 from .test_dicom import write_series
 from .test_formats import ramp, raw_bytes
@@ -272,9 +273,13 @@ def fault(number):
 
 
 def main(count, first=0):
+    readers = set(READERS.values())
     for write, read in FILES:  # what libraries allocate once
         with tempfile.TemporaryDirectory() as folder:
-            assert read(write(Path(folder))) >= 60
+            path = write(Path(folder))
+            assert read(path) >= 60
+        readers -= {reader for ending, reader in READERS.items() if path.name.endswith(ending)}
+    assert not readers, "each reader of a kind of file has a good file in FILES"
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + ROOM, used + ROOM))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -8,6 +8,7 @@ import pickle
 import sys
 import tracemalloc
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from jaxvol._util import files
-from jaxvol.io.formats import load
+from jaxvol.io.formats import READERS, load
 
 
 SHAPE = (5, 4, 3)
@@ -89,6 +90,12 @@ def test_arguments_win_over_json_and_json_over_the_name(tmp_path):
     )
     given = load(path, shape=SHAPE, dtype="uint8", spacing=(3, 3, 3), origin=(5, 5, 5))
     assert same(given, ramp(), (3, 3, 3), (5, 5, 5))
+
+
+def test_the_page_of_files_names_every_ending():
+    page = (Path(__file__).parents[3] / "docs" / "files.md").read_text(encoding="utf-8")
+    rows = " ".join(line.split("|")[1] for line in page.splitlines() if line.startswith("| "))
+    assert [ending for ending in READERS if f"`{ending}`" not in rows] == []
 
 
 def test_a_json_file_is_found_under_either_name(tmp_path):

@@ -13,10 +13,24 @@ from jaxvol._util.vec3 import apart
 from jaxvol.march.march import Cell
 from jaxvol.scene.space import Affine, Ray, Straight, enter
 
+from ... import oracle
 from ...scenes import around, rendered, scaled_phantom, soft_transfer, uniform_transfer
 from ...switch import switch
 
 
+EXAMPLES = {"alignment": lambda values: jv.AlphaCorrection()}
+
+
+def cut_at_exit(begin, end, rays):
+    """What lies before the exit, in three pieces where rays have a gap."""
+    end = np.minimum(end, rays.t_out)
+    if rays.gap is None:
+        return [(begin, end)]
+    first, last = (np.clip(side, begin, np.maximum(begin, end)) for side in rays.gap)
+    return [(begin, first), (first, last), (last, end)]
+
+
+MEANINGS = {jv.AlphaCorrection: lambda alignment, camera: oracle.Meaning(cut=cut_at_exit)}
 BOX = jv.Volume(np.ones((2, 2, 2), np.float32))
 LABELS = (np.arange(16) >= 8).astype(np.uint8)[:, None, None] * np.ones((1, 4, 4), np.uint8)
 LABELLED = jv.Volume(np.ones(LABELS.shape, np.float32), labels=LABELS)  # the face lies at x = 7.5

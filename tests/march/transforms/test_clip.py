@@ -23,6 +23,7 @@ from ...scenes import (
     anisotropic_noise,
     around,
     in_float64,
+    reference_image,
     rendered,
     rendered_rays,
     same_trees,
@@ -31,9 +32,32 @@ from ...scenes import (
     uniform_transfer,
 )
 from ...switch import switch
-from ...test_agreement import reference_image
 
 
+EXAMPLES = {
+    "clip": lambda values: jv.Clip(values.box, values.planes),
+    "hollow": lambda values: jv.Clip(values.box, values.planes, inside_out=True),
+}
+
+
+def clipped(clip, camera):
+    """A ray begins with the first point that is seen, and ends with the last one; inside out, what is not
+    seen in between is a gap."""
+    planes = oracle.planes_of(clip.box, zip(*map(np.asarray, (clip.origins, clip.normals)), strict=True))
+
+    def clip_rays(origins, directions, rays):
+        (t_in, t_out, _), (first, last) = rays, oracle.side_interval(origins, directions, planes)
+        if not clip.inside_out:
+            return oracle.Rays(np.maximum(t_in, first), np.minimum(t_out, last))
+        crosses = (first < last) & (first < t_out) & (last > t_in)
+        gap = np.where(crosses & (first > t_in) & (last < t_out), (first, last), np.inf)
+        starts, stops = crosses & (first <= t_in), crosses & (last >= t_out)
+        return oracle.Rays(np.where(starts, last, t_in), np.where(stops, first, t_out), gap)
+
+    return oracle.Meaning(clip=clip_rays)
+
+
+MEANINGS = {jv.Clip: clipped}
 ALIGNED = jv.AlphaCorrection()
 EVERYWHERE = (-9.0, 9.0) * 3
 

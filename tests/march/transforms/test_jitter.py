@@ -11,9 +11,32 @@ from jaxvol.engine.rays import lines
 from jaxvol.march.march import Cell
 from jaxvol.scene.space import Affine, enter
 
-from ...scenes import around
+from ... import oracle
+from ...scenes import around, random_numbers
 
 
+EXAMPLES = {
+    "jitter": lambda values: jv.Jitter(values.seed),
+    "residual": lambda values: jv.Jitter(values.seed, "blue", front_residual=True),
+    "shift": lambda values: jv.EmptySpaceJitter(values.seed),
+}
+
+
+def jittered(jitter, camera):
+    """The first sample lies so many steps past the entry; a front residual is a cell of its own before it."""
+    numbers = random_numbers(jitter, camera)
+    if not jitter.front_residual:
+        return oracle.Meaning(start=numbers)
+    return oracle.Meaning(
+        start=numbers - 1, cut=lambda begin, end, rays: [(np.maximum(begin, rays.t_in), end)]
+    )
+
+
+def shifted(jitter, camera):
+    return oracle.Meaning(jump=random_numbers(jitter, camera))
+
+
+MEANINGS = {jv.Jitter: jittered, jv.EmptySpaceJitter: shifted}
 BOX = jv.Volume(np.ones((5, 5, 5), np.float32), spacing=[0.5] * 3)  # 2 long
 SIDE = 128
 

@@ -10,10 +10,13 @@ from hypothesis import given, settings, strategies as st
 
 import jaxvol as jv
 
+from ... import oracle
 from ...scenes import around, in_float64, inside, orthographic, scaled_phantom, slow, to_float64
 from ...switch import switch
 
 
+EXAMPLES = {"leaping": lambda values: jv.SpaceLeaping()}
+MEANINGS = {jv.SpaceLeaping: lambda leaping, camera: oracle.Meaning()}
 SHAPE = (24, 20, 28)
 SPACING = (0.05, 0.06, 0.04)
 SIZE = (20, 16)
