@@ -270,11 +270,11 @@ class _Run(eqx.Module):
     def _offset(self, problem: Problem) -> float:
         """Distance of the best point from the minimum of the linear model: in standard errors, root mean
         square over all directions. Source: the relative offset of Bates and Watts 1981."""
-        *reducible, rest = np.asarray(cast(Triangles, self.triangles).residual[:, -1], np.float64)
+        *reducible, remainder = np.asarray(cast(Triangles, self.triangles).residual[:, -1], np.float64)
         freedom = problem.count - len(reducible)
-        if freedom <= 0 or rest == 0:
+        if freedom <= 0 or remainder == 0:
             return math.inf
-        return math.sqrt(np.mean(np.square(reducible)) / (rest**2 / freedom))
+        return math.sqrt(np.mean(np.square(reducible)) / (remainder**2 / freedom))
 
 
 @eqx.filter_jit

@@ -291,8 +291,8 @@ class SampledRun(eqx.Module):
     def triangles(self) -> Triangles:
         """Triangles of the mean residual and Jacobian of the averaged samples."""
         *matrices, informed = Triangles.of(self.window.rows)
-        both = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in matrices)
-        return Triangles(*both, informed)
+        factors = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in matrices)
+        return Triangles(*factors, informed)
 
     @property
     def settled(self) -> bool:

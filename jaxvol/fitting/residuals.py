@@ -328,8 +328,8 @@ class Problem(eqx.Module):
 
                 matrices = Triangles.of(jacobian(residual, flat))
                 pairs = zip(triangles[:2], matrices[:2], strict=True)
-                both = (jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs)
-                return Triangles(*both, triangles.informed + matrices.informed)
+                factors = (jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs)
+                return Triangles(*factors, triangles.informed + matrices.informed)
 
             zeros = [jnp.zeros((n, n), flat.dtype) for n in (flat.size + 1, flat.size)]
             triangle, scores, informed = self._accumulate(add, Triangles(*zeros, jnp.zeros((), flat.dtype)))
