@@ -184,7 +184,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "jitter: behind a leap samples lie at whole steps",
-        "engine.wavefront:_to_next_cell",
+        "engine.wavefront:to_next_cell",
         behind_leaps_at_whole_steps,
         (f"{OF_VOXELS}[leaps and early ends-phantom_head-8-0.05]",),
     ),
