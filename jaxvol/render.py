@@ -232,7 +232,7 @@ def render_rays(
             f'most_samples is needed for outputs="samples", and for no others; got outputs={outputs!r}, '
             f"most_samples={described(most_samples)}."
         )
-    most = None if most_samples is None else integer("most_samples", most_samples, 1, 2**24)
+    limit = None if most_samples is None else integer("most_samples", most_samples, 1, 2**24)
     order = "render_rays(volume, transfer, origins, directions, march)"
     grid, function = together(volume, transfer)
     check_arguments(order, volume=grid, transfer=function, march=march, lighting=lighting)
@@ -252,7 +252,7 @@ def render_rays(
         source = Ending(source, finite_array("until", until, origins.shape[:-1], infinite=True))
     scene = Scene(grid, function, source, march, compositing_of(compositing), lighting)
     shown: RenderOutputs = "all" if outputs == "samples" else outputs
-    return render_scene(scene, shown, adjoint, devices=devices, most_samples=most)
+    return render_scene(scene, shown, adjoint, devices=devices, most_samples=limit)
 
 
 @jax.jit

@@ -145,6 +145,9 @@ class Weighting(Compositing[Composite]):
             after: sum of the weights up to and including this cell's.
             weight_bar: derivative of the loss with respect to the cell's weight.
             sum_behind: sum of weight × weight_bar over all cells behind this one.
+
+        Raises:
+            NotImplementedError: unless it is overridden (`has_slope`); engines do not call it then.
         """
         raise NotImplementedError
 
@@ -162,16 +165,16 @@ class Weighting(Compositing[Composite]):
         Of weights (c - `before`) f(`alpha`), all those behind have the factor c - `after`. If c - `after` is
         rounding, so is `sum_behind`."""
         dtype = after.dtype
-        alpha = jnp.array([[0.5], [0.25], [0.75]], dtype)
-        before = jnp.array([0, 0.25, 0.5], dtype) + 0 * alpha
+        tried = (jnp.array(numbers, dtype) for numbers in ([0.5, 0.25, 0.75], [0, 0.25, 0.5]))
+        alpha, before = jnp.meshgrid(*tried, indexing="ij")
         weight, change = jax.jvp(partial(self.weight, alpha), (before,), (jnp.ones_like(before),))
         hides = change[0, 0] != 0
         limit = jnp.where(hides, -weight[0, 0] / jnp.where(hides, change[0, 0], 1), jnp.inf)
         error, eps = weight - weight[:, :1] * (1 - before / limit), float(jnp.finfo(dtype).eps)
         holds = jnp.all(jnp.abs(error) <= 64 * eps * weight[:, :1]) & (weight[0, 0] > 0)
-        left = jnp.where(holds, limit, jnp.nan) - after
-        opaque = left <= 2 * eps
-        return weight_bar - jnp.where(opaque, 0, sum_behind / jnp.where(opaque, 1, left))
+        remaining = jnp.where(holds, limit, jnp.nan) - after
+        opaque = remaining <= 2 * eps
+        return weight_bar - jnp.where(opaque, 0, sum_behind / jnp.where(opaque, 1, remaining))
 
     def transmittance(self, state: Composite) -> Scalar:
         """Transmittance of the cells so far; by default 1, for a mode without occlusion."""

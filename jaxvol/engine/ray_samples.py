@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..march.beams import Box, EmptySpaceIndex
-from ..ray import Progress, Scene, Track
+from ..ray import Progress, Scene, Track, by_rules
 from ..scene.rendering import RaySamples
 from ..scene.space import Ray
 from ..xla.trees import PyTree
@@ -21,22 +21,22 @@ def scan_samples(
     leap: Callable[[Progress], Progress],
     rays: Ray,
     start: Progress,
-    most: int,
+    limit: int,
 ) -> tuple[Progress, RaySamples]:
-    """The rays (groups, rays in a group) after at most `most` samples and cells, and these samples. A cell
+    """The rays (groups, rays in a group) after at most `limit` samples and cells, and these samples. A cell
     with more pieces than there is room for is not taken: its ray is not finished."""
 
     def advance(state: PyTree, _: None) -> tuple[PyTree, RaySamples]:
         at, count = state
         at = leap(at)
-        after, taken = step(at)
-        total = count + jnp.sum(taken.width > 0, axis=-1, dtype=count.dtype)
-        fits = (total <= most) & (at.index < at.track.until)
+        after, cells = step(at)
+        total = count + jnp.sum(cells.width > 0, axis=-1, dtype=count.dtype)
+        fits = (total <= limit) & (at.index < at.track.until)
         state = jax.tree.map(lambda a, b: jnp.where(fits, a, b), (after, total), (at, count))
-        return state, replace(taken, width=jnp.where(fits[..., None], taken.width, 0))
+        return state, replace(cells, width=jnp.where(fits[..., None], cells.width, 0))
 
     none = jnp.zeros_like(start.index)
-    (at, _), taken = jax.lax.scan(advance, (start, none), None, length=most)
+    (at, _), cells = jax.lax.scan(advance, (start, none), None, length=limit)
 
     def by_ray(leaf: Array) -> Array:
         """From (cells, groups, rays, pieces, ...) to (groups, rays, samples, ...)."""
@@ -44,9 +44,9 @@ def scan_samples(
         return leaf.reshape(*leaf.shape[:2], -1, *leaf.shape[4:])
 
     depth, width, weight, color = (
-        by_ray(leaf) for leaf in (taken.depth, taken.width, taken.weight, taken.color)
+        by_ray(leaf) for leaf in (cells.depth, cells.width, cells.weight, cells.color)
     )
-    order = jnp.argsort(width <= 0, axis=-1, stable=True)[..., :most]
+    order = jnp.argsort(width <= 0, axis=-1, stable=True)[..., :limit]
     depth, width, weight = (jnp.take_along_axis(leaf, order, -1) for leaf in (depth, width, weight))
     color = jnp.take_along_axis(color, order[..., None], -2)
     counts, exit_ = width > 0, (rays.t_in + rays.length)[..., None]
@@ -73,7 +73,7 @@ def leap_by_ray(
 
     alone = jax.tree.map(lambda leaf: leaf[:, None], flat(rays))
     skips = index.skips(lambda occupancy: Box.around(occupancy, alone), scene.march.step)
-    job = Job(scene, tiling, (rays, track, None), None, skips, track.shifted is not None)
+    job = Job(by_rules(scene), tiling, (rays, track, None), None, skips, track.shifted is not None)
     numbers = jnp.arange(rays.length.size, dtype=jnp.int32)
 
     def leap(at: Progress) -> Progress:

@@ -104,7 +104,11 @@ class Space(eqx.Module):
         """Grid coordinate of a world point."""
 
     def point(self, coordinate: Vec3) -> Vec3:
-        """World point of a grid coordinate. By default it raises `ValueError`."""
+        """World point of a grid coordinate.
+
+        Raises:
+            ValueError: unless it is overridden.
+        """
         raise ValueError(f"{type(self).__name__} needs a method point(coordinate), inverse to coordinate.")
 
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
