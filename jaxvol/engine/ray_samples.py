@@ -39,7 +39,7 @@ def scan_samples(
     (at, _), cells = jax.lax.scan(advance, (start, none), None, length=limit)
 
     def by_ray(leaf: Array) -> Array:
-        """From (cells, groups, rays, pieces, ...) to (groups, rays, samples, ...)."""
+        """Reshapes (cells, groups, rays, pieces, ...) to (groups, rays, samples, ...)."""
         leaf = jnp.moveaxis(leaf, 0, 2)
         return leaf.reshape(*leaf.shape[:2], -1, *leaf.shape[4:])
 

@@ -122,12 +122,12 @@ def test_sums_over_samples_are_the_image(name, limit):
     image = jax.device_get(rendered_rays(volume, transfer, *camera.rays(), march))
     samples, whole = found.ray_samples, ~np.asarray(found.exhausted)
     np.testing.assert_allclose(found.rgba[whole], image.rgba[whole], atol=2e-6)
-    np.testing.assert_allclose(samples.weight.sum(-1), found.opacity, atol=1e-6)
+    np.testing.assert_allclose(samples.weight.sum(-1), found.rgba[..., 3], atol=1e-6)
     sums = np.sum(samples.weight[..., None] * samples.color, axis=-2)
     np.testing.assert_allclose(sums, found.rgba[..., :3], atol=1e-6)
-    mean = np.sum(samples.weight * samples.depth, axis=-1) / np.maximum(found.opacity, 1e-9)
-    seen = np.asarray(found.opacity) > 1e-3
-    np.testing.assert_allclose(mean[seen], np.asarray(found.depth)[seen], rtol=1e-5)
+    mean = np.sum(samples.weight * samples.depth, axis=-1) / np.maximum(found.rgba[..., 3], 1e-9)
+    seen = np.asarray(found.rgba[..., 3]) > 1e-3
+    np.testing.assert_allclose(mean[seen], np.asarray(found.details.depth)[seen], rtol=1e-5)
     counts = np.sum(np.asarray(samples.width) > 0, axis=-1)
     cells = np.ceil(Rays(volume, camera).length / 0.09).reshape(counts.shape)
     if limit > cells.max():
