@@ -53,6 +53,7 @@ from .reference import render_ray_reference as render_ray_reference
 from .render import render as render, render_rays as render_rays
 from .scene.camera import Camera as Camera
 from .scene.labels import LabelTransferFunction as LabelTransferFunction
+from .scene.occupancy import Occupancy as Occupancy
 from .scene.presets import (
     PRESETS as PRESETS,
     attenuation as attenuation,
@@ -60,7 +61,8 @@ from .scene.presets import (
     preset as preset,
 )
 from .scene.radiance import RadianceField as RadianceField
-from .scene.rendering import Rendering as Rendering
+from .scene.rendering import RaySamples as RaySamples, Rendering as Rendering
+from .scene.space import Gap as Gap, Space as Space
 from .scene.transfer import Transfer as Transfer, TransferFunction as TransferFunction
 from .scene.transfer2d import TransferFunction2D as TransferFunction2D
 from .scene.volume import Field as Field, Volume as Volume

@@ -25,6 +25,7 @@ from .ray import (
     check_arguments,
     check_channels,
     end,
+    is_sample,
     measure,
     move,
     opacity,
@@ -33,7 +34,7 @@ from .ray import (
     stop,
     track_of,
 )
-from .scene.rendering import Rendering
+from .scene.rendering import RaySamples, Rendering
 from .scene.several import together
 from .scene.space import Line, Ray, enter, invalid
 from .scene.transfer import Transfer
@@ -95,7 +96,7 @@ def render_ray_reference(
     marched = scene.marched.prepared()
 
     def advance(at: Progress, _: None) -> tuple[Progress, None]:
-        return step(marched, ray, at), None
+        return step(marched, ray, at)[0], None
 
     start = begin(marched, ray, track_of(marched.march, ray))
     at, _ = jax.lax.scan(advance, varying(start, ray), None, length=length)
@@ -108,11 +109,12 @@ def _has_fault(scene: Scene) -> Bool[Array, ""]:
     return scene.has_fault
 
 
-def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
-    """Sample one cell, composite it, and move on."""
+def step(scene: Scene, ray: Ray, at: Progress) -> tuple[Progress, RaySamples | None]:
+    """Sample one cell, composite it, and move on. Also the samples of its pieces, of width 0 where a piece is
+    no sample of the ray; None for a `Selection`."""
     march, compositing = scene.march, scene.compositing
     sampler = RaySampler(ray, scene.classification, space=scene.space)
-    progress, alphas, color = at, [], None
+    progress, alphas, color, samples = at, [], None, []
     cut = pieces(scene, ray, at)
     for piece in cut:
         measured = measure(scene, ray, piece)
@@ -121,9 +123,17 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
             transmittance = compositing.transmittance(progress.composite)
             classified = scene.classification.of_cells(measured)
             color = sampler.color(march.sample(piece), measured, classified, transmittance)
+        if isinstance(compositing, Weighting) and color is not None:
+            depth, before = march.sample(piece), progress.composite.opacity
+            counts = ~at.finished & is_sample(march, ray, piece, divided=len(cut) > 1) & ray.contains(depth)
+            depth = ray.t_in + jnp.where(counts, depth, ray.length)
+            weight = jnp.where(counts, compositing.weight(alphas[-1], before), 0)
+            width, shown = jnp.where(counts, piece.width, 0), jnp.where(counts, jnp.stack(color), 0)
+            samples.append(RaySamples(*(jnp.stack([part]) for part in (depth, width, weight, shown))))
         progress = add(scene, ray, progress, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
-    return move(march, ray, stop(scene, progress), transparent, 1)
+    pieces_of = jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples) if samples else None
+    return move(march, ray, stop(scene, progress), transparent, 1), pieces_of
 
 
 def resolved(scene: Scene, line: Line, rendering: Rendering) -> Rendering:

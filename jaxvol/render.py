@@ -196,7 +196,8 @@ def render_rays(
     pixels: Arrayable | None = None,
     compositing: Mode | Compositing[Any] = "over",
     lighting: Lighting | None = None,
-    outputs: RenderOutputs = "all",
+    outputs: RenderOutputs | Literal["samples"] = "all",
+    most_samples: SupportsIndex | None = None,
     adjoint: Adjoint = "replay",
     devices: Devices | None = None,
     until: Arrayable | None = None,
@@ -210,6 +211,14 @@ def render_rays(
             (index in the flattened array, 0). Within a `jax.shard_map` over the first axis, the index is that
             in the full array; but under `check_vma=False`, where a shard is not known as one, pass pixels, or
             all shards draw the same numbers.
+        outputs: as for `render`; or `"samples"`: also `Rendering.ray_samples`, the depth, width, weight and
+            colour of up to `most_samples` samples of each ray, for losses along rays (distortion, depth).
+            They are those of the march, without what `SpaceLeaping` leaps over (which each ray does by
+            itself), and their sums are the pixel's. A ray that needs more than `most_samples` samples or
+            cells (with cells in gaps of the volume) ends there: it is `Rendering.exhausted`, and its pixel
+            is that of its samples. Rays are marched by the reference's steps, and differentiated by JAX, in
+            any mode and order, whatever the `adjoint`; memory grows with the number of samples.
+        most_samples: number of samples, for `"samples"` only.
         until: (*rays,) distances at which rays end.
 
     Returns:
@@ -217,8 +226,15 @@ def render_rays(
 
     Raises:
         ValueError: as `render`; and for shapes that differ or do not end in 3, NaN or infinity, and
-            directions of length 0.
+            directions of length 0; for `"samples"` without `most_samples`, and with a compositing mode that
+            does not weight samples.
     """
+    if (outputs == "samples") != (most_samples is not None):
+        raise ValueError(
+            f'most_samples is needed for outputs="samples", and for no others; got outputs={outputs!r}, '
+            f"most_samples={described(most_samples)}."
+        )
+    limit = None if most_samples is None else integer("most_samples", most_samples, 1, 2**24)
     order = "render_rays(volume, transfer, origins, directions, march)"
     grid, function = together(volume, transfer)
     check_arguments(order, volume=grid, transfer=function, march=march, lighting=lighting)
@@ -239,7 +255,8 @@ def render_rays(
     if until is not None:
         source = Ending(source, finite_array("until", until, origins.shape[:-1], infinite=True))
     scene = Scene(grid, function, source, march, compositing_of(compositing), lighting)
-    return render_scene(scene, outputs, adjoint, devices=devices)
+    shown: RenderOutputs = "all" if outputs == "samples" else outputs
+    return render_scene(scene, shown, adjoint, devices=devices, most_samples=limit)
 
 
 @jax.jit

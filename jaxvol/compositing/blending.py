@@ -5,6 +5,7 @@ sum of the weights. A `Selection` picks one depth on the ray, such as that of th
 """
 
 from abc import abstractmethod
+from functools import partial
 from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar, final
 
 import equinox as eqx
@@ -121,11 +122,13 @@ class Composite(eqx.Module):
 
 class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
-    must override `weight` and `slope`; these, and `transmittance`, work elementwise.
+    must override `weight`; it, `slope` and `transmittance` work elementwise.
 
-    Weights depend only on the cells' opacities, are at least 0, and sum to at most 1. If transforms divide a
-    cell, each part has a weight. Parameters are static fields, or, if only `resolved` depends on them,
-    arrays, which have gradients.
+    Weights depend on the cells' opacities and on parameters, are at least 0, and sum to at most 1. If
+    transforms divide a cell, each part has a weight. Parameters are static fields, or JAX arrays, which have
+    gradients in every adjoint. For `jax.grad` with `adjoint="replay"`, weights must be f(`alpha`) or
+    (constant - `before`) f(`alpha`), with f(1/2) > 0; for other weights the gradient is NaN, and
+    `adjoint="direct"` has it.
     """
 
     @abstractmethod
@@ -133,17 +136,45 @@ class Weighting(Compositing[Composite]):
         """Weight of a cell of opacity `alpha` behind cells whose weights sum to `before`. It must be 0 if
         `alpha` is 0, since engines skip such cells."""
 
-    @abstractmethod
     def slope(self, alpha: Scalar, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
-        """Derivative of a loss with respect to the optical depth τ of a cell, for the second march. The
-        arguments suffice only for weights f(`alpha`) or (constant - `before`) f(`alpha`).
+        """Derivative of a loss with respect to the optical depth τ of a cell, for the second march; by
+        default, JAX derives it from `weight`. Override it to save time.
 
         Args:
             alpha: opacity of the cell, 1 - exp(-τ), with the derivative 1 - `alpha`.
             after: sum of the weights up to and including this cell's.
             weight_bar: derivative of the loss with respect to the cell's weight.
             sum_behind: sum of weight × weight_bar over all cells behind this one.
+
+        Raises:
+            NotImplementedError: unless it is overridden (`has_slope`); engines do not call it then.
         """
+        raise NotImplementedError
+
+    @property
+    @final
+    def has_slope(self) -> bool:
+        """True if `slope` is overridden."""
+        return type(self).slope is not Weighting.slope
+
+    @final
+    def total_bar(self, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
+        """Derivative of a loss with respect to the weight of a cell, which hides the cells behind it.
+        Arguments as for `slope`; NaN for weights of another form than the two of the class's docstring.
+
+        Of weights (c - `before`) f(`alpha`), all those behind have the factor c - `after`. If c - `after` is
+        rounding, so is `sum_behind`."""
+        dtype = after.dtype
+        tried = (jnp.array(numbers, dtype) for numbers in ([0.5, 0.25, 0.75], [0, 0.25, 0.5]))
+        alpha, before = jnp.meshgrid(*tried, indexing="ij")
+        weight, change = jax.jvp(partial(self.weight, alpha), (before,), (jnp.ones_like(before),))
+        hides = change[0, 0] != 0
+        limit = jnp.where(hides, -weight[0, 0] / jnp.where(hides, change[0, 0], 1), jnp.inf)
+        error, eps = weight - weight[:, :1] * (1 - before / limit), float(jnp.finfo(dtype).eps)
+        holds = jnp.all(jnp.abs(error) <= 64 * eps * weight[:, :1]) & (weight[0, 0] > 0)
+        remaining = jnp.where(holds, limit, jnp.nan) - after
+        opaque = remaining <= 2 * eps
+        return weight_bar - jnp.where(opaque, 0, sum_behind / jnp.where(opaque, 1, remaining))
 
     def transmittance(self, state: Composite) -> Scalar:
         """Transmittance of the cells so far; by default 1, for a mode without occlusion."""

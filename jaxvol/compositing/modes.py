@@ -33,13 +33,19 @@ OVER = Over()
 
 
 def compositing_of(mode: object) -> Compositing[Any]:
-    """The mode, or the mode of this name. **Raises** `ValueError` for anything else, and for a `Weighting`
-    with fields that are not static, unless only `resolved` may depend on them."""
+    """The mode, or the mode of this name. **Raises** `ValueError` for anything else, for a `Weighting` with
+    fields that are neither arrays nor static, and for an `Over` with another `weight`."""
     if isinstance(mode, Weighting | Selection):
-        if isinstance(mode, Weighting) and not mode.resolves and jax.tree.leaves(mode):
+        if isinstance(mode, Over) and type(mode).weight is not Over.weight:
             raise ValueError(
-                "compositing must be a Weighting with static fields only, eqx.field(static=True); "
-                f"{described(mode)} has others."
+                f"compositing: {type(mode).__name__} is an Over with another weight, for which its slope and "
+                "transmittance are wrong. Subclass jaxvol.Weighting."
+            )
+        loose = [leaf for leaf in jax.tree.leaves(mode) if not isinstance(leaf, jax.Array)]
+        if isinstance(mode, Weighting) and loose:
+            raise ValueError(
+                f"compositing: fields of {described(mode)} must be JAX arrays, eqx.field(converter="
+                f"jnp.asarray), or static, eqx.field(static=True); got {described(loose[0])}."
             )
         return mode
     hint = ""

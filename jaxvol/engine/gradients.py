@@ -115,11 +115,14 @@ class ImageVjp(NamedTuple):
     def zeros(self, perturbed: PyTree) -> Sums:
         """Zeros for all perturbed parts."""
         geometric = moves_rays(perturbed)
-        of_transfer = any(jax.tree.leaves(perturbed.transfer))
+        of_transfer, of_mode = (
+            any(jax.tree.leaves(part)) for part in (perturbed.transfer, perturbed.compositing)
+        )
         total = Total.zeros(
             self.scene,
             self.shader,
             transfer=of_transfer,
+            mode=of_mode,
             geometric=geometric,
             voxels=asked_of(self.scene.volume, perturbed.volume),
         )
@@ -189,9 +192,10 @@ class ImageVjp(NamedTuple):
     def cotangents(self, sums: Sums) -> Scene:
         """Cotangents of the scene's parts; 0 for parts that are not perturbed."""
         total, volume = sums.total, self.scene.volume
-        parts = without_voxels(volume), self.scene.transfer, self.scene.source, self.scene.march
-        of_parts = total.volume, total.transfer, sums.source, total.march
-        of_volume, of_transfer, of_source, of_march = (
+        _, transfer, source, march, mode, *_ = self.scene
+        parts = without_voxels(volume), transfer, source, march, mode
+        of_parts = total.volume, total.transfer, sums.source, total.march, total.mode
+        of_volume, of_transfer, of_source, of_march, of_mode = (
             zeros_of(part) if bar is None else bar for part, bar in zip(parts, of_parts, strict=True)
         )
         if total.rules is not None:
@@ -202,10 +206,7 @@ class ImageVjp(NamedTuple):
             more_volume, more_transfer, more_march, of_lighting = self.pull_shader(total.shader)[0]
             of_volume, of_transfer = added(of_volume, more_volume), added(of_transfer, more_transfer)
             of_march = added(of_march, more_march)
-        # a march does not depend on the parameters of a mode
-        return Scene(
-            of_volume, of_transfer, of_source, of_march, zeros_of(self.scene.compositing), of_lighting
-        )
+        return Scene(of_volume, of_transfer, of_source, of_march, of_mode, of_lighting)
 
 
 def _vjp_by_tiles(

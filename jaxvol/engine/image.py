@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Int
 
+from ..compositing.blending import OpticalDepths, Weighting
 from ..compositing.selection import Selection
 from ..lighting.template_lighting import with_baked_light
 from ..ray import Scene, by_rules, check_channels, end
@@ -28,6 +29,7 @@ from ..xla.trees import PyTree, constant, floats, strong
 from .acceleration import VolumeAcceleration, empty_space_of
 from .devices import Devices, check_not_sharded, mesh_of, on_all, over_devices
 from .gradients import render_vjp
+from .ray_samples import leap_by_ray, scan_samples
 from .rays import RayTiles, vmap_rays
 from .resolve import MarchResult, resolve_image, with_pixels
 from .shifts import begin_rays
@@ -53,8 +55,10 @@ def render_scene(
     adjoint: Adjoint,
     tiling: Tiling | None = None,
     devices: Devices | None = None,
+    most_samples: int | None = None,
 ) -> Rendering:
-    """The image of a scene whose arguments have been checked.
+    """The image of a scene whose arguments have been checked. `most_samples`: number of samples that are kept
+    of each ray, as `Rendering.ray_samples`; None: no samples.
 
     Raises:
         ValueError: if `outputs` or `adjoint` is unknown; if `adjoint` is `"direct"`, the march or the spacing
@@ -71,12 +75,17 @@ def render_scene(
     volume, march, lighting = scene.volume, scene.march, scene.lighting
     check_channels(volume, scene.transfer, march, scene.compositing, lighting)
     steps = None
-    if adjoint == "direct":
+    if most_samples is not None:
+        if not isinstance(scene.compositing, Weighting) or scene.resolves:
+            name = type(scene.compositing).__name__
+            raise ValueError(f'compositing must weight samples for outputs="samples", as "over"; got {name}.')
+        adjoint, steps = "direct", most_samples
+    elif adjoint == "direct":
         # a multiple of 64, so that a change of step rarely compiles the program again
         steps = min(-(-steps_across(volume, march) // 64) * 64, march.most_samples)
     if lighting is not None:
         scene = scene._replace(lighting=with_baked_light(lighting, volume, scene.transfer, march))
-    options = RenderOptions(outputs, tiling, adjoint, steps)
+    options = RenderOptions(outputs, tiling, adjoint, steps, most_samples is not None)
     acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting, scene.compositing)
     scene, acceleration = varying((scene, acceleration))
     image = _resolved if scene.resolves else _image
@@ -89,10 +98,11 @@ def render_scene(
 
 def _resolved(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
     """Marches the rays without light, and computes the pixels from the result."""
-    # The march does not depend on the mode's parameters, or is not differentiated: stop their gradient.
-    marched = scene.marched._replace(compositing=jax.lax.stop_gradient(scene.compositing))
-    if isinstance(scene.compositing, Selection):
+    marched, mode = scene.marched, scene.compositing
+    if isinstance(mode, Selection):
         marched = constant(marched)
+    elif isinstance(mode, OpticalDepths):  # weights without parameters
+        marched = marched._replace(compositing=constant(mode))
     outputs = options.outputs
     options = replace(options, outputs="all" if outputs == "all" else "depth")
     rendering = _image(marched, options, acceleration)
@@ -148,17 +158,25 @@ def march_image(
 
 
 def scan_image(scene: Scene, options: RenderOptions, acceleration: VolumeAcceleration) -> Rendering:
-    """The image by `options.steps` reference steps along each ray, which JAX differentiates."""
+    """The image by `options.steps` reference steps along each ray, which JAX differentiates; and, with
+    `options.samples`, the samples of those steps, which then do not lie in empty space."""
     tiles = RayTiles.of(scene.source, options.tiling, direct=True)
     scene = nan_derivatives(scene, scene.has_fault)
     prepared = acceleration.prepared(scene)
+    index = empty_space_of(scene, acceleration, options.tiling) if options.samples else None
 
     def scan_tile(_: Int[Array, ""], rays: Ray) -> tuple[Rendering, None]:
         one = vmap_rays(partial(step, prepared))
         start = begin_rays(scene.march, prepared, rays, options.tiling, options.outputs, finds_shifts=False)
         start = varying(start, rays)
-        at, _ = jax.lax.scan(lambda at, none: (one(rays, at), none), start, None, length=options.steps)
-        return vmap_rays(partial(end, prepared))(rays, at), None
+        if options.samples:
+            leap = leap_by_ray(prepared, options.tiling, index, rays, start.track)
+            at, samples = scan_samples(partial(one, rays), leap, rays, start, options.steps or 0)
+        else:
+            samples = None
+            at, _ = jax.lax.scan(lambda at, none: (one(rays, at)[0], none), start, None, length=options.steps)
+        rendering = vmap_rays(partial(end, prepared))(rays, at)
+        return replace(rendering, details=rendering.details._replace(ray_samples=samples)), None
 
     return _over_tiles(scene, prepared.space, tiles, scan_tile)[0]
 

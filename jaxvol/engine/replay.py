@@ -81,6 +81,8 @@ class Total(NamedTuple):
     voxels: Sums
     shader: PyTree
     """Cotangent of `Shader.leaves`."""
+    mode: PyTree
+    """Cotangent of the compositing mode."""
 
     @property
     def of_voxels(self) -> bool:
@@ -94,7 +96,14 @@ class Total(NamedTuple):
 
     @classmethod
     def zeros(
-        cls, scene: Scene, shader: Shader | None, *, transfer: bool, geometric: bool, voxels: list[bool]
+        cls,
+        scene: Scene,
+        shader: Shader | None,
+        *,
+        transfer: bool,
+        mode: bool,
+        geometric: bool,
+        voxels: list[bool],
     ) -> "Total":
         """Zeros for the requested parts."""
         volume = scene.volume
@@ -105,6 +114,7 @@ class Total(NamedTuple):
             zeros_of(without_voxels(volume)) if geometric else None,
             zero_sums(volume, voxels),
             None if shader is None else zeros_of(shader.leaves),
+            zeros_of(scene.compositing) if mode else None,
         )
 
 
@@ -167,7 +177,8 @@ class Replay(SampleVisitor):
             pairs = zip(weight_bars, depths, strict=True)
             weight_bars = [value + bar.depth * (depth - bar.middle) for value, depth in pairs]
         inside = vmap_cells(Ray.contains, of_cells=(False, True))
-        carry, slopes = self._slopes(samples.opacity, weights, weight_bars, constants.total, carry)
+        carry, slopes, of_mode = self._slopes(samples.opacity, weights, weight_bars, constants.total, carry)
+        total = total._replace(mode=added(total.mode, of_mode))
         slopes = [jnp.where(inside(ray, s), slope, 0) for s, slope in zip(depths, slopes, strict=True)]
 
         of_measured = []
@@ -292,17 +303,41 @@ class Replay(SampleVisitor):
 
     def _slopes(
         self, alphas: list[Scalar], weights: Weights, weight_bars: list[Scalar], total: Scalar, front: Scalar
-    ) -> tuple[Scalar, list[Scalar]]:
-        """The new sum of w_j q_j in front, and the derivative of the loss by each sample's optical depth."""
+    ) -> tuple[Scalar, list[Scalar], PyTree]:
+        """The new sum of w_j q_j in front, the derivative of the loss by each sample's optical depth, and the
+        cotangent of the compositing mode, None if it is not perturbed."""
         slopes: list[list[Scalar]] = [[] for _ in weight_bars]
-        compositing = self.prepared.compositing
+        total_bars: list[list[Scalar]] = [[] for _ in weight_bars]
+        compositing, of_mode = self.prepared.compositing, self.total.mode
         assert isinstance(compositing, Weighting)
         for k in range(weight_bars[0].shape[0]):
             for i, value in enumerate(weight_bars):
                 front = front + weights.weight[i][k] * value[k]
-                slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], total - front)
-                slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
-        return front, [jnp.stack(values) for values in slopes]
+                parts, finished = (weights.after[i][k], value[k], total - front), weights.finished[i][k]
+                if compositing.has_slope:
+                    slope = compositing.slope(alphas[i][k], *parts)
+                    slopes[i].append(jnp.where(finished, 0, slope))
+                if of_mode is not None or not compositing.has_slope:
+                    total_bars[i].append(jnp.where(finished, 0, compositing.total_bar(*parts)))
+        known = [jnp.stack(values) for values in slopes] if compositing.has_slope else None
+        if known is not None and of_mode is None:
+            return front, known, None
+        groups = zip(alphas, weights.before, map(jnp.stack, total_bars), strict=True)
+        pulled = [_weight_vjp(compositing, *group) for group in groups]
+        of_mode = None if of_mode is None else reduce(added, (of_part for of_part, _ in pulled))
+        return front, [slope for _, slope in pulled] if known is None else known, of_mode
+
+
+def _weight_vjp(mode: Weighting, alpha: Scalar, before: Scalar, bar: Scalar) -> tuple[PyTree, Scalar]:
+    """Pull-back of the weights of cells to the mode, and to the cells' optical depths."""
+    moving, fixed = eqx.partition(mode, eqx.is_inexact_array)
+
+    def weight(moving: PyTree, more: Scalar) -> Scalar:
+        # the derivative of opacity 1 is 0, also where that of the weight is infinite
+        thicker = alpha + jnp.where(alpha < 1, (1 - alpha) * more, 0)
+        return eqx.combine(moving, fixed).weight(thicker, before)
+
+    return jax.vjp(weight, moving, jnp.zeros_like(alpha))[1](bar)
 
 
 def _dot(a: Color, b: Color) -> Scalar:

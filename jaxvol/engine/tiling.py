@@ -87,12 +87,14 @@ class RenderOptions(eqx.Module):
 
     Attributes:
         steps: number of steps of each ray's scan, for `adjoint="direct"`.
+        samples: whether that scan leaps, and returns at most `steps` samples of each ray.
     """
 
     outputs: Outputs = eqx.field(static=True)
     tiling: Tiling = eqx.field(static=True)
     adjoint: Adjoint = eqx.field(static=True, default="replay")
     steps: int | None = eqx.field(static=True, default=None)
+    samples: bool = eqx.field(static=True, default=False)
 
 
 GPU = Tiling(cells=16, batch=2**12, turns=8, tile=2**14, searched=2**16, chunk=0)

@@ -249,7 +249,7 @@ def _march_batch(
 
     def advance(state: tuple[Lanes, PyTree]) -> tuple[Lanes, PyTree]:
         lanes, total = state
-        at = _to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
+        at = to_next_cell(job, beam, rays, jax.vmap(_progress)(lanes, track))
         after, samples = march_segment(job.scene, tiling, rays, at, shifts=job.shifts)
         carry, sums = lanes.carry, lanes.sums
         if job.visitor is not None:
@@ -302,7 +302,7 @@ def _moved(march: Any, ray: Ray, at: Progress, steps: Int[Array, ""], *, transpa
     return jax.tree.map(lambda a, b: jnp.where((steps > 0) & ~at.finished, a, b), moved, at)
 
 
-def _to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
+def to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -> Progress:
     """Moves rays to their next cell that is not proven empty."""
     if job.skips is None:
         return at

@@ -39,6 +39,26 @@ class BrickReport(NamedTuple):
     """Memory of the voxels held, of the data derived from them, and of the next brick."""
 
 
+class RaySamples(eqx.Module):
+    """The samples of rays, front to back, each with the part of the ray that it represents: what losses along
+    rays need. Where a ray has fewer samples than the arrays have room for, the last ones have the weight,
+    width and colour 0, at the depth of the ray's exit.
+
+    Attributes:
+        depth: distance from the ray's origin to the sample, world length. A sample is at the front of its
+            part of the ray under `quadrature="left"`, otherwise in its middle.
+        width: length of that part, world length.
+        weight: its share of the pixel, T α under `"over"`. The weights of a ray sum to its opacity, weights
+            times colours to its premultiplied colour.
+        color: colours, linear and lit, not premultiplied.
+    """
+
+    depth: Float[Array, "*rays samples"]
+    width: Float[Array, "*rays samples"]
+    weight: Float[Array, "*rays samples"]
+    color: Float[Array, "*rays samples colors"]
+
+
 class Details(NamedTuple):
     """Outputs that cost time; None for those not requested. See `Rendering`."""
 
@@ -49,6 +69,7 @@ class Details(NamedTuple):
     selected: PyTree = None
     """The final state of a `Selection`, for `ray.resolve`; None in an image."""
     bricks: BrickReport | None = None
+    ray_samples: RaySamples | None = None
 
 
 class Rendering(eqx.Module):
@@ -65,6 +86,7 @@ class Rendering(eqx.Module):
         aligned: whether a visible last cell was cut at the exit (Kye 2013, Fig. 13).
         normal: unit normal of an `Isosurface` in the world; 0 where nothing is visible.
         bricks: the `BrickReport` of `render_bricks`.
+        ray_samples: the `RaySamples` of `render_rays(..., outputs="samples")`.
         background: linear RGB of the default background of `image` and of the notebook's picture; white
             unless set by `jaxvol.show`. Static.
 
@@ -73,8 +95,8 @@ class Rendering(eqx.Module):
     With `antialias`, a pixel has the mean `rgba` of its rays, the means of `depth` and `normal` weighted by
     opacity, and the sum of `samples`; it is `exhausted` or `aligned` if any of its rays is.
 
-    `depth`, `samples`, `aligned`, `normal` and `bricks` raise `AttributeError` if not computed, as with
-    `outputs="rgba"`. Modes other than `"over"` document their depth.
+    `depth`, `samples`, `aligned`, `normal`, `bricks` and `ray_samples` raise `AttributeError` if not
+    computed, as with `outputs="rgba"`. Modes other than `"over"` document their depth.
     """
 
     rgba: Float[Array, "*rays numbers"]
@@ -107,9 +129,15 @@ class Rendering(eqx.Module):
     def bricks(self) -> BrickReport:
         return self._detail("bricks", "render it by render_bricks, and ")
 
-    def _detail(self, name: str, condition: str = "") -> Any:
+    @property
+    def ray_samples(self) -> RaySamples:
+        return self._detail("ray_samples", "render it by render_rays, and ", "samples")
+
+    def _detail(self, name: str, condition: str = "", outputs: str = "all") -> Any:
         if (value := getattr(self.details, name)) is None:
-            raise AttributeError(f'{name} is not part of this rendering: {condition}pass outputs="all".')
+            raise AttributeError(
+                f'{name} is not part of this rendering: {condition}pass outputs="{outputs}".'
+            )
         return value
 
     def image(self, background: Arrayable | None = None) -> Float[Array, "*rays 3"]:

@@ -1,7 +1,9 @@
 """Maps between the world and the grid, and rays clipped to the grid: a `Space` (seam `locate`). Rays are
 straight in the grid of the default, `Affine`; other spaces return another `Path`."""
 
+import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from functools import reduce
 from typing import NamedTuple, TypeAlias, cast
 
@@ -11,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
 
 from .._util.vec3 import Frame, Scalar, Vec3, along, apart, minus, plus, times
-from .occupancy import BLOCK, Occupancy
+from .occupancy import BLOCK, Occupancy, Sums
 from .several import Several
 from .volume import Volume
 
@@ -27,9 +29,23 @@ class Path(eqx.Module):
 Gap: TypeAlias = tuple[Scalar, Scalar]
 """Entry and exit depth of an interval along a ray, such as one outside the grid."""
 
+CUBES = 48
+"""Cells per side of the cube around a space, in its default occupancy grid."""
+
+FAR = 1e6
+"""Nodes: beyond any grid."""
+
 
 class Space(eqx.Module):
-    """The mapping between the world and a volume's grid."""
+    """The mapping between the world and a volume's grid, which `Transform.locate` returns. Methods take one
+    point or ray, as tuples of three numbers, and work elementwise.
+
+    A subclass overrides `coordinate`, `interval`, `middle` and `diagonal`; `gaps` if rays may leave the grid
+    and come back; `least_distances`, so that rays leap over empty space; and `point`, for `plan`,
+    `render_bricks`, and lighting by `ScattererTemplates`. The node `data[i, j, k]` has the coordinate
+    (i, j, k). From its entry to its exit, except in its gaps, a ray must be inside the grid. Float arrays
+    have gradients through `coordinate`, `interval` and `gaps`.
+    """
 
     @property
     def searches(self) -> bool:
@@ -87,21 +103,50 @@ class Space(eqx.Module):
     def coordinate(self, point: Vec3) -> Vec3:
         """Grid coordinate of a world point."""
 
-    @abstractmethod
     def point(self, coordinate: Vec3) -> Vec3:
-        """World point of a grid coordinate."""
+        """World point of a grid coordinate.
 
-    @abstractmethod
+        Raises:
+            ValueError: unless it is overridden.
+        """
+        raise ValueError(f"{type(self).__name__} needs a method point(coordinate), inverse to coordinate.")
+
     def least_distances(self, low: Vec3, high: Vec3) -> Vec3:
-        """Least world distance between neighbouring layers of nodes along each axis, in a box of grid
-        coordinates that may exceed the grid; 0 where nodes coincide."""
+        """Least world distance between neighbouring layers of nodes along each axis (the reciprocal of the
+        steepest rise of the coordinate), in a box of grid coordinates that may exceed the grid; 0 where nodes
+        coincide or the coordinate jumps. By default 0: unknown."""
+        zero = jnp.zeros_like(low[0])
+        return zero, zero, zero
 
-    @abstractmethod
     def occupancy(
         self, visible: Bool[Array, "bx by bz"], first: Vec3 | None = None, side: int = BLOCK
     ) -> Occupancy:
         """Cells that may hold anything visible, relative to `anchor`, from the visible blocks of `side`³
-        cells of the grid, or of a part of it that begins at the node `first`."""
+        cells of the grid, or of a part of it that begins at the node `first`. By default, cubes of the world
+        from which a visible block is in reach by `least_distances`."""
+        space, middle, width = jax.lax.stop_gradient(
+            (self.local, self.place(self.middle), self.diagonal / CUBES)
+        )
+        low = cast(Vec3, tuple(m - width * CUBES / 2 for m in middle))
+        middles = (m + width * (jnp.arange(CUBES, dtype=m.dtype) + 0.5) for m in low)
+        x, y, z = jnp.meshgrid(*middles, indexing="ij")
+        center, radius = space.coordinate((x, y, z)), width * (math.sqrt(3) / 2 + 1e-3)
+
+        def changes(box: Sequence[Scalar]) -> list[Scalar]:
+            """Most that coordinates change in the sphere around a cube, if they stay in this box."""
+            ends = ([c + sign * b for c, b in zip(center, box, strict=True)] for sign in (-1, 1))
+            distances = space.least_distances(*(cast(Vec3, tuple(end)) for end in ends))
+            return [radius / jnp.maximum(d, radius / FAR) for d in distances]
+
+        zero = jnp.zeros_like(x)
+        box = [2 * change for change in changes([zero, zero, zero])]
+        # Coordinates stay in a box in which none may change by more than the box. Where one may, the box
+        # becomes all of its axis, and the others are tested again.
+        for _ in range(3):
+            pairs = zip(changes(box), box, strict=True)
+            box = [jnp.where(change <= half, half, FAR) for change, half in pairs]
+        reached = blocks_in_reach(center, changes(box), visible, first, side)
+        return Occupancy(reached, low, (width, width, width), anchor=self.anchor)
 
     def path(self, entry: Vec3, direction: Vec3) -> Path:
         """The straight world ray from `entry`, in grid coordinates."""
@@ -293,6 +338,28 @@ class Affine(Space):
     def _components(self, point: Vec3) -> Vec3:
         """Components of a point along the axes, relative to the first node."""
         return self.frame.components(self.place(point))
+
+
+def blocks_in_reach(
+    center: Vec3,
+    changes: Sequence[Scalar],
+    visible: Bool[Array, "bx by bz"],
+    first: Vec3 | None,
+    side: int,
+    lasts: Sequence[int] | None = None,
+) -> Bool[Array, "cx cy cz"]:
+    """Mask of cells, True where a visible block is in reach from the `center` by these `changes` of its
+    coordinates. `visible`, `first`, `side`: as for `Space.occupancy`. `lasts`: last node along each axis."""
+    begin, stop, reached = [], [], jnp.ones(center[0].shape, bool)
+    for axis, (change, blocks) in enumerate(zip(changes, visible.shape, strict=True)):
+        c = center[axis] - (0 if first is None else first[axis])
+        last = side * blocks if lasts is None else min(lasts[axis], side * blocks)
+        nodes = change + 1e-3 * (last + 1)
+        reached &= (c + nodes >= 0) & (c - nodes <= last)
+        for end, bounds in ((c - nodes, begin), (c + nodes, stop)):
+            bounds.append(jnp.clip(jnp.floor(end / side).astype(jnp.int32), 0, blocks - 1))
+    shows = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
+    return reached & shows
 
 
 def slab_interval(origin: Vec3, direction: Vec3, low: Vec3, high: Vec3) -> tuple[Scalar, Scalar]:

@@ -182,7 +182,7 @@ traced = eqx.filter_eval_shape
 
 
 class Scaled(Additive):
-    """With a parameter that is not static."""
+    """With a number that is neither an array nor static."""
 
     by: float = 1.0
 
@@ -236,7 +236,7 @@ REFUSED = {
     "a class": (lambda: modes.compositing_of(jv.Over), "got the class Over"),
     "a field": (
         lambda: modes.compositing_of(Scaled(0.1, 2.0)),
-        "must be a Weighting with static fields only.*a Scaled has",
+        r"fields of a Scaled must be JAX arrays, .*; got 2.0",
     ),
     "average, labels": (average_of_labels, "value alone; LabelTransferFunction reads more"),
     "average, light": (average_that_is_lit, "lighting must be None"),

@@ -72,6 +72,19 @@ def behind_leaps_at_whole_steps(to_next_cell):
     return moved
 
 
+def a_cell_further(leap_by_ray):
+    def leap_of(*given):
+        leap = leap_by_ray(*given)
+
+        def further(at):
+            at = leap(at)
+            return replace(at, index=at.index + 1)
+
+        return further
+
+    return leap_of
+
+
 MARCH, GRAIN = "march/test_march.py::", "test_wood_grain.py::"
 OF_VOXELS = f"{GRAIN}test_jitter_breaks_wood_grain_of_voxels_and_leaves_the_error"
 FAULTS: list[Fault] = [
@@ -184,7 +197,7 @@ FAULTS: list[Fault] = [
     ),
     Fault(
         "jitter: behind a leap samples lie at whole steps",
-        "engine.wavefront:_to_next_cell",
+        "engine.wavefront:to_next_cell",
         behind_leaps_at_whole_steps,
         (f"{OF_VOXELS}[leaps and early ends-phantom_head-8-0.05]",),
     ),
@@ -239,5 +252,11 @@ FAULTS: list[Fault] = [
         "xla.compiling:_batch",
         lambda f: lambda *given: jax.tree.map(lambda leaf: leaf[::-1], f(*given)),
         ("engine/test_gradients.py::test_vmap_is_a_loop_for_image_and_gradient",),
+    ),
+    Fault(
+        "ray samples: rays leap a cell too far",
+        "engine.ray_samples:leap_by_ray",
+        a_cell_further,
+        ("engine/test_ray_samples.py::test_sums_over_samples_are_the_image",),
     ),
 ]

@@ -171,4 +171,16 @@ FAULTS: list[Fault] = [
         lambda f: lambda means, plain: (plain[:3], f(means, plain)[1]),
         ("test_preintegration.py::test_means_are_integrals",),
     ),
+    Fault(
+        "compositing: a weight's derivative leaves out what the cell hides",
+        "compositing.blending:Weighting.total_bar",
+        lambda _: lambda self, after, weight_bar, sum_behind: weight_bar,
+        ("compositing/test_fitted_modes.py::test_parameters_have_the_gradient_of_differences[veiled]",),
+    ),
+    Fault(
+        "space: a cell of the default occupancy reaches half as far",
+        "scene.space:blocks_in_reach",
+        lambda f: lambda center, changes, *given: f(center, [0.5 * c for c in changes], *given),
+        ("march/test_space_of_a_user.py::test_a_cell_that_is_empty_reaches_nothing_visible",),
+    ),
 ]

@@ -21,8 +21,8 @@ from jaxtyping import Array, Bool, Float
 
 from ..._util.checks import Arrayable, finite_array, number, require
 from ..._util.vec3 import Scalar, Vec3, apart
-from ...scene.occupancy import BLOCK, Occupancy, Sums
-from ...scene.space import Gap, Space
+from ...scene.occupancy import BLOCK, Occupancy
+from ...scene.space import Gap, Space, blocks_in_reach
 from ...scene.volume import Volume
 from ..march import Transform
 from .sector_faces import SectorFaces, hypot
@@ -197,16 +197,11 @@ class _Sector(Space):
             return jnp.where(off_axis, jnp.arcsin(ratio), math.tau)
 
         changes, ranges = (angle(rho), angle(off), radius), self.probe.ranges
-        begin, stop, reached = [], [], jnp.ones(rho.shape, bool)
-        coordinate = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
-        for axis, (change, ends, n) in enumerate(zip(changes, ranges, self.shape, strict=True)):
-            blocks, c = visible.shape[axis], coordinate[axis] - (0 if first is None else first[axis])
-            nodes = change / (ends[1] - ends[0]) * (n - 1) + 1e-3 * n
-            reached &= (c + nodes >= 0) & (c - nodes <= min(n - 1, side * blocks))
-            for end, bounds in ((c - nodes, begin), (c + nodes, stop)):
-                bounds.append(jnp.clip(jnp.floor(end / side).astype(jnp.int32), 0, blocks - 1))
-        shows = Sums.of(visible).any_between((begin[0], begin[1], begin[2]), (stop[0], stop[1], stop[2]))
-        return Occupancy(reached & shows, low, (x, y, z))
+        lasts = [n - 1 for n in self.shape]
+        parts = zip(changes, ranges, lasts, strict=True)
+        nodes = [change / (ends[1] - ends[0]) * last for change, ends, last in parts]
+        center = jax.lax.stop_gradient(self).coordinate((point[0], point[1], point[2]))
+        return Occupancy(blocks_in_reach(center, nodes, visible, first, side, lasts), low, (x, y, z))
 
     @property
     def _faces(self) -> SectorFaces:
