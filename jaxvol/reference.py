@@ -30,8 +30,10 @@ from .ray import (
     opacity,
     pieces,
     resolve,
+    reweigh,
     stop,
     track_of,
+    transmittance,
 )
 from .scene.rendering import Rendering
 from .scene.several import together
@@ -116,11 +118,12 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
         measured = measure(scene, ray, piece)
         alphas.append(opacity(scene, ray, piece, measured))
         if not isinstance(compositing, Selection):
-            transmittance = compositing.transmittance(progress.composite)
             classified = scene.classification.of_cells(measured)
-            color = sampler.color(march.sample(piece), measured, classified, transmittance)
+            reaching = transmittance(scene, progress.composite)
+            color = sampler.color(march.sample(piece), measured, classified, reaching)
         progress = add(scene, ray, progress, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
+    progress = reweigh(scene, ray, progress, alphas)
     return move(march, ray, stop(scene, progress), transparent, 1)
 
 

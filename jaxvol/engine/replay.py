@@ -19,7 +19,7 @@ If rays leap over empty space, the first march records each ray's first and last
 leaps over all others, which saves two fifths of the samples in the head.
 """
 
-from functools import reduce
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.vec3 import Color, Scalar, along
-from ..compositing.blending import Weighting
+from ..compositing.blending import Composite, Weighting
 from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
@@ -147,7 +147,7 @@ class Replay(SampleVisitor):
         classify = vmap_cells(self.prepared.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.prepared.march.sample(cell) for cell in samples.cells]
-        weights = weights_of(self.prepared, at, samples.opacity)
+        weights = weights_of(self.prepared, ray, at, samples.opacity)
         of_color = [tuple(weight * of for of in bar.color) for weight in weights.weight]
         shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
@@ -210,11 +210,12 @@ class Replay(SampleVisitor):
             total = total._replace(voxels=voxels)
         return carry, of_rays, total
 
-    def _weight_of_thin(self, before: Scalar) -> Scalar:
-        """The derivative of a cell's weight by its opacity, at 0, behind the opacity `before`."""
-        compositing, zero = self.prepared.compositing, jnp.zeros_like(before)
+    def _weight_of_thin(self, before: Composite) -> Scalar:
+        """The derivative of a cell's weight by its opacity, at 0, behind the cells `before`."""
+        compositing, zero = self.prepared.compositing, jnp.zeros_like(before.opacity)
         assert isinstance(compositing, Weighting)
-        return jax.jvp(lambda alpha: compositing.weight(alpha, before), (zero,), (zero + 1,))[1]
+        weight = partial(compositing.weight, before=before.opacity)
+        return _scaled(jax.jvp(weight, (zero,), (zero + 1,))[1], before.factor)
 
     @property
     def reads_transfer(self) -> bool:
@@ -300,9 +301,15 @@ class Replay(SampleVisitor):
         for k in range(weight_bars[0].shape[0]):
             for i, value in enumerate(weight_bars):
                 front = front + weights.weight[i][k] * value[k]
+                # linear in the last two
+                value = _scaled(value, weights.before[i].factor)
                 slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], total - front)
                 slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
         return front, [jnp.stack(values) for values in slopes]
+
+
+def _scaled(value: Scalar, factor: Scalar | None) -> Scalar:
+    return value if factor is None else value * factor
 
 
 def _dot(a: Color, b: Color) -> Scalar:

@@ -15,13 +15,13 @@ from ..compositing.blending import Composite, Weighting
 from ..compositing.selection import Selection
 from ..lighting.shading import Sample, Shader, no_terms
 from ..march.march import Cell
-from ..ray import Progress, Scene, stopped
+from ..ray import Progress, Scene, reweigh, stop, transmittance
 from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, with_fields
 from .rays import vmap_cells
 
 
@@ -87,44 +87,47 @@ def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
 
 
 class Weights(NamedTuple):
-    """Weights of samples, opacity before and after them, and whether the ray was finished before: one array
-    (cells, rays) per piece of a cell."""
+    """Weights of samples, state of compositing before and opacity after them, and whether the ray was
+    finished before: one entry per piece of a cell, of arrays (cells, rays)."""
 
     weight: list[Scalar]
-    before: list[Scalar]
+    before: list[Composite]
     after: list[Scalar]
     finished: list[Bool[Array, "cells rays"]]
 
 
-def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
+def weights_of(scene: Scene, ray: Ray, at: Progress, alphas: list[Scalar]) -> Weights:
     compositing = scene.compositing
     assert isinstance(compositing, Weighting)
-    composite, finished = Composite(at.composite.opacity), at.finished
-    steps: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
+    at = with_fields(at, composite=Composite(at.composite.opacity, factor=at.composite.factor))
+    steps: list[list[PyTree]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
-            before = composite.opacity
-            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
-            composite = composite.add(weight)
-            steps[i].append((weight, before, composite.opacity, finished))
-        finished |= jax.vmap(partial(stopped, scene))(composite)
-    stacked = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in steps]
+            before, finished = at.composite, at.finished
+            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before.opacity))
+            at = with_fields(at, composite=before.add(weight))
+            weight = weight if before.factor is None else weight * before.factor
+            steps[i].append((weight, before, at.composite.opacity, finished))
+        opacities = [alpha[k] for alpha in alphas]
+        at = jax.vmap(partial(reweigh, scene, ahead=k))(ray, at, opacities)
+        at = jax.vmap(partial(stop, scene))(at)
+    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *pieces) for pieces in steps]
     return Weights(*(list(values) for values in zip(*stacked, strict=True)))
 
 
-Parts: TypeAlias = list[tuple[Scalar, Measured, Scalar]]
-"""Depth, measured values, and the opacity before, of each piece of a cell; arrays (cells, rays)."""
+Parts: TypeAlias = list[tuple[Scalar, Measured, Composite]]
+"""Depth, measured values, and the state before, of each piece of a cell; arrays (cells, rays)."""
 
 
-def _sample(scene: Scene, ray: PyTree, depth: Scalar, measured: Measured, opacity: Scalar) -> Sample:
-    """The sample at `depth` along a ray (entry, direction, pixel), behind `opacity`."""
+def _sample(scene: Scene, ray: PyTree, depth: Scalar, measured: Measured, before: Composite) -> Sample:
+    """The sample at `depth` along a ray (entry, direction, pixel), behind the cells `before`."""
     entry, direction, pixel = ray
     color, extinction = scene.classification.of_cells(measured)
-    transmittance = scene.compositing.transmittance(Composite(opacity))
     place = along(entry, direction, depth)
     point = scene.space.world(place)
     shown = cast(Vec3, color)  # light needs three
-    return Sample(point, direction, measured, shown, extinction, transmittance, pixel, place)
+    reaching = transmittance(scene, before)
+    return Sample(point, direction, measured, shown, extinction, reaching, pixel, place)
 
 
 def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, parts: Parts) -> Sample:
@@ -144,7 +147,7 @@ def shaded_colors(
     alphas: list[Scalar],
 ) -> list[Vec3]:
     """Shaded colours of a segment's samples; arbitrary finite ones for invisible samples."""
-    weights, light = weights_of(scene, at, alphas), scene.classification.light
+    weights, light = weights_of(scene, ray, at, alphas), scene.classification.light
     assert isinstance(light, Shader)
     (shading, around), thresholds = light, light.shading.thresholds()
     none = jnp.zeros_like(alphas[0])
