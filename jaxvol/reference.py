@@ -33,7 +33,6 @@ from .ray import (
     reweigh,
     stop,
     track_of,
-    transmittance,
 )
 from .scene.rendering import Rendering
 from .scene.several import together
@@ -118,9 +117,9 @@ def step(scene: Scene, ray: Ray, at: Progress) -> Progress:
         measured = measure(scene, ray, piece)
         alphas.append(opacity(scene, ray, piece, measured))
         if not isinstance(compositing, Selection):
+            transmittance = compositing.transmittance(progress.composite)
             classified = scene.classification.of_cells(measured)
-            reaching = transmittance(scene, progress.composite)
-            color = sampler.color(march.sample(piece), measured, classified, reaching)
+            color = sampler.color(march.sample(piece), measured, classified, transmittance)
         progress = add(scene, ray, progress, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     progress = reweigh(scene, ray, progress, alphas)

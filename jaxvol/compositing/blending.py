@@ -151,7 +151,8 @@ class Weighting(Compositing[Composite]):
     @abstractmethod
     def slope(self, alpha: Scalar, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
         """Derivative of a loss with respect to the optical depth τ of a cell, for the second march. The
-        arguments suffice only for weights f(`alpha`) or (constant - `before`) f(`alpha`).
+        arguments suffice only for weights f(`alpha`) or (constant - `before`) f(`alpha`). It is linear in the
+        last two, by which factors of `Transform.roulette` enter.
 
         Args:
             alpha: opacity of the cell, 1 - exp(-τ), with the derivative 1 - `alpha`.

@@ -19,7 +19,7 @@ If rays leap over empty space, the first march records each ray's first and last
 leaps over all others, which saves two fifths of the samples in the head.
 """
 
-from functools import partial, reduce
+from functools import reduce
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from .._util.vec3 import Color, Scalar, along
-from ..compositing.blending import Composite, Weighting
+from ..compositing.blending import Weighting
 from ..lighting.shading import Shader
 from ..ray import Progress, Scene, measure, pieces
 from ..scene.rendering import Rendering
@@ -176,7 +176,8 @@ class Replay(SampleVisitor):
             if isinstance(self.scene.transfer, Together):
                 (color, extinction), weight = classified[i], weights.weight[i]
                 live = inside(ray, depths[i]) & ~weights.finished[i]
-                clear = jnp.where(live, self._weight_of_thin(weights.before[i]) * cell.width, 0)
+                thin = _scaled(self._weight_of_thin(weights.before[i]), weights.factor[i])
+                clear = jnp.where(live, thin * cell.width, 0)
                 # the derivative of colour by emission, also where nothing is visible
                 scale = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
                 emission = tuple(of * scale for of in bar.color)
@@ -210,12 +211,11 @@ class Replay(SampleVisitor):
             total = total._replace(voxels=voxels)
         return carry, of_rays, total
 
-    def _weight_of_thin(self, before: Composite) -> Scalar:
-        """The derivative of a cell's weight by its opacity, at 0, behind the cells `before`."""
-        compositing, zero = self.prepared.compositing, jnp.zeros_like(before.opacity)
+    def _weight_of_thin(self, before: Scalar) -> Scalar:
+        """The derivative of a cell's weight by its opacity, at 0, behind the opacity `before`."""
+        compositing, zero = self.prepared.compositing, jnp.zeros_like(before)
         assert isinstance(compositing, Weighting)
-        weight = partial(compositing.weight, before=before.opacity)
-        return _scaled(jax.jvp(weight, (zero,), (zero + 1,))[1], before.factor)
+        return jax.jvp(lambda alpha: compositing.weight(alpha, before), (zero,), (zero + 1,))[1]
 
     @property
     def reads_transfer(self) -> bool:
@@ -301,9 +301,8 @@ class Replay(SampleVisitor):
         for k in range(weight_bars[0].shape[0]):
             for i, value in enumerate(weight_bars):
                 front = front + weights.weight[i][k] * value[k]
-                # linear in the last two
-                value = _scaled(value, weights.before[i].factor)
-                slope = compositing.slope(alphas[i][k], weights.after[i][k], value[k], total - front)
+                of_weight = _scaled(value, weights.factor[i])[k]
+                slope = compositing.slope(alphas[i][k], weights.after[i][k], of_weight, total - front)
                 slopes[i].append(jnp.where(weights.finished[i][k], 0, slope))
         return front, [jnp.stack(values) for values in slopes]
 

@@ -15,7 +15,7 @@ from ..compositing.blending import Composite, Weighting
 from ..compositing.selection import Selection
 from ..lighting.shading import Sample, Shader, no_terms
 from ..march.march import Cell
-from ..ray import Progress, Scene, reweigh, stop, transmittance
+from ..ray import Progress, Scene, reweigh, stop
 from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..scene.volume import fetches_of, with_fetches
@@ -87,13 +87,14 @@ def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
 
 
 class Weights(NamedTuple):
-    """Weights of samples, state of compositing before and opacity after them, and whether the ray was
-    finished before: one entry per piece of a cell, of arrays (cells, rays)."""
+    """Weights of samples, opacity before and after them, whether the ray was finished before, and the factor
+    in the weight by `roulette`, if any: one array (cells, rays) per piece of a cell."""
 
     weight: list[Scalar]
-    before: list[Composite]
+    before: list[Scalar]
     after: list[Scalar]
     finished: list[Bool[Array, "cells rays"]]
+    factor: list[Scalar | None]
 
 
 def weights_of(scene: Scene, ray: Ray, at: Progress, alphas: list[Scalar]) -> Weights:
@@ -103,11 +104,12 @@ def weights_of(scene: Scene, ray: Ray, at: Progress, alphas: list[Scalar]) -> We
     steps: list[list[PyTree]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
-            before, finished = at.composite, at.finished
-            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before.opacity))
-            at = with_fields(at, composite=before.add(weight))
-            weight = weight if before.factor is None else weight * before.factor
-            steps[i].append((weight, before, at.composite.opacity, finished))
+            composite, finished = at.composite, at.finished
+            before, factor = composite.opacity, composite.factor
+            weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
+            at = with_fields(at, composite=composite.add(weight))
+            weight = weight if factor is None else weight * factor
+            steps[i].append((weight, before, at.composite.opacity, finished, factor))
         opacities = [alpha[k] for alpha in alphas]
         at = jax.vmap(partial(reweigh, scene, ahead=k))(ray, at, opacities)
         at = jax.vmap(partial(stop, scene))(at)
@@ -115,19 +117,19 @@ def weights_of(scene: Scene, ray: Ray, at: Progress, alphas: list[Scalar]) -> We
     return Weights(*(list(values) for values in zip(*stacked, strict=True)))
 
 
-Parts: TypeAlias = list[tuple[Scalar, Measured, Composite]]
-"""Depth, measured values, and the state before, of each piece of a cell; arrays (cells, rays)."""
+Parts: TypeAlias = list[tuple[Scalar, Measured, Scalar]]
+"""Depth, measured values, and the opacity before, of each piece of a cell; arrays (cells, rays)."""
 
 
-def _sample(scene: Scene, ray: PyTree, depth: Scalar, measured: Measured, before: Composite) -> Sample:
-    """The sample at `depth` along a ray (entry, direction, pixel), behind the cells `before`."""
+def _sample(scene: Scene, ray: PyTree, depth: Scalar, measured: Measured, opacity: Scalar) -> Sample:
+    """The sample at `depth` along a ray (entry, direction, pixel), behind `opacity`."""
     entry, direction, pixel = ray
     color, extinction = scene.classification.of_cells(measured)
+    transmittance = scene.compositing.transmittance(Composite(opacity))
     place = along(entry, direction, depth)
     point = scene.space.world(place)
     shown = cast(Vec3, color)  # light needs three
-    reaching = transmittance(scene, before)
-    return Sample(point, direction, measured, shown, extinction, reaching, pixel, place)
+    return Sample(point, direction, measured, shown, extinction, transmittance, pixel, place)
 
 
 def samples_of(chosen: Chosen, indices: Int[Array, " chunk"], scene: Scene, ray: Ray, parts: Parts) -> Sample:

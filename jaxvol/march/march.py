@@ -98,7 +98,8 @@ class Transform(eqx.Module):
     """Whether `cut` shortens what reaches past the exit."""
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
-        """Decide whether the ray is finished. `stopped`: the answer of the transforms before."""
+        """Decide whether the ray is finished. `stopped`: the answer of the transforms before.
+        `transmittance`: as for `roulette`, after its factor."""
         return stopped
 
     def roulette(self, transmittance: Scalar, random: Scalar) -> Scalar:

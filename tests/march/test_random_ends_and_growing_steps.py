@@ -11,7 +11,16 @@ import pytest
 
 import jaxvol as jv
 
-from ..scenes import QUADRATURES, in_float64, slow, to_float64
+from ..scenes import (
+    QUADRATURES,
+    around,
+    in_float64,
+    rendered as rendered_image,
+    scaled_phantom,
+    slow,
+    soft_transfer,
+    to_float64,
+)
 from ..switch import switch
 from ..test_documents import examples
 
@@ -212,3 +221,109 @@ def test_gradients_are_central_differences(quadrature):
             ways, total = eqx.tree_at(leaf, ways, way), total + along
         assert float(slope(scene, ways)) == pytest.approx(total, rel=1e-9, abs=1e-9)
         assert float(found[4].transforms[1].survival) == 0
+
+
+class Darkened(jv.lighting.Shading):
+    """Darker colours where the extinction is high, computed for visible samples alone."""
+
+    def color(self, sample, shared, sums):
+        return tuple(channel * jnp.exp(-sample.extinction) for channel in sample.color)
+
+
+def camera_scene(voxels=np.float32, **values):
+    """A phantom, seen by a camera, with both transforms and others."""
+    head = scaled_phantom("head", 16)
+    volume = jv.Volume(np.asarray(head.data, voxels), head.spacing, head.origin)
+    transforms = (
+        Growing(1.5),
+        Roulette(below=0.8, survival=0.6),
+        jv.EmptySpaceJitter(),
+        jv.SpaceLeaping(),
+        jv.AlphaCorrection(),
+    )
+    return volume, soft_transfer(0.3), around(volume), jv.March(0.05, transforms, max_samples=128)
+
+
+def test_images_of_a_camera_in_float32_are_those_of_the_reference():
+    scene = camera_scene()
+    fast, reference = jv.render(*scene), rendered_image(*scene, adjoint="direct")
+    np.testing.assert_allclose(fast.rgba, reference.rgba, rtol=0, atol=5e-6)
+    assert np.asarray(fast.rgba)[..., 3].max() > 1  # of single pixels, not of their mean
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [jv.lighting.Phong(), Darkened()], ids=["inline", "chunks"])
+def test_lit_gradients_are_those_of_the_reference(light):
+    with in_float64():
+        scene, lighting = to_float64((camera_scene(np.float64), light))
+
+        @eqx.filter_jit
+        def gradient(scene, adjoint):
+            def loss(scene):
+                return (jv.render(*scene, lighting=lighting, adjoint=adjoint).rgba ** 2).sum()
+
+            return eqx.filter_grad(loss)(scene)
+
+        found, expected = (jax.device_get(gradient(scene, adjoint)) for adjoint in ("replay", "direct"))
+        visible = np.asarray(scene[1].extinction) > 0  # leaps leave out the others
+        for leaf in (
+            lambda scene: scene[1].colors,
+            lambda scene: scene[1].extinction[visible],
+            lambda scene: scene[2].position,
+            lambda scene: scene[3].step,
+            lambda scene: scene[3].transforms[0].near,
+        ):
+            np.testing.assert_allclose(leaf(found), leaf(expected), rtol=1e-9, atol=1e-9)
+            assert np.abs(leaf(expected)).max() > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["maximum", "isosurface"])
+def test_selected_depths_move_with_steps_that_grow(mode):
+    with in_float64():
+        volume, transfer, origins, directions, march = slab_of(np.full(8, 0.7), near=NEAR)
+        mode = jv.Isosurface(0.4) if mode == "isosurface" else mode
+        march = jv.March(march.step, march.transforms[:1], max_samples=64)
+
+        @eqx.filter_jit
+        def depth(step, near, adjoint="forward"):
+            moved = eqx.tree_at(lambda m: (m.step, m.transforms[0].near), march, (step, near))
+            found = jv.render_rays(
+                volume, transfer, origins, directions, moved, compositing=mode, adjoint=adjoint
+            )
+            return found.depth.sum()
+
+        at = march.step, march.transforms[0].near
+        np.testing.assert_allclose(depth(*at), depth(*at, "direct"), rtol=1e-12)
+        found = eqx.filter_jit(jax.grad(lambda at: depth(*at, "replay")))(at)
+        for i, slope in enumerate(found):
+            ends = [depth(*(x + sign * 1e-7 * (i == j) for j, x in enumerate(at))) for sign in (1, -1)]
+            assert float(slope) == pytest.approx(float(ends[0] - ends[1]) / 2e-7, rel=1e-5, abs=1e-5)
+
+
+class OneWay(jv.Transform):
+    """Steps that grow, without the way back."""
+
+    def depth(self, distance, ray):
+        return 2 * distance
+
+
+def test_errors_name_what_does_not_go_together():
+    with pytest.raises(ValueError, match=r"OneWay must override both depth and its inverse, distance\."):
+        jv.March(0.1, (OneWay(),))
+    volume, transfer, camera, march = camera_scene()
+    with pytest.raises(ValueError, match=r"Roulette\.roulette weights the cells .* compositing by Maximum"):
+        jv.render(volume, transfer, camera, march, compositing="maximum")
+    with pytest.raises(ValueError, match=r"march: Growing\.depth: .* equal steps\. Use jv\.render\."):
+        jv.render_bricks(volume.data, transfer, camera, march, spacing=volume.spacing, memory=2**30)
+
+
+@pytest.mark.slow
+def test_bricks_continue_a_roulette():
+    volume, transfer, camera, march = camera_scene()
+    march = jv.March(march.step, march.transforms[1:])
+    whole = jv.render(volume, transfer, camera, march).rgba
+    place = {"spacing": np.asarray(volume.spacing), "origin": np.asarray(volume.origin)}
+    bricks = jv.render_bricks(np.asarray(volume.data), transfer, camera, march, bricks=(2, 2, 2), **place)
+    assert bricks.bricks.loads > 1
+    np.testing.assert_allclose(bricks.rgba, whole, rtol=0, atol=2e-6)
