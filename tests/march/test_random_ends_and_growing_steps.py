@@ -33,8 +33,8 @@ Roulette, Growing = PAGE["Roulette"], PAGE["Growing"]
 LENGTH, NODES, RAYS, STEP, NEAR = 4.0, 17, 512, 0.11, 2.5
 FAR = 1e6  # steps are equal up to there
 VALUES, COLORS = np.linspace(0, 1, 8), np.random.default_rng(1).random((8, 3))
-EMPTY_FIRST = np.array([0.0, 0.0, 0.0, 1.5, 2.0, 0.5, 3.0, 1.0])
-"""Extinction along the slab, which begins with empty blocks."""
+EXTINCTION = np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 3.0, 1.0])
+"""Extinction along the slab, which begins with empty blocks, and is empty between two layers."""
 
 
 def slab_of(extinction, quadrature="left", step=STEP, *, on=(), near=FAR, survival=1.0, below=0.6, seed=0):
@@ -154,7 +154,7 @@ CASES = (
 def test_images_are_those_of_another_marcher_in_both_engines():
     with in_float64():
         for on, values in CASES:
-            scene = slab_of(EMPTY_FIRST, on=on, **values)
+            scene = slab_of(EXTINCTION, on=on, **values)
             (found, evaluated, _), (rgba, samples) = rendered(scene), marched(scene, on)
             np.testing.assert_allclose(found, rgba, rtol=0, atol=1e-12)
             if "leaping" in on:
@@ -193,7 +193,7 @@ def slope(scene, way):
 def test_gradients_are_central_differences(quadrature):
     with in_float64():
         on = "leaping", "jitter", "shift", "alignment"
-        scene = slab_of(EMPTY_FIRST, quadrature, on=on, near=NEAR, survival=0.6)
+        scene = slab_of(EXTINCTION, quadrature, on=on, near=NEAR, survival=0.6)
         found, random = gradient(scene), np.random.default_rng(6)
         leaves = {
             "voxels": lambda scene: scene[0].data,
@@ -208,7 +208,7 @@ def test_gradients_are_central_differences(quadrature):
         ways = zero
         for name, leaf in leaves.items():
             way = random.choice([-1.0, 1.0], np.shape(leaf(scene)))
-            way = way * (EMPTY_FIRST > 0) if name == "extinction" else way
+            way = way * (EXTINCTION > 0) if name == "extinction" else way
 
             def moved(h, leaf=leaf, way=way):
                 changed = eqx.tree_at(leaf, scene, jax.device_put(np.asarray(leaf(scene)) + h * way))
