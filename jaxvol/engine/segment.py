@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Scalar
 from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
-from ..march.march import Cell
+from ..march.march import Cell, CellRules, March
 from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, reweigh, stop, stopped
 from ..scene.several import Together
 from ..scene.space import Ray
@@ -87,7 +87,7 @@ class Ahead(eqx.Module):
     until: Int[Array, " rays"]
 
     @classmethod
-    def of(cls, rays: Ray, at: Progress, march: Any) -> "Ahead":
+    def of(cls, rays: Ray, at: Progress, march: March | CellRules) -> "Ahead":
         """The cells ahead of rays with progress `at`."""
         track = at.track
         offset, until = track.offset, track.until
