@@ -1,7 +1,8 @@
 """One ray, cell by cell: the steps that the reference and the fast engine share.
 
 `begin` a ray; cut each cell into `pieces`, `measure` each piece at its sample, compute its `opacity`, and
-`add` it to the pixel; `stop` the ray if it needs no more, and `move` it on; at last `end` it. A cell of
+`add` it to the pixel; `reweigh` what lies behind, `stop` the ray if it needs no more, and `move` it on; at
+last `end` it. A cell of
 extinction σ and width w has the opacity α = 1 - exp(-σ w); `compositing` makes the pixel. "In front" and
 "behind" are as seen from the camera. Comparing the two engines cannot show a bug of this file, which is in
 both: `tests/oracle.py` is independent.
@@ -204,6 +205,12 @@ def check_channels(
         if channels > 1 and value is not None:
             got = f"{len(volumes)} volumes" if volumes else f"one of {channels} channels"
             raise ValueError(f"{name}: {value} needs a single volume of one channel; got {got}.")
+    if march.reweights and not isinstance(compositing, Weighting):
+        name = type(march.overriding("roulette")[0]).__name__
+        raise ValueError(
+            f"march.transforms: {name}.roulette weights the cells of a Weighting; got compositing by "
+            f"{type(compositing).__name__}, which selects one."
+        )
     bands_of(transfer, volume, lighting)
     if lighting is not None and not lighting.reads_gradient:  # as `Phong` does, where samples are placed
         _check_near(volume, lighting)
@@ -266,9 +273,9 @@ NEVER = int(jnp.iinfo(jnp.int32).max)
 
 
 class Track(eqx.Module):
-    """Depths of the cells of a ray.
+    """Distances past the entry at which the cells of a ray begin: depths, unless steps grow (`March.depth`).
 
-    Cell k begins at the depth `(offset + k) d`, and from the cell `shifted` on, which follows the first
+    Cell k begins at the distance `(offset + k) d`, and from the cell `shifted` on, which follows the first
     transparent cell (NEVER until that is known), at `(offset + shift + k) d`. Counting steps rather than
     summing them keeps the ten-thousandth sample as exact as the first. `until`: end of the cells that are
     marched, exclusive. `shift` and `shifted` are None where no transform shifts.
@@ -279,8 +286,8 @@ class Track(eqx.Module):
     shifted: Int[Array, ""] | None
     until: Int[Array, ""]
 
-    def front(self, number: Int[Array, "..."], step: Scalar) -> Scalar:
-        """Depth at which a cell begins."""
+    def distance(self, number: Int[Array, "..."], step: Scalar) -> Scalar:
+        """Distance at which a cell begins."""
         offset = self.offset
         if self.shift is not None and self.shifted is not None:
             offset = offset + jnp.where(number >= self.shifted, self.shift, 0)
@@ -314,6 +321,8 @@ def begin(scene: Scene, ray: Ray, track: Track, outputs: Outputs | None = "all")
     if isinstance(compositing, Weighting) and composite.color is not None:
         bands = bands_of(scene.transfer, scene.volume)
         composite = composite if bands == 3 else replace(composite, color=(zero,) * bands)
+    if scene.march.reweights:
+        composite = replace(composite, factor=jnp.ones_like(zero), reweighted=zero)
     return Progress(
         index=count,
         composite=composite,
@@ -335,8 +344,16 @@ def pieces(scene: Scene, ray: Ray, at: PyTree, number: Int[Array, ""] | int = 0)
     """Cut the ray's next cell, or the `number`-th one after it, into pieces. `at`: a `Progress`, or another
     object with its `index` and `track`."""
     march = scene.march
-    begin = at.track.front(at.index + number, march.step)
-    return march.cut(Cell(begin, march.step, jnp.zeros(begin.shape, bool)), ray, scene.volume)
+    cell = cell_at(march, ray, at.track.distance(at.index + number, march.step))
+    return march.cut(cell, ray, scene.volume)
+
+
+def cell_at(march: March | CellRules, ray: Ray, distance: Scalar) -> Cell:
+    """The cell of a step that begins at this distance."""
+    begin, width = march.depth(distance, ray), march.step
+    if march.grows:
+        width = march.depth(distance + march.step, ray) - begin
+    return Cell(begin, width, jnp.zeros(begin.shape, bool))
 
 
 def read(scene: Scene, ray: Ray, piece: Cell) -> Measured:
@@ -409,12 +426,31 @@ def add(
     fragment = Fragment(alpha, depth, piece, measured, color, counts & ray.contains(depth))
     stats = at.stats
     if stats is not None:
-        shows = (alpha > 0) & (compositing.transmittance(at.composite) > 0)
+        shows = (alpha > 0) & (transmittance(scene, at.composite) > 0)
         samples = stats.samples + counts.astype(stats.samples.dtype)
         stats = replace(stats, samples=samples, aligned=stats.aligned | (piece.cut & shows))
     composite = compositing.add(at.composite, fragment)
     check_answer(compositing, "add", composite, at.composite)
     return replace(at, composite=composite, stats=stats)
+
+
+def transmittance(scene: Scene, composite: PyTree) -> Scalar:
+    """Transmittance of a ray in this state of compositing, times all factors of `roulette`."""
+    plain = scene.compositing.transmittance(composite)
+    return plain * composite.factor if scene.march.reweights else plain
+
+
+def reweigh(
+    scene: Scene, ray: Ray, at: Progress, alphas: list[Scalar], ahead: Int[Array, ""] | int = 0
+) -> Progress:
+    """Multiply the weights of all cells behind one by its factor, unless it is transparent, so that leaps do
+    not show. `alphas`: opacities of its pieces. `ahead`: its steps past the next one."""
+    if not scene.march.reweights:
+        return at
+    visible = jnp.any(jnp.stack(alphas) > 0, axis=0) & ~at.finished
+    factor = scene.march.roulette(transmittance(scene, at.composite), ray, at.index + ahead)
+    factor = at.composite.factor * jnp.where(visible, factor, 1)
+    return replace(at, composite=replace(at.composite, factor=factor))
 
 
 def stop(scene: Scene, at: Progress) -> Progress:
@@ -425,9 +461,9 @@ def stop(scene: Scene, at: Progress) -> Progress:
 def stopped(scene: Scene, composite: PyTree) -> Bool[Array, ""]:
     """True if a ray in this state of compositing needs no other cell."""
     march, compositing = scene.march, scene.compositing
-    stops, finished = march.stop(compositing.transmittance(composite)), compositing.finished(composite)
+    stops, finished = march.stop(transmittance(scene, composite)), compositing.finished(composite)
     check_answer(compositing, "finished", finished, stops)
-    return stops | finished
+    return stops | finished | (composite.factor <= 0) if march.reweights else stops | finished
 
 
 def move(
@@ -441,12 +477,12 @@ def move(
     if track.shifted is not None and transparent is not None:
         shifted = jnp.where(transparent, jnp.minimum(track.shifted, at.index), track.shifted)
         at = replace(at, track=replace(track, shifted=shifted))
-    return replace(at, finished=at.finished | (front(march, at) >= ray.length))
+    return replace(at, finished=at.finished | (front(march, ray, at) >= ray.length))
 
 
-def front(march: March | CellRules, at: Progress, ahead: Int[Array, "..."] | int = 0) -> Scalar:
-    """Depth at which the cell begins that is `ahead` steps after the next one."""
-    return at.track.front(at.index + ahead, march.step)
+def front(march: March | CellRules, ray: Ray, at: Progress) -> Scalar:
+    """Depth at which the next cell begins."""
+    return march.depth(at.track.distance(at.index, march.step), ray)
 
 
 def end(scene: Scene, ray: Ray, at: Progress) -> Rendering:
@@ -522,10 +558,8 @@ def _movement(march: March, ray: Ray, volume: Volume, depth: Scalar, scale: Scal
     step = jax.lax.stop_gradient(march.step)
     moving, gap = depth * scale, jnp.full_like(depth, MATCH) * step
     for start in map(jax.lax.stop_gradient, starts):
-        number = jnp.floor(depth / step - start + MATCH)
-        begin = (start + number) * march.step
-        cell = Cell(begin, march.step + jnp.zeros_like(begin), jnp.zeros(begin.shape, bool))
-        for piece in march.cut(cell, ray, volume):
+        number = jnp.floor(march.distance(depth, ray) / step - start + MATCH)
+        for piece in march.cut(cell_at(march, ray, (start + number) * march.step), ray, volume):
             sample = march.sample(piece)
             distance = jnp.abs(jax.lax.stop_gradient(sample) - depth)
             moving = jnp.where(distance < gap, sample, moving)

@@ -31,6 +31,7 @@ from .ray import (
     opacity,
     pieces,
     resolve,
+    reweigh,
     stop,
     track_of,
 )
@@ -128,11 +129,14 @@ def step(scene: Scene, ray: Ray, at: Progress) -> tuple[Progress, RaySamples | N
             counts = ~at.finished & is_sample(march, ray, piece, divided=len(cut) > 1) & ray.contains(depth)
             depth = ray.t_in + jnp.where(counts, depth, ray.length)
             weight = jnp.where(counts, compositing.weight(alphas[-1], before), 0)
+            if (factor := progress.composite.factor) is not None:
+                weight = weight * factor
             width, shown = jnp.where(counts, piece.width, 0), jnp.where(counts, jnp.stack(color), 0)
             samples.append(RaySamples(*(jnp.stack([part]) for part in (depth, width, weight, shown))))
         progress = add(scene, ray, progress, piece, measured, color, alphas[-1], divided=len(cut) > 1)
     transparent = jnp.all(jnp.stack(alphas) == 0, axis=0)
     pieces_of = jax.tree.map(lambda *parts: jnp.concatenate(parts), *samples) if samples else None
+    progress = reweigh(scene, ray, progress, alphas)
     return move(march, ray, stop(scene, progress), transparent, 1), pieces_of
 
 

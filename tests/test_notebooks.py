@@ -54,7 +54,7 @@ have.)"""
 
 OWN = {
     "radiance_field": ["class Decoded(jv.Field):"],
-    "write_a_transform": ["class BallCut(jv.Transform):"],
+    "write_a_transform": ["class BallCut(jv.Transform):", "class Roulette(jv.Transform):"],
 }
 """Classes that notebooks define, where that is what they are about."""
 

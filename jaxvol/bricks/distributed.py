@@ -52,6 +52,7 @@ def check_joins(scene: Scene, method: Method) -> None:
         f"method={method!r}": method != "overlap",
         f"compositing by {type(mode).__name__}, which joins no segments": not isinstance(mode, Over),
         "EmptySpaceJitter, which shifts a ray by what lies in front": march.may_shift,
+        "roulette, which depends on what lies in front": march.reweights,
         "ToroidalMap, where a ray may come back to a brick": not is_straight(march.locate(scene.volume)),
     }
     for feature, refuses in refused.items():

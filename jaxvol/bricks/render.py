@@ -166,6 +166,9 @@ def scene_of(
         raise ValueError(
             f"march: SpaceLeaping(block={march.block_side}) needs the whole volume; use {BLOCK}."
         )
+    if march.grows:
+        name = type(march.overriding("depth")[0]).__name__
+        raise ValueError(f"march: {name}.depth: cells of bricks have equal steps. Use jv.render.")
     if lighting is not None and lighting.farthest_read is None:
         raise ValueError(
             "lighting must read up to a finite distance (Lighting.farthest_read); got "

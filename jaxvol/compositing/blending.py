@@ -104,25 +104,40 @@ class Compositing(eqx.Module, Generic[State]):
 
 
 class Composite(eqx.Module):
-    """Sums of w, and if computed of w × colour and w × depth, over a ray's cells with weights w so far."""
+    """Sums over a ray's cells so far, with weights w, which have factors under `Transform.roulette`.
+
+    Attributes:
+        opacity: sum of w without factors, on which later weights depend.
+        color: sum of w × colour, if computed.
+        moment: sum of w × depth, if computed.
+        factor: product of the factors so far, of all later weights; None: 1.
+        reweighted: sum of w, if it differs from `opacity`.
+    """
 
     opacity: Scalar
     color: Color | None = None
     moment: Scalar | None = None
+    factor: Scalar | None = None
+    reweighted: Scalar | None = None
 
     def add(self, weight: Scalar, color: Color | None = None, depth: Scalar | None = None) -> "Composite":
         """Adds a cell to the sums."""
-        sums = moment = None
+        opacity, sums, moment, reweighted = self.opacity + weight, None, None, None
+        if self.factor is not None:
+            weight = weight * self.factor
         if self.color is not None and color is not None:
             sums = tuple(sum_ + weight * part for sum_, part in zip(self.color, color, strict=True))
         if self.moment is not None and depth is not None:
             moment = self.moment + weight * depth
-        return Composite(self.opacity + weight, sums, moment)
+        if self.reweighted is not None:
+            reweighted = self.reweighted + weight
+        return Composite(opacity, sums, moment, self.factor, reweighted)
 
 
 class Weighting(Compositing[Composite]):
     """A mode that gives each cell of colour c a weight w. The pixel is Σ w c, its opacity Σ w. Subclasses
-    must override `weight`; it, `slope` and `transmittance` work elementwise.
+    must override `weight`; it, `slope` and `transmittance` work elementwise, and know nothing of the factors
+    of `Transform.roulette`.
 
     Weights depend on the cells' opacities and on parameters, are at least 0, and sum to at most 1. If
     transforms divide a cell, each part has a weight. Parameters are static fields, or JAX arrays, which have
@@ -138,7 +153,8 @@ class Weighting(Compositing[Composite]):
 
     def slope(self, alpha: Scalar, after: Scalar, weight_bar: Scalar, sum_behind: Scalar) -> Scalar:
         """Derivative of a loss with respect to the optical depth τ of a cell, for the second march; by
-        default, JAX derives it from `weight`. Override it to save time.
+        default, JAX derives it from `weight`. Override it to save time. It is linear in the last two
+        arguments, by which factors of `Transform.roulette` enter.
 
         Args:
             alpha: opacity of the cell, 1 - exp(-τ), with the derivative 1 - `alpha`.
@@ -212,14 +228,15 @@ class Weighting(Compositing[Composite]):
     @final
     def end(self, state: Composite) -> tuple[Float[Array, " n"], Scalar | None]:
         assert state.color is not None
-        rgba = jnp.stack([*state.color, state.opacity])
+        opacity = state.opacity if state.reweighted is None else state.reweighted
+        rgba = jnp.stack([*state.color, opacity])
         if state.moment is None:
             return rgba, None
-        visible = ~(state.opacity <= 0)  # also NaN
+        visible = ~(opacity <= 0)  # also NaN
         # Divide both by a constant first, so that the denominator is 1: the derivative divides by its square,
         # which would underflow for a very small opacity.
-        total = jax.lax.stop_gradient(jnp.where(visible, state.opacity, 1))
-        mean = (state.moment / total) / jnp.where(visible, state.opacity / total, 1)
+        total = jax.lax.stop_gradient(jnp.where(visible, opacity, 1))
+        mean = (state.moment / total) / jnp.where(visible, opacity / total, 1)
         return rgba, jnp.where(visible, mean, jnp.inf)
 
 

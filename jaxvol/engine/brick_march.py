@@ -79,7 +79,7 @@ def march_brick(
 
 def ended(scene: Scene, rays: Ray, at: Progress) -> Bool[Array, "groups rays"]:
     """True for rays that need no other cell of any brick."""
-    past = vmap_rays(lambda ray, at: front(scene.march, at) >= ray.length)(rays, at)
+    past = vmap_rays(lambda ray, at: front(scene.march, ray, at) >= ray.length)(rays, at)
     return past | opaque(scene, at)
 
 

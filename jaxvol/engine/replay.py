@@ -157,7 +157,7 @@ class Replay(SampleVisitor):
         classify = vmap_cells(self.prepared.classification.of_cells)
         classified = [classify(measured) for measured in samples.measured]
         depths = [self.prepared.march.sample(cell) for cell in samples.cells]
-        weights = weights_of(self.prepared, at, samples.opacity)
+        weights = weights_of(self.prepared, ray, at, samples.opacity)
         of_color = [tuple(weight * of for of in bar.color) for weight in weights.weight]
         shaded: list[ShadingVjp] | None = None
         colors = [color for color, _ in classified]
@@ -187,7 +187,8 @@ class Replay(SampleVisitor):
             if isinstance(self.scene.transfer, Together):
                 (color, extinction), weight = classified[i], weights.weight[i]
                 live = inside(ray, depths[i]) & ~weights.finished[i]
-                clear = jnp.where(live, self._weight_of_thin(weights.before[i]) * cell.width, 0)
+                thin = _scaled(self._weight_of_thin(weights.before[i]), weights.factor[i])
+                clear = jnp.where(live, thin * cell.width, 0)
                 # the derivative of colour by emission, also where nothing is visible
                 scale = jnp.where(extinction > 0, weight / jnp.where(extinction > 0, extinction, 1), clear)
                 emission = tuple(of * scale for of in bar.color)
@@ -313,7 +314,8 @@ class Replay(SampleVisitor):
         for k in range(weight_bars[0].shape[0]):
             for i, value in enumerate(weight_bars):
                 front = front + weights.weight[i][k] * value[k]
-                parts, finished = (weights.after[i][k], value[k], total - front), weights.finished[i][k]
+                of_weight, finished = _scaled(value, weights.factor[i])[k], weights.finished[i][k]
+                parts = weights.after[i][k], of_weight, total - front
                 if compositing.has_slope:
                     slope = compositing.slope(alphas[i][k], *parts)
                     slopes[i].append(jnp.where(finished, 0, slope))
@@ -338,6 +340,10 @@ def _weight_vjp(mode: Weighting, alpha: Scalar, before: Scalar, bar: Scalar) -> 
         return eqx.combine(moving, fixed).weight(thicker, before)
 
     return jax.vjp(weight, moving, jnp.zeros_like(alpha))[1](bar)
+
+
+def _scaled(value: Scalar, factor: Scalar | None) -> Scalar:
+    return value if factor is None else value * factor
 
 
 def _dot(a: Color, b: Color) -> Scalar:

@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 from .._util.vec3 import Scalar
 from ..compositing.blending import Weighting
 from ..compositing.selection import Selection
-from ..march.march import Cell
-from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, stop, stopped
+from ..march.march import Cell, CellRules, March
+from ..ray import Progress, Scene, Track, add, move, opacity, pieces, read, reweigh, stop, stopped
 from ..scene.several import Together
 from ..scene.space import Ray
 from ..scene.transfer import Classification, Measured
@@ -87,7 +87,7 @@ class Ahead(eqx.Module):
     until: Int[Array, " rays"]
 
     @classmethod
-    def of(cls, rays: Ray, at: Progress, step: Scalar) -> "Ahead":
+    def of(cls, rays: Ray, at: Progress, march: March | CellRules) -> "Ahead":
         """The cells ahead of rays with progress `at`."""
         track = at.track
         offset, until = track.offset, track.until
@@ -95,7 +95,9 @@ class Ahead(eqx.Module):
             before = at.index < track.shifted
             offset = offset + jnp.where(before, 0, track.shift)
             until = jnp.where(before, jnp.minimum(until, track.shifted), until)
-        back = (offset + until.astype(offset.dtype)) * step
+        back = (offset + until.astype(offset.dtype)) * march.step
+        if march.grows:
+            back = jax.vmap(march.depth)(back, rays)
         reach = jnp.where(at.finished, 0, jnp.minimum(back, rays.length))
         return cls(rays, at.index, offset, reach, until)
 
@@ -121,7 +123,7 @@ def march_segment(
     """Marches rays by a segment of cells: by fewer where a ray has fewer left, by none where it is finished.
     `shifts`: a segment is one cell, behind which rays may shift."""
     classification, number = scene.classification, tiling.cells
-    ahead = Ahead.of(rays, at, scene.march.step)
+    ahead = Ahead.of(rays, at, scene.march)
     samples = _sampled(scene, number, ahead)
     ray, _ = ahead.place
     colors: Any
@@ -142,16 +144,19 @@ def march_segment(
     rules: Any = scene.march
     follows = isinstance(scene.compositing, Weighting) and not rules.custom
 
-    def composite(ray: Ray, at: Progress, cell: PyTree) -> Progress:
+    def composite(ray: Ray, at: Progress, cell: PyTree, number: Int[Array, ""]) -> Progress:
         if follows:
             at = with_fields(at, finished=stopped(scene, at.composite))
         for piece in cell:
             at = add(scene, ray, at, *piece, divided=len(cell) > 1)
+        at = reweigh(scene, ray, at, [piece[-1] for piece in cell], number)
         return at if follows else stop(scene, at)
 
     # unrolled, so that no intermediate between two cells is stored
+    composite_all = jax.vmap(composite, in_axes=(0, 0, 0, None))
+    numbered = cells, jnp.arange(number, dtype=at.index.dtype)
     after, _ = jax.lax.scan(
-        lambda at, cell: (jax.vmap(composite)(ray, at, cell), None), at, cells, unroll=number
+        lambda at, cell: (composite_all(ray, at, *cell), None), at, numbered, unroll=number
     )
     after = jax.vmap(partial(stop, scene))(with_fields(after, finished=at.finished) if follows else after)
     steps = jnp.where(at.finished, 0, jnp.clip(ahead.until - at.index, 0, number))

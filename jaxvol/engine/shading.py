@@ -15,13 +15,13 @@ from ..compositing.blending import Composite, Weighting
 from ..compositing.selection import Selection
 from ..lighting.shading import Sample, Shader, no_terms
 from ..march.march import Cell
-from ..ray import Progress, Scene, stopped
+from ..ray import Progress, Scene, reweigh, stop
 from ..scene.space import Ray
 from ..scene.transfer import Measured
 from ..scene.volume import fetches_of, with_fetches
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
-from ..xla.trees import PyTree
+from ..xla.trees import PyTree, with_fields
 from .rays import vmap_cells
 
 
@@ -87,28 +87,33 @@ def _inline_sample(scene: Scene, ray: Ray, cell: Cell) -> Sample:
 
 
 class Weights(NamedTuple):
-    """Weights of samples, opacity before and after them, and whether the ray was finished before: one array
-    (cells, rays) per piece of a cell."""
+    """Weights of samples, opacity before and after them, whether the ray was finished before, and the factor
+    in the weight by `roulette`, if any: one array (cells, rays) per piece of a cell."""
 
     weight: list[Scalar]
     before: list[Scalar]
     after: list[Scalar]
     finished: list[Bool[Array, "cells rays"]]
+    factor: list[Scalar | None]
 
 
-def weights_of(scene: Scene, at: Progress, alphas: list[Scalar]) -> Weights:
+def weights_of(scene: Scene, ray: Ray, at: Progress, alphas: list[Scalar]) -> Weights:
     compositing = scene.compositing
     assert isinstance(compositing, Weighting)
-    composite, finished = Composite(at.composite.opacity), at.finished
-    steps: list[list[tuple[Array, ...]]] = [[] for _ in alphas]
+    at = with_fields(at, composite=Composite(at.composite.opacity, factor=at.composite.factor))
+    steps: list[list[PyTree]] = [[] for _ in alphas]
     for k in range(alphas[0].shape[0]):
         for i, alpha in enumerate(alphas):
-            before = composite.opacity
+            composite, finished = at.composite, at.finished
+            before, factor = composite.opacity, composite.factor
             weight = jnp.where(finished, 0, compositing.weight(alpha[k], before))
-            composite = composite.add(weight)
-            steps[i].append((weight, before, composite.opacity, finished))
-        finished |= jax.vmap(partial(stopped, scene))(composite)
-    stacked = [[jnp.stack(values) for values in zip(*pieces, strict=True)] for pieces in steps]
+            at = with_fields(at, composite=composite.add(weight))
+            weight = weight if factor is None else weight * factor
+            steps[i].append((weight, before, at.composite.opacity, finished, factor))
+        opacities = [alpha[k] for alpha in alphas]
+        at = jax.vmap(partial(reweigh, scene, ahead=k))(ray, at, opacities)
+        at = jax.vmap(partial(stop, scene))(at)
+    stacked = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *pieces) for pieces in steps]
     return Weights(*(list(values) for values in zip(*stacked, strict=True)))
 
 
@@ -144,7 +149,7 @@ def shaded_colors(
     alphas: list[Scalar],
 ) -> list[Vec3]:
     """Shaded colours of a segment's samples; arbitrary finite ones for invisible samples."""
-    weights, light = weights_of(scene, at, alphas), scene.classification.light
+    weights, light = weights_of(scene, ray, at, alphas), scene.classification.light
     assert isinstance(light, Shader)
     (shading, around), thresholds = light, light.shading.thresholds()
     none = jnp.zeros_like(alphas[0])

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from ..compositing.blending import Outputs, Over, Weighting
 from ..march.march import March
-from ..ray import NEVER, Progress, Scene, begin, is_sample, measure, opacity, pieces, track_of
+from ..ray import NEVER, Progress, Scene, begin, front, is_sample, measure, opacity, pieces, track_of
 from ..scene.space import Ray
 from ..xla.compaction import Chosen
 from ..xla.memory import in_memory
@@ -102,7 +102,8 @@ def _shifted(scene: Scene, rays: Ray, at: Progress, tiling: Tiling) -> Int[Array
 def _search(scene: Scene, rays: Ray, at: Progress) -> Int[Array, " rays"]:
     """Computes `_shifted` for a chunk of rays."""
     rules: Any = scene.march
-    over = isinstance(scene.compositing, Over)
+    # with factors, a ray may need cells behind opaque ones
+    over = isinstance(scene.compositing, Over) and not rules.reweights
 
     def test_cells(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         index, shifted, transmittance = state
@@ -121,9 +122,10 @@ def _search(scene: Scene, rays: Ray, at: Progress) -> Int[Array, " rays"]:
 
     def searching(state: tuple[Array, Array, Array]) -> Bool[Array, ""]:
         index, shifted, transmittance = state
-        front = jax.vmap(lambda track, index: track.front(index, rules.step))(at.track, index)
+        front_of = jax.vmap(lambda ray, at: front(rules, ray, at))
+        depth = front_of(rays, with_fields(at, index=index))
         opaque = jax.vmap(rules.stop)(transmittance) | (transmittance <= 0)
-        searched = (shifted == NEVER) & (front < rays.length) & (index < at.track.until)
+        searched = (shifted == NEVER) & (depth < rays.length) & (index < at.track.until)
         return jnp.any(searched & ~(opaque if over else jnp.zeros_like(opaque)))
 
     none = jnp.full_like(at.index, NEVER)

@@ -312,8 +312,12 @@ def to_next_cell(job: Job, beam: Int[Array, " rays"], rays: Ray, at: Progress) -
 
 def _leap(march: CellRules, skip_to: Callable[..., Array], rays: Ray, at: Progress) -> Int[Array, " rays"]:
     """Number of steps to the first cell that is not proven empty, or past the exit without one."""
-    depth = front(march, at)
+    depth = jax.vmap(partial(front, march))(rays, at)
     target = jnp.minimum(skip_to(rays, depth), rays.length + march.step)
+    if march.grows:
+        inside = jnp.minimum(target, rays.length)
+        target = jax.vmap(march.distance)(inside, rays) + (target - inside)
+        depth = jax.vmap(lambda at: at.track.distance(at.index, march.step))(at)
     steps = jnp.floor((target - depth) / march.step - 1e-3)
     limit = jnp.maximum(at.track.until - at.index, 0)
     # clipped as a float, since it may exceed the range of integers

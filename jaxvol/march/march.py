@@ -6,6 +6,7 @@ the last may reach past the exit. A transform is one idea of one paper: it overr
 `Transform`, the seams. At each seam the answers of all transforms are combined, so that they compose.
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, SupportsIndex, TypeAlias, get_args
@@ -17,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import Arrayable, check_answer, described, integer, number
+from .._util.noise import hashed_uniforms_4, seed_word
 from .._util.texts import pasted
 from .._util.vec3 import Scalar
 from ..scene.occupancy import BLOCK, Occupancy
@@ -62,6 +64,16 @@ class Transform(eqx.Module):
         """Index of empty space, made once for an image; None: unknown. `view`: None for `render_rays`."""
         return None
 
+    def depth(self, distance: Scalar, ray: Ray) -> Scalar:
+        """Depth under steps that grow of a point whose depth under equal steps is `distance`, both world
+        lengths past the entry. It increases with the distance, is 0 at 0, and from there on at least the
+        distance: `March.step` is the shortest step. Defined from one step before the entry on."""
+        return distance
+
+    def distance(self, depth: Scalar, ray: Ray) -> Scalar:
+        """Inverse of `depth` between entry and exit, without gradient. Overridden with `depth`."""
+        return depth
+
     @property
     def block_side(self) -> int:
         """Cells of the voxel grid along the side of the blocks of `empty_space`'s occupancy."""
@@ -86,15 +98,31 @@ class Transform(eqx.Module):
     """Whether `cut` shortens what reaches past the exit."""
 
     def stop(self, stopped: Bool[Array, ""], transmittance: Scalar) -> Bool[Array, ""]:
-        """Decide whether the ray is finished. `stopped`: the answer of the transforms before."""
+        """Decide whether the ray is finished. `stopped`: the answer of the transforms before.
+        `transmittance`: as for `roulette`, after its factor."""
         return stopped
 
+    def roulette(self, transmittance: Scalar, random: Scalar) -> Scalar:
+        """Factor by which the weights of all later cells are multiplied, at least 0; 0 ends the ray. Called
+        after each cell that is not transparent, for a `Weighting`.
+
+        With a mean of 1 over `random`, as of 1 / p with probability p and else 0, colour and opacity are
+        unbiased. Factors are constants to derivatives, which are therefore unbiased, too: those of the mean
+        over all random numbers, not of the image by these. By parameters of the factor they are 0.
+
+        Args:
+            transmittance: of the cells so far, times all factors so far.
+            random: number in [0, 1), independent for each pixel, cell, transform and `seed`.
+        """
+        return jnp.ones_like(transmittance)
+
+    seed: ClassVar[Any] = 0
+    """Seed of `roulette`: an integer in [0, 2³²), or a key of `jax.random`. May be a field."""
+
     def rules(self, rules: "CellRules") -> "CellRules | None":
-        """The rules with what `cut` and `stop` do as numbers, so that marches with and without this
-        transform share a program. None, the default where it overrides either: unknown."""
-        seams = "cut", "stop"
-        plain = all(getattr(type(self), seam) is getattr(Transform, seam) for seam in seams)
-        return rules if plain else None
+        """The rules with what the `KERNEL_SEAMS` do as numbers, so that marches with and without this
+        transform share a program. None, the default where it overrides any: unknown."""
+        return None if any(overriding((self,), seam) for seam in KERNEL_SEAMS) else rules
 
     @property
     def leaves_gaps(self) -> bool:
@@ -113,7 +141,57 @@ class Transform(eqx.Module):
         return None
 
 
-class CellRules(eqx.Module):
+KERNEL_SEAMS = "cut", "stop", "depth", "roulette"
+"""Seams that are called for each cell."""
+
+
+def overriding(transforms: tuple[Transform, ...], seam: str) -> list[Transform]:
+    """The transforms that override a seam."""
+    default = getattr(Transform, seam)
+    return [transform for transform in transforms if getattr(type(transform), seam) is not default]
+
+
+class _Cells(eqx.Module):
+    """Answers of all transforms that place and weight cells, for a march and its `CellRules`."""
+
+    @abstractmethod
+    def overriding(self, seam: str) -> list[Transform]:
+        """The transforms that override a seam."""
+
+    @property
+    def grows(self) -> bool:
+        """True if steps grow."""
+        return bool(self.overriding("depth"))
+
+    @property
+    def reweights(self) -> bool:
+        """True if cells have factors by `roulette`."""
+        return bool(self.overriding("roulette"))
+
+    def depth(self, distance: Scalar, ray: Ray) -> Scalar:
+        for transform in self.overriding("depth"):
+            distance = _checked(transform, "depth", transform.depth(distance, ray), distance)
+        return distance
+
+    def distance(self, depth: Scalar, ray: Ray) -> Scalar:
+        for transform in reversed(self.overriding("depth")):
+            depth = _checked(transform, "distance", transform.distance(depth, ray), depth)
+        return depth
+
+    def roulette(self, transmittance: Scalar, ray: Ray, index: Int[Array, ""]) -> Scalar:
+        """Factor of all cells behind the one with this index."""
+        column, row, cell = (word.astype(jnp.uint32) for word in (*ray.pixel, index))
+        factor = jnp.ones_like(transmittance)
+        for i, transform in enumerate(self.overriding("roulette")):
+            # far apart, so that successive seeds of two transforms give independent numbers
+            seed = seed_word(transform.seed) + np.uint32(i * 0x9E3779B9 % 2**32)
+            random = hashed_uniforms_4(column, row, cell, seed)[0].astype(factor.dtype)
+            answer = transform.roulette(transmittance * factor, random)
+            factor = factor * _checked(transform, "roulette", answer, factor)
+        return jax.lax.stop_gradient(factor)
+
+
+class CellRules(_Cells):
     """Rules by which the kernel of a march cuts rays into cells, and ends them. The library's transforms are
     numbers here, so that all subsets of them, and both quadratures that sample, share a program.
 
@@ -125,8 +203,8 @@ class CellRules(eqx.Module):
         opacity_left: transmittance at or below which rays end; negative: never.
         most_samples: of a ray.
         divide: cuts a cell at what lies within; None if nothing does.
-        custom: transforms that cut or stop in ways of their own. If there are any, all are here, and only
-            `step`, `place` and `most_samples` count beside them.
+        custom: transforms that override `KERNEL_SEAMS` and are no numbers. If there are any, all are here,
+            and only `step`, `place` and `most_samples` count beside them.
     """
 
     step: Float[Array, ""]
@@ -138,6 +216,9 @@ class CellRules(eqx.Module):
     at_entry: bool = eqx.field(static=True, default=False)
     divide: Callable[[Cell, Ray, Volume], tuple[Cell, ...]] | None = eqx.field(static=True, default=None)
     custom: tuple[Transform, ...] = ()
+
+    def overriding(self, seam: str) -> list[Transform]:
+        return overriding(self.custom, seam)
 
     @property
     def joins(self) -> bool:
@@ -180,7 +261,7 @@ class CellRules(eqx.Module):
         return eqx.tree_at(lambda rules: (rules.step, rules.custom), none, (True, floats))
 
 
-class March(eqx.Module):
+class March(_Cells):
     """Steps of rays through a volume. Its methods combine the answers of all transforms at a seam.
 
     Args:
@@ -232,6 +313,9 @@ class March(eqx.Module):
             if (count := kinds.count(type(transform))) > 1:
                 name = type(transform).__name__
                 raise ValueError(f"transforms must each be given once; got {name} {count} times.")
+            if bool(overriding((transform,), "depth")) != bool(overriding((transform,), "distance")):
+                name = type(transform).__name__
+                raise ValueError(f"transforms: {name} must override both depth and its inverse, distance.")
         if quadrature not in get_args(Quadrature):
             names = " or ".join(f'"{name}"' for name in get_args(Quadrature))
             raise ValueError(f"quadrature must be {names}; got {quadrature!r}.")
@@ -260,9 +344,7 @@ class March(eqx.Module):
         return None
 
     def overriding(self, seam: str) -> list[Transform]:
-        """The transforms that override a seam."""
-        default = getattr(Transform, seam)
-        return [t for t in self.transforms if getattr(type(t), seam) is not default]
+        return overriding(self.transforms, seam)
 
     @property
     def leaps(self) -> bool:

@@ -86,6 +86,7 @@ def a_cell_further(leap_by_ray):
 
 
 MARCH, GRAIN = "march/test_march.py::", "test_wood_grain.py::"
+RANDOM = "march/test_random_ends_and_growing_steps.py::"
 OF_VOXELS = f"{GRAIN}test_jitter_breaks_wood_grain_of_voxels_and_leaves_the_error"
 FAULTS: list[Fault] = [
     Fault(
@@ -120,6 +121,34 @@ FAULTS: list[Fault] = [
         "march.march:CellRules.stop",
         lambda _: lambda self, transmittance: transmittance >= self.opacity_left,
         (f"{MARCH}test_early_termination_stops_where_little_is_left",),
+    ),
+    Fault(
+        "growing steps: cells are as wide as the first",
+        "ray:cell_at",
+        lambda f: lambda march, *rest: replace(f(march, *rest), width=march.step),
+        (f"{RANDOM}test_images_are_those_of_another_marcher_in_both_engines",),
+    ),
+    Fault(
+        "growing steps: leaps count equal steps",
+        "march.march:_Cells.distance",
+        lambda _: lambda self, depth, ray: depth,
+        (f"{RANDOM}test_images_are_those_of_another_marcher_in_both_engines",),
+    ),
+    Fault(
+        "roulette: transparent cells count, too",
+        "ray:reweigh",
+        lambda f: (
+            lambda scene, ray, at, alphas, ahead=0: f(
+                scene, ray, at, [jnp.ones_like(alpha) for alpha in alphas], ahead
+            )
+        ),
+        (f"{RANDOM}test_images_are_those_of_another_marcher_in_both_engines",),
+    ),
+    Fault(
+        "roulette: factors are not in the gradient",
+        "engine.replay:_scaled",
+        lambda _: lambda value, factor: value,
+        (f"{RANDOM}test_gradients_are_central_differences",),
     ),
     Fault(
         "cut: the last cell reaches past the exit",
