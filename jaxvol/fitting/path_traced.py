@@ -290,9 +290,9 @@ class SampledRun(eqx.Module):
     @property
     def triangles(self) -> Triangles:
         """Triangles of the mean residual and Jacobian of the averaged samples."""
-        *matrices, informed = Triangles.of(self.window.rows)
-        factors = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in matrices)
-        return Triangles(*factors, informed)
+        rows, scores, informed = Triangles.of(self.window.rows)
+        rows, scores = (jnp.asarray(np.linalg.qr(np.asarray(matrix), "r")) for matrix in (rows, scores))
+        return Triangles(rows, scores, informed)
 
     @property
     def settled(self) -> bool:

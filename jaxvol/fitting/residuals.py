@@ -10,6 +10,7 @@ condition number. The scores Jᵢ rᵢ are reduced in the same pass.
 import inspect
 import math
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias, cast
 
 import equinox as eqx
@@ -328,11 +329,12 @@ class Problem(eqx.Module):
 
                 matrices = Triangles.of(jacobian(residual, flat))
                 pairs = zip(triangles[:2], matrices[:2], strict=True)
-                factors = (jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs)
-                return Triangles(*factors, triangles.informed + matrices.informed)
+                rows, scores = (jnp.linalg.qr(jnp.concatenate(pair), mode="r") for pair in pairs)
+                return Triangles(rows, scores, triangles.informed + matrices.informed)
 
-            zeros = [jnp.zeros((n, n), flat.dtype) for n in (flat.size + 1, flat.size)]
-            triangle, scores, informed = self._accumulate(add, Triangles(*zeros, jnp.zeros((), flat.dtype)))
+            n, zeros = flat.size, partial(jnp.zeros, dtype=flat.dtype)
+            start = Triangles(zeros((n + 1, n + 1)), zeros((n, n)), zeros(()))
+            triangle, scores, informed = self._accumulate(add, start)
             # QR's row signs are arbitrary; fix them, so that they do not jump from step to step
             signs = jnp.where(jnp.diagonal(triangle) < 0, -1, 1)[:, None].astype(flat.dtype)
             return Triangles(triangle * signs, scores, informed)
