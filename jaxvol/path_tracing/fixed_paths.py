@@ -6,9 +6,11 @@ from typing import Any, TypeVar
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from ..lighting.lights import Light, located
 from ..lighting.materials import Material
 from ..scene.camera import Camera
 from ..scene.transfer import Transfer, TransferFunction
@@ -33,7 +35,11 @@ def constant(name: str, tree: T, reason: str = "it moves the paths") -> T:
 
 
 def with_constant_paths(
-    volume: Volume, transfer: Transfer, camera: Camera, materials: tuple[Material, ...]
+    volume: Volume,
+    transfer: Transfer,
+    camera: Camera,
+    materials: tuple[Material, ...],
+    lights: tuple[Light, ...],
 ) -> tuple[Volume, Transfer, Camera, tuple[Material, ...]]:
     """The arguments. **Raises** `RuntimeError` where an input that moves paths or jumps is differentiated."""
     name = "the volume's spacing, origin and direction"
@@ -54,6 +60,11 @@ def with_constant_paths(
         eqx.tree_at(lambda m: m.values, material, edge, is_leaf=is_none)
         for material, edge in zip(materials, edges, strict=True)
     )
+
+    for light in located(lights) if is_traced(lights) else ():  # any place shows what `at` depends on
+        zero = jnp.zeros(())
+        arriving = light.at((zero, zero, zero), (zero, zero, zero))
+        constant("the directions and positions of lights", (arriving.toward, arriving.distance))
     return volume, transfer, constant("camera", camera), materials
 
 

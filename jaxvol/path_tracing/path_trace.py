@@ -249,7 +249,7 @@ def path_trace(
         raise ValueError(f"groups must divide paths; got groups = {groups} and paths = {paths}.")
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
-    volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials)
+    volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials, lights)
     blocks = Blocks.of(constant(volume), slopes=transfer.reads_gradient)
     inputs = Inputs(volume, transfer, materials, lights, anisotropy)
     options = TraceOptions(paths, groups, lanes, pixels, antialias)

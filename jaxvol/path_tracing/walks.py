@@ -17,7 +17,6 @@ from ..scene.space import Affine
 from ..scene.transfer import Measured
 from ..scene.volume import Volume
 from ..xla.memory import in_memory
-from .fixed_paths import constant
 from .likelihood import Sampling, likelihood
 from .medium import Medium
 from .tracking import Candidate, Decision, Flight, fly
@@ -31,8 +30,6 @@ ROULETTE = 0.25
 DARK = 3e-4
 """Factor of the throughput below which a walk that is replayed keeps it apart (`Walk.dark`): about the square
 root of float32's precision."""
-
-LIGHTS = "the directions and positions of lights"
 
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
 """Key of all random numbers along a path: pixel, path, seed."""
@@ -119,8 +116,7 @@ class WalkScene(NamedTuple):
             lambda *leaves: jnp.select([number == i for i in range(count)], leaves), *arriving
         )
         r, g, b = chosen.irradiance
-        toward, distance = constant(LIGHTS, (chosen.toward, chosen.distance))
-        return Arriving(toward, distance, (r * count, g * count, b * count))
+        return chosen._replace(irradiance=(r * count, g * count, b * count))
 
 
 class Scattering(NamedTuple):
