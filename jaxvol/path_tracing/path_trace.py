@@ -180,11 +180,18 @@ def path_trace(
     with a range, such as a mean free path, raise an error instead). Random numbers have 24 bits, so free
     paths longer than 16.6 mean free paths within a block of voxels, of probability 6e-8, are never drawn.
 
-    **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
-    colours and extinction, the opacity and mean free path of materials, the anisotropy, the emission of
-    lights, and, without materials, voxels. They are unbiased: decisions stay as drawn, and their
-    probabilities enter as weights, so that the image does not change. `jax.jacfwd` takes the same paths for
-    all its columns; with `groups`, a derivative has the standard error of the mean over groups.
+    **Derivatives** are with respect to the transfer function's colours and extinction, the opacity and mean
+    free path of materials, the anisotropy, the emission of lights, and, without materials, voxels. They are
+    unbiased: decisions stay as drawn, and their probabilities enter as weights, so that the image does not
+    change. Forward mode (`jax.jvp`, `jax.jacfwd`) takes the same paths for all its columns; with `groups`, a
+    derivative has the standard error of the mean over groups. Reverse mode (`jax.grad`) is for many
+    parameters, such as voxels. It sums over the same paths, which it walks again (`replay`): no step is
+    stored, so that memory does not grow with the number of scatterings. Second derivatives are in forward
+    mode over forward mode.
+
+    An image and its derivative are by the same random numbers, so the gradient of a squared error is biased
+    by their covariance. The product of two independent residuals, by `groups=2` or two keys, is without bias:
+    `jnp.sum((a - reference) * (b - reference)) / 2`, with `a, b = traced.images(background)`.
 
     Derivatives have more noise than the image, which grows with the number of collisions of a path: take many
     paths in very thick media of high albedo. At a colour of 0 or 1, where the albedo is clipped, and at an
@@ -201,8 +208,8 @@ def path_trace(
         lights: a light, or several. At every scattering, a random one of those with a position or a direction
             is sampled; a `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a
             medium is also unbiased, but has infinite variance: a few pixels are far too bright.
-        paths: number of paths of a pixel, ≥ 1. A path takes 64 bytes, and 16 for each derivative.
-            `PathTraced.joined` adds more paths of another key.
+        paths: number of paths of a pixel, ≥ 1. A path takes 64 bytes, and 16 for each derivative in forward
+            mode, in batches of 128 `lanes` paths. `PathTraced.joined` adds more paths of another key.
         key: a seed, or a key of `jax.random`. The random numbers along a path depend only on the key, the
             pixel and the path's number.
         materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
@@ -222,7 +229,7 @@ def path_trace(
 
     Raises:
         ValueError: for arguments out of range, no lights, a transfer function without a majorant, labels
-            where the volume has none, and reverse-mode differentiation (`jax.grad`).
+            where the volume has none, and reverse mode over a derivative.
         RuntimeError: for differentiation with respect to inputs that move paths or jumps of the medium: the
             camera, the volume's place, directions and positions of lights, the control points' values of the
             transfer function, the values of materials, and voxels where there are materials or a transfer

@@ -13,7 +13,7 @@ Source: Vicini, Speierer and Jakob, "Path Replay Backpropagation", 2021.
 
 from collections.abc import Callable
 from functools import partial, reduce
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -96,9 +96,8 @@ class Replay(NamedTuple):
 
     def cotangents(self, ahead: Walk) -> tuple[Any, ...]:
         """Cotangents of `_moving(ahead)`."""
-        dark, result, total, bar = ahead.dark, ahead.result, self.total, self.radiance_bar
-        assert dark is not None and result.behind is not None  # noqa: PT018
-        assert total.behind is not None and self.walk.dark is not None  # noqa: PT018
+        bar, parts = self.radiance_bar, (ahead.dark, self.walk.dark, ahead.result, self.total)
+        dark, dark_before, result, total = cast(Any, parts)  # replayed walks have all optional parts
         light_bar = times(bar, dark)
         # what the flight towards a light will add
         pending = scaled(ahead.unoccluded, jnp.where(ahead.to_light, self.transmittance, 0))
@@ -109,7 +108,7 @@ class Replay(NamedTuple):
         # an opacity of 1 minus the throughput, where nothing scattered
         red = red - self.opacity_bar * (1 - total.opacity)
         throughput_bar = tuple(map(_over, (red, green, blue), ahead.throughput))
-        fell = [(d != 1) & (d_before == 1) for d, d_before in zip(dark, self.walk.dark, strict=True)]
+        fell = [(d != 1) & (d_before == 1) for d, d_before in zip(dark, dark_before, strict=True)]
         dark_bar = tuple(map(jnp.where, fell, times(bar, total.behind), (0, 0, 0)))
         unoccluded_bar = scaled(light_bar, self.transmittance)
         transmittance_bar = _over(dot(unoccluded_bar, ahead.unoccluded), ahead.transmittance)
