@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -230,10 +231,11 @@ def path_trace(
     Raises:
         ValueError: for arguments out of range, no lights, a transfer function without a majorant, labels
             where the volume has none, and reverse mode over a derivative.
-        RuntimeError: for differentiation with respect to inputs that move paths or jumps of the medium: the
-            camera, the volume's place, directions and positions of lights, the control points' values of the
-            transfer function, the values of materials, and voxels where there are materials or a transfer
-            function has a step (the derivative is NaN if the transfer function is traced).
+        RuntimeError: for forward mode over reverse mode, and for differentiation with respect to inputs that
+            move paths or jumps of the medium: the camera, the volume's place, directions and positions of
+            lights, the control points' values of the transfer function, the values of materials, and voxels
+            where there are materials or a transfer function has a step (the derivative is NaN if the
+            transfer function is traced).
     """
     order = "path_trace(volume, transfer, camera, lights)"
     transfer = sized(transfer, volume)
@@ -401,6 +403,7 @@ def _pull(
     options: TraceOptions,
 ) -> Inputs:
     """Cotangents of the perturbed inputs, by replays of the walks for derivatives."""
+    inputs = eqxi.nondifferentiable(inputs, msg=FIRST_ONLY)
     walks = Walks.of(inputs, constants, OF_DERIVATIVES)
     bars = jnp.concatenate([cotangents.radiance, cotangents.opacity[..., None]], axis=-1)[None]
     if cotangents.groups is not None:

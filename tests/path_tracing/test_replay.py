@@ -101,6 +101,14 @@ def test_the_gradient_by_voxels_is_that_of_quadrature():
     assert np.all(error < 0.1 * np.abs(found).max())
 
 
+def test_forward_mode_over_reverse_mode_is_refused():
+    def slope(extinction: Any) -> jax.Array:
+        return jax.grad(loss)((DATA, COLORS, extinction), WEIGHTS, SUN, SKY, np.int32(0))[2]
+
+    with pytest.raises(RuntimeError, match="first derivatives in either mode"):
+        jax.eval_shape(lambda at: jax.jvp(slope, (at,), (at,)), EXTINCTION)
+
+
 def test_a_nan_makes_the_gradient_nan():
     for at in range(3):
         broken = [leaf.copy() for leaf in INPUTS]
@@ -173,27 +181,26 @@ def test_voxels_are_found_from_scattered_light():
             (0, 0, 0)
         )
 
-    views = [images(truth, camera, 1000 + at, 2048).mean(axis=0) for at, camera in enumerate(cameras)]
+    views = [images(truth, camera, 1000 + at, 1024).mean(axis=0) for at, camera in enumerate(cameras)]
 
     @jax.jit
     @jax.value_and_grad
     def loss(data: Any, camera: jv.Camera, view: Any, key: Any) -> jax.Array:
-        residual, other = images(data, camera, key, 32) - view[None]
+        residual, other = images(data, camera, key, 16) - view[None]
         return jnp.mean(residual * other) / 2
 
-    data, mean, square, losses = np.full((4,) * 3, 0.5, np.float32), 0.0, 0.0, []
-    for step in range(1, 201):
+    data, mean, square, losses = np.full((4,) * 3, 0.9, np.float32), 0.0, 0.0, []
+    for step in range(1, 101):
         found = [
             loss(data, camera, view, np.int32(4 * step + at))
             for at, (camera, view) in enumerate(zip(cameras, views, strict=True))
         ]
         slope = sum(np.asarray(g) for _, g in found)
         mean, square = 0.9 * mean + 0.1 * slope, 0.99 * square + 0.01 * slope**2
-        rate = 0.03 if step < 100 else 0.01
+        rate = 0.05 if step < 50 else 0.015
         data = data - rate * (mean / (1 - 0.9**step)) / (np.sqrt(square / (1 - 0.99**step)) + 1e-12)
         data = np.clip(data, 0.01, 1).astype(np.float32)
         losses.append(float(sum(value for value, _ in found)))
-    before, after = (np.sqrt(np.mean((x - truth) ** 2)) for x in (0.5, data))
-    print(before, after, losses[0], np.mean(losses[-20:]))
-    assert abs(np.mean(losses[-20:])) < 0.05 * losses[0]
-    assert after < 0.4 * before
+    before, after = (np.sqrt(np.mean((x - truth) ** 2)) for x in (0.9, data))
+    assert abs(np.mean(losses[-20:])) < 0.1 * losses[0]
+    assert after < 0.35 * before
