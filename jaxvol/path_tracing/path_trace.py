@@ -420,8 +420,8 @@ def _pull(
         begin = partial(walks.begin, options, number, replayed=True)
         return replay_all(walks.scene, walks.inputs, begin, bars_of, sums, options.count, options.lanes), None
 
-    pulled, _ = jax.lax.scan(batch, Pulled.zeros(walks.inputs, perturbed), options.batches(walks.camera))
-    result = pulled.cotangents(walks.inputs)
+    zeros, batches = Pulled.zeros(walks.inputs, perturbed), options.batches(walks.camera)
+    result = jax.lax.scan(batch, zeros, batches)[0].cotangents(walks.inputs)
     step = has_step(inputs.transfer)
     volume = jax.tree.map(partial(jnp.where, step, jnp.nan), result.volume)
     result = jax.tree.map(partial(jnp.where, ~walks.valid, jnp.nan), result._replace(volume=volume))

@@ -80,7 +80,7 @@ class Replay(NamedTuple):
 
     @property
     def result(self) -> tuple[()]:
-        """Nothing: sums over all paths are the result."""
+        """Empty result: that of replays is a sum over all paths."""
         return ()
 
     def advanced(self, ahead: Walk) -> "Replay":
