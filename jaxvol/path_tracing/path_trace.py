@@ -431,7 +431,7 @@ def _pull(
 _trace = compiled(_image, by_jvp=True)
 _differentiable = differentiable(
     _trace,
-    lambda *given: (_trace(*given), ()),
+    lambda *args: (_trace(*args), ()),
     compiled(_push, in_turn=False),
     compiled(_pull, by_jvp=True),
     FIRST_ONLY,

@@ -101,15 +101,15 @@ class Replay(NamedTuple):
         light_bar = times(bar, dark)
         # what the flight towards a light will add
         pending = scaled(ahead.unoccluded, jnp.where(ahead.to_light, self.transmittance, 0))
-        later = minus(minus(total.radiance, result.radiance), times(pending, dark))
-        behind = times(minus(minus(total.behind, result.behind), pending), dark)
-        zipped = zip(bar, dark, later, behind, strict=True)
+        rest = minus(minus(total.radiance, result.radiance), times(pending, dark))
+        dark_rest = times(minus(minus(total.after_dark, result.after_dark), pending), dark)
+        zipped = zip(bar, dark, rest, dark_rest, strict=True)
         red, green, blue = (c_bar * jnp.where(d == 1, near, far) for c_bar, d, near, far in zipped)
         # an opacity of 1 minus the throughput, where nothing scattered
         red = red - self.opacity_bar * (1 - total.opacity)
         throughput_bar = tuple(map(_over, (red, green, blue), ahead.throughput))
         fell = [(d != 1) & (d_before == 1) for d, d_before in zip(dark, dark_before, strict=True)]
-        dark_bar = tuple(map(jnp.where, fell, times(bar, total.behind), (0, 0, 0)))
+        dark_bar = tuple(map(jnp.where, fell, times(bar, total.after_dark), (0, 0, 0)))
         unoccluded_bar = scaled(light_bar, self.transmittance)
         transmittance_bar = _over(dot(unoccluded_bar, ahead.unoccluded), ahead.transmittance)
         bars = throughput_bar, dark_bar, unoccluded_bar, transmittance_bar, bar
@@ -193,8 +193,8 @@ def _replay_step(scene: WalkScene, inputs: Inputs, replays: Replay, sums: Pulled
         changed = eqx.combine(moving, inputs)
 
         def medium(volume: Volume) -> Medium:
-            given = volume, changed.transfer, changed.materials
-            return Medium.within(scene.medium.majorants, *given, jumping_in_reverse)
+            parts = volume, changed.transfer, changed.materials
+            return Medium.within(scene.medium.majorants, *parts, jumping_in_reverse)
 
         def measure(changes: list[Any], coordinate: Vec3) -> tuple[Measured, list[list[Fetched]]]:
             if not asked:

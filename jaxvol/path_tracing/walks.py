@@ -37,21 +37,21 @@ Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Arra
 
 class WalkResult(NamedTuple):
     """Radiance of a path, opacity (0 or 1), number of scatterings, and `exhausted` if it was cut off.
-    `behind`: the radiance since `Walk.dark` is not 1, without that factor; None where `Walk.dark` is."""
+    `after_dark`: the radiance since `Walk.dark` is not 1, without that factor; None where `Walk.dark` is."""
 
     radiance: Vec3
     opacity: Scalar
     scatterings: Int[Array, "..."]
     exhausted: Bool[Array, "..."]
-    behind: Vec3 | None = None
+    after_dark: Vec3 | None = None
 
     def plus(self, gathered: Vec3, dark: Vec3 | None) -> "WalkResult":
         """The result after gathering light."""
-        if dark is None or self.behind is None:
+        if dark is None or self.after_dark is None:
             return self._replace(radiance=plus(self.radiance, gathered))
         r, g, b = (jnp.where(factor == 1, 0, c) for factor, c in zip(dark, gathered, strict=True))
-        behind = plus(self.behind, (r, g, b))
-        return self._replace(radiance=plus(self.radiance, times(gathered, dark)), behind=behind)
+        after_dark = plus(self.after_dark, (r, g, b))
+        return self._replace(radiance=plus(self.radiance, times(gathered, dark)), after_dark=after_dark)
 
 
 class Walk(NamedTuple):
@@ -207,7 +207,7 @@ def _scatter(
     else:
         importance = walk.importance * jnp.maximum(jax.lax.stop_gradient(greatest(kept)), floor)
     if dark is not None:
-        kept, dark = _apart(kept, dark)
+        kept, dark = _split_dark(kept, dark)
     before_roulette = times(walk.throughput, kept)
     weight, importance = _roulette(importance, survive)
     weight = weight * likelihood(phase(turn[2], scene.anisotropy))
@@ -226,13 +226,12 @@ def _scatter(
     return Scattering(direction, throughput, importance, unoccluded, to_light, toward, end, dark)
 
 
-def _apart(kept: Vec3, dark: Vec3) -> tuple[Vec3, Vec3]:
+def _split_dark(kept: Vec3, dark: Vec3) -> tuple[Vec3, Vec3]:
     """The factors of a throughput at a scattering, without the first one below DARK; and `Walk.dark`."""
     pairs = list(zip(kept, dark, strict=True))
     first = [(factor < DARK) & (before == 1) for factor, before in pairs]
     r, g, b = (jnp.where(is_first, 1, factor) for is_first, factor in zip(first, kept, strict=True))
-    apart = (jnp.where(is_first, *pair) for is_first, pair in zip(first, pairs, strict=True))
-    dark_r, dark_g, dark_b = apart
+    dark_r, dark_g, dark_b = (jnp.where(is_first, *pair) for is_first, pair in zip(first, pairs, strict=True))
     return (r, g, b), (dark_r, dark_g, dark_b)
 
 
