@@ -61,7 +61,9 @@ class PathTracedResidual(eqx.Module):
     biases loss and gradient. `fit` therefore takes all products between halves of the paths, which are
     independent, and the losses that it reports of single steps may be negative.
 
-    The path tracer must have derivatives with respect to all free parameters: see `path_trace`.
+    The path tracer must have derivatives with respect to all free parameters: see `path_trace`. A fit takes
+    the Jacobian, in forward mode: for many parameters, such as voxels, minimise the product of residuals that
+    `path_trace` describes, by `jax.grad`.
 
     Args:
         scene: `scene(parameters, camera)` returns the arguments of `path_trace` for the parameters and a

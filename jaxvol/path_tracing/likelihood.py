@@ -65,3 +65,15 @@ def jumping(number: Scalar, jump: Bool[Array, "..."]) -> Scalar:
 def _(primals: tuple[Scalar, Array], tangents: tuple[Scalar, Any]) -> tuple[Scalar, Scalar]:
     (number, jump), (tangent, _) = primals, tangents
     return jumping(number, jump), jnp.where(jump & (tangent != 0), jnp.nan, tangent)
+
+
+@jax.custom_vjp
+def jumping_in_reverse(number: Scalar, jump: Bool[Array, "..."]) -> Scalar:
+    """The number, with the cotangent NaN where it is at a jump and the loss depends on it."""
+    return number
+
+
+jumping_in_reverse.defvjp(
+    lambda number, jump: (number, jump),
+    lambda jump, bar: (jnp.where(jump & (bar != 0), jnp.nan, bar), None),
+)

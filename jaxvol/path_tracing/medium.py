@@ -127,6 +127,19 @@ class Medium(NamedTuple):
         sampling: Sampling = OF_IMAGES,
     ) -> "Medium":
         """The medium that `path_trace` describes."""
+        majorants = Majorants.of(volume, blocks, transfer, materials, sampling)
+        return cls.within(majorants, volume, transfer, materials)
+
+    @classmethod
+    def within(
+        cls,
+        majorants: Majorants,
+        volume: Volume,
+        transfer: Transfer,
+        materials: tuple[Material, ...],
+        jumping: Callable[[Scalar, Array], Scalar] = jumping,
+    ) -> "Medium":
+        """The medium of known majorants. `jumping`: as in `likelihood`, for the mode of differentiation."""
         classification = classification_of(transfer, volume)
 
         def measure(coordinate: Vec3) -> Measured:
@@ -153,4 +166,4 @@ class Medium(NamedTuple):
             r, g, b = (clipped(c) * kept for c in color)
             return extinction, (r, g, b)
 
-        return cls(measure, classify, Majorants.of(volume, blocks, transfer, materials, sampling))
+        return cls(measure, classify, majorants)

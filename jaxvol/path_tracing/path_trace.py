@@ -1,11 +1,12 @@
 """Unbiased path tracing of light that is scattered many times: the reference for cheaper lighting."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._util.checks import Arrayable, all_finite, described, flag, integer, number
 from .._util.noise import hashed_uniforms_4, is_key
+from .._util.vec3 import Scalar, Vec3
 from ..engine.acceleration import with_words, words_of
 from ..lighting.lights import Light, lights_of
 from ..lighting.materials import Material, materials_of
@@ -23,13 +25,14 @@ from ..scene.space import Affine, enter
 from ..scene.transfer import Transfer, sized
 from ..scene.volume import Volume, check_one_channel, without_voxels
 from ..xla.compiling import compiled
-from ..xla.differentiation import forward_only, refuse_reverse_mode
+from ..xla.linear import differentiable, moving_leaves
 from ..xla.platform import is_traced
-from ..xla.trees import PyTree, constant, is_none
-from .fixed_paths import check_voxels, has_step, with_constant_paths
-from .lanes import walk_all
+from ..xla.trees import PyTree, constant, floats
+from .fixed_paths import has_step, with_constant_paths
+from .lanes import Index, walk_all
 from .likelihood import OF_DERIVATIVES, OF_IMAGES, Sampling
 from .medium import Medium
+from .replay import Inputs, Pulled, replay_all
 from .walks import Walk, WalkResult, WalkScene, Words, step
 
 
@@ -39,11 +42,11 @@ LANES = 2**13
 WALKS_PER_LANE = 128
 """Mean number of walks that a lane of a batch runs, one after the other."""
 
-FORWARD_ONLY = (
-    "path_trace has derivatives in forward mode only; take jax.jacfwd or jax.jvp in place of jax.grad, "
-    "jax.vjp or jax.jacrev."
+FIRST_ONLY = (
+    "path_trace has first derivatives in either mode, and forward mode over forward mode; take jax.jacfwd or "
+    "jax.jvp of these in place of jax.grad."
 )
-"""Error message: a reverse pass would have to keep or repeat every step of each path."""
+"""Error message for reverse mode over a derivative, and forward mode over reverse mode."""
 
 
 class PathTraced(eqx.Module):
@@ -178,11 +181,18 @@ def path_trace(
     with a range, such as a mean free path, raise an error instead). Random numbers have 24 bits, so free
     paths longer than 16.6 mean free paths within a block of voxels, of probability 6e-8, are never drawn.
 
-    **Derivatives** are in forward mode (`jax.jvp`, `jax.jacfwd`), with respect to the transfer function's
-    colours and extinction, the opacity and mean free path of materials, the anisotropy, the emission of
-    lights, and, without materials, voxels. They are unbiased: decisions stay as drawn, and their
-    probabilities enter as weights, so that the image does not change. `jax.jacfwd` takes the same paths for
-    all its columns; with `groups`, a derivative has the standard error of the mean over groups.
+    **Derivatives** are with respect to the transfer function's colours and extinction, the opacity and mean
+    free path of materials, the anisotropy, the emission of lights, and, without materials, voxels. They are
+    unbiased: decisions stay as drawn, and their probabilities enter as weights, so that the image does not
+    change. Forward mode (`jax.jvp`, `jax.jacfwd`) takes the same paths for all its columns; with `groups`, a
+    derivative has the standard error of the mean over groups. Reverse mode (`jax.grad`) is for many
+    parameters, such as voxels. It sums over the same paths, which it walks again (`replay`): no step is
+    stored, so that memory does not grow with the number of scatterings. Second derivatives are in forward
+    mode over forward mode.
+
+    An image and its derivative are by the same random numbers, so the gradient of a squared error is biased
+    by their covariance. The product of two independent residuals, by `groups=2` or two keys, is without bias:
+    `jnp.sum((a - reference) * (b - reference)) / 2`, with `a, b = traced.images(background)`.
 
     Derivatives have more noise than the image, which grows with the number of collisions of a path: take many
     paths in very thick media of high albedo. At a colour of 0 or 1, where the albedo is clipped, and at an
@@ -199,8 +209,8 @@ def path_trace(
         lights: a light, or several. At every scattering, a random one of those with a position or a direction
             is sampled; a `ConstantLight` is gathered by paths that leave the volume. A `PointLight` inside a
             medium is also unbiased, but has infinite variance: a few pixels are far too bright.
-        paths: number of paths of a pixel, ≥ 1. A path takes 64 bytes, and 16 for each derivative.
-            `PathTraced.joined` adds more paths of another key.
+        paths: number of paths of a pixel, ≥ 1. A path takes 64 bytes, and 16 for each derivative in forward
+            mode, in batches of 128 `lanes` paths. `PathTraced.joined` adds more paths of another key.
         key: a seed, or a key of `jax.random`. The random numbers along a path depend only on the key, the
             pixel and the path's number.
         materials: where the transfer function shows a material, the extinction is 1/λ instead, and the albedo
@@ -220,15 +230,14 @@ def path_trace(
 
     Raises:
         ValueError: for arguments out of range, no lights, a transfer function without a majorant, labels
-            where the volume has none, and reverse-mode differentiation (`jax.grad`).
-        RuntimeError: for differentiation with respect to inputs that move paths or jumps of the medium: the
-            camera, the volume's place, directions and positions of lights, the control points' values of the
-            transfer function, the values of materials, and voxels where there are materials or a transfer
-            function has a step (the derivative is NaN if the transfer function is traced).
+            where the volume has none, and reverse mode over a derivative.
+        RuntimeError: for forward mode over reverse mode, and for differentiation with respect to inputs that
+            move paths or jumps of the medium: the camera, the volume's place, directions and positions of
+            lights, the control points' values of the transfer function, the values of materials, and voxels
+            where there are materials or a transfer function has a step (the derivative is NaN if the
+            transfer function is traced).
     """
     order = "path_trace(volume, transfer, camera, lights)"
-    given = volume, transfer, camera, lights, materials, anisotropy
-    refuse_reverse_mode(given, FORWARD_ONLY)
     transfer = sized(transfer, volume)
     check_arguments(order, volume=volume, transfer=transfer, camera=camera)
     check_one_channel(volume, "path_trace")
@@ -249,12 +258,13 @@ def path_trace(
         raise ValueError(f"groups must divide paths; got groups = {groups} and paths = {paths}.")
     lanes, antialias, seed = integer("lanes", lanes, 1), flag("antialias", antialias), _seed(key)
     pixels = min(max(WALKS_PER_LANE * lanes // paths, 1), camera.size[0] * camera.size[1])
-    volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials)
+    volume, transfer, camera, materials = with_constant_paths(volume, transfer, camera, materials, lights)
     blocks = Blocks.of(constant(volume), slopes=transfer.reads_gradient)
     inputs = Inputs(volume, transfer, materials, lights, anisotropy)
     options = TraceOptions(paths, groups, lanes, pixels, antialias)
     constants = camera, blocks, words_of(volume), jnp.asarray(limit, jnp.int32), seed
-    return forward_only(_traced(inputs, constants, options), FORWARD_ONLY)
+    trace = _differentiable if is_traced(inputs) else _trace
+    return trace(inputs, constants, options)
 
 
 def _seed(key: Arrayable) -> UInt32[Array, ""]:
@@ -268,16 +278,6 @@ def _seed(key: Arrayable) -> UInt32[Array, ""]:
     return jax.random.bits(key, (), jnp.uint32)
 
 
-class Inputs(NamedTuple):
-    """Inputs of an image that have derivatives, at least in part."""
-
-    volume: Volume
-    transfer: Transfer
-    materials: tuple[Material, ...]
-    lights: tuple[Light, ...]
-    anisotropy: Float[Array, ""]
-
-
 @dataclass(frozen=True)
 class TraceOptions:
     """Static arguments. `pixels`: number of pixels of a batch."""
@@ -287,7 +287,16 @@ class TraceOptions:
     lanes: int
     pixels: int
     antialias: bool
-    sampling: Sampling = OF_IMAGES
+
+    @property
+    def count(self) -> int:
+        """Number of paths of a batch."""
+        return self.pixels * self.paths
+
+    def batches(self, camera: Camera) -> Int[Array, " batches"]:
+        """Numbers of the batches of an image."""
+        width, height = camera.size
+        return jnp.arange(-(-width * height // self.pixels), dtype=jnp.int32)
 
 
 Constants: TypeAlias = tuple[
@@ -296,72 +305,55 @@ Constants: TypeAlias = tuple[
 """Camera, ranges of blocks, the volume's packed voxels, `max_scatterings`, and the seed."""
 
 
-@eqx.filter_custom_jvp
-def _traced(inputs: Inputs, constants: Constants, options: TraceOptions) -> PathTraced:
-    return _trace(inputs, constants, options)
+class Walks(NamedTuple):
+    """The walks of an image, in float32. `valid`: False makes the image NaN."""
 
+    scene: WalkScene
+    inputs: Inputs
+    camera: Camera
+    seed: UInt32[Array, ""]
+    valid: Bool[Array, ""]
 
-@_traced.def_jvp
-def _(
-    primals: tuple[Inputs, Constants, TraceOptions], tangents: tuple[Any, Any, Any]
-) -> tuple[PathTraced, Any]:
-    inputs, constants, options = primals
-    traced, moving = _traced(*primals), tangents[0]
-    constant = jax.tree.map(lambda _: None, traced)
-    if not jax.tree.leaves(moving):
-        return traced, constant
-    if jax.tree.leaves(moving.volume):
-        check_voxels(inputs.transfer, inputs.materials)
-    derivative = _derivative(inputs, moving, constants, replace(options, sampling=OF_DERIVATIVES))
-    return traced, eqx.tree_at(_estimates, constant, derivative, is_leaf=is_none)
-
-
-def _estimates(traced: PathTraced) -> tuple[Any, ...]:
-    """Outputs that have a derivative."""
-    return traced.radiance, traced.opacity, traced.groups
-
-
-def _derivative_of(inputs: Inputs, tangents: Inputs, constants: Constants, options: TraceOptions) -> PyTree:
-    """Derivatives of the `_estimates` along tangents, which are None where they are 0."""
-    perturbed = jax.tree.map(lambda _, tangent: tangent is not None, inputs, tangents)
-    moving, fixed = eqx.partition(inputs, perturbed)
-
-    def image(moving: Inputs) -> tuple[Any, ...]:
-        return _estimates(_traced_by(eqx.combine(moving, fixed), constants, options))
-
-    _, derivative = jax.jvp(image, (moving,), (tangents,))
-    if jax.tree.leaves(moving.volume):  # a transfer function that is traced was not checked
-        derivative = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), derivative)
-    return derivative
-
-
-def _traced_by(inputs: Inputs, constants: Constants, options: TraceOptions) -> PathTraced:
-    """Trace the image in batches of pixels."""
-    # float64 becomes float32, whose rounding is far below the noise
-    (volume, transfer, materials, lights, anisotropy), (camera, blocks, words, max_scatterings, seed) = (
-        jax.tree.map(
-            lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, (inputs, constants)
+    @classmethod
+    def of(cls, inputs: Inputs, constants: Constants, sampling: Sampling) -> "Walks":
+        """The walks by some sampling."""
+        # float64 becomes float32, whose rounding is far below the noise
+        (volume, transfer, materials, lights, anisotropy), (camera, blocks, words, limit, seed) = (
+            jax.tree.map(
+                lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf,
+                (inputs, constants),
+            )
         )
-    )
-    packed, (width, height) = with_words(volume, [words]), camera.size
-    medium = Medium.of(packed, blocks, transfer, materials, options.sampling)
-    scene = WalkScene(packed, medium, lights, anisotropy, max_scatterings, options.sampling)
-    # Checked here, since comparisons in the walks would hide a NaN. The values of a custom field are unknown
-    # and their ranges infinite, which is not an error.
-    ranges = blocks if volume.field is None else None
-    valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
-    valid &= all_finite((materials, lights, anisotropy, camera)) & transfer.valid & camera.valid
-    paths, pixels = options.paths, options.pixels
-    batches, count = -(-width * height // pixels), pixels * paths
+        packed = with_words(volume, [words])
+        medium = Medium.of(packed, blocks, transfer, materials, sampling)
+        scene = WalkScene(packed, medium, lights, anisotropy, limit, sampling)
+        # Checked here, since comparisons in the walks would hide a NaN. The values of a custom field are
+        # unknown and their ranges infinite, which is not an error.
+        ranges = blocks if volume.field is None else None
+        valid = all_finite((without_voxels(volume), ranges, medium.majorants, transfer))
+        valid &= all_finite((materials, lights, anisotropy, camera)) & transfer.valid & camera.valid
+        return cls(scene, Inputs(packed, transfer, materials, lights, anisotropy), camera, seed, valid)
+
+    def begin(
+        self, options: TraceOptions, batch: Int[Array, ""], index: Index, *, replayed: bool = False
+    ) -> Walk:
+        """Walks of a batch by index."""
+        pixel, path = batch * options.pixels + index // options.paths, index % options.paths
+        width, height = self.camera.size
+        alive = self.valid & (index < options.count) & (pixel < width * height)
+        words = pixel.astype(jnp.uint32), path.astype(jnp.uint32), jnp.broadcast_to(self.seed, index.shape)
+        return jax.vmap(partial(_begin, self.scene, self.camera, options.antialias, replayed))(words, alive)
+
+
+def _traced_by(walks: Walks, options: TraceOptions) -> PathTraced:
+    """Trace the image in batches of pixels."""
+    (width, height), paths, pixels = walks.camera.size, options.paths, options.pixels
+
+    def advance(batch: Walk, none: tuple[()]) -> tuple[Walk, tuple[()]]:
+        return step(walks.scene, batch), none
 
     def batch(number: Int[Array, ""]) -> tuple[Array, ...]:
-        def begin(index: Int[Array, " lanes"]) -> Walk:
-            pixel, path = number * pixels + index // paths, index % paths
-            alive = valid & (index < count) & (pixel < width * height)
-            words = pixel.astype(jnp.uint32), path.astype(jnp.uint32), jnp.broadcast_to(seed, index.shape)
-            return jax.vmap(partial(_begin, scene, camera, options.antialias))(words, alive)
-
-        results = walk_all(begin, partial(step, scene), count, options.lanes)
+        results, _ = walk_all(partial(walks.begin, options, number), advance, options.count, options.lanes)
         results = jax.tree.map(lambda leaf: leaf.reshape(pixels, paths), results)
         radiance = jnp.stack(results.radiance, axis=-1)
         mean = radiance.mean(axis=1)
@@ -375,18 +367,80 @@ def _traced_by(inputs: Inputs, constants: Constants, options: TraceOptions) -> P
     def image(leaf: Array) -> Array:
         return leaf.reshape(-1, *leaf.shape[2:])[: width * height].reshape(height, width, *leaf.shape[2:])
 
-    outputs = map(image, jax.lax.map(batch, jnp.arange(batches, dtype=jnp.int32)))
+    outputs = map(image, jax.lax.map(batch, options.batches(walks.camera)))
     radiance, opacity, deviations, exhausted, *groups = outputs
     numbers = radiance, opacity, deviations, *(jnp.moveaxis(group, 2, 0) for group in groups)
     # by nan * array, the derivative becomes NaN, too
-    radiance, opacity, deviations, *groups = (jnp.where(valid, array, jnp.nan * array) for array in numbers)
-    return PathTraced(radiance, opacity, deviations, exhausted, paths, seed, *groups)
+    radiance, opacity, deviations, *groups = (
+        jnp.where(walks.valid, array, jnp.nan * array) for array in numbers
+    )
+    return PathTraced(radiance, opacity, deviations, exhausted, paths, walks.seed, *groups)
 
 
-_trace, _derivative = compiled(_traced_by), compiled(_derivative_of, in_turn=False)
+def _image(inputs: Inputs, constants: Constants, options: TraceOptions) -> PathTraced:
+    return _traced_by(Walks.of(inputs, constants, OF_IMAGES), options)
 
 
-def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, alive: Bool[Array, ""]) -> Walk:
+def _push(tangents: Inputs, inputs: Inputs, constants: Constants, options: TraceOptions) -> PyTree:
+    """Tangents of an image, by walks for derivatives."""
+
+    def image(moving: Inputs) -> PathTraced:
+        walks = Walks.of(eqx.combine(moving, inputs), constants, OF_DERIVATIVES)
+        return floats(_traced_by(walks, options))
+
+    derivative = jax.jvp(image, (moving_leaves(inputs, tangents),), (tangents,))[1]
+    if jax.tree.leaves(tangents.volume):  # a transfer function that is traced was not checked
+        derivative = jax.tree.map(partial(jnp.where, has_step(inputs.transfer), jnp.nan), derivative)
+    return eqx.tree_at(lambda d: d.deviations, derivative, jnp.zeros_like(derivative.deviations))
+
+
+def _pull(
+    cotangents: PathTraced,
+    perturbed: Inputs,
+    _: tuple[()],
+    inputs: Inputs,
+    constants: Constants,
+    options: TraceOptions,
+) -> Inputs:
+    """Cotangents of the perturbed inputs, by replays of the walks for derivatives."""
+    inputs = eqxi.nondifferentiable(inputs, msg=FIRST_ONLY)
+    walks = Walks.of(inputs, constants, OF_DERIVATIVES)
+    bars = jnp.concatenate([cotangents.radiance, cotangents.opacity[..., None]], axis=-1)[None]
+    if cotangents.groups is not None:
+        bars = bars + options.groups * cotangents.groups
+    bars = bars.reshape(len(bars), -1, 4) / options.paths
+
+    def batch(sums: Pulled, number: Int[Array, ""]) -> tuple[Pulled, None]:
+        def bars_of(index: Index) -> tuple[Vec3, Scalar]:
+            pixel = jnp.minimum(number * options.pixels + index // options.paths, bars.shape[1] - 1)
+            group = index % options.paths * len(bars) // options.paths
+            r, g, b, opacity = jnp.moveaxis(bars[group, pixel], -1, 0)
+            return (r, g, b), opacity
+
+        begin = partial(walks.begin, options, number, replayed=True)
+        return replay_all(walks.scene, walks.inputs, begin, bars_of, sums, options.count, options.lanes), None
+
+    zeros, batches = Pulled.zeros(walks.inputs, perturbed), options.batches(walks.camera)
+    result = jax.lax.scan(batch, zeros, batches)[0].cotangents(walks.inputs)
+    step = has_step(inputs.transfer)
+    volume = jax.tree.map(partial(jnp.where, step, jnp.nan), result.volume)
+    result = jax.tree.map(partial(jnp.where, ~walks.valid, jnp.nan), result._replace(volume=volume))
+    return jax.tree.map(lambda bar, leaf: bar.astype(leaf.dtype), result, eqx.filter(inputs, perturbed))
+
+
+_trace = compiled(_image, by_jvp=True)
+_differentiable = differentiable(
+    _trace,
+    lambda *args: (_trace(*args), ()),
+    compiled(_push, in_turn=False),
+    compiled(_pull, by_jvp=True),
+    FIRST_ONLY,
+)
+
+
+def _begin(
+    scene: WalkScene, camera: Camera, antialias: bool, replayed: bool, words: Words, alive: Bool[Array, ""]
+) -> Walk:
     """Start a walk at the entry of the camera's ray into the volume."""
     pixel, path, seed = words
     row, column = jnp.divmod(pixel.astype(jnp.int32), camera.size[0])
@@ -399,8 +453,10 @@ def _begin(scene: WalkScene, camera: Camera, antialias: bool, words: Words, aliv
     ray = enter(Affine(scene.volume), origin, direction, (column, row))
     start = ray.path(jnp.zeros_like(ray.length))
     flight = scene.flight(start, direction, jnp.full_like(ray.length, jnp.inf))
-    zero, result = jnp.zeros_like(flight.depth), WalkResult.zeros(())
+    zero, no = jnp.zeros_like(flight.depth), jnp.zeros((), bool)
     black, white = (zero, zero, zero), (zero + 1, zero + 1, zero + 1)
-    steps, to_light, alive = jnp.zeros((), jnp.int32), jnp.zeros((), bool), alive & (ray.length > 0)
+    result = WalkResult(black, zero, jnp.zeros((), jnp.int32), no, black if replayed else None)
+    steps, alive = jnp.zeros((), jnp.int32), alive & (ray.length > 0)
     importance = None if scene.sampling.importance is None else zero + 1
-    return Walk(words, steps, flight, to_light, direction, white, importance, black, zero, result, alive)
+    dark = white if replayed else None
+    return Walk(words, steps, flight, no, direction, white, importance, black, zero, result, alive, dark)

@@ -14,9 +14,9 @@ from .._util.vec3 import Scalar, Vec3, dot, greatest, plus, scaled, select, time
 from ..lighting.lights import Arriving, Light, located, sky_of
 from ..lighting.phase import phase, sample_phase, scattered
 from ..scene.space import Affine
+from ..scene.transfer import Measured
 from ..scene.volume import Volume
 from ..xla.memory import in_memory
-from .fixed_paths import constant
 from .likelihood import Sampling, likelihood
 from .medium import Medium
 from .tracking import Candidate, Decision, Flight, fly
@@ -27,24 +27,31 @@ T = TypeVar("T")
 ROULETTE = 0.25
 """Threshold of Russian roulette, for a walk's throughput and for the transmittance towards a light."""
 
-LIGHTS = "the directions and positions of lights"
+DARK = 3e-4
+"""Factor of the throughput below which a walk that is replayed keeps it apart (`Walk.dark`): about the square
+root of float32's precision."""
 
 Words: TypeAlias = tuple[UInt32[Array, "..."], UInt32[Array, "..."], UInt32[Array, "..."]]
 """Key of all random numbers along a path: pixel, path, seed."""
 
 
 class WalkResult(NamedTuple):
-    """Radiance of a path, opacity (0 or 1), number of scatterings, and `exhausted` if it was cut off."""
+    """Radiance of a path, opacity (0 or 1), number of scatterings, and `exhausted` if it was cut off.
+    `after_dark`: the radiance since `Walk.dark` is not 1, without that factor; None where `Walk.dark` is."""
 
     radiance: Vec3
     opacity: Scalar
     scatterings: Int[Array, "..."]
     exhausted: Bool[Array, "..."]
+    after_dark: Vec3 | None = None
 
-    @classmethod
-    def zeros(cls, shape: tuple[int, ...]) -> "WalkResult":
-        dark, no = jnp.zeros(shape, jnp.float32), jnp.zeros(shape, bool)
-        return cls((dark, dark, dark), dark, jnp.zeros(shape, jnp.int32), no)
+    def plus(self, gathered: Vec3, dark: Vec3 | None) -> "WalkResult":
+        """The result after gathering light."""
+        if dark is None or self.after_dark is None:
+            return self._replace(radiance=plus(self.radiance, gathered))
+        r, g, b = (jnp.where(factor == 1, 0, c) for factor, c in zip(dark, gathered, strict=True))
+        after_dark = plus(self.after_dark, (r, g, b))
+        return self._replace(radiance=plus(self.radiance, times(gathered, dark)), after_dark=after_dark)
 
 
 class Walk(NamedTuple):
@@ -57,6 +64,8 @@ class Walk(NamedTuple):
         to_light: True on the way to a light.
         direction: world direction of the path, unit; on the way to a light, the one after it.
         throughput: fraction of the light at the path's end that arrives at the camera; (r, g, b).
+        dark: first factor of the throughput below DARK, which `throughput` and `unoccluded` then lack; else
+            1. None: these have all factors.
         importance: importance for Russian roulette, a constant for derivatives; None: that of the throughput.
         unoccluded: radiance that the light adds without occlusion.
         transmittance: transmittance towards the light, so far.
@@ -75,6 +84,7 @@ class Walk(NamedTuple):
     transmittance: Scalar
     result: WalkResult
     alive: Bool[Array, ""]
+    dark: Vec3 | None = None
 
 
 class WalkScene(NamedTuple):
@@ -106,8 +116,7 @@ class WalkScene(NamedTuple):
             lambda *leaves: jnp.select([number == i for i in range(count)], leaves), *arriving
         )
         r, g, b = chosen.irradiance
-        toward, distance = constant(LIGHTS, (chosen.toward, chosen.distance))
-        return Arriving(toward, distance, (r * count, g * count, b * count))
+        return chosen._replace(irradiance=(r * count, g * count, b * count))
 
 
 class Scattering(NamedTuple):
@@ -120,40 +129,64 @@ class Scattering(NamedTuple):
     to_light: Bool[Array, "..."]
     toward: Vec3
     end: Scalar
+    dark: Vec3 | None
+
+
+class Proposal(NamedTuple):
+    """Constants of a step: the advanced flight, its candidate, random numbers, and the turn of a scattering
+    (its new direction in the frame of the old)."""
+
+    flight: Flight
+    candidate: Candidate
+    turn: Vec3
+    decide: Scalar
+    choose: Scalar
+    survive: Scalar
 
 
 def step(scene: WalkScene, walks: Walk) -> Walk:
     """Advance many walks by a part of a flight. Expensive values are stored, or XLA recomputes them."""
-    live = jnp.any(walks.alive)
+    proposal = propose(scene, walks)
+    measured = _stored(walks, scene.medium.measure, proposal.candidate.coordinate)
+    return advance(scene, walks, proposal, measured)
+
+
+def _stored(walks: Walk, f: Callable[..., Any], *arguments: Any) -> Any:
+    return in_memory(jnp.any(walks.alive), jax.vmap(f), *arguments)
+
+
+def propose(scene: WalkScene, walks: Walk) -> Proposal:
+    """The part of a step that has no derivative."""
 
     def uniforms(walk: Walk, stage: int) -> tuple[Scalar, Scalar, Scalar, Scalar]:
         pixel, path, seed = walk.words
         return hashed_uniforms_4(pixel, path, (2 * walk.steps + stage).astype(jnp.uint32), seed)
 
-    def stored(f: Callable[..., Any], *arguments: Any) -> Any:
-        return in_memory(live, jax.vmap(f), *arguments)
-
+    stored = partial(_stored, walks)
     first, second = (stored(partial(uniforms, stage=stage), walks) for stage in (0, 1))
     (draw, decide, *_), (choose, first_turn, second_turn, survive) = first, second
     turn = stored(partial(sample_phase, jax.lax.stop_gradient(scene.anisotropy)), first_turn, second_turn)
-    majorants = scene.medium.majorants
-    flight, candidate = stored(partial(fly, majorants), walks.flight, draw)
-    extinction, albedo = stored(scene.medium.classify, stored(scene.medium.measure, candidate.coordinate))
-    decision = jax.vmap(partial(Decision.at, majorants))(candidate, extinction)
+    flight, candidate = stored(partial(fly, scene.medium.majorants), walks.flight, draw)
+    return Proposal(flight, candidate, turn, decide, choose, survive)
+
+
+def advance(scene: WalkScene, walks: Walk, proposal: Proposal, measured: Measured) -> Walk:
+    """The walks after a step, from measurements at the candidates."""
+    flight, candidate, turn, decide, choose, survive = proposal
+    extinction, albedo = _stored(walks, scene.medium.classify, measured)
+    decision = jax.vmap(partial(Decision.at, scene.medium.majorants))(candidate, extinction)
     inputs = walks, candidate.coordinate, albedo, decision.collided, turn, choose, survive
-    scattering = stored(partial(_scatter, scene), *inputs)
+    scattering = _stored(walks, partial(_scatter, scene), *inputs)
     candidate = candidate._replace(hit=candidate.hit & walks.alive, ended=candidate.ended & walks.alive)
     walks = walks._replace(flight=flight, steps=walks.steps + 1)
 
-    def advance(
-        walk: Walk, candidate: Candidate, decision: Decision, scattering: Scattering, u: Scalar
-    ) -> Walk:
+    def one(walk: Walk, candidate: Candidate, decision: Decision, scattering: Scattering, u: Scalar) -> Walk:
         advanced = _delta_tracking(scene, walk, candidate, decision, scattering, u)
         if not located(scene.lights):
             return advanced
-        return _where(walk.to_light, _ratio_tracking(scene, walk, candidate, decision, u), advanced)
+        return where_all(walk.to_light, _ratio_tracking(scene, walk, candidate, decision, u), advanced)
 
-    return jax.vmap(advance)(walks, candidate, decision, scattering, decide)
+    return jax.vmap(one)(walks, candidate, decision, scattering, decide)
 
 
 def _scatter(
@@ -167,13 +200,15 @@ def _scatter(
     survive: Scalar,
 ) -> Scattering:
     """Scatter a walk. `collided`: weight of the collision; `turn`: new direction in the frame of the old."""
-    kept = scaled(albedo, collided)
-    before_roulette = times(walk.throughput, kept)
+    kept, dark = scaled(albedo, collided), walk.dark
     floor = scene.sampling.importance
     if walk.importance is None or floor is None:
-        importance = greatest(before_roulette)
+        importance = greatest(times(walk.throughput, kept))
     else:
         importance = walk.importance * jnp.maximum(jax.lax.stop_gradient(greatest(kept)), floor)
+    if dark is not None:
+        kept, dark = _split_dark(kept, dark)
+    before_roulette = times(walk.throughput, kept)
     weight, importance = _roulette(importance, survive)
     weight = weight * likelihood(phase(turn[2], scene.anisotropy))
     throughput = scaled(before_roulette, weight)
@@ -181,14 +216,23 @@ def _scatter(
     endless = jnp.full_like(survive, jnp.inf)
     if not located(scene.lights):
         no = jnp.zeros(survive.shape, bool)
-        return Scattering(direction, throughput, importance, walk.unoccluded, no, direction, endless)
+        return Scattering(direction, throughput, importance, walk.unoccluded, no, direction, endless, dark)
     light = scene.light(coordinate, walk.direction, choose)
     assert light.toward is not None
     density = phase(dot(walk.direction, light.toward), scene.anisotropy)
     unoccluded = scaled(times(before_roulette, light.irradiance), density)
     to_light = (greatest(unoccluded) > 0) | (walk.importance is not None)
     toward, end = select(to_light, light.toward, direction), jnp.where(to_light, light.distance, endless)
-    return Scattering(direction, throughput, importance, unoccluded, to_light, toward, end)
+    return Scattering(direction, throughput, importance, unoccluded, to_light, toward, end, dark)
+
+
+def _split_dark(kept: Vec3, dark: Vec3) -> tuple[Vec3, Vec3]:
+    """The factors of a throughput at a scattering, without the first one below DARK; and `Walk.dark`."""
+    pairs = list(zip(kept, dark, strict=True))
+    first = [(factor < DARK) & (before == 1) for factor, before in pairs]
+    r, g, b = (jnp.where(is_first, 1, factor) for is_first, factor in zip(first, kept, strict=True))
+    dark_r, dark_g, dark_b = (jnp.where(is_first, *pair) for is_first, pair in zip(first, pairs, strict=True))
+    return (r, g, b), (dark_r, dark_g, dark_b)
 
 
 def _delta_tracking(
@@ -200,7 +244,8 @@ def _delta_tracking(
     decide: Scalar,
 ) -> Walk:
     """Advance a walk along its path. A collision scatters it; at the end it gathers the constant light."""
-    before, (direction, throughput, importance, unoccluded, to_light, toward, end) = walk.result, scattering
+    direction, throughput, importance, unoccluded, to_light, toward, end, dark = scattering
+    before = walk.result
     collides = candidate.hit & (decide < decision.chance)
     capped = collides & (before.scatterings >= scene.max_scatterings)
     scatters, met = collides & ~capped, before.scatterings > 0
@@ -210,19 +255,19 @@ def _delta_tracking(
     opacity = jnp.where(candidate.ended & ~met, 1 - walk.throughput[0], before.opacity)
     goes_on = to_light | (importance > 0)
     return walk._replace(
-        flight=_where(scatters, scene.flight(candidate.coordinate, toward, end), walk.flight),
+        flight=where_all(scatters, scene.flight(candidate.coordinate, toward, end), walk.flight),
         to_light=scatters & to_light,
         direction=select(scatters, direction, walk.direction),
         throughput=select(scatters, throughput, scaled(walk.throughput, passed)),
         importance=None if walk.importance is None else jnp.where(scatters, importance, walk.importance),
         unoccluded=select(scatters, unoccluded, walk.unoccluded),
         transmittance=jnp.ones_like(walk.transmittance),
-        result=WalkResult(
-            plus(before.radiance, gathered),
-            jnp.where(scatters & ~met, 1, opacity),
-            before.scatterings + scatters.astype(jnp.int32),
-            before.exhausted | capped,
+        result=before.plus(gathered, walk.dark)._replace(
+            opacity=jnp.where(scatters & ~met, 1, opacity),
+            scatterings=before.scatterings + scatters.astype(jnp.int32),
+            exhausted=before.exhausted | capped,
         ),
+        dark=None if dark is None or walk.dark is None else select(scatters, dark, walk.dark),
         alive=walk.alive & ~candidate.ended & ~capped & (~scatters | goes_on),
     )
 
@@ -239,15 +284,16 @@ def _ratio_tracking(
     next_flight = scene.flight(walk.flight.start, walk.direction, jnp.full_like(walk.flight.end, jnp.inf))
     importance = greatest(walk.throughput) if walk.importance is None else walk.importance
     return walk._replace(
-        flight=_where(done, next_flight, walk.flight),
+        flight=where_all(done, next_flight, walk.flight),
         to_light=~done,
         transmittance=transmittance,
-        result=walk.result._replace(radiance=plus(walk.result.radiance, gathered)),
+        result=walk.result.plus(gathered, walk.dark),
         alive=walk.alive & (~done | (importance > 0)),
     )
 
 
-def _where(condition: Bool[Array, ""], a: T, b: T) -> T:
+def where_all(condition: Bool[Array, "..."], a: T, b: T) -> T:
+    """`jnp.where` of each leaf."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
 
 

@@ -1,7 +1,6 @@
 """Detection of JAX's transformations, and errors for modes of differentiation that are not supported."""
 
 from collections.abc import Iterator
-from itertools import chain
 from typing import Any
 
 import equinox as eqx
@@ -25,15 +24,6 @@ def tracers(leaf: object) -> Iterator[Any]:
 def transformations(leaf: Any) -> list[str]:
     """Names of the `tracers` around an array. Names, since JAX does not export their classes."""
     return [type(tracer).__name__ for tracer in tracers(leaf)]
-
-
-def refuse_reverse_mode(tree: PyTree, message: str) -> None:
-    """Raises `ValueError` where the tree is known to be differentiated in reverse mode, before any work; not
-    under `jax.linearize`. A `jax.jit` in between and older versions of JAX hide it: then `forward_only`
-    refuses."""
-    for tracer in chain.from_iterable(map(tracers, jax.tree.leaves(tree))):
-        if getattr(getattr(tracer, "_trace", None), "is_vjp", False):
-            raise ValueError(message)
 
 
 def check_captured(name: str, function: object) -> None:

@@ -10,7 +10,7 @@ from . import Fault
 
 PHOTONS, SHADING = "lighting/test_photons.py::", "lighting/test_shading.py::"
 PHONG, PATHS = "lighting/test_phong.py::", "path_tracing/test_path_trace.py::"
-SLOPES = "path_tracing/test_derivatives.py::"
+SLOPES, REPLAY = "path_tracing/test_derivatives.py::", "path_tracing/test_replay.py::"
 TRANSPORT, LIGHT_FIT = "lighting/test_transport.py::", "fitting/test_light_fit.py::"
 
 
@@ -151,5 +151,20 @@ FAULTS: list[Fault] = [
         "path_tracing.likelihood:likelihood",
         lambda f: jnp.ones_like,
         (f"{SLOPES}test_derivatives_of_light_scattered_often_are_those_of_images_of_the_same_key",),
+    ),
+    Fault(
+        "path tracing: a factor of 0 of a throughput has no gradient in reverse mode",
+        "path_tracing.walks:DARK",
+        lambda _: -1.0,
+        (f"{REPLAY}test_the_gradient_is_that_of_forward_mode",),
+    ),
+    Fault(
+        "path tracing: light from lights has no gradient in reverse mode",
+        "path_tracing.replay:Replay.advanced",
+        lambda f: lambda self, ahead: f(self, ahead)._replace(transmittance=self.transmittance),
+        (
+            f"{REPLAY}test_the_gradient_is_that_of_forward_mode",
+            f"{REPLAY}test_the_gradient_by_voxels_is_that_of_quadrature",
+        ),
     ),
 ]
