@@ -12,6 +12,7 @@ import numpy as np
 
 from .._util.checks import Arrayable, described, finite_array, flag, number
 from .._util.memory import require_room
+from .._util.progress import progress
 from .._util.srgb import linear_color
 from .._util.voxels import faces_of
 from ..compositing.blending import Compositing, Over
@@ -47,7 +48,6 @@ from .automatic import (
     xray_transfer,
 )
 from .framing import FAINT, VISIBLE, automatic_camera, clipped_points, framed, visible_points, warn_of_gap
-from .progress import progress
 from .settings import COLOR_OPTIONS, header_of
 
 

@@ -16,7 +16,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._util.checks import integer, not_negative, output_file
+from .._util.checks import flag, integer, not_negative, output_file
+from .._util.progress import progress
 from ..xla.trees import PyTree
 from . import checkpoints
 from .constraints import Free, FreeVariables, Where, size
@@ -99,6 +100,7 @@ def fit(
     max_jacobian: int = 2**30,
     callback: Callable[[int, PyTree, float], Any] | None = None,
     checkpoint: str | PathLike[str] | None = None,
+    quiet: bool = False,
 ) -> Fit:
     """Fit parameters to make a residual small: the loss is half the sum of its squares.
 
@@ -140,6 +142,8 @@ def fit(
         checkpoint: a file for the state, which is written between steps, in a tenth of the time, and when the
             fit ends or is interrupted. If the file exists, the fit continues from it, with the same bits as
             without interruption (on the same machine).
+        quiet: whether no progress is shown. By default, a terminal or a notebook shows the step, its loss and
+            what is being compiled.
 
     Returns:
         A `Fit`. If the solver fails, stalls or runs out of steps, `Fit.success` and `Fit.message` say so, and
@@ -153,6 +157,7 @@ def fit(
             that is not finite at the start, and a checkpoint that is damaged or of another fit.
         ImportError: if Optax is requested but not installed.
     """
+    quiet = flag("quiet", quiet)
     not_negative("rtol", rtol)
     not_negative("atol", atol)
     if not isinstance(residual, PathTracedResidual):
@@ -171,32 +176,35 @@ def fit(
         least_squares = isinstance(method, optx.AbstractLeastSquaresSolver)
         problem = Problem.of(residual, free, y, max_jacobian, least_squares)
         run = _Run.of(method, problem, y)
-    run, loss = run.step(method, problem)
-    losses = [loss]
-    if not math.isfinite(loss):
-        raise ValueError(f"residual must be finite at the parameters that the fit starts from; loss {loss}.")
-    bounds = zip(free.paths, free.bijections, strict=True)
-    description = {
-        "solver": method if isinstance(method, str) else type(method).__name__,
-        "parameters": [f"{path}: {type(bijection).__name__}" for path, bijection in bounds],
-        "number of residuals": problem.count,
-        "loss at the start": f"{loss:.3g}",  # other machines round differently
-    }
-    if file is not None and (saved := checkpoints.load(file, run, description)) is not None:
-        run, losses = saved[0], saved[1]["losses"]
-    due = 0.0
-    try:
-        while (result := run.ended(problem, losses, limits)) is None:
-            run, loss = run.step(method, problem)
-            losses.append(loss)
-            if callback is not None:
-                callback(len(losses), free.forward(run.evaluated), loss)
-            if file is not None and (begun := time.monotonic()) >= due:
+    with progress("fitting", max_steps, quiet=quiet) as show:
+        run, loss = run.step(method, problem)
+        losses = [loss]
+        show(f"loss {loss:.3g}")
+        if not math.isfinite(loss):
+            raise ValueError(f"residual must be finite at the starting parameters; loss {loss}.")
+        bounds = zip(free.paths, free.bijections, strict=True)
+        description = {
+            "solver": method if isinstance(method, str) else type(method).__name__,
+            "parameters": [f"{path}: {type(bijection).__name__}" for path, bijection in bounds],
+            "number of residuals": problem.count,
+            "loss at the start": f"{loss:.3g}",  # other machines round differently
+        }
+        if file is not None and (saved := checkpoints.load(file, run, description)) is not None:
+            run, losses = saved[0], saved[1]["losses"]
+        due = 0.0
+        try:
+            while (result := run.ended(problem, losses, limits)) is None:
+                run, loss = run.step(method, problem)
+                losses.append(loss)
+                show(f"loss {loss:.3g}")
+                if callback is not None:
+                    callback(len(losses), free.forward(run.evaluated), loss)
+                if file is not None and (begun := time.monotonic()) >= due:
+                    checkpoints.save(file, run, {**description, "losses": losses})
+                    due = time.monotonic() + (time.monotonic() - begun) / CHECKPOINTS
+        finally:
+            if file is not None:
                 checkpoints.save(file, run, {**description, "losses": losses})
-                due = time.monotonic() + (time.monotonic() - begun) / CHECKPOINTS
-    finally:
-        if file is not None:
-            checkpoints.save(file, run, {**description, "losses": losses})
     return _report(run, problem, losses, limits, result)
 
 

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..._util.checks import Arrayable, integer, output_file
+from ..._util.progress import progress
 from ..._util.srgb import displayed
 from ..._util.whole_files import whole_file
 from ...fitting.bijections import RigidMotion
 from ...scene.camera import Camera
 from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import scene_of, with_march
-from ..progress import progress
 from ..show import why_empty
 from .options import Parser, add_option, add_output, add_scene
 

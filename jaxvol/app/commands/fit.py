@@ -5,10 +5,10 @@ import warnings
 from pathlib import Path
 
 from ..._util.checks import output_file
+from ..._util.progress import progress
 from ...fitting import ImageResidual, fit, flat_grey, read_views, write_transfer
 from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import background_of, quick_march, volume_of
-from ..progress import progress
 from .options import Parser, add_clim, add_output, add_quiet, add_sampling, add_volume, refuse_to_replace
 
 
@@ -25,15 +25,14 @@ def run_fit(options: argparse.Namespace) -> None:
         volume = volume_of(options)
     step = float(volume.spacing.min()) / 2 if options.step is None else options.step
     march = quick_march(step)
-    shown = progress("fitting", options.max_steps, quiet=options.quiet)
-    with warnings.catch_warnings(record=True) as warned, shown as done:
+    with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always", UserWarning)
         result = fit(
             ImageResidual(lambda transfer, camera: (volume, transfer, camera, march), views, background),
             flat_grey(volume, options.points, options.clim),
             max_steps=options.max_steps,
             checkpoint=options.checkpoint,
-            callback=lambda *_: done(),
+            quiet=options.quiet,
         )
     path = write_transfer(options.output, result.parameters)
     error = (2 * result.loss) ** 0.5

@@ -79,8 +79,8 @@ PICTURES = {head: ("head",), grain: ("before", "after"), fit: ("fit_start", "fit
 
 def run_demo(options: argparse.Namespace) -> None:
     from ..._util.checks import output_file
+    from ..._util.progress import progress
     from ...xla.persistent_cache import keep_programs_by_default
-    from ..progress import progress
 
     keep_programs_by_default()
     page = '<!doctype html><meta charset="utf-8"><title>jaxvol demo</title>'

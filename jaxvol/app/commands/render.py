@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from ..._util.progress import progress
 from ..._util.srgb import displayed
 from ...io.display import image_file, save_image
 from ...scene.labels import LabelTransferFunction
@@ -14,7 +15,6 @@ from ...scene.rendering import Rendering
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs_by_default
 from ..picture import PictureRequest, scene_of, with_march
-from ..progress import progress
 from ..recorded import text_of_options
 from ..show import why_empty
 from .options import SWITCH, Parser, add_output, add_scene, refuse_to_replace

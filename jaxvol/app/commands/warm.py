@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..._util.progress import progress
 from ...compositing.modes import MODES
 from ...io.phantoms import phantom
 from ...render import render
@@ -14,7 +15,6 @@ from ...scene.transfer import Transfer
 from ...scene.volume import Volume
 from ...xla.persistent_cache import keep_programs
 from ..picture import PictureRequest, scene_of, with_march
-from ..progress import progress
 from ..settings import DEFAULTS
 from .options import Parser, add_quiet, add_size
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Generator
 from dataclasses import fields, replace
 from typing import Any, Literal
 
+from ..._util.progress import every_second
 from ..._util.srgb import png_of
 from ...scene.transfer import TransferFunction
-from ..progress import every_second
 from ..recorded import text_of
 from .marks import with_marks
 from .state import PROGRAM, State, Vector, ViewerSetup

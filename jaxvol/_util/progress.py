@@ -55,10 +55,10 @@ def _compiled_now() -> list[str]:
 
 
 @contextmanager
-def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Iterator[Callable[[], object]]:
+def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Iterator[Callable[..., None]]:
     """Show a task, and the program being compiled, if it takes longer than a second: in a terminal or a
     notebook, unless `quiet`. With a `total` of steps, a bar shows the finished ones. The context's value is
-    the function to call after each step."""
+    the function to call after each step, with a note to show beside the bar, or without."""
     from tqdm import tqdm
 
     kernel = "ipykernel" in sys.modules
@@ -67,8 +67,13 @@ def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Ite
     form: dict[str, Any] = {"bar_format": "{desc}: {elapsed}"} if total is None else {}
     disable = quiet or not (kernel or sys.stderr.isatty())
     with tqdm(desc=task, total=total, delay=INTERVAL, disable=disable, leave=False, **form) as bar:
+
+        def done(note: str = "") -> None:
+            bar.set_postfix_str(note, refresh=False)
+            bar.update()
+
         if disable:
-            yield bar.update
+            yield done
             return
         programs = _compiled_now()
 
@@ -77,4 +82,4 @@ def progress(task: str, total: int | None = None, *, quiet: bool = False) -> Ite
             bar.set_description_str(f"{task}, compiling {programs[-1]}" if programs else task)
 
         with every_second(tell):
-            yield bar.update
+            yield done

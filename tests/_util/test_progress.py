@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxvol.app import progress as module
-from jaxvol.app.progress import progress
+from jaxvol._util import progress as module
+from jaxvol._util.progress import progress
 
 
 class Terminal(io.StringIO):
@@ -27,8 +27,8 @@ def test_a_task_is_told_while_it_takes_long(terminal, quiet, monkeypatch):
     stderr = Terminal(terminal)
     monkeypatch.setattr(sys, "stderr", stderr)
     with progress("drawing frames", 8, quiet=quiet) as done:
-        for _ in range(4):
-            done()
+        for number in range(4):
+            done(f"frame {number}")
         time.sleep(0.1)
     with progress("reading", quiet=quiet):
         time.sleep(0.1)
@@ -36,6 +36,7 @@ def test_a_task_is_told_while_it_takes_long(terminal, quiet, monkeypatch):
     assert bool(told) == (terminal and not quiet)
     if told:
         assert "drawing frames:  50%" in told
+        assert "frame 3" in told
         assert "reading: 00:00" in told
         assert told.endswith("\r")  # the line is cleared at the end
 
