@@ -126,10 +126,11 @@ def shares(
     value: Scalar,
     *,
     edge: float = 0.0,
+    at_bound: float = 0.5,
 ) -> tuple[Scalar, ...]:
     """Shares of materials at a place with this value: 1 for the first present; sum at most 1. `labelled`:
     the share of a label there. `edge`: fraction of the narrowest range over which materials fade; above 0,
-    shares by values are continuous."""
+    shares by values are continuous. `at_bound`: share at the ends of a material's range then, ½ or 1."""
     remaining, fractions = jnp.ones_like(value), []
     ranges = [m.values[1] - m.values[0] for m in materials if m.values is not None]
     width = edge * jax.lax.stop_gradient(jnp.min(jnp.stack(ranges))) if ranges else jnp.zeros_like(value)
@@ -143,7 +144,9 @@ def shares(
             if edge == 0:
                 share = step(value - low) * step(high - value)
             else:
-                share = smoothstep((value - low) / width + 0.5) * smoothstep((high - value) / width + 0.5)
+                share = smoothstep((value - low) / width + at_bound) * smoothstep(
+                    (high - value) / width + at_bound
+                )
         # so that two materials of adjacent ranges have half each where they meet
         fractions.append(jnp.where(share > remaining, remaining, share))  # NaN stays NaN
         remaining = remaining - fractions[-1]

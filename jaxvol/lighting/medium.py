@@ -15,7 +15,8 @@ from .shading import Surroundings
 
 
 FADE = 0.02
-"""Materials fade over this fraction of the narrowest value range, so that their edges have derivatives."""
+"""Materials fade beyond their ends over this fraction of the narrowest value range, so that their edges have
+derivatives. At the ends themselves, which the largest voxels may have, they are whole, as for paths."""
 
 
 class MediumTransfer(Transfer):
@@ -75,7 +76,7 @@ class MediumTransfer(Transfer):
             def labelled(number: int) -> Scalar:
                 return jnp.asarray(label == number, value.dtype)
 
-            fractions = shares(self.materials, labelled, value, edge=FADE)
+            fractions = shares(self.materials, labelled, value, edge=FADE, at_bound=1)
             rate, remaining, kept = jnp.zeros_like(value), jnp.ones_like(value), jnp.ones_like(value)
             for fraction, material in zip(fractions, self.materials, strict=True):
                 rate = rate + fraction / material.mean_free_path

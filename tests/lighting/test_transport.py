@@ -89,6 +89,15 @@ def test_where_two_materials_meet_nothing_is_in_neither():
     assert np.interp(60, values, each[0]) == pytest.approx(0.5, abs=0.1)
 
 
+def test_a_material_is_whole_at_the_ends_of_its_range():
+    """Which are often the smallest and the largest value of a volume."""
+    medium = MediumTransfer(transfer(3.0), (Material(0.25, 0.5, values=(60, 100)),))
+    for value in (60.0, 80.0, 100.0):
+        albedo, extinction = medium.classifier()((jnp.float32(value),))
+        assert float(extinction) == 2
+        np.testing.assert_allclose(albedo, 0.75 * np.array([0.8, 0.5, 0.9]), rtol=1e-6)
+
+
 def test_two_labels_of_one_material_are_one():
     labels = np.where(np.indices(SHAPE)[0] < 5, 1, 2).astype(np.uint8)
     volume = jv.Volume(np.ones(SHAPE, np.uint8), nested().spacing, nested().origin, labels)
