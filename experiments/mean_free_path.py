@@ -4,10 +4,9 @@ From renders of templates: three balls of three materials, lit from the side. St
 too short, Levenberg–Marquardt fits the three mean free paths.
 
 From path-traced views, whose noise is known: one ball, from half a mean free path thick to 32. All fits start
-three times too short, and see two views. Four ways:
+three times too short, and see two views. Three ways:
 
-- templates by transport, with the extinction that the camera's rays meet known, or following from the mean
-  free path, 1/λ;
+- templates by transport;
 - the path tracer itself, with other paths in each step; and from where templates by transport end.
 
 Each is repeated with other references, and other templates. A warning says where a model does not fit: then,
@@ -50,7 +49,7 @@ MATERIALS = {
     "CT of a head": (500.0, 5000.0, COLOR, 0.3, 0.5),
 }
 """Low and high value, colour, mean free path and opacity; balls are one mean free path thick."""
-MARKS = {TRANSPORT + KNOWN: "C0^", TRANSPORT + TIED: "C9^", PATHS: "C2o", STAGES: "ko"}
+MARKS = {TRANSPORT + TIED: "C9^", PATHS: "C2o", STAGES: "ko"}
 PER_PATH = 3
 """Nodes of templates by transport per mean free path of the ball, as long as there are few."""
 
@@ -215,14 +214,13 @@ def from_paths(scene: Scene, truth: dict[str, Any], chosen: Namespace) -> dict[s
     views = scene.views(truth, chosen.size, chosen.paths)
     transport = jv.ImageResidual(scene.transport, views, (0, 0, 0))
     paths = jv.PathTracedResidual(scene.traced, views, (0, 0, 0), paths=16, key=scene.seed)
-    ways: list[tuple[Sequence[str], Sequence[Any], float]] = [
-        ([TRANSPORT + KNOWN], [transport], 0.0),
-        ([TRANSPORT + TIED, STAGES], [transport, paths], 1.0),
-        ([PATHS], [paths], 1.0),
+    ways: list[tuple[Sequence[str], Sequence[Any]]] = [
+        ([TRANSPORT + TIED, STAGES], [transport, paths]),
+        ([PATHS], [paths]),
     ]
     rows: dict[str, dict[str, Any]] = {}
-    for names, residuals, tied in ways:
-        start, begun = times(1 / 3, truth) | {"tied": jnp.float32(tied)}, time.perf_counter()
+    for names, residuals in ways:
+        start, begun = times(1 / 3, truth), time.perf_counter()
         how = {"constraints": FIXED, "max_steps": chosen.steps, "patience": 3, "rtol": 1e-3}
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
