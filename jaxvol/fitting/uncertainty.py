@@ -45,8 +45,8 @@ class Uncertainty(NamedTuple):
         covariance: covariance in the order of `names`, for noise that is independent from pixel to pixel,
             of any variance in each ("sandwich", Huber–White). Where parameters are many, it is too small: in
             fits of 125 voxels and 4 extinctions to three views of 24² pixels, standard errors were 0.9 of the
-            true ones, and those by `covariance_of_equal_noise` 0.99. If a direction that the residual does not
-            determine changes a parameter, its variance is infinite and its covariances are NaN.
+            true ones, and those by `covariance_of_equal_noise` 0.99. If a direction that the residual does
+            not determine changes a parameter, its variance is infinite and its covariances are NaN.
         names: names of the numbers, such as `.extinction[3]`.
         undetermined: for each undetermined direction, the parameters that it changes most.
         covariance_of_equal_noise: covariance if all entries of the residual have independent noise of equal
