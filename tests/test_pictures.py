@@ -1,4 +1,4 @@
-"""Is any picture of the documentation, the figures and the results black, or smaller than 256 x 256 pixels?"""
+"""Is a picture of the documentation, the figures or the results black, or smaller than 256 x 256 pixels?"""
 
 from pathlib import Path
 
