@@ -182,10 +182,8 @@ def records() -> str:
     lines = ["| record | commit | commits since | machine | command |", "|---|---|---|---|---|"]
     for file in sorted((ROOT / "experiments/results").glob("*.json")):
         found = json.loads(file.read_text(encoding="utf-8"))
-        device, parts = (
-            found["device"],
-            [part for part in merged(found["result"]) if part[0] != found["commit"]],
-        )
+        device = found["device"]
+        parts = [part for part in merged(found["result"]) if part[0] != found["commit"]]
         machine = device["kind"] if device["platform"] != "cpu" else device.get("processor", "CPU")
         commits = {found["commit"], *(commit for commit, _ in parts)}
         since = max((commits_since(commit.rstrip("+")) for commit in commits), key=lambda n: int(n or 0))
@@ -196,9 +194,8 @@ def records() -> str:
 
 def merged(result: Any, name: str = "parts") -> Iterator[tuple[str, str]]:
     """The commits at which parts of a result were measured, where they are named, with how many parts."""
-    rows = (
-        {key: row for key, row in result.items() if isinstance(row, dict)} if isinstance(result, dict) else {}
-    )
+    pairs = result.items() if isinstance(result, dict) else ()
+    rows = {key: row for key, row in pairs if isinstance(row, dict)}
     counts = Counter(row["measured"]["commit"] for row in rows.values() if "measured" in row)
     for commit, count in counts.items():
         yield commit, f"{count} of {len(rows)} {name} of `{commit}`"
