@@ -14,6 +14,8 @@ import posixpath
 import re
 import subprocess
 import sys
+from collections import Counter
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -180,11 +182,26 @@ def records() -> str:
     lines = ["| record | commit | commits since | machine | command |", "|---|---|---|---|---|"]
     for file in sorted((ROOT / "experiments/results").glob("*.json")):
         found = json.loads(file.read_text(encoding="utf-8"))
-        commit, device = found["commit"], found["device"]
+        device = found["device"]
+        parts = [part for part in merged(found["result"]) if part[0] != found["commit"]]
         machine = device["kind"] if device["platform"] != "cpu" else device.get("processor", "CPU")
-        since = commits_since(commit.rstrip("+"))
-        lines.append(f"| {file.stem} | `{commit}` | {since} | {machine} | `{found['command']}` |")
+        commits = {found["commit"], *(commit for commit, _ in parts)}
+        since = max((commits_since(commit.rstrip("+")) for commit in commits), key=lambda n: int(n or 0))
+        told = "; ".join([f"`{found['commit']}`", *(part for _, part in parts)])
+        lines.append(f"| {file.stem} | {told} | {since} | {machine} | `{found['command']}` |")
     return "\n".join(lines)
+
+
+def merged(result: Any, name: str = "parts") -> Iterator[tuple[str, str]]:
+    """The commits at which parts of a result were measured, where they are named, with how many parts."""
+    pairs = result.items() if isinstance(result, dict) else ()
+    rows = {key: row for key, row in pairs if isinstance(row, dict)}
+    counts = Counter(row["measured"]["commit"] for row in rows.values() if "measured" in row)
+    for commit, count in counts.items():
+        yield commit, f"{count} of {len(rows)} {name} of `{commit}`"
+    for key, row in rows.items():
+        if "measured" not in row:
+            yield from merged(row, key)
 
 
 def commits_since(commit: str) -> str:

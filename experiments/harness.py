@@ -8,6 +8,7 @@ import argparse
 import math
 import os
 import sys
+import tempfile
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -39,7 +40,8 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
 
     Args:
         about: what the script does, its docstring.
-        output: default of `--output`, the folder to write into, which is made.
+        output: default of `--output`, the folder to write into, which is made. Under `--quick` the default is
+            a new temporary folder, so that nothing that is kept is overwritten.
         options: the other options, by name: the default of an integer, what `add_argument` takes (a dict), or
             a tuple, which is handed on and cannot be given. `commits` is given without its name.
 
@@ -61,6 +63,9 @@ def command(about: str | None, output: Path, **options: Any) -> Callable[[Callab
             pairs = zip(["", *given], given, strict=False)
             kept = [word for last, word in pairs if "--output" not in (last, word.partition("=")[0])]
             chosen = parser.parse_args(given, Namespace(argv=kept, **constants))
+            if getattr(chosen, "quick", False) and chosen.output is output:
+                chosen.output = Path(tempfile.mkdtemp(prefix="jaxvol-quick-"))
+                print(f"--quick without --output writes into {chosen.output}", flush=True)
             chosen.output.mkdir(parents=True, exist_ok=True)
             run(chosen)
 

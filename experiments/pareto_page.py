@@ -76,31 +76,40 @@ GRAIN = {
 """Settings of the chart of wood grain, all by the midpoint rule and aligned."""
 GRAIN_OF = "head phantom", "engine", "bonsai", "lidc0314_airway"
 NO_GRAIN = 1e-8
-"""Below it, an energy is that of noise, or 0."""
+"""The least energy that is told from 0: less is rounding."""
 
 
 def grain_chart(result: dict[str, Any]) -> Any:
-    """Time against the energy of wood grain: of jitter, and of shorter steps."""
+    """Time against the energy of wood grain: of jitter, and of shorter steps.
+
+    Energies are estimates. As far as the lowest of those drawn lies below 0, others may lie above it by
+    chance: below that, points are drawn at one place, which the chart calls "not told from 0".
+    """
     scenes = {name: result["scenes"][name] for name in GRAIN_OF if name in result["scenes"]}
+    drawn = [
+        (number, label, {n: scene["points"][n] for n in settings if n in scene["points"]})
+        for number, scene in enumerate(scenes.values())
+        for label, settings in GRAIN.items()
+    ]
+    floor = max([NO_GRAIN, *(-p["wood grain"] for _, _, points in drawn for p in points.values())])
     figure, axes = charts.panels(1, max(len(scenes), 1), 4 * max(len(scenes), 1), 4.4)
     for panel, (name, scene) in zip(axes.flat, scenes.items(), strict=False):
-        base = scene["points"]["midpoint, step 1"]["time"]
-        for label, settings in GRAIN.items():
-            chosen = {n: scene["points"][n] for n in settings if n in scene["points"]}
-            places = [(max(p["wood grain"], NO_GRAIN), p["time"] / base) for p in chosen.values()]
-            if not places:
-                continue
-            panel.plot(*zip(*places, strict=True), "o-", markersize=4.5, linewidth=0.8, label=label)
-            for setting, place in zip(chosen, places, strict=True):
-                panel.annotate(
-                    setting.rsplit(" ", 1)[1], place, (3, 3), textcoords="offset points", fontsize=8
-                )
+        panel.axvspan(floor / 4, floor, color="0.9")
         panel.set(xscale="log", xlabel="energy of wood grain", title=f"{name}, {scene['pixels']}²")
         panel.grid(which="major", linewidth=0.3)
+    for number, label, points in drawn:
+        if not points:
+            continue
+        panel, base = axes.flat[number], list(scenes.values())[number]["points"]["midpoint, step 1"]["time"]
+        energies = [p["wood grain"] if p["wood grain"] > floor else floor / 2 for p in points.values()]
+        places = list(zip(energies, (p["time"] / base for p in points.values()), strict=True))
+        panel.plot(*zip(*places, strict=True), "o-", markersize=4.5, linewidth=0.8, label=label)
+        for setting, place in zip(points, places, strict=True):
+            panel.annotate(setting.rsplit(" ", 1)[1], place, (3, 3), textcoords="offset points", fontsize=8)
     axes.flat[0].set_ylabel("time of a frame / at one voxel")
     figure.suptitle(
         "Time against wood grain: of jitter, and of shorter equidistant steps. Numbers are steps in voxels; "
-        "below and to the left is better",
+        f"below and to the left is better. Grey: below {floor:.1e}, not told from 0",
         fontsize=10,
     )
     handles, labels = axes.flat[0].get_legend_handles_labels()

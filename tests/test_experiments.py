@@ -2,6 +2,7 @@
 
 import importlib
 import re
+import tempfile
 from argparse import Namespace
 from pathlib import Path
 
@@ -46,6 +47,17 @@ def test_experiment_writes_its_result_and_all_that_it_takes_to_run_it_again(tmp_
     assert imread(tmp_path / f"{name}.png").std() > 10
     squares(["--output", str(tmp_path)])
     assert record.read(tmp_path / f"{name}.json")["result"]["squares"] == {"1": 1, "2": 4, "3": 9}
+
+
+def test_quick_runs_overwrite_no_record(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    before = {path: path.stat().st_mtime_ns for path in record.RESULTS.iterdir()}
+    squares(["--quick"])
+    (made,) = tmp_path.iterdir()
+    name = __name__.split(".")[-1]
+    assert {path.name for path in made.iterdir()} == {f"{name}.json", f"{name}.png"}
+    assert str(made) in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in record.RESULTS.iterdir()} == before
 
 
 def test_what_is_not_measured_again_is_kept_with_its_commit_if_it_is_of_the_same_sizes(tmp_path):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import jaxvol as jv
-from experiments import pareto, pareto_measure, pareto_points
+from experiments import charts, pareto, pareto_measure, pareto_points
 from experiments.pareto import behind, front
+from experiments.pareto_page import GRAIN, grain_chart
 from experiments.pareto_points import BASE, SETTINGS, Setting
 from experiments.pareto_scenes import ROWS
 from experiments.programs import Case, Program
@@ -88,3 +89,14 @@ def test_bad_options_are_named(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             pareto.main(["--quick", *words, "--output", str(tmp_path)])
+
+
+def test_energies_below_what_chance_gives_are_drawn_at_one_place_of_the_chart_of_wood_grain():
+    energies = dict(zip(GRAIN["equidistant"], (2e-9, 2e-6, 4e-6, 5e-5, 1e-3), strict=True))
+    energies |= {"jittered, step 1": -3e-6, "jittered, step 2": 2.9e-6}
+    points = {name: {"wood grain": energy, "time": 1.0} for name, energy in energies.items()}
+    figure = grain_chart({"scenes": {"engine": {"pixels": 256, "points": points}}})
+    equidistant, jittered = (line.get_xdata() for line in figure.axes[0].lines[:2])
+    assert list(equidistant[2:]) == [4e-6, 5e-5, 1e-3]
+    assert {*equidistant[:2], *jittered} == {1.5e-6}  # half of the largest below 0
+    charts.plt.close(figure)
