@@ -2,7 +2,7 @@
 
 Balls with edges several voxels wide, and a bar of two materials: one view of 400 paths, lit by one lamp far
 away, marched by steps of one voxel. Fits start three times too short. Two ways, all options at their
-defaults: by the path tracer (`PathTracedResidual`); and, of one ball and the bar, by templates by transport
+defaults: by the path tracer (`PathTracedResidual`); and, of one ball, by templates by transport
 (`ImageResidual`). The time is that of the whole call, with what it compiles: the first fit of each volume
 compiles, later ones do not.
 """
@@ -30,7 +30,7 @@ BALLS = {
 }
 """Voxels along an axis, radius, opacity of the material, and width of the edge in voxels."""
 BAR = "bar of two materials"
-TEMPLATES = "ball of 40³", BAR
+TEMPLATES = ("ball of 40³",)
 """Scenes whose fits by templates are measured, too."""
 HALF = 0.5
 """Half of the bar's width."""

@@ -19,6 +19,10 @@ from ..xla.memory import gather
 from .likelihood import OF_IMAGES, Sampling, jumping
 
 
+DENSEST = 2.0**10
+"""Upper bound of the extinction, per voxel. Matter that dense is opaque; if it were denser, only the time would
+grow, since flights beside it stop once a mean free path."""
+
 Block: TypeAlias = tuple[Int[Array, "..."], Int[Array, "..."], Int[Array, "..."]]
 """Indices of a block of a volume along x, y and z."""
 
@@ -68,7 +72,7 @@ class Majorants(eqx.Module):
             bound = jnp.where(open_ & may, jnp.maximum(bound, 1 / material.mean_free_path), bound)
             open_ &= ~fills
         bound = jnp.where(open_, jnp.maximum(bound, majorant), bound)
-        bound = jnp.where(majorant > 0, bound, 0)
+        bound = jnp.where(majorant > 0, jnp.minimum(bound, _densest(volume)), 0)
         distance = Affine(volume).occupancy(bound > 0).distance().astype(bound.dtype)
         x, y, z = (jnp.asarray(n - 1, bound.dtype) for n in volume.shape)
         last, distance = (x, y, z), distance.reshape(bound.shape)
@@ -140,7 +144,7 @@ class Medium(NamedTuple):
         jumping: Callable[[Scalar, Array], Scalar] = jumping,
     ) -> "Medium":
         """The medium of known majorants. `jumping`: as in `likelihood`, for the mode of differentiation."""
-        classification = classification_of(transfer, volume)
+        classification, densest = classification_of(transfer, volume), _densest(volume)
 
         def measure(coordinate: Vec3) -> Measured:
             measured = classification.measure(coordinate)
@@ -163,7 +167,13 @@ class Medium(NamedTuple):
                 extinction = jumping(extinction, ~visible & (share > 0))
                 extinction = jnp.where(inside, 1 / material.mean_free_path, extinction)
                 kept = jnp.where(inside, 1 - material.opacity, kept)
+            extinction = jnp.minimum(extinction, densest)
             r, g, b = (clipped(c) * kept for c in color)
             return extinction, (r, g, b)
 
         return cls(measure, classify, majorants)
+
+
+def _densest(volume: Volume) -> Scalar:
+    """Upper bound of the extinction (1/length)."""
+    return jax.lax.stop_gradient(DENSEST / jnp.min(volume.spacing))

@@ -302,6 +302,13 @@ def test_it_may_stand_in_what_is_differentiated_with_respect_to_something_else()
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(1.0), expected, rtol=1e-5)
 
 
+def test_matter_far_denser_than_a_voxel_is_opaque_and_takes_no_longer():
+    """Also where a fit leads: flights beside it would stop once a mean free path, at the shorter one forever."""
+    found = [np.asarray(image_of(SCENE, materials=(Material(0.9, path),))) for path in (1e-6, 1e-30)]
+    np.testing.assert_array_equal(*found)
+    assert found[0].max() > 0
+
+
 def test_nan_and_infinity_make_the_image_nan():
     for where in (
         lambda scene: scene["transfer"].extinction,
