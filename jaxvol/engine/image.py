@@ -66,7 +66,8 @@ def render_scene(
     """
     for name, value, choices in (("outputs", outputs, RenderOutputs), ("adjoint", adjoint, Adjoint)):
         if value not in get_args(choices):
-            raise ValueError(f"{name} must be one of {', '.join(get_args(choices))}; got {value!r}.")
+            more = '; and "samples", by render_rays' if name == "outputs" else ""
+            raise ValueError(f"{name} must be one of {', '.join(get_args(choices))}{more}; got {value!r}.")
     mesh, tiling = mesh_of(devices), Tiling.of_backend() if tiling is None else tiling
     tiling = tiling._replace(cells=scene.march.tested_every or tiling.cells)
     if mesh is not None:

@@ -11,6 +11,7 @@ means are over the last two epochs, half to three quarters of all steps. Unlike 
 """
 
 import math
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -49,6 +50,9 @@ FORGET = 2.0
 
 MIN_STEPS = 12
 """Minimum number of steps of a fit: standard errors are then known from 9 samples."""
+
+MANY = 256
+"""Number of parameters from which a fit warns of the time that forward mode takes."""
 
 ENOUGH = 0.5
 """Maximum ratio of standard errors, by noise of the paths over by noise of the references, at convergence."""
@@ -136,6 +140,12 @@ class SampledProblem(eqx.Module):
             raise ValueError(
                 f"max_jacobian leaves no room for the Jacobian of {size(y)} parameters and all views, which "
                 f"takes {needed} bytes as paths are averaged; got {limit}. Raise it, or fit fewer parameters."
+            )
+        if size(y) > MANY:
+            warnings.warn(
+                f"{size(y)} parameters are differentiated one by one, in forward mode; for so many, such as "
+                "voxels, take jax.grad of path_trace and an optimiser of gradients.",
+                stacklevel=4,
             )
         return cls(residual, free)
 

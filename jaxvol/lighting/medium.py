@@ -32,6 +32,10 @@ class MediumTransfer(Transfer):
     materials: tuple[Material, ...]
 
     @property
+    def whose(self) -> str:
+        return 'lighting by ScattererTemplates(..., form="transport")'
+
+    @property
     def channels(self) -> int | None:
         return self.transfer.channels
 

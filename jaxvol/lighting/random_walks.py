@@ -65,7 +65,10 @@ def scatterings(
     if levels is not None:
         return integer("levels", levels, 1)
     if is_traced([material.opacity for material in materials]):
-        raise ValueError("levels must be given where opacity is traced: the length of walks depends on it.")
+        raise ValueError(
+            "levels must be given where opacity is traced: the length of walks depends on it. If only the "
+            "mean free path is fitted, let that be the parameter, and make the Material of it in the scene."
+        )
     lowest = min(float(material.opacity) for material in materials)
     if lowest == 0:
         raise ValueError("levels must be given for a material of opacity 0, in which no light is absorbed.")

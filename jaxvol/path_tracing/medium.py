@@ -20,8 +20,8 @@ from .likelihood import OF_IMAGES, Sampling, jumping
 
 
 DENSEST = 2.0**10
-"""Upper bound of the extinction, per voxel. Matter that dense is opaque; if it were denser, only the time would
-grow, since flights beside it stop once a mean free path."""
+"""Upper bound of the extinction, per voxel. Matter that dense is opaque; if it were denser, only the time
+would grow, since flights beside it stop once a mean free path."""
 
 Block: TypeAlias = tuple[Int[Array, "..."], Int[Array, "..."], Int[Array, "..."]]
 """Indices of a block of a volume along x, y and z."""

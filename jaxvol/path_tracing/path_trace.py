@@ -189,7 +189,7 @@ def path_trace(
     derivative has the standard error of the mean over groups. Reverse mode (`jax.grad`) is for many
     parameters, such as voxels. It sums over the same paths, which it walks again (`replay`): no step is
     stored, so that memory does not grow with the number of scatterings. Second derivatives are in forward
-    mode over forward mode.
+    mode over forward mode. The first gradient takes half a minute to compile on a CPU.
 
     An image and its derivative are by the same random numbers, so the gradient of a squared error is biased
     by their covariance. The product of two independent residuals, by `groups=2` or two keys, is without bias:
@@ -231,8 +231,8 @@ def path_trace(
 
     Raises:
         ValueError: for arguments out of range, no lights, a transfer function without a majorant, labels
-            where the volume has none, and reverse mode over a derivative.
-        RuntimeError: for forward mode over reverse mode, and for differentiation with respect to inputs that
+            where the volume has none, and reverse mode over forward mode.
+        RuntimeError: for any mode over reverse mode, and for differentiation with respect to inputs that
             move paths or jumps of the medium: the camera, the volume's place, directions and positions of
             lights, the control points' values of the transfer function, the values of materials, and voxels
             where there are materials or a transfer function has a step (the derivative is NaN if the

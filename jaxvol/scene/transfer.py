@@ -100,6 +100,11 @@ class Transfer(eqx.Module):
         return True
 
     @property
+    def whose(self) -> str:
+        """Description for errors; by default the name of the class."""
+        return type(self).__name__
+
+    @property
     def reads_more(self) -> bool:
         """True if `attributes` reads anything; by default, if it is overridden."""
         return type(self).attributes is not Transfer.attributes
@@ -160,8 +165,8 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
         )
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
-        name = type(transfer).__name__
-        raise ValueError(f'quadrature="preintegrated" needs means: {name} has no integrator; use "midpoint".')
+        why = f"{transfer.whose} has no integrator"
+        raise ValueError(f'quadrature="preintegrated" needs means: {why}; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:
         return (*volume.values(coordinate), *transfer.attributes(volume, coordinate))

@@ -303,7 +303,7 @@ def test_it_may_stand_in_what_is_differentiated_with_respect_to_something_else()
 
 
 def test_matter_far_denser_than_a_voxel_is_opaque_and_takes_no_longer():
-    """Also where a fit leads: flights beside it would stop once a mean free path, at the shorter one forever."""
+    """Also where a fit leads: flights beside it would stop once a mean free path."""
     found = [np.asarray(image_of(SCENE, materials=(Material(0.9, path),))) for path in (1e-6, 1e-30)]
     np.testing.assert_array_equal(*found)
     assert found[0].max() > 0
