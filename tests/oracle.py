@@ -145,7 +145,7 @@ def march(data, spacing, origin, points, origins, directions, d, *, quadrature="
             width, t = np.maximum(end - begin, 0), sampled(begin, end)
             past = ended | (t >= rays.t_out)
 
-            def value(t, past=past):
+            def value(t: np.ndarray, past: np.ndarray = past) -> np.ndarray:
                 where = (origins + np.where(past, 0, t)[:, None] * directions - origin) / spacing
                 return map_coordinates(data, where.T, order=1, mode="nearest")
 

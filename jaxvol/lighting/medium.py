@@ -32,7 +32,7 @@ class MediumTransfer(Transfer):
     materials: tuple[Material, ...]
 
     @property
-    def whose(self) -> str:
+    def title(self) -> str:
         return 'lighting by ScattererTemplates(..., form="transport")'
 
     @property

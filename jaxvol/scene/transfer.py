@@ -100,7 +100,7 @@ class Transfer(eqx.Module):
         return True
 
     @property
-    def whose(self) -> str:
+    def title(self) -> str:
         """Description for errors; by default the name of the class."""
         return type(self).__name__
 
@@ -165,7 +165,7 @@ def classification_of(transfer: Transfer, volume: Volume, *, integrated: bool = 
         )
     integrate = transfer.integrator() if integrated else None
     if integrated and integrate is None:
-        why = f"{transfer.whose} has no integrator"
+        why = f"{transfer.title} has no integrator"
         raise ValueError(f'quadrature="preintegrated" needs means: {why}; use "midpoint".')
 
     def measure(coordinate: Vec3) -> Measured:

@@ -279,7 +279,8 @@ def test_nan_and_infinity_reach_image_and_gradient():
         scene = double_scene({"alignment", "leaping", "termination"}, "outside")
         whole = {name: where for name, where in LEAVES.items() if name != "voxels"}
         whole["values"] = lambda scene: scene[1].values
-        ends = [isinstance(each.inner, jv.EarlyTermination) for each in scene[3].transforms].index(True)
+        inner = [getattr(each, "inner", None) for each in scene[3].transforms]
+        ends = [isinstance(each, jv.EarlyTermination) for each in inner].index(True)
         whole["opacity_left"] = lambda scene: scene[3].transforms[ends].inner.opacity_left
         for number, (name, where) in enumerate(whole.items()):
             # in the reference, of which each image takes as long as ten others, every third

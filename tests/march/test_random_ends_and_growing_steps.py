@@ -228,7 +228,8 @@ class Darkened(jv.lighting.Shading):
     """Darker colours where the extinction is high, computed for visible samples alone."""
 
     def color(self, sample, shared, sums):
-        return tuple(channel * jnp.exp(-sample.extinction) for channel in sample.color)
+        r, g, b = (channel * jnp.exp(-sample.extinction) for channel in sample.color)
+        return r, g, b
 
 
 def camera_scene(voxels=np.float32, **values):
@@ -294,7 +295,7 @@ def test_selected_depths_move_with_steps_that_grow(mode):
             )
             return found.depth.sum()
 
-        at = march.step, march.transforms[0].near
+        at = march.step, getattr(march.transforms[0], "near")  # noqa: B009
         np.testing.assert_allclose(depth(*at), depth(*at, "direct"), rtol=1e-12)
         found = eqx.filter_jit(jax.grad(lambda at: depth(*at, "replay")))(at)
         for i, slope in enumerate(found):
