@@ -131,8 +131,12 @@ def march(data, spacing, origin, points, origins, directions, d, *, quadrature="
     (jump,) = [meaning.jump for meaning in meanings if meaning.jump is not None] or [1.0]
     jumps = np.ones(n, bool)
 
-    def sampled(begin, end):
+    def sampled(begin: np.ndarray, end: np.ndarray) -> np.ndarray:
         return begin if quadrature == "left" else begin + np.maximum(end - begin, 0) / 2
+
+    def value(t: np.ndarray, past: np.ndarray) -> np.ndarray:
+        where = (origins + np.where(past, 0, t)[:, None] * directions - origin) / spacing
+        return map_coordinates(data, where.T, order=1, mode="nearest")
 
     for _ in range(1_000_000):
         parts = [(front, front + d)]
@@ -145,17 +149,13 @@ def march(data, spacing, origin, points, origins, directions, d, *, quadrature="
             width, t = np.maximum(end - begin, 0), sampled(begin, end)
             past = ended | (t >= rays.t_out)
 
-            def value(t: np.ndarray, past: np.ndarray = past) -> np.ndarray:
-                where = (origins + np.where(past, 0, t)[:, None] * directions - origin) / spacing
-                return map_coordinates(data, where.T, order=1, mode="nearest")
-
             if quadrature == "preintegrated":
                 rgb, sigma = mean_between(
-                    value(begin), value(np.minimum(end, rays.t_out)), values, colors, extinction
+                    value(begin, past), value(np.minimum(end, rays.t_out), past), values, colors, extinction
                 )
             else:
-                rgb = np.stack([np.interp(value(t), values, c) for c in colors.T], axis=1)
-                sigma = np.interp(value(t), values, extinction)
+                rgb = np.stack([np.interp(value(t, past), values, c) for c in colors.T], axis=1)
+                sigma = np.interp(value(t, past), values, extinction)
             unseen = past if rays.gap is None else past | ((rays.gap[0] <= t) & (t < rays.gap[1]))
             alpha = np.where(unseen, 0, 1 - np.exp(-sigma * width))
             color += (transmittance * alpha)[:, None] * rgb

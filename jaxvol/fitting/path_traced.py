@@ -51,7 +51,7 @@ FORGET = 2.0
 MIN_STEPS = 12
 """Minimum number of steps of a fit: standard errors are then known from 9 samples."""
 
-MANY = 256
+NUMEROUS = 256
 """Number of parameters from which a fit warns of the time that forward mode takes."""
 
 ENOUGH = 0.5
@@ -141,7 +141,7 @@ class SampledProblem(eqx.Module):
                 f"max_jacobian leaves no room for the Jacobian of {size(y)} parameters and all views, which "
                 f"takes {needed} bytes as paths are averaged; got {limit}. Raise it, or fit fewer parameters."
             )
-        if size(y) > MANY:
+        if size(y) > NUMEROUS:
             warnings.warn(
                 f"{size(y)} parameters are differentiated one by one, in forward mode; for so many, such as "
                 "voxels, take jax.grad of path_trace and an optimiser of gradients.",
