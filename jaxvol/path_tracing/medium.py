@@ -19,7 +19,7 @@ from ..xla.memory import gather
 from .likelihood import OF_IMAGES, Sampling, jumping
 
 
-DENSEST = 2.0**10
+DENSEST = 2.0**7
 """Upper bound of the extinction, per voxel. Matter that dense is opaque; if it were denser, only the time
 would grow, since flights beside it stop once a mean free path."""
 

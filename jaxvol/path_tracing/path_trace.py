@@ -178,7 +178,7 @@ def path_trace(
     The image is radiance, in the unit of `lights`, as that of `ScattererTemplates`: in a white furnace
     (albedo 1 under a `ConstantLight` of radiance L) it is L times the opacity. Images are float32, also of
     float64 scenes. NaN or infinity in any input makes every pixel NaN, since any path may reach it (arguments
-    with a range, such as a mean free path, raise an error instead). Extinctions above 1024 per voxel count as
+    with a range, such as a mean free path, raise an error instead). Extinctions above 128 per voxel count as
     that, for time. Random numbers have 24 bits, so free
     paths longer than 16.6 mean free paths within a block of voxels, of probability 6e-8, are never drawn.
 
