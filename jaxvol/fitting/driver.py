@@ -181,7 +181,8 @@ def fit(
         losses = [loss]
         show(f"loss {loss:.3g}")
         if not math.isfinite(loss):
-            raise ValueError(f"residual must be finite at the starting parameters; loss {loss}.")
+            start = "at the parameters that the fit starts from"
+            raise ValueError(f"residual must be finite {start}; loss {loss}.")
         bounds = zip(free.paths, free.bijections, strict=True)
         description = {
             "solver": method if isinstance(method, str) else type(method).__name__,
