@@ -92,10 +92,11 @@ def test_where_two_materials_meet_nothing_is_in_neither():
 def test_a_material_is_whole_at_the_ends_of_its_range():
     """Which are often the smallest and the largest value of a volume."""
     medium = MediumTransfer(transfer(3.0), (Material(0.25, 0.5, values=(60, 100)),))
-    for value in (60.0, 80.0, 100.0):
-        albedo, extinction = medium.classifier()((jnp.float32(value),))
-        assert float(extinction) == 2
-        np.testing.assert_allclose(albedo, 0.75 * np.array([0.8, 0.5, 0.9]), rtol=1e-6)
+    classify = jax.jit(jax.vmap(lambda value: medium.classifier()((value,))))
+    albedo, extinction = classify(np.float32([60, 80, 100]))
+    np.testing.assert_array_equal(extinction, 2)
+    expected = 0.75 * np.array([0.8, 0.5, 0.9])
+    np.testing.assert_allclose(np.stack(albedo, axis=-1), np.tile(expected, (3, 1)), rtol=1e-6)
 
 
 def test_two_labels_of_one_material_are_one():
