@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from .compiling import compiled
@@ -68,12 +69,12 @@ def differentiable(
             moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents[:tree_size]]
             known = len(primals)
 
-            def pushed(constants: Sequence[Array], moving: Sequence[Array]) -> list[Array]:
+            def pushed(constants: Sequence[ArrayLike], moving: Sequence[Array]) -> list[Array]:
                 tangent = iter(moving)
                 tree_dot = like_tree([next(tangent) if moves_ else None for moves_ in moves], None)
                 return jax.tree.leaves(push(tree_dot, *arguments(constants[:known])))
 
-            def pulled(constants: Sequence[Array], cotangents: Sequence[Array]) -> list[Array]:
+            def pulled(constants: Sequence[ArrayLike], cotangents: Sequence[Array]) -> list[Array]:
                 cotangent = iter(cotangents)
                 results_bar = [next(cotangent) if float_ else None for float_ in is_float]
                 residuals = jax.tree.unflatten(kept_structure, constants[known:])
@@ -137,7 +138,9 @@ def _pushed(*operands: Array, count: int, push: Any, **_: Any) -> list[Array]:
     return push(operands[:count], operands[count:])
 
 
-def _jvp(primals: Sequence[Array], tangents: Sequence[Any], *, count: int, **params: Any) -> tuple[Any, Any]:
+def _jvp(
+    primals: Sequence[ArrayLike], tangents: Sequence[Any], *, count: int, **params: Any
+) -> tuple[Any, Any]:
     constants, moving = primals[:count], primals[count:]
     results = _PUSH.bind(*primals, count=count, **params)
     change: list[Any] = [jnp.zeros_like(leaf) for leaf in results]
@@ -164,7 +167,7 @@ def _transpose(cotangents: Sequence[Any], *operands: Any, count: int, pull: Any,
 
 
 def _batched(
-    operands: Sequence[Array],
+    operands: Sequence[ArrayLike],
     axes: Sequence[Any],
     *,
     count: int,
@@ -176,10 +179,10 @@ def _batched(
     size = next(leaf.shape[axis] for leaf, axis in zip(operands, axes, strict=True) if axis is not None)
     constant_axes, moving_axes = list(axes[:count]), list(axes[count:])
 
-    def pushes(constants: Sequence[Array], moving: Sequence[Array]) -> list[Array]:
+    def pushes(constants: Sequence[ArrayLike], moving: Sequence[Array]) -> list[Array]:
         return jax.vmap(push, in_axes=(constant_axes, moving_axes))(list(constants), list(moving))
 
-    def pulls(constants: Sequence[Array], cotangents: Sequence[Array]) -> list[Array]:
+    def pulls(constants: Sequence[ArrayLike], cotangents: Sequence[Array]) -> list[Array]:
         parts = jax.vmap(pull, in_axes=(constant_axes, 0))(list(constants), list(cotangents))
         pairs = zip(parts, moving_axes, strict=True)
         return [jnp.sum(part, 0) if axis is None else jnp.moveaxis(part, 0, axis) for part, axis in pairs]
