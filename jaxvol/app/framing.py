@@ -185,8 +185,8 @@ def _visible(volume: Volume, transfer: Transfer, min_opacity: float) -> Bool[np.
 
 def warn_of_gap(volume: Volume, pairs: Sequence[tuple[Volume, Transfer]]) -> None:
     """Warn of volumes of `pairs` that do not overlap the first one, mostly since a file has no origin."""
-    low, high = np.asarray(volume.bounds).reshape(3, 2).T
-    for number, (added, _) in enumerate(pairs):
+    for number, (added, _) in enumerate(pairs):  # bounds in here: without `pairs`, they compile nothing
+        low, high = np.asarray(volume.bounds).reshape(3, 2).T
         first, last = np.asarray(added.bounds).reshape(3, 2).T
         if (last < low).any() or (first > high).any():
             place = f"others[{number}], from {pasted(first)} to {pasted(last)},"

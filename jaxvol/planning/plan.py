@@ -182,7 +182,7 @@ def plan(
     first = search(ends, tolerance, {})
     coarse = first.render(COARSEST, "midpoint").image
     between = shows and is_empty(coarse)
-    opaque = probe.mean(np.asarray(coarse.opacity) >= 1 - ends) if over else 0.0
+    opaque = probe.mean(np.asarray(coarse.rgba)[..., -1] >= 1 - ends) if over else 0.0
     share = ends if opaque >= OPAQUE else 0.0
     brightest = brightest_of(coarse)
     within = search(ends / brightest, MARGIN * tolerance - share, first.rendered if brightest == 1 else {})
