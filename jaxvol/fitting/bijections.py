@@ -109,8 +109,7 @@ class Positive(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must not be negative to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
-        ratio = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
-        return ratio + jnp.log(-jnp.expm1(-ratio))  # inverse of softplus, which JAX lacks
+        return _inverse_softplus(value / self.scale.astype(value.dtype))
 
 
 class UnitInterval(Bijection):
@@ -126,7 +125,7 @@ class UnitInterval(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must be in [0, 1] to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: (v >= 0) & (v <= 1), message)
-        return logit(jnp.clip(value, MARGIN, 1 - MARGIN))
+        return _clipped_logit(value)
 
 
 class Pose(Bijection):
@@ -258,6 +257,7 @@ class ProbeGeometry(Bijection):
         return eqx.tree_at(lambda probe: probe.gamma_range, value, value.gamma_range[1])
 
 
+@jax.jit
 def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
     """Logarithms of the angles below and above a range of angles, relative to its width."""
     gaps = jnp.stack([angles[0], angles[1] - angles[0], jnp.pi - angles[1]])
@@ -268,3 +268,14 @@ def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
 def _range_of(ratios: Float[Array, "2"]) -> Float[Array, "2"]:
     gaps = jnp.pi * jax.nn.softmax(jnp.stack([ratios[0], jnp.zeros_like(ratios[0]), ratios[1]]))
     return jnp.stack([gaps[0], gaps[0] + gaps[1]])
+
+
+@jax.jit
+def _inverse_softplus(ratio: Float[Array, "*shape"]) -> Float[Array, "*shape"]:  # which JAX lacks
+    ratio = jnp.maximum(ratio, MARGIN)
+    return ratio + jnp.log(-jnp.expm1(-ratio))
+
+
+@jax.jit
+def _clipped_logit(value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    return logit(jnp.clip(value, MARGIN, 1 - MARGIN))

@@ -1,6 +1,5 @@
 """Starting points for fits of transfer functions."""
 
-import jax.numpy as jnp
 import numpy as np
 
 from .._util.checks import Arrayable, finite_array, integer, require
@@ -23,9 +22,11 @@ def flat_grey(volume: Volume, points: int = 8, clim: Arrayable | None = None) ->
         ValueError: for fewer than two points, and for a range that does not increase.
     """
     points = integer("points", points, 2)
-    clim = (float(volume.data.min()), float(volume.data.max())) if clim is None else clim
+    if clim is None:
+        data = np.asarray(volume.data)
+        clim = float(data.min()), float(data.max())
     message = "clim must be (low, high), low first; got {got}."
     low, high = require(finite_array("clim", clim, (2,)), lambda c: c[0] < c[1], message)
-    extent = float(jnp.mean(volume.bounds[1::2] - volume.bounds[::2]))
+    extent = float(np.mean(np.diff(np.asarray(volume.bounds).reshape(3, 2))))
     values = np.linspace(float(low), float(high), points)
     return TransferFunction(values, np.full((points, 3), 0.5), np.full(points, 1 / extent))

@@ -239,10 +239,7 @@ class Volume(eqx.Module):
     def bounds(self) -> Float[Array, "6"]:
         """World extent (x_min, x_max, y_min, y_max, z_min, z_max) of the nodes."""
         turn = np.eye(3, dtype=self.spacing.dtype) if self.direction is None else self.direction
-        # extent of each axis of the data along the world's axes
-        reach = turn * (self._steps * self.spacing)[None, :]
-        ends = (self.origin + jnp.sum(end(reach, 0), axis=1) for end in (jnp.minimum, jnp.maximum))
-        return jnp.stack(list(ends), axis=-1).reshape(-1)
+        return _bounds(self.origin, turn, self.spacing, self._steps)
 
     @property
     def corners(self) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
@@ -399,3 +396,15 @@ def fetches_of(volume: Volume) -> list[Fetch]:
 
 def _index(bound: Any) -> int | None:
     return None if bound is None else operator.index(bound)
+
+
+@jax.jit
+def _bounds(
+    origin: Float[Array, "3"],
+    turn: Float[Array, "3 3"],
+    spacing: Float[Array, "3"],
+    steps: Float[Array, "3"],
+) -> Float[Array, "6"]:
+    reach = turn * (steps * spacing)[None, :]  # of each axis of the data along the world's axes
+    ends = (origin + jnp.sum(end(reach, 0), axis=1) for end in (jnp.minimum, jnp.maximum))
+    return jnp.stack(list(ends), axis=-1).reshape(-1)
