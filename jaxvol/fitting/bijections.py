@@ -109,7 +109,7 @@ class Positive(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must not be negative to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
-        return _inverse_softplus(value / self.scale.astype(value.dtype))
+        return _inverse_softplus(value, self.scale)
 
 
 class UnitInterval(Bijection):
@@ -271,8 +271,8 @@ def _range_of(ratios: Float[Array, "2"]) -> Float[Array, "2"]:
 
 
 @jax.jit
-def _inverse_softplus(ratio: Float[Array, "*shape"]) -> Float[Array, "*shape"]:  # which JAX lacks
-    ratio = jnp.maximum(ratio, MARGIN)
+def _inverse_softplus(value: Float[Array, "*shape"], scale: Float[Array, ""]) -> Float[Array, "*shape"]:
+    ratio = jnp.maximum(value / scale.astype(value.dtype), MARGIN)
     return ratio + jnp.log(-jnp.expm1(-ratio))
 
 

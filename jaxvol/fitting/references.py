@@ -111,4 +111,4 @@ def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera
 
 def _stacked(*leaves: Array) -> Array:
     """The leaves stacked; of arrays that are not traced in NumPy, which compiles nothing."""
-    return jnp.stack(leaves) if is_traced(leaves) else jnp.asarray(np.stack(leaves))
+    return jnp.stack(leaves) if is_traced(leaves) else jax.device_put(np.stack(leaves))

@@ -39,13 +39,17 @@ def grain(folder: Path, size: tuple[int, int], resolution: int) -> None:
     """Wood grain, before and after: a translucent cube at far too long a step. Each ray's last cell reaches
     past the cube by another fraction of a step, which shows as terraces. AlphaCorrection cuts that cell where
     the ray leaves the cube, and makes the same step exact there; nothing else is changed."""
+    import numpy as np
+
     import jaxvol as jv
 
-    cube = jv.phantom("linear", 64)
-    transfer = jv.TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (1, (0.15, 0.35, 0.9), 0.45)])
+    ramp = jv.phantom("linear", 64)
+    cube = jv.Volume((255 * np.asarray(ramp.data)).astype(np.uint8), ramp.spacing, ramp.origin)
+    transfer = jv.TransferFunction.from_points([(0, (0.9, 0.35, 0.1), 0.45), (255, (0.15, 0.35, 0.9), 0.45)])
     camera = jv.Camera.looking_at(cube, (-0.6, 0.5, -1), (0, 1, 0), size=size).zoom(1.05)
     for name, transforms in (("before", ()), ("after", (jv.AlphaCorrection(),))):
-        rendering = jv.render(cube, transfer, camera, jv.March(0.25, transforms))
+        march = jv.March(0.25, (jv.SpaceLeaping(), *transforms))
+        rendering = jv.render(cube, transfer, camera, march)
         jv.save_png(folder / f"{name}.png", rendering.image(background=(0, 0, 0)))
 
 
