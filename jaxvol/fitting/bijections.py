@@ -109,7 +109,8 @@ class Positive(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must not be negative to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: v >= 0, message)
-        return _inverse_softplus(value, self.scale)
+        ratio = jnp.maximum(value / self.scale.astype(value.dtype), MARGIN)
+        return ratio + jnp.log(-jnp.expm1(-ratio))  # inverse of softplus, which JAX lacks
 
 
 class UnitInterval(Bijection):
@@ -125,7 +126,7 @@ class UnitInterval(Bijection):
     def inverse(self, value: Arrayable, name: str = "value") -> Float[Array, "*shape"]:
         message = f"{name} must be in [0, 1] to be fitted; got {{got}}."
         value = require(finite_array(name, value, (...,)), lambda v: (v >= 0) & (v <= 1), message)
-        return _clipped_logit(value)
+        return logit(jnp.clip(value, MARGIN, 1 - MARGIN))
 
 
 class Pose(Bijection):
@@ -257,7 +258,6 @@ class ProbeGeometry(Bijection):
         return eqx.tree_at(lambda probe: probe.gamma_range, value, value.gamma_range[1])
 
 
-@jax.jit
 def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
     """Logarithms of the angles below and above a range of angles, relative to its width."""
     gaps = jnp.stack([angles[0], angles[1] - angles[0], jnp.pi - angles[1]])
@@ -268,14 +268,3 @@ def _ratios(angles: Float[Array, "2"]) -> Float[Array, "2"]:
 def _range_of(ratios: Float[Array, "2"]) -> Float[Array, "2"]:
     gaps = jnp.pi * jax.nn.softmax(jnp.stack([ratios[0], jnp.zeros_like(ratios[0]), ratios[1]]))
     return jnp.stack([gaps[0], gaps[0] + gaps[1]])
-
-
-@jax.jit
-def _inverse_softplus(value: Float[Array, "*shape"], scale: Float[Array, ""]) -> Float[Array, "*shape"]:
-    ratio = jnp.maximum(value / scale.astype(value.dtype), MARGIN)
-    return ratio + jnp.log(-jnp.expm1(-ratio))
-
-
-@jax.jit
-def _clipped_logit(value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    return logit(jnp.clip(value, MARGIN, 1 - MARGIN))

@@ -64,8 +64,8 @@ class Free(eqx.Module):
 
     def names(self, free: FreeVariables) -> list[str]:
         """Name of every number in `moved`, such as `.extinction[3]`."""
-        names, moved = [], eqx.filter_eval_shape(self.moved, free)
-        for (number, *inner), leaf in jax.tree_util.tree_flatten_with_path(moved)[0]:
+        names = []
+        for (number, *inner), leaf in jax.tree_util.tree_flatten_with_path(self.moved(free))[0]:
             name = self.paths[number.idx].removeprefix("parameters") + jax.tree_util.keystr(tuple(inner))
             names += [name + (str(list(at)) if at else "") for at in np.ndindex(leaf.shape)]
         return names
@@ -144,7 +144,7 @@ def _default(node: Any) -> PyTree:
         return ProbeGeometry(node)
     fixed = jax.tree.map(lambda _: Fixed(), node)
     if isinstance(node, TRANSFERS):
-        top = float(np.max(np.asarray(node.extinction)))
+        top = float(jnp.max(node.extinction))
         bounds = UnitInterval(), Positive(top if top > 0 else 1.0)
         return eqx.tree_at(lambda t: (t.colors, t.extinction), fixed, bounds)
     if isinstance(node, LabelTransferFunction):  # factors of its extinctions are free in `stacked`

@@ -262,7 +262,7 @@ class _Run(eqx.Module):
 
     def ended(self, problem: Problem, losses: list[float], limits: Limits) -> Any:
         """The result if the fit has ended, else None."""
-        finite = all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(self.y))
+        finite = all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(self.y))
         if not finite or not math.isfinite(losses[-1]):
             return Outcome.nonfinite
         if self.done or self.result != optx.RESULTS.successful:
@@ -279,7 +279,7 @@ class _Run(eqx.Module):
     def _offset(self, problem: Problem) -> float:
         """Distance of the best point from the minimum of the linear model: in standard errors, root mean
         square over all directions. Source: the relative offset of Bates and Watts 1981."""
-        *reducible, remainder = np.asarray(cast(Triangles, self.triangles).residual, np.float64)[:, -1]
+        *reducible, remainder = np.asarray(cast(Triangles, self.triangles).residual[:, -1], np.float64)
         freedom = problem.count - len(reducible)
         if freedom <= 0 or remainder == 0:
             return math.inf

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 from .._util.checks import Arrayable, described, finite_array
 from ..path_tracing import PathTraced
 from ..scene.camera import Camera
-from ..xla.platform import is_traced
 from ..xla.trees import PyTree
 from .noise import Noise, path_traced_view, pixel_values
 
@@ -47,7 +46,7 @@ class References(eqx.Module):
         for number, (camera, image, _) in enumerate(read):
             kinds.setdefault((jax.tree.structure(camera), image.shape), []).append(number)
         pairs = [[read[number][:2] for number in kind] for kind in kinds.values()]
-        groups = [jax.tree.map(_stacked, *kind) for kind in pairs]
+        groups = [jax.tree.map(lambda *leaves: jnp.stack(leaves), *kind) for kind in pairs]
         stacked = [
             None if counted is None else jax.device_put(np.stack([counted[number] for number in kind]))
             for kind in kinds.values()
@@ -107,8 +106,3 @@ def _view(number: int, view: Any, background: Float[Array, "3"]) -> tuple[Camera
     if image.shape[2] < 3:
         raise ValueError(f"{name} must have 3 channels, or those of Rendering.rgba; got {image.shape[2]}.")
     return camera, image, variance
-
-
-def _stacked(*leaves: Array) -> Array:
-    """The leaves stacked; of arrays that are not traced in NumPy, which compiles nothing."""
-    return jnp.stack(leaves) if is_traced(leaves) else jax.device_put(np.stack(leaves))

@@ -13,7 +13,6 @@ parameters follows from the Jacobian of the bijections.
 import warnings
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -99,13 +98,6 @@ def spreads(triangles: Triangles, count: int, scale: float) -> Spreads:
     return Spreads(unequal / np.sqrt(shrunk), equal, directions[~determined])
 
 
-@eqx.filter_jit
-def _jacobian(free: Free, at: FreeVariables) -> Float[Array, "numbers free"]:
-    """Derivatives of the numbers of `free.moved(at)`."""
-    flat, unravel = ravel_pytree(at)
-    return jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat)
-
-
 def uncertainty(
     triangles: Triangles,
     count: int,
@@ -116,7 +108,8 @@ def uncertainty(
     path_covariance: Float[Array, "free free"] | None = None,
 ) -> Uncertainty:
     """Uncertainty of `free.forward(at)`. `path_covariance`: part due to noise of the fit's paths."""
-    jac = np.asarray(_jacobian(free, at), np.float64)
+    flat, unravel = ravel_pytree(at)
+    jac = np.asarray(jax.jacfwd(lambda flat: ravel_pytree(free.moved(unravel(flat)))[0])(flat), np.float64)
     unequal, equal, undetermined = spreads(triangles, count, scale)
     names = free.names(at)
     # relative to the norm of a parameter's row: where a bijection is nearly flat, the effect is small, yet
@@ -128,7 +121,7 @@ def uncertainty(
     by_paths = 0.0 if path_covariance is None else jac @ np.asarray(path_covariance, np.float64) @ jac.T
 
     def covariance(spread: np.ndarray) -> np.ndarray:
-        if count <= jac.shape[1]:  # no entries are left to estimate variances from
+        if count <= flat.size:  # no entries are left to estimate variances from
             return np.full((len(jac),) * 2, np.inf)
         matrix = (jac @ spread) @ (jac @ spread).T + by_paths
         matrix[touched] = matrix[:, touched] = np.nan
