@@ -25,12 +25,10 @@ from .compositing.selection import RaySampler, Selection
 from .lighting.shading import Lighting, lit_classification
 from .march.march import Cell, CellRules, March
 from .scene.camera import Camera, without_ends
-from .scene.labels import LabelTransferFunction
 from .scene.rendering import Details, Rendering
 from .scene.several import Several, Together
 from .scene.space import Line, Ray, Space, enter, world_gradient
-from .scene.transfer import Classification, Measured, Transfer, TransferFunction, classification_of
-from .scene.transfer2d import TransferFunction2D
+from .scene.transfer import Classification, Measured, Transfer, classification_of
 from .scene.volume import Volume, grids, without_voxels
 from .xla.differentiation import check_captured
 from .xla.memory import in_memory
@@ -139,15 +137,6 @@ COARSE = 1 / 16
 MATCH = 1e-3
 """Distance from a selected depth, in steps, up to which a sample is the selected one."""
 
-FINAL: dict[type, str] = {
-    Volume: "jaxvol.Field instead, and pass it as Volume(..., field=...)",
-    TransferFunction: "jaxvol.Transfer instead",
-    TransferFunction2D: "jaxvol.Transfer instead",
-    LabelTransferFunction: "jaxvol.Transfer instead",
-}
-"""Classes whose subclasses may disagree with what the fast engine computes for the class itself (packed
-voxels, ranges of blocks, the VJP), and what to subclass instead."""
-
 
 def check_arguments(call: str, **arguments: Any) -> None:
     """Check that arguments are of the types that `EXPECTED` has for their names.
@@ -161,8 +150,8 @@ def check_arguments(call: str, **arguments: Any) -> None:
     """
     for name, value in arguments.items():
         kind, expected, remedy = EXPECTED[name]
-        for final, base in FINAL.items():
-            if isinstance(value, final) and type(value) is not final:
+        for final in type(value).__mro__[1:]:
+            if base := vars(final).get("subclass_instead"):
                 raise ValueError(
                     f"{name} must be a jaxvol {final.__name__} itself; got its subclass "
                     f"{type(value).__name__}, with which the fast engine may disagree. Subclass {base}."

@@ -18,7 +18,6 @@ from .engine.devices import Devices
 from .engine.image import Adjoint, RenderOutputs, render_scene
 from .lighting.shading import Lighting
 from .march.march import March
-from .planning import plan
 from .ray import Scene, check_arguments
 from .scene.camera import Camera, Ending, GivenRays, finer
 from .scene.rendering import Rendering, pooled
@@ -139,6 +138,8 @@ def render(
             raise ValueError(f'march must be a jaxvol March or "auto"; got {march!r}.')
         check_arguments(order, volume=grid)
         tolerance = PLANNED if tolerance is None else tolerance
+        from .planning import plan  # here, since few images need it
+
         planned = plan(grid, function, camera, tolerance, compositing=compositing, lighting=lighting)
         if not planned.within:
             warnings.warn(f"the image may not be within the tolerance: {planned}", stacklevel=2)

@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import sys
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,14 +11,13 @@ import numpy as np
 from .affine import directions
 from .checks import finite_array, integer, shortened
 from .files import MOST_VOXELS, ensure
+from .texts import warn_caller
 from .units import axis_letters, length_of
 from .voxels import WHOLE, check_shape, is_flat, within
 
 
 ALONG_AXES = 1e-5
 """Maximum deviation of directions from the world's axes that is ignored: 0.01 voxels in 1000."""
-
-INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a user's call and `warn_caller`
 
 
 @dataclass
@@ -202,14 +199,6 @@ def volume_arguments(
     for text in record.assumed:
         warn_caller(f"{record.what.removeprefix('path: ')}: {text}")
     return arguments
-
-
-def warn_caller(text: str) -> None:
-    """Warn at the line that called the library."""
-    level, frame = 1, sys._getframe()
-    while frame is not None and frame.f_globals.get("__name__", "").startswith(INNER):
-        level, frame = level + 1, frame.f_back
-    warnings.warn(text, stacklevel=level)
 
 
 def _filled(record: ImageRecord, data: np.ndarray, mask: np.ndarray, nan: float | None) -> np.ndarray:

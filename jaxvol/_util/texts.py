@@ -1,5 +1,7 @@
-"""Array literals for messages, and suggestions of names similar to a wrong one."""
+"""Array literals for messages, suggestions of names similar to a wrong one, and warnings."""
 
+import sys
+import warnings
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -8,6 +10,9 @@ import numpy as np
 
 from ..xla.platform import is_traced
 from .checks import described
+
+
+INNER = "jaxvol.", "equinox.", "jaxtyping.", "beartype"  # modules between a user's call and `warn_caller`
 
 
 def is_concrete(array: object) -> bool:
@@ -29,3 +34,11 @@ def near(word: str, names: Iterable[str]) -> str:
     count = 1 if word.lower() in by_case else 3
     matches = [by_case[name] for name in get_close_matches(word.lower(), by_case, count)]
     return f" Did you mean {' or '.join(matches)}?" if matches else ""
+
+
+def warn_caller(text: str) -> None:
+    """Warn at the line that called the library."""
+    level, frame = 1, sys._getframe()
+    while frame is not None and frame.f_globals.get("__name__", "").startswith(INNER):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, stacklevel=level)

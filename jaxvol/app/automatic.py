@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from .._util.checks import Arrayable, described
-from .._util.image_record import warn_caller
 from .._util.srgb import from_srgb
+from .._util.texts import warn_caller
 from .._util.voxels import faces_of, is_flat
 from ..ray import check_arguments
 from ..scene.labels import LabelTransferFunction

@@ -14,9 +14,10 @@ import numpy as np
 
 from .._util.checks import Arrayable, described, shortened
 from .._util.files import MOST_VOXELS
-from .._util.image_record import DecodedArray, ImageRecord, choose, warn_caller
+from .._util.image_record import DecodedArray, ImageRecord, choose
 from .._util.memory import memory_of_device, require_room
 from .._util.named_axes import cf_scale, even_step, record_of
+from .._util.texts import warn_caller
 from .._util.units import axis_letters
 from .._util.voxels import check_shape
 from ..io.formats import FOLDERS, read_record

@@ -14,7 +14,6 @@ from jaxtyping import Array, Int
 
 from ..compositing.blending import OpticalDepths, Weighting
 from ..compositing.selection import Selection
-from ..lighting.template_lighting import with_baked_light
 from ..ray import Scene, by_rules, check_channels, end
 from ..reference import step, steps_across
 from ..scene.camera import GivenRays, without_ends
@@ -85,7 +84,7 @@ def render_scene(
         # a multiple of 64, so that a change of step rarely compiles the program again
         steps = min(-(-steps_across(volume, march) // 64) * 64, march.most_samples)
     if lighting is not None:
-        scene = scene._replace(lighting=with_baked_light(lighting, volume, scene.transfer, march))
+        scene = scene._replace(lighting=lighting.baked(volume, scene.transfer, march))
     options = RenderOptions(outputs, tiling, adjoint, steps, most_samples is not None)
     acceleration = VolumeAcceleration.of(volume, scene.transfer, march, scene.lighting, scene.compositing)
     scene, acceleration = varying((scene, acceleration))

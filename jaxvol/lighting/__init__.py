@@ -1,18 +1,7 @@
 """Lighting of samples: light sources, and the materials that scatter their light."""
 
-from .lights import (
-    ConstantLight as ConstantLight,
-    DirectionalLight as DirectionalLight,
-    HeadLight as HeadLight,
-    Light as Light,
-    PointLight as PointLight,
-)
-from .materials import Material as Material, mean_free_path as mean_free_path
-from .phong import Phong as Phong
-from .shading import Lighting as Lighting, Shading as Shading
-from .simulation import (
-    scatterer_template as scatterer_template,
-    scatterer_templates as scatterer_templates,
-)
-from .template import ScattererTemplate as ScattererTemplate
-from .template_lighting import ScattererTemplates as ScattererTemplates
+import lazy_loader
+
+
+# names are those of `__init__.pyi`; a module is imported when the first of its names is used
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._util.checks import check_answer
 from .._util.vec3 import Scalar, Vec3
+from ..march.march import March
 from ..scene.space import Space
 from ..scene.transfer import Classification, Measured, Transfer, classification_of
 from ..scene.volume import (
@@ -142,6 +143,10 @@ class Lighting(eqx.Module):
     def medium(self, transfer: Transfer) -> Transfer:
         """The transfer function by which rays see the volume; by default, that of the scene."""
         return transfer
+
+    def baked(self, volume: Volume, transfer: Transfer, march: March) -> "Lighting":
+        """The lighting with what is computed once for all images of a scene; by default, itself."""
+        return self
 
     @abstractmethod
     def for_image(self, around: Surroundings) -> "Shading":

@@ -273,28 +273,27 @@ class ScattererTemplates(Lighting):
         blended = jax.tree.map(lambda leaf: leaf[:, None], templates.blended())
         return blended.brightest(self.photons * self.templates)
 
+    def baked(self, volume: Volume, transfer: Transfer, march: March) -> Lighting:
+        """The lighting, with light on a grid computed once for all images of a scene. If an input is traced,
+        the light is computed for this image, by a separate program, which JAX differentiates."""
+        if self.form == "published":
+            return self
+        # only transforms of the march that locate points affect the light
+        spaces = march.overriding("locate")
+        inputs = jax.tree.flatten((self, without_voxels(volume), transfer, spaces))
+        if is_traced(inputs, volume.data):
+            return _solved(self, Surroundings(volume, transfer, march.locate(volume)))
+        cache = memoized(volume.data, _light_cache)
+        if not cache or not _equal(cache["inputs"], inputs):
+            with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
+                around = Surroundings(volume, transfer, march.locate(volume))
+            cache.update(inputs=inputs, light=computed_now(_solved, self, around))
+        return cache["light"]
+
 
 @eqx.filter_jit
 def _solved(lighting: ScattererTemplates, around: Surroundings) -> Shading:
     return lighting.for_image(around)
-
-
-def with_baked_light(lighting: Lighting, volume: Volume, transfer: Transfer, march: March) -> Lighting:
-    """The lighting, with light on a grid computed once for all images of a scene. If an input is traced, the
-    light is computed for this image, by a separate program, which JAX differentiates."""
-    if not isinstance(lighting, ScattererTemplates) or lighting.form == "published":
-        return lighting
-    # only transforms of the march that locate points affect the light
-    spaces = march.overriding("locate")
-    inputs = jax.tree.flatten((lighting, without_voxels(volume), transfer, spaces))
-    if is_traced(inputs, volume.data):
-        return _solved(lighting, Surroundings(volume, transfer, march.locate(volume)))
-    cache = memoized(volume.data, _light_cache)
-    if not cache or not _equal(cache["inputs"], inputs):
-        with jax.ensure_compile_time_eval():  # the cached light must outlive an enclosing `jax.jit`
-            around = Surroundings(volume, transfer, march.locate(volume))
-        cache.update(inputs=inputs, light=computed_now(_solved, lighting, around))
-    return cache["light"]
 
 
 def _light_cache(_: Array) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Transfer functions of segmented volumes: one for each label."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -40,6 +40,8 @@ class LabelTransferFunction(Transfer):
     """
 
     bands = 3
+    subclass_instead: ClassVar[str] = "jaxvol.Transfer instead"
+
     stacked: TransferFunction
     """All functions, stacked along a leading axis for the label; the last one is that of invisible labels."""
     opacity: Float[Array, " labels"]

@@ -203,6 +203,8 @@ class TransferFunction(Transfer):
     """
 
     bands = 3
+    subclass_instead: ClassVar[str] = "jaxvol.Transfer instead"
+
     values: Float[Array, " n"]
     colors: Float[Array, "n 3"]
     extinction: Float[Array, " n"]

@@ -1,6 +1,7 @@
 """Transfer functions of the value and the magnitude of its gradient."""
 
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +43,8 @@ class TransferFunction2D(Transfer):
     """
 
     bands = 3
+    subclass_instead: ClassVar[str] = "jaxvol.Transfer instead"
+
     values: Float[Array, " n"]
     magnitudes: Float[Array, " m"]
     colors: Float[Array, "n m 3"]

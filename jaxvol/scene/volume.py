@@ -7,7 +7,7 @@ Values are interpolated trilinearly; outside the grid they are those of the near
 import operator
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -18,7 +18,6 @@ from jaxtyping import Array, Float, Int, Integer, Shaped
 from .._util.affine import FLAT
 from .._util.axes import XYZ, Axes
 from .._util.checks import Arrayable, described, finite_array, integers, require, shortened
-from .._util.named_axes import object_arguments
 from .._util.texts import is_concrete, pasted
 from .._util.vec3 import Frame, Scalar, Vec3
 from .._util.voxels import label_array, voxel_array
@@ -79,6 +78,9 @@ class Volume(eqx.Module):
             another shape, or beyond int32.
     """
 
+    # the engine packs voxels, finds ranges of blocks and differentiates by what it knows of this class
+    subclass_instead: ClassVar[str] = "jaxvol.Field instead, and pass it as Volume(..., field=...)"
+
     data: Shaped[Array, "nx ny nz *c"]
     spacing: Float[Array, "3"]
     origin: Float[Array, "3"]
@@ -100,7 +102,11 @@ class Volume(eqx.Module):
         label_ids: Arrayable | None = None,
         field: Field | None = None,
     ):
-        place: dict[str, Any] = object_arguments(data) or {"data": data}
+        place: dict[str, Any] = {"data": data}
+        if not isinstance(data, np.ndarray | jax.Array):
+            from .._util.named_axes import object_arguments  # here, since most volumes are arrays
+
+            place = object_arguments(data) or place
         self.data = voxel_array(place["data"])
         spacing = place.get("spacing", (1.0, 1.0, 1.0)) if spacing is None else spacing
         origin = place.get("origin", (0.0, 0.0, 0.0)) if origin is None else origin

@@ -23,7 +23,6 @@ from jaxvol.lighting import (
 from jaxvol.lighting.lights import lights_of
 from jaxvol.lighting.materials import materials_of
 from jaxvol.lighting.packet_tree import PacketTree
-from jaxvol.lighting.template_lighting import with_baked_light
 
 from ..scenes import slow
 from .samples import shaded
@@ -119,7 +118,7 @@ BAD = {
     "nodes": (lit(form="transport", nodes=1), "nodes must be an integer of at least 2"),
     "nodes as published": (lit(nodes=9), 'nodes=9 needs form="transport"'),
     "a fine grid": (
-        lambda: with_baked_light(lit(form="transport", nodes=10**5)(), VOLUME, TRANSFER, jv.March(0.1)),
+        lambda: lit(form="transport", nodes=10**5)().baked(VOLUME, TRANSFER, jv.March(0.1)),
         "nodes for nodes=100000.*asks for .* GiB",
     ),
     "faint": (lit(FAINT), "opacity 0.031 leaves no photon"),

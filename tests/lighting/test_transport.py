@@ -26,7 +26,6 @@ from jaxvol.lighting.materials import shares
 from jaxvol.lighting.medium import FADE, MediumTransfer, scattering_at
 from jaxvol.lighting.random_walks import unit_walks
 from jaxvol.lighting.shading import Surroundings
-from jaxvol.lighting.template_lighting import with_baked_light
 
 from ..scenes import in_float64
 
@@ -338,7 +337,7 @@ def test_light_that_was_computed_inside_a_program_serves_outside():
 
     def prepared():
         lighting = light_of(materials(1.2, 0.8), lit(SUN), nodes=2, levels=1, templates=1, packets=1)
-        return jax.tree.leaves(with_baked_light(lighting, *scene))
+        return jax.tree.leaves(lighting.baked(*scene))
 
     jax.eval_shape(lambda x: (prepared(), x)[1], 0.0)
     assert not any(isinstance(leaf, jax.core.Tracer) for leaf in prepared())

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from ..._util.checks import integer
-from ..._util.image_record import warn_caller
+from ..._util.texts import warn_caller
 from ..._util.vec3 import Scalar, Vec3
 from ...scene.occupancy import BLOCK, FARTHEST, Occupancy, Sums
 from ...scene.space import Ray
